@@ -1,0 +1,1 @@
+"""Mathematics of six-axis arms under the modified (Craig) Denavit-Hartenberg convention."""

@@ -1,0 +1,157 @@
+"""The configuration as the platform uses it: frozen, checked whole by `rtcp.config.schema`, SI units throughout.
+
+This module imports nothing heavy: the loop's process holds these objects and no validator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+
+U8 = Annotated[int, Ge(0), Le(0xFF)]
+U16 = Annotated[int, Ge(0), Le(0xFFFF)]
+U32 = Annotated[int, Ge(0), Le(0xFFFFFFFF)]
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Fraction = Annotated[float, Gt(0), Lt(1)]
+Name = Annotated[str, MinLen(1), MaxLen(64)]
+
+DataTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
+                       "float32", "float64"]  # fmt: skip
+DriveModeName = Literal["csp", "csv", "cst"]
+
+
+@dataclass(frozen=True)
+class PdoEntry:
+    """One mapped object: `value in SI = counts * factor`. Index 0 is padding and has no name of use."""
+
+    index: U16
+    sub_index: U8
+    type: DataTypeName
+    name: Name
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Pdo:
+    """A process data object (0x16xx from the master, 0x1Axx to it) and the entries mapped into it, in order."""
+
+    index: U16
+    channels: Annotated[tuple[PdoEntry, ...], MinLen(1)]
+
+
+@dataclass(frozen=True)
+class StartupSdo:
+    """An SDO written in PRE-OP and read back; `optional` ones may be absent from the device."""
+
+    index: U16
+    sub_index: U8
+    type: DataTypeName
+    value: float
+    name: str = ""
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class DeviceDescription:
+    """A kind of slave, from `config/devices/<key>.yaml`."""
+
+    name: Name
+    kind: Literal["cia402", "io"]
+    vendor_id: U32
+    product_id: U32
+    rpdo: tuple[Pdo, ...]
+    """Outputs of the master, assigned through 0x1C12."""
+    tpdo: tuple[Pdo, ...]
+    """Inputs of the master, assigned through 0x1C13."""
+    configurable_pdos: bool = True
+    """False where the device's mapping is fixed: it is then read and compared, never written."""
+    sdo: tuple[StartupSdo, ...] = ()
+    assign_activate: U16 = 0
+    """DC AssignActivate word of the ESI (0x0300: SYNC0; 0x0700: SYNC0 and SYNC1); 0: no distributed clocks."""
+    sync0_shift_us: float = 0.0
+    watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
+    """Process-data (sync manager) watchdog: the drive stops when no output arrives for so long."""
+
+
+@dataclass(frozen=True)
+class SlaveConfig:
+    """A slave of the segment, in the order of the cable: position is its index + 1."""
+
+    name: Name
+    device: DeviceDescription
+
+
+@dataclass(frozen=True)
+class Range:
+    """A closed interval; `min < max`."""
+
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint, the drive that moves it and its limits (rad, rad/s, rad/s^2, rad/s^3, Nm)."""
+
+    name: Name
+    slave: Name
+    position: Range
+    velocity: Positive
+    acceleration: Positive
+    jerk: Positive
+    torque: Positive
+    csv_gain: NotNegative = 10.0
+    """Position gain of the loop closed in CSV, 1/s."""
+    cst_stiffness: NotNegative = 600.0
+    """Joint stiffness in CST, Nm/rad."""
+    cst_damping: NotNegative = 60.0
+    """Joint damping in CST, Nm s/rad."""
+    cst_integral: NotNegative = 1200.0
+    """Integral gain in CST, Nm/(rad s)."""
+
+
+@dataclass(frozen=True)
+class CycleConfig:
+    """The cycle: its period, its priority and its place."""
+
+    period_us: Annotated[float, Ge(100), Le(100_000)] = 500.0
+    priority: Annotated[int, Ge(1), Le(98)] = 80
+    cpu: int | None = None
+    """CPU of the cycle; None: the last one that the process may use."""
+
+
+@dataclass(frozen=True)
+class BusConfig:
+    """The bus: an interface or `virtual`, and how long what may be missing."""
+
+    interface: Name = "virtual"
+    segment: str = "segment.yaml"
+    """Slaves of the virtual segment; a path relative to the arm's file."""
+    receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
+    """How long a frame is waited for, as a fraction of the period."""
+    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 20
+    """So many cycles in a row without a right working counter are a fault."""
+    send_phase: Fraction = 0.5
+    """Where between two SYNC0 the frame passes the reference slave, as a fraction of the period."""
+    op_timeout_s: Positive = 5.0
+
+
+@dataclass(frozen=True)
+class ArmConfig:
+    """The whole configuration of an arm: what `config/assistive_arm.yaml` and the files it names say."""
+
+    name: Name
+    slaves: Annotated[tuple[SlaveConfig, ...], MinLen(1)]
+    joints: Annotated[tuple[Joint, ...], MinLen(1)]
+    cycle: CycleConfig
+    bus: BusConfig
+    mode: DriveModeName = "csp"
+    enable_timeout_s: Positive = 3.0
+    lease_s: Positive = 0.5
+    """A commander that is silent for so long has lost its lease: the arm stops in a controlled way."""
+    source: Path = Path()
+    """The file it was read from."""

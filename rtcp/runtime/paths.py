@@ -1,0 +1,63 @@
+"""Where the processes of one running platform meet: the runtime directory and what lies in it."""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+
+class RuntimeDirectoryError(Exception):
+    """The runtime directory cannot be used: a sentence that says why."""
+
+
+def runtime_directory() -> Path:
+    """Return the directory of the control socket and its companions, without making it.
+
+    `RTCP_RUNTIME_DIR` chooses it; else `$XDG_RUNTIME_DIR/rtcp`, `/run/rtcp` for root, `rtcp-<uid>` in the temporary
+    directory for anyone else. One platform runs in one such directory.
+    """
+    if chosen := os.environ.get("RTCP_RUNTIME_DIR"):
+        return Path(chosen)
+    if os.geteuid() == 0:
+        return Path("/run/rtcp")
+    if session := os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(session) / "rtcp"
+    return Path(tempfile.gettempdir()) / f"rtcp-{os.geteuid()}"
+
+
+def prepare(directory: Path) -> None:
+    """Make the directory, for its owner alone.
+
+    Raises:
+        RuntimeDirectoryError: where it cannot be made, or is another user's.
+    """
+    try:
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        found = directory.stat()
+    except OSError as error:
+        raise RuntimeDirectoryError(f"runtime directory {directory} cannot be made: {error.strerror}") from error
+    if found.st_uid != os.geteuid():
+        raise RuntimeDirectoryError(
+            f"runtime directory {directory} belongs to user {found.st_uid}, not to user {os.geteuid()}: "
+            "set RTCP_RUNTIME_DIR to one of your own"
+        )
+    if stat.S_IMODE(found.st_mode) != 0o700:
+        directory.chmod(0o700)
+
+
+def control_socket(directory: Path) -> Path:
+    """Return the path of the control socket."""
+    return directory / "control.sock"
+
+
+def processes_file(directory: Path) -> Path:
+    """Return the path of the file that names the processes."""
+    return directory / "processes.json"
+
+
+def blackboard_file(directory: Path) -> Path:
+    """Return the path of the blackboard: always in memory, so that a disk never holds up the cycle."""
+    name = str(directory.resolve()).strip("/").replace("/", "-")
+    return Path("/dev/shm") / f"rtcp-{os.geteuid()}-{name}"

@@ -1,0 +1,200 @@
+"""The object dictionary of a virtual slave: entries by index and subindex (ETG.1000.6, 5.6.7).
+
+A device model reads and writes `Entry.value`; the CoE server and the PDO mapping turn entries into bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+
+
+class DataType(IntEnum):
+    """Data types of CoE objects (ETG.1000.6, table 64)."""
+
+    BOOLEAN = 0x0001
+    INTEGER8 = 0x0002
+    INTEGER16 = 0x0003
+    INTEGER32 = 0x0004
+    UNSIGNED8 = 0x0005
+    UNSIGNED16 = 0x0006
+    UNSIGNED32 = 0x0007
+    REAL32 = 0x0008
+    VISIBLE_STRING = 0x0009
+    OCTET_STRING = 0x000A
+    REAL64 = 0x0011
+    INTEGER64 = 0x0015
+    UNSIGNED64 = 0x001B
+    PDO_MAPPING = 0x0021
+    IDENTITY = 0x0023
+
+
+class ObjectCode(IntEnum):
+    """Kinds of CoE objects (ETG.1000.6, table 62)."""
+
+    VARIABLE = 7
+    ARRAY = 8
+    RECORD = 9
+
+
+class Access(IntFlag):
+    """Access rights of an entry as SDO information reports them (ETG.1000.6, 5.6.3.6.2)."""
+
+    READ_PREOP = 0x01
+    READ_SAFEOP = 0x02
+    READ_OP = 0x04
+    WRITE_PREOP = 0x08
+    WRITE_SAFEOP = 0x10
+    WRITE_OP = 0x20
+    RXPDO = 0x40
+    TXPDO = 0x80
+    RO = READ_PREOP | READ_SAFEOP | READ_OP
+    WO = WRITE_PREOP | WRITE_SAFEOP | WRITE_OP
+    RW = RO | WO
+    RW_PREOP = RO | WRITE_PREOP
+
+
+class SdoAbort(Exception):
+    """An SDO service refused with one of the standard's abort codes (ETG.1000.6, table 41)."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"SDO abort 0x{code:08X}")
+        self.code = code
+
+
+Value = int | float | bytes
+WriteHook = Callable[["Entry", Value], None]
+_FLOATS = (DataType.REAL32, DataType.REAL64)
+_BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING)
+BITS = {
+    DataType.BOOLEAN: 1,
+    DataType.INTEGER8: 8,
+    DataType.UNSIGNED8: 8,
+    DataType.INTEGER16: 16,
+    DataType.UNSIGNED16: 16,
+    DataType.INTEGER32: 32,
+    DataType.UNSIGNED32: 32,
+    DataType.REAL32: 32,
+    DataType.INTEGER64: 64,
+    DataType.UNSIGNED64: 64,
+    DataType.REAL64: 64,
+}
+
+
+class Entry:
+    """One entry of the object dictionary.
+
+    `value` is an int, a float or (strings) bytes, in the entry's own counts. `minimum` and `maximum` bound what an SDO
+    may write; `on_write` is called with the entry and the new value before it is stored and may raise `SdoAbort`.
+    """
+
+    __slots__ = (
+        "access", "bit_length", "data_type", "index", "maximum", "minimum", "name", "on_write", "subindex", "value",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        index: int,
+        subindex: int,
+        name: str,
+        data_type: DataType,
+        value: Value = 0,
+        access: Access = Access.RO,
+        *,
+        bit_length: int | None = None,
+        minimum: int | None = None,
+        maximum: int | None = None,
+        on_write: WriteHook | None = None,
+    ) -> None:
+        self.index = index
+        self.subindex = subindex
+        self.name = name
+        self.data_type = data_type
+        # Any, in effect: the type of a value follows from data_type, which mypy cannot see.
+        self.value: Value = value
+        self.access = access
+        if bit_length is None:
+            bit_length = BITS[data_type] if data_type in BITS else 8 * len(value)  # type: ignore[arg-type]
+        self.bit_length = bit_length
+        self.minimum = minimum
+        self.maximum = maximum
+        self.on_write = on_write
+
+    @property
+    def is_float(self) -> bool:
+        """Whether the value is a floating-point number."""
+        return self.data_type in _FLOATS
+
+    @property
+    def is_bytes(self) -> bool:
+        """Whether the value is a string of bytes."""
+        return self.data_type in _BYTES
+
+    def __repr__(self) -> str:
+        return f"Entry(0x{self.index:04X}:{self.subindex}, {self.name!r}, {self.value!r})"
+
+
+@dataclass
+class DictionaryObject:
+    """An object: a variable (subindex 0 only), an array or a record (subindex 0 counts the entries)."""
+
+    index: int
+    name: str
+    code: ObjectCode
+    entries: dict[int, Entry] = field(default_factory=dict)
+
+    @property
+    def highest_subindex(self) -> int:
+        """The highest subindex that exists."""
+        return max(self.entries)
+
+
+class ObjectDictionary:
+    """The objects of one slave by index and subindex."""
+
+    def __init__(self) -> None:
+        self._objects: dict[int, DictionaryObject] = {}
+
+    def variable(self, index: int, name: str, data_type: DataType, value: Value = 0, access: Access = Access.RO,
+                 *, minimum: int | None = None, maximum: int | None = None,
+                 on_write: WriteHook | None = None) -> Entry:  # fmt: skip
+        """Add a variable; return its only entry."""
+        entry = Entry(index, 0, name, data_type, value, access, minimum=minimum, maximum=maximum, on_write=on_write)
+        self._objects[index] = DictionaryObject(index, name, ObjectCode.VARIABLE, {0: entry})
+        return entry
+
+    def record(self, index: int, name: str, entries: list[Entry], *, code: ObjectCode = ObjectCode.RECORD,
+               count_access: Access = Access.RO) -> DictionaryObject:  # fmt: skip
+        """Add a record or an array of `entries` (subindex 1 upwards); subindex 0, their number, is made here."""
+        count = Entry(index, 0, "Number of entries", DataType.UNSIGNED8, len(entries), count_access, maximum=255)
+        made = DictionaryObject(index, name, code, {0: count, **{entry.subindex: entry for entry in entries}})
+        self._objects[index] = made
+        return made
+
+    def __getitem__(self, key: tuple[int, int]) -> Entry:
+        """Return the entry.
+
+        Raises:
+            SdoAbort: 0x06020000 where the object does not exist, 0x06090011 where the subindex does not.
+        """
+        found = self.object(key[0])
+        try:
+            return found.entries[key[1]]
+        except KeyError:
+            raise SdoAbort(0x06090011) from None
+
+    def object(self, index: int) -> DictionaryObject:
+        """Return the object; raises SdoAbort 0x06020000 where it does not exist."""
+        try:
+            return self._objects[index]
+        except KeyError:
+            raise SdoAbort(0x06020000) from None
+
+    def __contains__(self, key: tuple[int, int]) -> bool:
+        found = self._objects.get(key[0])
+        return found is not None and key[1] in found.entries
+
+    def __iter__(self) -> Iterator[DictionaryObject]:
+        """Iterate over the objects in the order of their indices."""
+        return iter(sorted(self._objects.values(), key=lambda found: found.index))
