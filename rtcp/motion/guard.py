@@ -1,0 +1,65 @@
+"""The last place before the drives: no target outside a limit passes, whatever asked for it.
+
+Promises 1 and 2 of the design: position inside the joint's range, no step beyond speed x cycle, speed and torque
+inside their bounds, never a number that is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rtcp.config.model import Joint
+from rtcp.motion.modes import Commanded
+
+
+class Guard:
+    """Clamps the targets of all drives, once a cycle, after the mode.
+
+    `held` is a bit mask of the joints whose target was changed in the last call.
+    """
+
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+        self._low = [joint.position.min for joint in joints]
+        self._high = [joint.position.max for joint in joints]
+        self._speed = [joint.velocity for joint in joints]
+        self._torque = [joint.torque for joint in joints]
+        # Rounding of the set-points is no violation.
+        self._step = [joint.velocity * period_s * (1 + 1e-6) for joint in joints]
+        self._last = [0.0] * len(self._low)
+        self.held = 0
+
+    def latch(self, position: Sequence[float]) -> None:
+        """Take `position` (rad, shape (n,)) as the targets sent last: on enabling, target = actual."""
+        self._last = list(position)
+
+    def check(self, drives: Sequence[Commanded]) -> None:
+        """Clamp every target of every drive in place."""
+        last = self._last
+        held = 0
+        for i, drive in enumerate(drives):
+            wanted = drive.target_position
+            before = last[i]
+            step = self._step[i]
+            low = max(self._low[i], before - step)
+            high = min(self._high[i], before + step)
+            # A comparison with NaN is false: what is no number fails the first test and the target stays.
+            if not (low <= wanted <= high):
+                held |= 1 << i
+                wanted = high if wanted > high else low if wanted < low else before
+            last[i] = drive.target_position = wanted
+            speed = drive.target_velocity
+            bound = self._speed[i]
+            if not (-bound <= speed <= bound):
+                held |= 1 << i
+                speed = bound if speed > bound else -bound if speed < -bound else 0.0
+            if (drive.position > self._high[i] and speed > 0.0) or (drive.position < self._low[i] and speed < 0.0):
+                held |= 1 << i
+                speed = 0.0
+            drive.target_velocity = speed
+            torque = drive.target_torque
+            bound = self._torque[i]
+            if not (-bound <= torque <= bound):
+                held |= 1 << i
+                torque = bound if torque > bound else -bound if torque < -bound else 0.0
+            drive.target_torque = torque
+        self.held = held

@@ -1,0 +1,111 @@
+"""How set-points reach a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
+
+In CSP the drive closes the position loop; in CSV and CST it is closed here, so that `hold` and `move` mean the same in
+all three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import Protocol
+
+from rtcp.config.model import Joint
+
+
+class DriveMode(IntEnum):
+    """Modes of operation that the cycle uses (CiA 402-2, object 0x6060)."""
+
+    CSP = 8
+    CSV = 9
+    CST = 10
+
+
+class Commanded(Protocol):
+    """The part of a drive that a mode reads and writes, in SI."""
+
+    position: float
+    velocity: float
+    target_position: float
+    target_velocity: float
+    target_torque: float
+
+
+class ModeLaw(Protocol):
+    """One mode for all joints."""
+
+    mode: DriveMode
+
+    def start(self) -> None:
+        """Begin at standstill: forget what an earlier use left behind."""
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write the targets of the drives for the set-points `position` (rad) and `velocity` (rad/s)."""
+
+
+class PositionLaw:
+    """CSP: the set-point itself."""
+
+    mode = DriveMode.CSP
+
+    def start(self) -> None:
+        """Nothing is kept."""
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Pass the set-points on; the drive takes the velocity field as its speed limit, which the driver fills in."""
+        for i, drive in enumerate(drives):
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = 0.0
+
+
+class VelocityLaw:
+    """CSV: the set-point's velocity and a proportional pull back to its position."""
+
+    mode = DriveMode.CSV
+
+    def __init__(self, joints: Sequence[Joint]) -> None:
+        self._gain = [joint.csv_gain for joint in joints]
+
+    def start(self) -> None:
+        """Nothing is kept."""
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write target velocities (rad/s)."""
+        gain = self._gain
+        for i, drive in enumerate(drives):
+            drive.target_position = position[i]
+            drive.target_velocity = velocity[i] + gain[i] * (position[i] - drive.position)
+            drive.target_torque = 0.0
+
+
+class TorqueLaw:
+    """CST: stiffness, damping and a bounded integral about the set-point (an impedance that ends where it should)."""
+
+    mode = DriveMode.CST
+
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+        self._stiffness = [joint.cst_stiffness for joint in joints]
+        self._damping = [joint.cst_damping for joint in joints]
+        self._integral_step = [joint.cst_integral * period_s for joint in joints]
+        self._bound = [joint.torque for joint in joints]
+        self._integral = [0.0] * len(self._bound)
+
+    def start(self) -> None:
+        """Begin with an empty integral."""
+        for i in range(len(self._integral)):
+            self._integral[i] = 0.0
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write target torques (Nm)."""
+        integral = self._integral
+        for i, drive in enumerate(drives):
+            error = position[i] - drive.position
+            bound = self._bound[i]
+            summed = integral[i] + self._integral_step[i] * error
+            integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = (
+                self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity) + summed
+            )

@@ -1,0 +1,108 @@
+"""The master follows the reference clock of the segment.
+
+The reference slave's clock runs free. Each frame brings its system time at the instant the frame passed it; with the
+master's own time just before sending, the difference of the two clocks is known but for the way through the kernel.
+That difference is tracked by a second-order filter (phase and rate), and the next wake-up is computed straight from
+the reference's time, not steered by a controller: wake-up jitter then never enters the clocks, and there is no gain to
+tune against it. Residuals are bounded before they enter, so that one late frame moves the estimate by little.
+
+Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
+grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
+"""
+
+from __future__ import annotations
+
+MEASURE_CYCLES = 100
+LOCK_CYCLES = 200
+LOCK_WITHIN_NS = 10_000.0
+UNLOCK_BEYOND_NS = 50_000.0
+_RESIDUAL_BOUND_NS = 20_000.0
+_PHASE_GAIN = 0.02
+# Critically damped for that phase gain.
+_RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
+_SHOWN_GAIN = 1 / 32
+
+
+class Discipline:
+    """Computes wake-up instants (CLOCK_MONOTONIC, ns) that keep the send instant at a phase of the DC cycle.
+
+    Args:
+        period_ns: the cycle.
+        phase_ns: wanted reference time of the frame, modulo the cycle: SYNC0 shift + send phase * period.
+    """
+
+    __slots__ = (
+        "_base", "_difference", "_good_cycles", "_measured", "_period", "_phase", "_rate", "_seen", "aligned",
+        "filtered_ns", "locked", "raw_ns",
+    )  # fmt: skip
+
+    def __init__(self, period_ns: int, phase_ns: int) -> None:
+        self._period = period_ns
+        self._phase = phase_ns % period_ns
+        # Reference less master: an integer part, too large for a float's 53 bits, and a small float part.
+        self._base = 0
+        self._difference = 0.0
+        self._rate = 0.0
+        self._measured = [0] * MEASURE_CYCLES
+        self._seen = 0
+        self._good_cycles = 0
+        self.aligned = False
+        self.locked = False
+        self.raw_ns = 0
+        """Reference time of the last frame less the nearest wanted instant: carries the wake-up's jitter."""
+        self.filtered_ns = 0.0
+        """The same less the wake-up's own latency, low-pass filtered over 32 cycles: how well the clock is followed."""
+
+    def observe(self, sent_ns: int, reference_ns: int) -> None:
+        """Take in one frame: the master's time just before sending and the reference's when it passed."""
+        period = self._period
+        offset = (reference_ns - self._phase) % period
+        self.raw_ns = offset - period if 2 * offset > period else offset
+        if not self.aligned:
+            self._measure(reference_ns - sent_ns)
+            return
+        self._difference += self._rate
+        residual = reference_ns - sent_ns - self._base - self._difference
+        bounded = min(max(residual, -_RESIDUAL_BOUND_NS), _RESIDUAL_BOUND_NS)
+        self._difference += _PHASE_GAIN * bounded
+        self._rate += _RATE_GAIN * bounded
+        self.filtered_ns += _SHOWN_GAIN * (min(max(residual, -period / 2), period / 2) - self.filtered_ns)
+        self._judge()
+
+    def coast(self) -> None:
+        """Let a cycle pass without an observation (no frame came back)."""
+        if self.aligned:
+            self._difference += self._rate
+
+    def _measure(self, difference: int) -> None:
+        self._measured[self._seen] = difference
+        self._seen += 1
+        if self._seen == MEASURE_CYCLES:
+            # The median: a preempted cycle of the first hundred does not shift the phase.
+            self._base = sorted(self._measured)[MEASURE_CYCLES // 2]
+            self.aligned = True
+
+    def _judge(self) -> None:
+        error = abs(self.filtered_ns)
+        if error < LOCK_WITHIN_NS:
+            self._good_cycles += 1
+            if self._good_cycles >= LOCK_CYCLES:
+                self.locked = True
+        else:
+            self._good_cycles = 0
+            if error > UNLOCK_BEYOND_NS:
+                self.locked = False
+
+    def next_wakeup(self, planned_ns: int) -> int:
+        """Return the wake-up that follows the one planned at `planned_ns`.
+
+        While measuring, the plain grid; then the first wanted instant of the reference clock that lies at least half
+        a period after `planned_ns`, in the master's time.
+        """
+        period = self._period
+        if not self.aligned:
+            return planned_ns + period
+        difference = self._base + round(self._difference + self._rate)
+        # Round to the nearest wanted instant: on the grid this is exactly the next one.
+        tick = planned_ns + difference + period - self._phase + period // 2
+        return tick - tick % period + self._phase - difference

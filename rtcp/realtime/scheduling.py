@@ -1,0 +1,140 @@
+"""What the host grants the cycle: SCHED_FIFO, a CPU, locked memory, shallow idle states, no garbage collection.
+
+Nothing here is a condition for running: what is refused becomes a note, said once and shown in `rtcp status`.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import resource
+import struct
+import sys
+from dataclasses import dataclass, field
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+_PR_SET_TIMERSLACK = 29
+_M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
+_PREFAULT_BYTES = 4 << 20
+_STACK_BYTES = 256 << 10
+
+
+@dataclass
+class Realtime:
+    """What the loop runs with: scheduler ("SCHED_FIFO 80", "SCHED_OTHER"), locked memory, CPU, and what was refused."""
+
+    scheduler: str = "SCHED_OTHER"
+    memory_locked: bool = False
+    cpu: int = -1
+    notes: list[str] = field(default_factory=list)
+    _latency_file: int = -1
+
+
+def available_cpus() -> list[int]:
+    """Return the CPUs that this process may use, in order."""
+    return sorted(os.sched_getaffinity(0))
+
+
+def choose_cpu(wanted: int | None) -> int:
+    """Return the CPU for the cycle: the one wanted, or the last available (interrupts gather on the first)."""
+    return available_cpus()[-1] if wanted is None else wanted
+
+
+def prepare(made: Realtime, priority: int, cpu: int | None) -> None:
+    """Make the calling thread the cycle's: pin it, lock and prefault memory, freeze the collector, go SCHED_FIFO.
+
+    Call it after everything is imported and built, from the thread that runs the cycle; what was granted goes into
+    `made`.
+    """
+    _pin(made, cpu)
+    _lock_memory(made)
+    _hold_latency(made)
+    _timer_slack()
+    _fifo(made, priority)
+    freeze_garbage()
+
+
+def freeze_garbage() -> None:
+    """Collect once, move what lives out of the collector's sight, and switch it off."""
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def release(made: Realtime) -> None:
+    """Give back what a file descriptor holds (the CPU latency request)."""
+    if made._latency_file >= 0:
+        os.close(made._latency_file)
+        made._latency_file = -1
+
+
+def _pin(made: Realtime, cpu: int | None) -> None:
+    allowed = available_cpus()
+    chosen = choose_cpu(cpu)
+    if chosen not in allowed:
+        made.notes.append(f"cycle.cpu is {chosen}, which this process may not use (allowed: {allowed}): not pinned")
+        return
+    os.sched_setaffinity(0, {chosen})
+    made.cpu = chosen
+
+
+def _lock_memory(made: Realtime) -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    # Freed memory stays in the process, so that a later allocation does not fault pages in again.
+    libc.mallopt(_M_TRIM_THRESHOLD, -1)
+    libc.mallopt(_M_MMAP_MAX, 0)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+        allowed = "unlimited" if limit == resource.RLIM_INFINITY else f"{limit // 1024} KiB"
+        made.notes.append(
+            f"memory is not locked ({os.strerror(ctypes.get_errno())}): allow it with LimitMEMLOCK=infinity or "
+            f"CAP_IPC_LOCK (RLIMIT_MEMLOCK is {allowed})"
+        )
+        return
+    made.memory_locked = True
+    bytearray(_PREFAULT_BYTES)
+    _touch_stack()
+
+
+def _touch_stack() -> None:
+    page = (ctypes.c_char * _STACK_BYTES)()
+    ctypes.memset(page, 0, _STACK_BYTES)
+
+
+def _hold_latency(made: Realtime) -> None:
+    try:
+        made._latency_file = os.open("/dev/cpu_dma_latency", os.O_WRONLY)
+        os.write(made._latency_file, struct.pack("=i", 0))
+    except OSError as error:
+        made.notes.append(f"idle states are not held off: /dev/cpu_dma_latency: {error.strerror}")
+
+
+def _timer_slack() -> None:
+    # Matters only without SCHED_FIFO: ordinary timers are else up to 50 us late on purpose.
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
+
+
+def _fifo(made: Realtime, priority: int) -> None:
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    except OSError as error:
+        made.notes.append(
+            f"SCHED_FIFO {priority} is refused ({error.strerror}): allow it with CAP_SYS_NICE or "
+            f"LimitRTPRIO={priority}; the cycle runs on as an ordinary thread"
+        )
+        return
+    made.scheduler = f"SCHED_FIFO {priority}"
+
+
+def ordinary_thread(avoid_cpu: int) -> None:
+    """Make the calling thread an ordinary one that stays off the cycle's CPU where there is another."""
+    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    others = set(available_cpus()) - {avoid_cpu}
+    if others:
+        os.sched_setaffinity(0, others)
+
+
+def share_interpreter_quickly() -> None:
+    """Let the cycle have the interpreter back from another thread within 50 us instead of 5 ms."""
+    sys.setswitchinterval(50e-6)

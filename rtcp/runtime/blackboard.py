@@ -1,0 +1,166 @@
+"""The loop's end of the blackboard: it writes cycle records, events and texts, and takes commands.
+
+Writers and readers share no lock. A record carries its number at both ends, the first written last: a reader that
+finds two different numbers, or another than it wanted, knows that the record is torn or gone.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rtcp.runtime.layout import (
+    ANSWER,
+    ANSWER_AT,
+    COMMAND,
+    COMMAND_HEAD_AT,
+    COMMAND_TAKEN_AT,
+    COMMANDS,
+    COMMANDS_AT,
+    COUNTER,
+    EVENT,
+    EVENTS,
+    EVENTS_AT,
+    EVENTS_HEAD_AT,
+    HEADER,
+    LEASE,
+    LEASE_AT,
+    MAGIC,
+    RECORDS,
+    RECORDS_AT,
+    RECORDS_HEAD_AT,
+    SLAVE,
+    SLAVES_AT,
+    SLAVES_MAX,
+    TEXT,
+    TEXTS,
+    TEXTS_AT,
+    TEXTS_HEAD_AT,
+    RecordLayout,
+)
+
+
+class Blackboard:
+    """Written by the loop's process alone, but for the lease and the command ring.
+
+    Args:
+        path: file to make, on a memory file system; an older one is replaced.
+        joints: number of joints.
+        period_ns: the cycle.
+    """
+
+    def __init__(self, path: Path, joints: int, period_ns: int) -> None:
+        layout = RecordLayout(joints)
+        self.path = path
+        self.joints = joints
+        # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
+        fresh = path.with_name(path.name + f".{os.getpid()}")
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+        try:
+            os.ftruncate(descriptor, layout.file_size)
+            self._map = mmap.mmap(descriptor, layout.file_size)
+        finally:
+            os.close(descriptor)
+        HEADER.pack_into(
+            self._map, 0, MAGIC, joints, layout.size, RECORDS, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
+        )
+        os.replace(fresh, path)
+        self._record_size = layout.size
+        # The record without its first number, which is published last.
+        self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
+        self._pack_counter = COUNTER.pack_into
+        self._unpack_counter = COUNTER.unpack_from
+        self._records = 0
+        self._events = 0
+        self._texts = 0
+        self._taken = 0
+        self._lock = threading.Lock()
+        self._text_lock = threading.Lock()
+        # Every page is touched now, so that none is faulted in by the cycle.
+        for page in range(0, layout.file_size, mmap.PAGESIZE):
+            self._map[page] = self._map[page]
+
+    def publish(self, values: Sequence[float]) -> None:
+        """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
+        number = self._records + 1
+        at = RECORDS_AT + (number % RECORDS) * self._record_size
+        target = self._map
+        self._pack_counter(target, at, 0)
+        self._fence()
+        self._pack_record(target, at + 8, *values, number)
+        self._fence()
+        self._pack_counter(target, at, number)
+        self._pack_counter(target, RECORDS_HEAD_AT, number)
+        self._records = number
+
+    def _fence(self) -> None:
+        # Two passes through a lock order the stores before against those after on weakly ordered CPUs (aarch64).
+        lock = self._lock
+        lock.acquire()
+        lock.release()
+        lock.acquire()
+        lock.release()
+
+    def event(self, code: int, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        """Append an event: a code that readers put into words."""
+        number = self._events + 1
+        at = EVENTS_AT + (number % EVENTS) * EVENT.size
+        EVENT.pack_into(self._map, at, number, time.time_ns(), code, axis, value, limit)
+        self._fence()
+        self._pack_counter(self._map, EVENTS_HEAD_AT, number)
+        self._events = number
+
+    def text(self, sentence: str) -> None:
+        """Append a sentence. Not for the cycle; any other thread of the loop's process may call it."""
+        encoded = sentence.encode()[:502]
+        with self._text_lock:
+            number = self._texts + 1
+            at = TEXTS_AT + (number % TEXTS) * TEXT.size
+            TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), encoded)
+            self._fence()
+            self._pack_counter(self._map, TEXTS_HEAD_AT, number)
+            self._texts = number
+
+    def slave(self, position: int, al_status: int, al_status_code: int) -> None:
+        """Note the state of the slave at `position` (from 1)."""
+        if 1 <= position <= SLAVES_MAX:
+            SLAVE.pack_into(self._map, SLAVES_AT + (position - 1) * SLAVE.size, al_status, al_status_code)
+
+    def lease(self) -> tuple[int, int, int]:
+        """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""
+        found = LEASE.unpack_from(self._map, LEASE_AT)
+        return found[0], found[1], found[2]
+
+    def command_waits(self) -> bool:
+        """Whether a command waits to be taken."""
+        waits: bool = self._unpack_counter(self._map, COMMAND_HEAD_AT)[0] != self._taken
+        return waits
+
+    def take_command(self) -> tuple[float, ...]:
+        """Take the next command: number, lease id, kind, twelve numbers. Only when `command_waits`."""
+        number = self._taken + 1
+        found = COMMAND.unpack_from(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size)
+        self._taken = number
+        self._pack_counter(self._map, COMMAND_TAKEN_AT, number)
+        return found
+
+    def answer(self, number: int, refusal: int = 0, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        """Answer the command `number`: accepted (0) or the code of a refusal with what it is about."""
+        # The number goes in last: a reader that finds its own number finds the whole answer.
+        ANSWER.pack_into(self._map, ANSWER_AT, 0, refusal, axis, value, limit)
+        self._fence()
+        self._pack_counter(self._map, ANSWER_AT, number)
+
+    @property
+    def memory(self) -> mmap.mmap:
+        """The mapped file, for the service thread's own part."""
+        return self._map
+
+    def close(self) -> None:
+        """Unmap; the file stays for those who read what happened last."""
+        self._map.close()

@@ -1,0 +1,139 @@
+"""The layout of the blackboard: one file in memory, mapped by the loop and by whoever reads or commands it.
+
+| offset | what | written by |
+|---|---|---|
+| 0 | header: magic, sizes, period, loop's pid | loop, once |
+| 128 | lease: id, renewed at, duration, holder's name | commanders, under a file lock |
+| 256 | command head; 264: commands taken; 272: answer to the last | commander; loop; loop |
+| 384 | published records; published events; published texts | loop |
+| 512 | request and answer of the service thread | commander; service thread |
+| 1024 | slave states | service thread |
+| 8192 | service text, texts, events, commands, cycle records | loop and commanders |
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+MAGIC = 0x5254_4350_0000_0001
+HEADER = struct.Struct("<QIIIIIIQIi")
+"""magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
+
+LEASE_AT = 128
+LEASE = struct.Struct("<QqQ64s")
+"""id (0: free), renewed at (CLOCK_MONOTONIC ns), duration ns, holder"""
+
+COMMAND_HEAD_AT = 256
+COMMAND_TAKEN_AT = 264
+ANSWER_AT = 272
+ANSWER = struct.Struct("<QIidd")
+"""command's number, refusal (0: accepted), axis, value, limit"""
+
+RECORDS_HEAD_AT = 384
+EVENTS_HEAD_AT = 392
+TEXTS_HEAD_AT = 400
+COUNTER = struct.Struct("<Q")
+
+SERVICE_STATE_AT = 512
+SERVICE = struct.Struct("<II")
+"""state (0 idle, 1 asked, 2 answered), length of the JSON text"""
+SERVICE_TEXT_AT = 8192
+SERVICE_TEXT_SIZE = 8192
+
+SLAVES_AT = 1024
+SLAVE = struct.Struct("<HH")
+"""AL status (state, error bit), AL status code; a state of 0: no answer"""
+SLAVES_MAX = 256
+
+TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
+TEXT = struct.Struct("<QqH502s")
+"""number, CLOCK_REALTIME ns, length, UTF-8 text"""
+TEXTS = 64
+
+EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size
+EVENT = struct.Struct("<QqIidd")
+"""number, CLOCK_REALTIME ns, code, axis, value, limit"""
+EVENTS = 256
+
+COMMANDS_AT = EVENTS_AT + EVENTS * EVENT.size
+COMMAND = struct.Struct("<QQI4x12d")
+"""number, lease id, kind, twelve numbers"""
+COMMANDS = 64
+
+RECORDS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
+RECORDS = 1 << 15
+
+SCALARS = (
+    ("number", "Q"),
+    ("cycle", "Q"),
+    ("time_ns", "q"),
+    ("dc_time_ns", "q"),
+    ("state", "B"),
+    ("mode", "B"),
+    ("flags", "H"),
+    ("wkc", "h"),
+    ("wkc_expected", "h"),
+    ("missed", "I"),
+    ("lost", "I"),
+    ("wakeup_ns", "i"),
+    ("exchange_ns", "i"),
+    ("compute_ns", "i"),
+    ("dc_offset_ns", "i"),
+    ("dc_filtered_ns", "i"),
+    ("inputs", "I"),
+    ("outputs", "I"),
+    ("counter", "i"),
+    ("fault", "I"),
+    ("held", "I"),
+    ("enables", "I"),
+    ("moves", "I"),
+    ("elapsed_s", "f"),
+    ("duration_s", "f"),
+)
+"""Fields of a cycle record that are one number: name and struct code. `number` is written last."""
+
+PER_JOINT = (("position", "d"), ("velocity", "d"), ("torque", "d"), ("target", "d"), ("statusword", "H"))
+"""Fields of a cycle record that are one number a joint, SI."""
+
+FLAG_DC_LOCKED = 1
+FLAG_ALL_OP = 2
+FLAG_ENABLED = 4
+
+
+@dataclass(frozen=True)
+class RecordLayout:
+    """The cycle record for a number of joints: as a struct for the writer, as a numpy dtype for readers."""
+
+    joints: int
+
+    @property
+    def format(self) -> str:
+        """The struct format, without padding; the record's number again at the end."""
+        per_joint = "".join(f"{self.joints}{code}" for _, code in PER_JOINT)
+        return "<" + "".join(code for _, code in SCALARS) + per_joint + "Q"
+
+    @property
+    def size(self) -> int:
+        """Size of a record in the ring: a multiple of 64 bytes."""
+        return (struct.calcsize(self.format) + 63) & ~63
+
+    @property
+    def dtype(self) -> np.dtype[np.void]:
+        """The same as a numpy record type, padded to `size`."""
+        codes = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
+                 "d": "<f8"}  # fmt: skip
+        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [(name, codes[code]) for name, code in SCALARS]
+        fields += [(name, codes[code], (self.joints,)) for name, code in PER_JOINT]
+        fields.append(("number_again", "<u8"))
+        padding = self.size - struct.calcsize(self.format)
+        if padding:
+            fields.append(("padding", "u1", (padding,)))
+        return np.dtype(fields)
+
+    @property
+    def file_size(self) -> int:
+        """Size of the whole blackboard."""
+        return RECORDS_AT + RECORDS * self.size

@@ -1,0 +1,281 @@
+"""The other end of the blackboard: reading what the loop publishes, and commanding it under a lease."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import mmap
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.runtime.layout import (
+    ANSWER,
+    ANSWER_AT,
+    COMMAND,
+    COMMAND_HEAD_AT,
+    COMMAND_TAKEN_AT,
+    COMMANDS,
+    COMMANDS_AT,
+    COUNTER,
+    EVENT,
+    EVENTS,
+    EVENTS_AT,
+    EVENTS_HEAD_AT,
+    HEADER,
+    LEASE,
+    LEASE_AT,
+    MAGIC,
+    RECORDS,
+    RECORDS_AT,
+    RECORDS_HEAD_AT,
+    SERVICE,
+    SERVICE_STATE_AT,
+    SERVICE_TEXT_AT,
+    SERVICE_TEXT_SIZE,
+    SLAVE,
+    SLAVES_AT,
+    TEXT,
+    TEXTS,
+    TEXTS_AT,
+    TEXTS_HEAD_AT,
+    RecordLayout,
+)
+
+
+class BlackboardError(Exception):
+    """The blackboard is not there or is none of ours: a sentence."""
+
+
+class LeaseRefused(Exception):
+    """Another commander holds the lease; `holder` names it."""
+
+    def __init__(self, holder: str) -> None:
+        super().__init__(f"the arm is commanded by {holder}: wait until it has finished, or stop it")
+        self.holder = holder
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in the cycle: a code (see `rtcp.runtime.sentences`) and what it is about."""
+
+    number: int
+    time_ns: int
+    code: int
+    axis: int
+    value: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class Text:
+    """A sentence of the loop's service thread."""
+
+    number: int
+    time_ns: int
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The loop's answer to a command: `refusal` 0 is acceptance."""
+
+    refusal: int
+    axis: int
+    value: float
+    limit: float
+
+
+class Observer:
+    """Reads and commands a blackboard.
+
+    Args:
+        path: the blackboard's file.
+
+    Raises:
+        BlackboardError: where it cannot be opened or is of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise BlackboardError(f"blackboard {path} cannot be opened: {error.strerror}") from error
+        size = os.fstat(self._descriptor).st_size
+        if size < RECORDS_AT:
+            os.close(self._descriptor)
+            raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
+        self._map = mmap.mmap(self._descriptor, size)
+        magic, joints, record_size, _, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
+        layout = RecordLayout(joints)
+        if magic != MAGIC or record_size != layout.size or size != layout.file_size:
+            self.close()
+            raise BlackboardError(f"blackboard {path} is not of this version (magic 0x{magic:X}): start anew")
+        self.joints = int(joints)
+        self.period_ns = int(period)
+        self.loop_pid = int(pid)
+        self._dtype = layout.dtype
+        self._records = np.frombuffer(self._map, dtype=self._dtype, count=RECORDS, offset=RECORDS_AT)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if hasattr(self, "_records"):
+            del self._records
+        self._map.close()
+        os.close(self._descriptor)
+
+    # -- records ------------------------------------------------------------------------------------------------
+
+    @property
+    def head(self) -> int:
+        """Number of the last record published; 0 before the first."""
+        return self._counter(RECORDS_HEAD_AT)
+
+    def _counter(self, at: int) -> int:
+        return int(COUNTER.unpack_from(self._map, at)[0])
+
+    def latest(self) -> npt.NDArray[np.void] | None:
+        """Return the last record, shape (1,), or None before the first."""
+        for _ in range(100):
+            found, _ = self.since(self.head - 1)
+            if len(found):
+                return found[-1:]
+            if self.head == 0:
+                return None
+        return None
+
+    def since(self, number: int) -> tuple[npt.NDArray[np.void], int]:
+        """Return the records after `number`, oldest first, and how many of them were lost to this reader.
+
+        Lost are those overwritten before they were read, and torn ones.
+        """
+        head = self.head
+        first = max(number + 1, head - RECORDS + 64, 1)
+        if head < first:
+            return np.empty(0, dtype=self._dtype), 0
+        numbers = np.arange(first, head + 1, dtype=np.uint64)
+        copied = self._records[(numbers % np.uint64(RECORDS)).astype(np.intp)]
+        # What the writer reached meanwhile may be torn although both numbers agree: it is dropped.
+        overtaken = self.head - RECORDS + 1
+        whole = (copied["number"] == numbers) & (copied["number_again"] == numbers) & (numbers > max(overtaken, 0))
+        kept = copied[whole]
+        return kept, int(head - max(number, 0)) - len(kept)
+
+    # -- events and texts ---------------------------------------------------------------------------------------
+
+    def events_since(self, number: int) -> list[Event]:
+        """Return the events after `number`, oldest first."""
+        head = self._counter(EVENTS_HEAD_AT)
+        found = []
+        for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
+            values = EVENT.unpack_from(self._map, EVENTS_AT + (wanted % EVENTS) * EVENT.size)
+            if values[0] == wanted:
+                found.append(Event(*values))
+        return found
+
+    def texts_since(self, number: int) -> list[Text]:
+        """Return the sentences after `number`, oldest first."""
+        head = self._counter(TEXTS_HEAD_AT)
+        found = []
+        for wanted in range(max(number + 1, head - TEXTS + 1, 1), head + 1):
+            made, when, length, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
+            if made == wanted:
+                found.append(Text(made, when, text[:length].decode(errors="replace")))
+        return found
+
+    def slaves(self, count: int) -> list[tuple[int, int]]:
+        """Return AL status and AL status code of the first `count` slaves."""
+        return [SLAVE.unpack_from(self._map, SLAVES_AT + i * SLAVE.size) for i in range(count)]
+
+    # -- the lease ----------------------------------------------------------------------------------------------
+
+    def holder(self) -> str:
+        """Return the name of who holds a lease that has not run out, or an empty string."""
+        lease, renewed, duration, name = LEASE.unpack_from(self._map, LEASE_AT)
+        if lease == 0 or time.monotonic_ns() - renewed > duration:
+            return ""
+        return bytes(name).rstrip(b"\0").decode(errors="replace")
+
+    def acquire(self, name: str, duration_s: float) -> int:
+        """Take the lease for `name`; return its id.
+
+        Raises:
+            LeaseRefused: while another holds it.
+        """
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        try:
+            if holder := self.holder():
+                raise LeaseRefused(holder)
+            lease = time.monotonic_ns()
+            LEASE.pack_into(self._map, LEASE_AT, lease, lease, int(duration_s * 1e9), name.encode()[:64])
+            return lease
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+
+    def renew(self, lease: int) -> bool:
+        """Renew the lease; return False where it is no longer this one or has run out."""
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        try:
+            held, renewed, duration, name = LEASE.unpack_from(self._map, LEASE_AT)
+            now = time.monotonic_ns()
+            if held != lease or now - renewed > duration:
+                return False
+            LEASE.pack_into(self._map, LEASE_AT, held, now, duration, name)
+            return True
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+
+    def release(self, lease: int) -> None:
+        """Give the lease back; does nothing where it is another's by now."""
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        try:
+            if LEASE.unpack_from(self._map, LEASE_AT)[0] == lease:
+                LEASE.pack_into(self._map, LEASE_AT, 0, 0, 0, b"")
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+
+    # -- commands -----------------------------------------------------------------------------------------------
+
+    def command(self, lease: int, kind: int, numbers: Sequence[float] = ()) -> int:
+        """Put a command into the ring; return its number. The lease's holder is the only writer.
+
+        Raises:
+            BlackboardError: where the loop takes no commands any more (the ring is full).
+        """
+        number = self._counter(COMMAND_HEAD_AT) + 1
+        if number - self._counter(COMMAND_TAKEN_AT) > COMMANDS:
+            raise BlackboardError("the loop takes no commands: its process hangs or is gone")
+        padded = [*numbers, *([0.0] * (12 - len(numbers)))]
+        COMMAND.pack_into(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size, number, lease, kind, *padded)
+        COUNTER.pack_into(self._map, COMMAND_HEAD_AT, number)
+        return number
+
+    def answer(self, number: int) -> Answer | None:
+        """Return the loop's answer to the command `number`, or None while there is none."""
+        found = ANSWER.unpack_from(self._map, ANSWER_AT)
+        return Answer(*found[1:]) if found[0] == number else None
+
+    # -- the service thread -------------------------------------------------------------------------------------
+
+    def ask_service(self, request: dict[str, Any]) -> None:
+        """Leave a request for the service thread. One at a time: the caller sees to it."""
+        text = json.dumps(request).encode()
+        if len(text) > SERVICE_TEXT_SIZE:
+            raise BlackboardError(f"the request is {len(text)} bytes long, at most {SERVICE_TEXT_SIZE} fit")
+        self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
+        SERVICE.pack_into(self._map, SERVICE_STATE_AT, 1, len(text))
+
+    def service_answer(self) -> dict[str, Any] | None:
+        """Return the service thread's answer, or None while there is none."""
+        state, length = SERVICE.unpack_from(self._map, SERVICE_STATE_AT)
+        if state != 2:
+            return None
+        found: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
+        SERVICE.pack_into(self._map, SERVICE_STATE_AT, 0, 0)
+        return found

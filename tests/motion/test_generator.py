@@ -1,0 +1,100 @@
+"""The generator of set-points keeps its bounds and its continuity whatever is asked."""
+
+from __future__ import annotations
+
+import math
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtcp.motion.generator import JointGenerator, Motion
+
+PERIOD = 0.0005
+SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6
+
+
+def generator() -> JointGenerator:
+    made = JointGenerator(PERIOD, SPEED, ACCELERATION, JERK)
+    made.latch([0.0] * 6)
+    return made
+
+
+def test_a_move_arrives_exactly_and_all_joints_together() -> None:
+    made = generator()
+    target = [1.0, -0.5, 0.25, 0.0, 0.1, -1.0]
+    made.move_to(target, 0.5)
+    still_moving = []
+    while made.motion is Motion.MOVE:
+        assert made.update()
+        still_moving.append(sum(abs(v) > 1e-9 for v in made.velocity))
+    assert max(abs(a - b) for a, b in zip(made.position, target, strict=True)) < 1e-12
+    assert still_moving[len(still_moving) // 2] == 5
+
+
+def test_a_slower_speed_is_kept() -> None:
+    made = generator()
+    made.move_to([1.0] * 6, 0.2)
+    fastest = 0.0
+    while made.motion is Motion.MOVE:
+        made.update()
+        fastest = max(fastest, *map(abs, made.velocity))
+    assert 0.199 < fastest <= 0.2 + 1e-9
+
+
+def test_a_stop_comes_to_rest_and_stays() -> None:
+    made = generator()
+    made.move_to([2.0] * 6, 0.5)
+    for _ in range(1000):
+        made.update()
+    made.stop()
+    assert made.motion is Motion.STOP
+    while made.motion is Motion.STOP:
+        made.update()
+    rest = list(made.position)
+    made.update()
+    assert made.position == rest
+    assert made.velocity == [0.0] * 6
+
+
+def test_a_stop_at_rest_changes_nothing() -> None:
+    made = generator()
+    made.stop()
+    assert made.motion is Motion.HOLD
+
+
+def test_latching_holds_there() -> None:
+    made = generator()
+    made.move_to([1.0] * 6, 0.5)
+    for _ in range(500):
+        made.update()
+    made.latch(made.position)
+    held = list(made.position)
+    assert made.motion is Motion.HOLD
+    made.update()
+    assert made.position == held
+
+
+angle = st.floats(-2.0, 2.0)
+event = st.one_of(
+    st.tuples(st.just("move"), st.lists(angle, min_size=6, max_size=6), st.floats(0.01, 0.5)),
+    st.tuples(st.just("stop"), st.none(), st.none()),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(event, st.integers(1, 400)), min_size=1, max_size=6))
+def test_position_speed_and_acceleration_stay_bounded_under_any_sequence(script: list) -> None:  # type: ignore[type-arg]
+    made = generator()
+    position, velocity = list(made.position), list(made.velocity)
+    for (kind, target, speed), cycles in script:
+        if kind == "move":
+            made.move_to(target, speed)
+        else:
+            made.stop()
+        for _ in range(cycles):
+            assert made.update()
+            for i in range(6):
+                assert math.isfinite(made.position[i])
+                assert abs(made.position[i] - position[i]) <= SPEED[i] * PERIOD * (1 + 1e-6)
+                assert abs(made.velocity[i] - velocity[i]) <= ACCELERATION[i] * PERIOD * (1 + 1e-3) + 1e-9
+            position, velocity = list(made.position), list(made.velocity)

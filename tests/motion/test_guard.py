@@ -1,0 +1,80 @@
+"""Nothing outside a limit passes the guard."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtcp.config.model import Joint, Range
+from rtcp.motion.guard import Guard
+
+PERIOD = 0.0005
+JOINT = Joint("shoulder", "drive", Range(-1.0, 2.0), velocity=0.5, acceleration=2.0, jerk=20.0, torque=10.0)
+STEP = 0.5 * PERIOD
+
+
+@dataclass
+class Drive:
+    """The fields of a drive that the guard sees."""
+
+    position: float = 0.0
+    velocity: float = 0.0
+    target_position: float = 0.0
+    target_velocity: float = 0.0
+    target_torque: float = 0.0
+
+
+def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
+    guard = Guard([JOINT], PERIOD)
+    guard.latch([last])
+    guard.check([drive])
+    return drive, guard.held
+
+
+@pytest.mark.parametrize(
+    ("last", "wanted", "passed"),
+    [
+        (0.0, STEP / 2, STEP / 2),
+        (0.0, 1.0, STEP),
+        (0.0, -1.0, -STEP),
+        (2.0, 2.1, 2.0),
+        (-1.0, -1.1, -1.0),
+        (0.3, math.nan, 0.3),
+        (0.3, math.inf, 0.3 + STEP),
+    ],
+)
+def test_a_target_is_held_inside_range_and_step(last: float, wanted: float, passed: float) -> None:
+    drive, held = guarded(last, Drive(target_position=wanted))
+    assert drive.target_position == pytest.approx(passed, abs=1e-9)
+    assert held == (0 if wanted == passed else 1)
+
+
+@pytest.mark.parametrize(("wanted", "passed"), [(0.4, 0.4), (9.0, 0.5), (-9.0, -0.5), (math.nan, 0.0)])
+def test_a_speed_is_held_inside_its_bound(wanted: float, passed: float) -> None:
+    assert guarded(0.0, Drive(target_velocity=wanted))[0].target_velocity == passed
+
+
+@pytest.mark.parametrize(("wanted", "passed"), [(4.0, 4.0), (99.0, 10.0), (-99.0, -10.0), (math.nan, 0.0)])
+def test_a_torque_is_held_inside_its_bound(wanted: float, passed: float) -> None:
+    assert guarded(0.0, Drive(target_torque=wanted))[0].target_torque == passed
+
+
+def test_beyond_the_range_speed_only_leads_back() -> None:
+    assert guarded(2.0, Drive(position=2.01, target_position=2.0, target_velocity=0.1))[0].target_velocity == 0.0
+    assert guarded(2.0, Drive(position=2.01, target_position=2.0, target_velocity=-0.1))[0].target_velocity == -0.1
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
+def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float], start: float) -> None:
+    guard, drive, before = Guard([JOINT], PERIOD), Drive(), start
+    guard.latch([start])
+    for target in wanted:
+        drive.target_position = target
+        guard.check([drive])
+        assert -1.0 <= drive.target_position <= 2.0
+        assert abs(drive.target_position - before) <= STEP * (1 + 1e-5)
+        before = drive.target_position

@@ -1,0 +1,106 @@
+"""The master's clock against a simulated reference: drift, jitter, late cycles, lost frames."""
+
+from __future__ import annotations
+
+import random
+
+import pytest
+
+from rtcp.realtime.discipline import Discipline
+
+PERIOD = 500_000
+PHASE = PERIOD // 2
+EPOCH = 8 * 10**17 + 123_457
+
+
+class Reference:
+    """A clock that runs fast by `drift_ppm`, read through a path that takes 8 us and a little more."""
+
+    def __init__(self, drift_ppm: float, seed: int) -> None:
+        self.drift = drift_ppm * 1e-6
+        self.random = random.Random(seed)
+
+    def at(self, instant_ns: int) -> int:
+        return EPOCH + instant_ns + round((instant_ns - 10**12) * self.drift)
+
+    def seen_by_frame(self, sent_ns: int) -> int:
+        return self.at(sent_ns + 8000 + int(self.random.expovariate(1 / 2000)))
+
+
+def run(discipline: Discipline, reference: Reference, cycles: int, *, lost: int = 0, stalls: float = 0.0) -> list[int]:
+    """Run the loop's use of a discipline; return the wake-ups."""
+    planned, wakeups = 10**12, []
+    for cycle in range(cycles):
+        woken = planned + int(reference.random.expovariate(1 / 15_000))
+        if reference.random.random() < stalls:
+            woken += reference.random.randrange(3_000_000)
+        wakeups.append(planned)
+        if lost and cycle % lost == 0:
+            discipline.coast()
+        else:
+            discipline.observe(woken, reference.seen_by_frame(woken))
+        planned = discipline.next_wakeup(planned)
+        while planned < woken + PERIOD // 2:
+            planned += PERIOD
+    return wakeups
+
+
+@pytest.mark.parametrize("drift_ppm", [-20.0, -3.0, 0.0, 7.5, 20.0])
+def test_the_cycle_locks_within_two_seconds_and_stays_at_its_phase(drift_ppm: float) -> None:
+    reference = Reference(drift_ppm, seed=1)
+    discipline = Discipline(PERIOD, PHASE)
+    run(discipline, reference, 4000)
+    assert discipline.locked
+    assert abs(discipline.filtered_ns) < 5_000
+    wakeups = run(discipline, reference, 4000)[2000:]
+    errors = [(reference.at(wakeup) + 10_000 - PHASE + PERIOD // 2) % PERIOD - PERIOD // 2 for wakeup in wakeups]
+    assert max(abs(error) for error in errors) < 10_000
+
+
+def test_stalls_of_milliseconds_do_not_move_the_followed_clock() -> None:
+    reference = Reference(15.0, seed=2)
+    discipline = Discipline(PERIOD, PHASE)
+    wakeups = run(discipline, reference, 8000, stalls=0.01)
+    steps = [(after - before) % PERIOD for before, after in zip(wakeups[500:], wakeups[501:], strict=False)]
+    assert discipline.locked
+    assert max(min(step, PERIOD - step) for step in steps) < 500
+
+
+def test_lost_frames_are_bridged_by_the_rate() -> None:
+    reference = Reference(20.0, seed=3)
+    discipline = Discipline(PERIOD, PHASE)
+    run(discipline, reference, 6000, lost=3)
+    assert discipline.locked
+    assert abs(discipline.filtered_ns) < 5_000
+
+
+def test_the_grid_is_plain_until_the_phase_is_measured() -> None:
+    reference = Reference(0.0, seed=4)
+    discipline = Discipline(PERIOD, PHASE)
+    wakeups = run(discipline, reference, 90)
+    assert {after - before for before, after in zip(wakeups, wakeups[1:], strict=False)} == {PERIOD}
+    assert not discipline.aligned
+
+
+def test_the_raw_offset_is_the_nearest_one() -> None:
+    discipline = Discipline(PERIOD, PHASE)
+    discipline.observe(0, 7 * PERIOD + PHASE + 1234)
+    assert discipline.raw_ns == 1234
+    discipline.observe(0, 7 * PERIOD + PHASE - 1234)
+    assert discipline.raw_ns == -1234
+
+
+def test_a_reference_that_jumps_unlocks_and_locks_again() -> None:
+    reference = Reference(0.0, seed=5)
+    discipline = Discipline(PERIOD, PHASE)
+    planned = 10**12
+    states = []
+    for cycle in range(12_000):
+        woken = planned + 10_000
+        jump = 200_000 if cycle > 3000 else 0
+        discipline.observe(woken, reference.at(woken) + jump)
+        states.append(discipline.locked)
+        planned = discipline.next_wakeup(planned)
+    assert states[2900]
+    assert not all(states[3000:])
+    assert states[-1]
