@@ -120,7 +120,7 @@ class CycleConfig:
 
     period_us: Annotated[float, Ge(100), Le(100_000)] = 500.0
     priority: Annotated[int, Ge(1), Le(98)] = 80
-    cpu: int | None = None
+    cpu: Annotated[int, Ge(0)] | None = None
     """CPU of the cycle; None: the last one that the process may use."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 
 import pytest
 
@@ -61,7 +62,7 @@ def test_stalls_of_milliseconds_do_not_move_the_followed_clock() -> None:
     reference = Reference(15.0, seed=2)
     discipline = Discipline(PERIOD, PHASE)
     wakeups = run(discipline, reference, 8000, stalls=0.01)
-    steps = [(after - before) % PERIOD for before, after in zip(wakeups[500:], wakeups[501:], strict=False)]
+    steps = [(after - before) % PERIOD for before, after in pairwise(wakeups[500:])]
     assert discipline.locked
     assert max(min(step, PERIOD - step) for step in steps) < 500
 
@@ -78,7 +79,7 @@ def test_the_grid_is_plain_until_the_phase_is_measured() -> None:
     reference = Reference(0.0, seed=4)
     discipline = Discipline(PERIOD, PHASE)
     wakeups = run(discipline, reference, 90)
-    assert {after - before for before, after in zip(wakeups, wakeups[1:], strict=False)} == {PERIOD}
+    assert {after - before for before, after in pairwise(wakeups)} == {PERIOD}
     assert not discipline.aligned
 
 

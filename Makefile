@@ -1,0 +1,33 @@
+# `make run` and `make test` are all it takes: both first set up what is missing in .venv.
+# Another interpreter: make run PYTHON=python3.12
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: help setup run test lint format clean
+.DEFAULT_GOAL := help
+
+help: ## show this list
+	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-16s%s\n", $$1, $$2 }'
+
+setup: ## make .venv with the package and what it needs
+	@sh .ci/setup "$(PYTHON)"
+
+run: setup ## run the demonstration: virtual segment, master, a move, the figures
+	@$(BIN)/rtcp demo
+
+test: setup ## run all tests
+	@$(BIN)/python -m pytest
+
+lint: setup ## check style, format and types
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/python -m mypy --strict -p rtcp -p kinematics
+
+format: setup ## put imports and layout in order
+	@$(BIN)/ruff check --select I --fix .
+	@$(BIN)/ruff format .
+
+clean: ## remove .venv and all else that can be made again
+	rm -rf .venv build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

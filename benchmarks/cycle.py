@@ -1,0 +1,265 @@
+"""How well the cycle holds: `python benchmarks/cycle.py [--seconds N] [--rounds N] [--json FILE]`.
+
+In one run, alternating: cyclictest (Debian's rt-tests) with the loop's interval, priority and CPU, and the platform on
+its virtual segment with six drives enabled and moving. Then the mean cycle and the average deviation for the ten cycle
+targets of the thesis, beside the thesis' own. Medians over the rounds; the ratio is that of the medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.table import Table
+
+from rtcp.config.find import find_config
+from rtcp.config.schema import load
+from rtcp.realtime.scheduling import choose_cpu
+from rtcp.realtime.statistics import percentiles
+from rtcp.runtime.client import ControlClient
+from rtcp.runtime.launcher import Running, StartOptions, start
+from rtcp.runtime.layout import RECORDS
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.paths import blackboard_file, runtime_directory
+
+THESIS = {
+    200: (218.1, 21.4),
+    300: (274, 23),
+    400: (372, 39),
+    500: (463, 46),
+    600: (558, 67),
+    700: (654, 40),
+    800: (758, 42),
+    900: (843, 56),
+    1000: (940, 60),
+    2000: (1879, 120),
+}
+"""Cycle target -> mean cycle and average deviation of the thesis, us (facts of the machine, experiments)."""
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Round:
+    """What one run of the platform gave; arrays of shape (cycles,), us."""
+
+    wakeup: Array
+    exchange: Array
+    compute: Array
+    period: Array
+    offset: Array
+    filtered: Array
+    missed: int
+    start_to_op_s: float
+    rss_mb: float
+
+
+def cyclictest(cpu: int, priority: int, interval_us: int, seconds: float) -> Array | None:
+    """Run cyclictest; return its latencies, shape (N,), us, or None where it is not installed."""
+    if shutil.which("cyclictest") is None:
+        return None
+    command = ["cyclictest", "-q", "-m", "-t1", f"-p{priority}", f"-i{interval_us}", f"-a{cpu}", f"-D{round(seconds)}",
+               "-h", "20000"]  # fmt: skip
+    printed = subprocess.run(command, capture_output=True, text=True, check=False)
+    counts = [
+        (int(bin_us), int(count)) for bin_us, count in re.findall(r"^(\d{6}) (\d+)", printed.stdout, re.MULTILINE)
+    ]
+    if not counts:
+        return None
+    return np.repeat([bin_us for bin_us, _ in counts], [count for _, count in counts]).astype(float)
+
+
+def wander(stop: threading.Event) -> None:
+    """Move the arm to and fro until `stop`."""
+    poses = ([0.4, -0.3, 0.5, 0.2, -0.4, 0.3], [0.0] * 6)
+    turn = 0
+    with ControlClient("benchmark") as client:
+        while not stop.is_set():
+            client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+            turn += 1
+
+
+def resident_mb(pid: int) -> float:
+    """Return the resident memory of a process, MB."""
+    found = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    return int(found.group(1)) / 1024 if found else float("nan")
+
+
+def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool) -> Round:
+    """Start the platform, enable, let it run (moving or holding), stop; return what the cycle records tell."""
+    running: Running = start(StartOptions(cycle_us=float(cycle_us), poll=poll), lambda sentence: None)
+    try:
+        observer = Observer(blackboard_file(runtime_directory()))
+        with ControlClient("benchmark") as client:
+            client.call("enable")
+        stop = threading.Event()
+        mover = threading.Thread(target=wander, args=(stop,), daemon=True)
+        if move:
+            mover.start()
+        time.sleep(0.5)
+        at, parts, lost = observer.head, [], 0
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            time.sleep(min(0.25, RECORDS * cycle_us * 1e-6 / 4))
+            records, missed = observer.since(at)
+            at += len(records) + missed
+            lost += missed
+            parts.append(records)
+        rss = resident_mb(running.processes.loop)
+        stop.set()
+        if move:
+            mover.join()
+        observer.close()
+    finally:
+        running.stop()
+    if lost:
+        sys.stderr.write(f"{lost} cycle records were not read in time\n")
+    records = np.concatenate(parts)
+    return Round(
+        wakeup=records["wakeup_ns"] / 1e3,
+        exchange=records["exchange_ns"] / 1e3,
+        compute=records["compute_ns"] / 1e3,
+        period=np.diff(records["time_ns"]) / 1e3,
+        offset=np.abs(records["dc_offset_ns"]) / 1e3,
+        filtered=np.abs(records["dc_filtered_ns"]) / 1e3,
+        missed=int(records["missed"][-1] - records["missed"][0]),
+        start_to_op_s=float(running.facts.get("start_to_op_s") or 0.0),
+        rss_mb=rss,
+    )
+
+
+def figures(samples: list[Array]) -> dict[str, float]:
+    """Return the medians over the rounds of p50, p99, p99.9 and the largest of all."""
+    each = [percentiles(sample) for sample in samples]
+    return {
+        "p50": statistics.median(one.p50 for one in each),
+        "p99": statistics.median(one.p99 for one in each),
+        "p99.9": statistics.median(one.p999 for one in each),
+        "max": max(one.max for one in each),
+    }
+
+
+def spread(samples: list[Array], name: str) -> str:
+    """Return the smallest and the largest of a percentile over the rounds."""
+    values = [getattr(percentiles(sample), name) for sample in samples]
+    return f"{min(values):.0f} to {max(values):.0f}"
+
+
+def compare(cycle_us: int, seconds: float, rounds: int, *, poll: bool, console: Console) -> dict[str, object]:
+    """Alternate cyclictest and the platform; print the table; return the figures."""
+    config = load(find_config(None))
+    cpu, priority = choose_cpu(config.cycle.cpu), config.cycle.priority
+    reference, runs = [], []
+    for _ in range(rounds):
+        measured = cyclictest(cpu, priority, cycle_us, seconds)
+        if measured is not None:
+            reference.append(measured)
+        runs.append(platform_round(cycle_us, seconds, poll=poll, move=True))
+    table = Table(title=f"{cycle_us} us cycle, {rounds} rounds of {seconds:g} s, CPU {cpu}, priority {priority}; us")
+    for heading in ("", "p50", "p99", "p99.9", "max", "p99 over the rounds"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    rows = {
+        "cyclictest wake-up": reference,
+        "loop wake-up": [run.wakeup for run in runs],
+        "loop exchange": [run.exchange for run in runs],
+        "loop compute": [run.compute for run in runs],
+        "DC offset, raw": [run.offset for run in runs],
+        "DC offset, filtered": [run.filtered for run in runs],
+    }
+    result: dict[str, object] = {}
+    for name, samples in rows.items():
+        if not samples:
+            table.add_row(name, "not installed", "", "", "", "")
+            continue
+        found = figures(samples)
+        result[name] = found
+        table.add_row(name, *(f"{found[key]:.1f}" for key in ("p50", "p99", "p99.9", "max")), spread(samples, "p99"))
+    console.print(table)
+    if reference:
+        ratio = figures([run.wakeup for run in runs])["p99"] / figures(reference)["p99"]
+        result["ratio"] = ratio
+        console.print(f"wake-up p99, loop / cyclictest: {ratio:.2f}")
+    periods = np.concatenate([run.period for run in runs])
+    error = (periods.mean() - cycle_us) / cycle_us * 100
+    cycles = sum(run.period.size for run in runs)
+    console.print(
+        f"mean cycle {periods.mean():.4f} us (error {error:+.4f} %), ticks skipped {sum(r.missed for r in runs)} of "
+        f"{cycles}; start to OP {statistics.median(r.start_to_op_s for r in runs):.2f} s; "
+        f"loop process {max(r.rss_mb for r in runs):.0f} MB resident"
+    )
+    result |= {"mean_us": float(periods.mean()), "error_percent": float(error)}
+    return result
+
+
+def targets(seconds: float, *, poll: bool, console: Console) -> dict[str, object]:
+    """Run each cycle target of the thesis; print mean and average deviation beside the thesis' own."""
+    table = Table(title=f"cycle targets, holding, {seconds:g} s each; us")
+    for heading in (
+        "target",
+        "mean",
+        "error %",
+        "average deviation",
+        "skipped",
+        "thesis: mean",
+        "error %",
+        "deviation",
+    ):
+        table.add_column(heading, justify="right")
+    result: dict[str, object] = {}
+    for target, (mean, deviation) in THESIS.items():
+        run = platform_round(target, seconds, poll=poll, move=False)
+        own = float(run.period.mean())
+        own_deviation = float(np.abs(run.period - own).mean())
+        result[str(target)] = {"mean": own, "deviation": own_deviation, "skipped": run.missed}
+        table.add_row(
+            str(target), f"{own:.2f}", f"{(own - target) / target * 100:+.3f}", f"{own_deviation:.1f}", str(run.missed),
+            f"{mean:g}", f"{(mean - target) / target * 100:+.1f}", f"{deviation:g}",
+        )  # fmt: skip
+    console.print(table)
+    return result
+
+
+def main() -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of one measurement")
+    parser.add_argument("--rounds", type=int, default=3, help="how often cyclictest and the platform alternate")
+    parser.add_argument("--cycle-us", type=int, default=500)
+    parser.add_argument("--poll", action="store_true", help="let the segment poll on its own CPU")
+    parser.add_argument("--no-targets", action="store_true", help="leave out the ten cycle targets")
+    parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    given = parser.parse_args()
+    console = Console()
+    machine = (
+        f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, Python {platform.python_version()}"
+    )
+    console.print(f"{machine}, {date.today().isoformat()}")
+    with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
+        os.environ["RTCP_RUNTIME_DIR"] = directory
+        found = {"machine": machine, "date": date.today().isoformat()}
+        found |= compare(given.cycle_us, given.seconds, given.rounds, poll=given.poll, console=console)
+        if not given.no_targets:
+            found["targets"] = targets(given.seconds / 2, poll=given.poll, console=console)
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""`rtcp demo`: the whole platform once through, from nothing to a table of figures and back to nothing."""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rtcp.cli.connection import connect
+from rtcp.cli.launch import launch, refuse_a_second_platform
+from rtcp.cli.motion import arrival, move
+from rtcp.cli.options import BusName, ConfigFile
+from rtcp.cli.outcome import CommandError, ExitCode, interruption_code, orderly_signals
+from rtcp.cli.output import report, show
+from rtcp.runtime import offline
+from rtcp.runtime.client import ControlClient
+
+if TYPE_CHECKING:
+    from rtcp.config.model import Joint
+    from rtcp.runtime.launcher import StartOptions
+
+REACH = 0.35
+"""How far a pose lies from where the arm stood, rad; less where a limit is nearer."""
+
+POSES = ((1, -1, 1, 1, -1, 1), (-1, 1, 1, -1, 1, -1), (1, 1, -1, 1, 1, 1), (-1, -1, -1, -1, -1, 1))
+"""Directions of the poses, joint by joint."""
+
+MARGIN = 0.05
+"""Part of a joint's range that the demo keeps away from each end."""
+
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+LOCK_TIMEOUT_S = 10.0
+LONGEST_S = 3600.0
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's commands."""
+    app.command("demo")(_demo)
+
+
+def _demo(
+    config: ConfigFile = None,
+    bus: BusName = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="N", help="How long to move, s.")] = 6.0,
+) -> None:
+    """Start, enable, move through a few poses and back, stop, and show how well the cycle held."""
+    if not 0 < seconds <= LONGEST_S:
+        raise CommandError(f"--seconds {seconds:g} is not allowed: above 0, at most {LONGEST_S:g}")
+    refuse_a_second_platform()
+    joints = offline.configuration(config).joints
+    from rtcp.runtime.launcher import StartOptions
+
+    options = StartOptions(config=config, bus=bus, mode="csp")
+    try:
+        with orderly_signals(), _platform(options) as started_s, connect("demo") as client:
+            status, mean_ns = _run(client, joints, seconds)
+    except KeyboardInterrupt as interruption:
+        raise CommandError("interrupted: the platform has been stopped", interruption_code(interruption)) from None
+    given = status.get("start_to_op_s")
+    from rtcp.cli.demo_view import table
+
+    show(table(status, given if isinstance(given, int | float) else started_s, mean_ns))
+
+
+def _run(client: ControlClient, joints: Sequence[Joint], seconds: float) -> tuple[dict[str, Any], float | None]:
+    """Enable, move, come back, and return the last status with the drives enabled and the mean cycle, ns."""
+    _wait_for_the_clocks(client)
+    client.call("enable")
+    report("enabled: the drives hold the arm where it is")
+    before, since_ns = client.call("status"), time.monotonic_ns()
+    home = [
+        min(joint.position.max, max(joint.position.min, float(position)))
+        for joint, position in zip(joints, before["joints"]["position"], strict=True)
+    ]
+    until = time.monotonic() + seconds
+    number = 0
+    while number == 0 or time.monotonic() < until:
+        target = pose(home, joints, POSES[number % len(POSES)])
+        number += 1
+        report(f"pose {number}: {arrival(move(client, target, None, _unseen))}")
+    report(f"back: {arrival(move(client, home, None, _unseen))}")
+    after, passed_ns = client.call("status"), time.monotonic_ns() - since_ns
+    client.call("disable")
+    report("disabled")
+    return after, _mean_cycle_ns(before, after, passed_ns)
+
+
+def pose(home: Sequence[float], joints: Sequence[Joint], directions: Sequence[int]) -> list[float]:
+    """Return a pose `REACH` away from `home`, rad, well inside the limits of every joint."""
+    target = []
+    for number, (start, joint) in enumerate(zip(home, joints, strict=True)):
+        margin = MARGIN * (joint.position.max - joint.position.min)
+        wanted = start + math.copysign(REACH, directions[number % len(directions)])
+        target.append(min(joint.position.max - margin, max(joint.position.min + margin, wanted)))
+    return target
+
+
+def _wait_for_the_clocks(client: ControlClient) -> None:
+    """Return when the master follows the reference clock, or at once on a bus without distributed clocks."""
+    deadline = time.monotonic() + LOCK_TIMEOUT_S
+    while True:
+        clocks = client.call("status").get("dc")
+        if not isinstance(clocks, dict) or clocks.get("locked") is None:
+            report("no distributed clocks on this bus")
+            return
+        if clocks["locked"]:
+            report("clocks locked")
+            return
+        if time.monotonic() > deadline:
+            raise CommandError(f"the clocks have not locked within {LOCK_TIMEOUT_S:g} s", ExitCode.FAULT)
+        time.sleep(0.05)
+
+
+def _mean_cycle_ns(before: Mapping[str, Any], after: Mapping[str, Any], passed_ns: int) -> float | None:
+    """Return the mean cycle by the records' own instants where they are told, else by those of the two questions."""
+    cycles = int(after["cycles"]) - int(before["cycles"])
+    if cycles <= 0:
+        return None
+    instants = (before.get("time_ns"), after.get("time_ns"))
+    if isinstance(instants[0], int) and isinstance(instants[1], int):
+        passed_ns = instants[1] - instants[0]
+    return passed_ns / cycles
+
+
+def _unseen(progress: Mapping[str, Any]) -> None:
+    """Take progress that a line a pose makes superfluous."""
+
+
+@contextmanager
+def _platform(options: StartOptions) -> Iterator[float]:
+    """Run a platform and give the seconds that its start took; it is stopped on the way out, whatever the way.
+
+    A second Ctrl-C does not leave half of it behind.
+    """
+    begun = time.monotonic()
+    running = launch(options, report)
+    try:
+        yield time.monotonic() - begun
+    finally:
+        kept = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING_SIGNALS}
+        try:
+            running.stop()
+        finally:
+            for number, handler in kept.items():
+                signal.signal(number, handler)
+        report("stopped")

@@ -1,0 +1,62 @@
+"""`rtcp start` and `rtcp stop`: the platform's processes, in the foreground or on their own."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import typer
+
+from rtcp.cli.launch import launch, serve
+from rtcp.cli.options import BusName, ConfigFile, Poll
+from rtcp.cli.outcome import CommandError, code_of
+from rtcp.cli.output import report
+
+MODES = ("csp", "csv", "cst")
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's commands."""
+    app.command("start")(_start)
+    app.command("stop")(_stop)
+
+
+def _start(
+    config: ConfigFile = None,
+    bus: BusName = None,
+    mode: Annotated[str | None, typer.Option("--mode", metavar="csp|csv|cst", help="Mode at the start.")] = None,
+    cycle_us: Annotated[
+        float | None, typer.Option("--cycle-us", metavar="N", help="Cycle, us; else the configuration's.")
+    ] = None,
+    poll: Poll = False,
+    detach: Annotated[bool, typer.Option("--detach", help="Return once it runs; `rtcp stop` ends it.")] = False,
+) -> None:
+    """Start the platform: bring the slaves to OP and wait for commands."""
+    mode = None if mode is None else mode.lower()
+    if mode is not None and mode not in MODES:
+        raise CommandError(f"--mode {mode} is not known: {', '.join(MODES)}")
+    if cycle_us is not None and not (math.isfinite(cycle_us) and cycle_us > 0):
+        raise CommandError(f"--cycle-us {cycle_us:g} is not allowed: a number of us above 0")
+    from rtcp.runtime.launcher import StartOptions
+
+    request = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
+    if detach:
+        # The processes have sessions of their own: nothing needs to stay behind for them.
+        launch(request, report)
+        report("ready: `rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop` ends it")
+        return
+    ready = "ready: `rtcp enable` and `rtcp move` in another terminal; Ctrl-C or `rtcp stop` ends it"
+    ending = serve(request, report, lambda: report(ready))
+    report("stopped" if ending == 0 else "the platform has ended")
+    raise typer.Exit(ending)
+
+
+def _stop() -> None:
+    """Stop the platform: drives disabled, slaves in INIT, processes ended."""
+    from rtcp.runtime import launcher
+
+    try:
+        launcher.stop()
+    except launcher.StartError as error:
+        raise CommandError(str(error), code_of(error.kind)) from error
+    report("stopped")

@@ -1,0 +1,62 @@
+"""Which file is the arm's."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from rtcp.config.errors import ConfigError
+
+SYSTEM = Path("/etc/rtcp/assistive_arm.yaml")
+"""The configuration of this machine."""
+
+ENVIRONMENT = "RTCP_CONFIG"
+"""The environment variable that names the arm's file."""
+
+
+def find_config(given: Path | None = None) -> Path:
+    """Return the arm's file: the one given, else $RTCP_CONFIG, else /etc/rtcp/assistive_arm.yaml, else the default.
+
+    Raises:
+        ConfigError: a file that was asked for does not exist, or the package has lost its default.
+    """
+    if given is not None:
+        return _there(given, "--config")
+    if named := os.environ.get(ENVIRONMENT):
+        return _there(Path(named), ENVIRONMENT)
+    if exists(SYSTEM):
+        return SYSTEM
+    return default_config()
+
+
+def default_config() -> Path:
+    """Return the arm's file that came with the package: in a wheel inside it, in a checkout beside it.
+
+    Raises:
+        ConfigError: it is in neither place.
+    """
+    package = Path(__file__).resolve().parent.parent
+    places = (package / "config" / "default" / SYSTEM.name, package.parent / "config" / SYSTEM.name)
+    for place in places:
+        if place.is_file():
+            return place
+    raise ConfigError([f"the default configuration is missing; it belongs at {' or '.join(map(str, places))}"])
+
+
+def exists(path: Path) -> bool:
+    """Return whether there is such a file, also where it may not be looked at: reading it then says why."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except OSError:
+        return True
+    return True
+
+
+def _there(path: Path, asked_by: str) -> Path:
+    if os.path.isdir(path):
+        raise ConfigError([f"{path}, named by {asked_by}, is a directory; name the arm's file in it"])
+    if not exists(path):
+        raise ConfigError([f"{path}, named by {asked_by}, does not exist; name the arm's file"])
+    return path

@@ -1,0 +1,142 @@
+"""Reads the arm's file and the device files that it names into one frozen `ArmConfig`, or names every mistake."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import MinLen
+
+from rtcp.config import rules
+from rtcp.config.checking import Checker
+from rtcp.config.document import Finding, dotted, read
+from rtcp.config.errors import ConfigError
+from rtcp.config.find import exists
+from rtcp.config.model import (
+    ArmConfig,
+    BusConfig,
+    CycleConfig,
+    DeviceDescription,
+    DriveModeName,
+    Joint,
+    Name,
+    Positive,
+    SlaveConfig,
+)
+
+
+@dataclass(frozen=True)
+class SlaveEntry:
+    """A slave as the arm's file lists it: its name and the file that describes its kind."""
+
+    name: Name
+    device: Name
+
+
+@dataclass(frozen=True)
+class ArmFile:
+    """The arm's file: an `ArmConfig` whose slaves only name their device."""
+
+    name: Name
+    slaves: Annotated[tuple[SlaveEntry, ...], MinLen(1)]
+    joints: Annotated[tuple[Joint, ...], MinLen(1)]
+    cycle: CycleConfig = field(default_factory=CycleConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
+    mode: DriveModeName = ArmConfig.mode
+    enable_timeout_s: Positive = ArmConfig.enable_timeout_s
+    lease_s: Positive = ArmConfig.lease_s
+
+
+_ARM, _DEVICE, _CYCLE = Checker(ArmFile), Checker(DeviceDescription), Checker(CycleConfig)
+
+
+def load(path: Path) -> ArmConfig:
+    """Read the arm's file and the device files beside it.
+
+    Raises:
+        ConfigError: with one sentence for every mistake in all of these files: file, line, key, what was found and
+            what is allowed.
+    """
+    document = read(path)
+    arm, findings = _ARM.check(document.data)
+    findings += rules.arm_findings(document.data)
+    period_us = rules.period_us(document.data)
+
+    devices: dict[str, DeviceDescription] = {}
+    in_devices: list[str] = []
+    for key, where in rules.devices_named(document.data).items():
+        file = device_path(path, key)
+        if not exists(file):
+            findings.append(((*where,), _no_device(key, file)))
+            continue
+        try:
+            devices[key] = load_device(file, period_us)
+        except ConfigError as error:
+            in_devices += error.problems
+    findings += rules.joint_findings(document.data, devices)
+    if findings or in_devices or arm is None:
+        raise ConfigError(document.sentences(findings) + in_devices)
+    return ArmConfig(
+        name=arm.name,
+        slaves=tuple(SlaveConfig(slave.name, devices[slave.device]) for slave in arm.slaves),
+        joints=arm.joints,
+        cycle=arm.cycle,
+        bus=arm.bus,
+        mode=arm.mode,
+        enable_timeout_s=arm.enable_timeout_s,
+        lease_s=arm.lease_s,
+        source=path,
+    )
+
+
+def load_device(path: Path, period_us: float | None = None) -> DeviceDescription:
+    """Read a device file; with a cycle period (us) its watchdog is checked against it.
+
+    Raises:
+        ConfigError: with one sentence for every mistake.
+    """
+    document = read(path)
+    rules.name_padding(document.data)
+    device, findings = _DEVICE.check(document.data)
+    findings += rules.device_findings(document.data)
+    if period_us is not None:
+        findings += rules.period_findings(document.data, period_us)
+    if findings or device is None:
+        raise ConfigError(document.sentences(findings))
+    return device
+
+
+def device_path(arm: Path, key: str) -> Path:
+    """Return the file of a device: `devices/<key>.yaml` beside the arm's file, or the path that the key is."""
+    if "/" in key or key.endswith((".yaml", ".yml")):
+        return arm.parent / key
+    return arm.parent / "devices" / f"{key}.yaml"
+
+
+def segment_path(config: ArmConfig) -> Path:
+    """Return the file of the virtual segment's slaves, which the arm's file names."""
+    return config.source.parent / config.bus.segment
+
+
+def with_period(config: ArmConfig, period_us: float) -> ArmConfig:
+    """Return the same arm with another cycle period (us), as a command's `--cycle-us` asks for.
+
+    Raises:
+        ConfigError: the period is out of range or does not suit a device's watchdog.
+    """
+    cycle, findings = _CYCLE.check({**dataclasses.asdict(config.cycle), "period_us": period_us})
+    problems = [f"cycle.{finding[0][-1]}: {finding[1]}" for finding in findings]
+    for device in {slave.device.name: slave.device for slave in config.slaves}.values():
+        found: list[Finding] = rules.period_findings(dataclasses.asdict(device), period_us) if cycle else []
+        problems += [f"{device.name}: {dotted(where)}: {text}" for where, text in found]
+    if cycle is None or problems:
+        raise ConfigError(problems)
+    return dataclasses.replace(config, cycle=cycle)
+
+
+def _no_device(key: str, file: Path) -> str:
+    there = sorted(other.stem for other in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+    listed = f"in {file.parent} are {', '.join(there)}" if there else f"{file.parent} holds no device files"
+    return f'found the text "{key}", but there is no file {file}; {listed}'

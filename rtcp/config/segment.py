@@ -1,0 +1,75 @@
+"""The file of the virtual segment (`config/segment.yaml`): its slaves in the order of the cable, and their options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import isfinite
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Ge, Le, MinLen
+
+from rtcp.config.checking import Checker, shown
+from rtcp.config.document import Finding, read
+from rtcp.config.errors import ConfigError
+from rtcp.config.model import U16, Name
+
+
+@dataclass(frozen=True)
+class SegmentSlave:
+    """A virtual slave. Which models there are and which options they take is known to `rtcp.virtual.models` alone."""
+
+    model: Name
+    drift_ppm: Annotated[float, Ge(-1000), Le(1000)] = 0.0
+    """How much faster than the host its own clock runs, parts per million."""
+    delay_ns: Annotated[int, Ge(0), Le(1_000_000)] | None = None
+    """Propagation delay from the master, ns; None: as on the real arm."""
+    alias: U16 = 0
+    """Station alias; 0: none."""
+    options: dict[str, object] = field(default_factory=dict)
+    """Texts, numbers and booleans by name."""
+
+
+@dataclass(frozen=True)
+class SegmentConfig:
+    """The virtual slaves in the order of the cable, and the file that lists them."""
+
+    slaves: tuple[SegmentSlave, ...]
+    source: Path
+
+
+@dataclass(frozen=True)
+class _SegmentFile:
+    slaves: Annotated[tuple[SegmentSlave, ...], MinLen(1)]
+
+
+_SEGMENT = Checker(_SegmentFile)
+
+
+def load_segment(path: Path) -> SegmentConfig:
+    """Read the file of a virtual segment.
+
+    Raises:
+        ConfigError: with one sentence for every mistake.
+    """
+    document = read(path)
+    segment, findings = _SEGMENT.check(document.data)
+    if segment is not None:
+        findings += _rules(segment)
+    if findings or segment is None:
+        raise ConfigError(document.sentences(findings))
+    return SegmentConfig(segment.slaves, path)
+
+
+def _rules(segment: _SegmentFile) -> list[Finding]:
+    findings: list[Finding] = []
+    first: dict[int, int] = {}
+    for i, slave in enumerate(segment.slaves):
+        if slave.alias and first.setdefault(slave.alias, i) != i:
+            text = f"found {slave.alias}, the alias of slaves[{first[slave.alias]}]; each needs its own, or 0 for none"
+            findings.append((("slaves", i, "alias"), text))
+        for name, value in slave.options.items():
+            if not isinstance(value, str) and not (isinstance(value, int | float) and isfinite(value)):
+                where = ("slaves", i, "options", name)
+                findings.append((where, f"found {shown(value)}, allowed is a text, a number, true or false"))
+    return findings

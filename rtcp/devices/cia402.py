@@ -1,0 +1,236 @@
+"""The CiA 402 drive: two tables, and the little code that walks them (CiA 402-2, clause 8: finite state automaton)."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from rtcp.config.model import SlaveConfig
+from rtcp.devices.codec import DeviceError, factors, integer_range, make_codec, slots
+from rtcp.fieldbus.emergency import error_meaning
+from rtcp.fieldbus.pdo import layout
+
+
+class DriveState(Enum):
+    """States of the automaton; the value is the state's name in the standard."""
+
+    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
+    SWITCH_ON_DISABLED = "switch on disabled"
+    READY_TO_SWITCH_ON = "ready to switch on"
+    SWITCHED_ON = "switched on"
+    OPERATION_ENABLED = "operation enabled"
+    QUICK_STOP_ACTIVE = "quick stop active"
+    FAULT_REACTION_ACTIVE = "fault reaction active"
+    FAULT = "fault"
+    UNKNOWN = "unknown"
+    """A statusword that the standard does not define."""
+
+
+class DriveGoal(Enum):
+    """Where a drive is led; the value names it in sentences."""
+
+    DISABLED = "disabled"
+    ENABLED = "enabled"
+    RESET = "free of faults"
+    """Resets a fault and takes the drive no further than `switch on disabled`."""
+
+
+# (mask, value) of the statusword -> state (CiA 402-2, table 29)
+STATES: dict[tuple[int, int], DriveState] = {
+    (0x4F, 0x00): DriveState.NOT_READY_TO_SWITCH_ON,
+    (0x4F, 0x40): DriveState.SWITCH_ON_DISABLED,
+    (0x6F, 0x21): DriveState.READY_TO_SWITCH_ON,
+    (0x6F, 0x23): DriveState.SWITCHED_ON,
+    (0x6F, 0x27): DriveState.OPERATION_ENABLED,
+    (0x6F, 0x07): DriveState.QUICK_STOP_ACTIVE,
+    (0x4F, 0x0F): DriveState.FAULT_REACTION_ACTIVE,
+    (0x4F, 0x08): DriveState.FAULT,
+}
+
+DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE_OPERATION, FAULT_RESET = 0x0000, 0x0006, 0x0007, 0x000F, 0x0080
+"""Commands of the controlword (CiA 402-2, table 27)."""
+
+_S = DriveState
+# (state, goal) -> controlword of the next step (CiA 402-2, figure 7). A fault is reset on request only.
+CONTROLWORDS: dict[tuple[DriveState, DriveGoal], int] = {
+    (_S.NOT_READY_TO_SWITCH_ON, DriveGoal.ENABLED): DISABLE_VOLTAGE,
+    (_S.SWITCH_ON_DISABLED, DriveGoal.ENABLED): SHUTDOWN,
+    (_S.READY_TO_SWITCH_ON, DriveGoal.ENABLED): SWITCH_ON,
+    (_S.SWITCHED_ON, DriveGoal.ENABLED): ENABLE_OPERATION,
+    (_S.OPERATION_ENABLED, DriveGoal.ENABLED): ENABLE_OPERATION,
+    # Transition 16: holds the arm, which `disable voltage` would let fall.
+    (_S.QUICK_STOP_ACTIVE, DriveGoal.ENABLED): ENABLE_OPERATION,
+    (_S.FAULT_REACTION_ACTIVE, DriveGoal.ENABLED): DISABLE_VOLTAGE,
+    (_S.FAULT, DriveGoal.ENABLED): DISABLE_VOLTAGE,
+    (_S.UNKNOWN, DriveGoal.ENABLED): DISABLE_VOLTAGE,
+    (_S.NOT_READY_TO_SWITCH_ON, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.SWITCH_ON_DISABLED, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.READY_TO_SWITCH_ON, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.SWITCHED_ON, DriveGoal.DISABLED): SHUTDOWN,
+    (_S.OPERATION_ENABLED, DriveGoal.DISABLED): SWITCH_ON,
+    (_S.QUICK_STOP_ACTIVE, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.FAULT_REACTION_ACTIVE, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.FAULT, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.UNKNOWN, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+}
+CONTROLWORDS |= {
+    (state, DriveGoal.RESET): FAULT_RESET if state is _S.FAULT else CONTROLWORDS[state, DriveGoal.DISABLED]
+    for state in DriveState
+}
+
+# States in which a goal is reached.
+REACHED: dict[DriveGoal, frozenset[DriveState]] = {
+    DriveGoal.ENABLED: frozenset({_S.OPERATION_ENABLED}),
+    DriveGoal.DISABLED: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
+    DriveGoal.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
+}
+
+_STATE_BITS = 0x6F
+_STATE_OF = tuple(
+    next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
+    for word in range(0x80)
+)
+_RESET_HOLD = 5
+"""Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
+_OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
+_INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
+_CSP, _CSV, _CST = 8, 9, 10
+"""Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
+_ENABLED = DriveState.OPERATION_ENABLED
+
+
+class Cia402Drive:
+    """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
+
+    Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm), `statusword`, `mode_display`,
+    `state`, and `error_code` where 0x603F is mapped as `error_code` (else whoever reads it by SDO may set it).
+    Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
+    `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
+    """
+
+    __slots__ = (
+        "_error_slot", "_fields", "_in", "_in_factors", "_limits", "_out", "_pack", "_reset_calls", "_scales",
+        "_unpack", "_was_enabled", "controlword", "error_code", "input_bytes", "mode", "mode_display", "name",
+        "output_bytes", "position", "speed_limit", "state", "statusword", "target_position", "target_torque",
+        "target_velocity", "torque", "velocity",
+    )  # fmt: skip
+
+    def __init__(self, slave: SlaveConfig, speed_limit: float = 0.0) -> None:
+        """Make the driver of `slave`.
+
+        Args:
+            slave: the slave's name and description.
+            speed_limit: rad/s; what the drive is given as its speed limit in CSP.
+
+        Raises:
+            DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
+        """
+        device = slave.device
+        outputs, inputs = layout(device.rpdo), layout(device.tpdo)
+        self._out = slots(device.name, "rpdo", outputs, _OUTPUTS)
+        self._in = slots(device.name, "tpdo", inputs, _INPUTS)
+        self._limits = tuple(integer_range(outputs, place) for place in self._out[1:4])
+        scales = factors(outputs, self._out[1:4])
+        if not all(scales):
+            raise DeviceError(f"{device.name}: a factor of 0 in `rpdo` is not allowed")
+        self._scales = tuple(1.0 / factor for factor in scales)
+        self._in_factors = factors(inputs, self._in[1:4])
+        error = inputs.find("error_code")
+        self._error_slot = -1 if error is None else inputs.channels.index(error)
+        self._unpack = make_codec(inputs).unpack
+        self._pack = make_codec(outputs).pack
+        self._fields: list[int] = [0] * len(outputs.channels)
+        self.name = slave.name
+        self.output_bytes, self.input_bytes = outputs.bytes, inputs.bytes
+        self.position = self.velocity = self.torque = 0.0
+        self.statusword = self.mode_display = self.error_code = 0
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
+        self.controlword = DISABLE_VOLTAGE
+        self.mode = _CSP
+        self.speed_limit = speed_limit
+        self.target_position = self.target_velocity = self.target_torque = 0.0
+        self._was_enabled = False
+        self._reset_calls = 0
+
+    def decode(self, data: bytes) -> None:
+        """Take the inputs of the cycle (`input_bytes` long). Until the drive is enabled the target follows them."""
+        values = self._unpack(data)
+        status, position, velocity, torque, mode = self._in
+        by_position, by_velocity, by_torque = self._in_factors
+        self.statusword = word = int(values[status])
+        self.position = values[position] * by_position
+        self.velocity = values[velocity] * by_velocity
+        self.torque = values[torque] * by_torque
+        self.mode_display = int(values[mode])
+        self.state = _STATE_OF[word & _STATE_BITS]
+        if self._error_slot >= 0:
+            self.error_code = int(values[self._error_slot])
+        if self.controlword != ENABLE_OPERATION:
+            self.target_position = self.position
+
+    def advance(self, goal: DriveGoal) -> bool:
+        """Choose the controlword of the next step towards `goal` by the state found; return whether it is reached."""
+        state = self.state
+        word = CONTROLWORDS[state, goal]
+        if word == ENABLE_OPERATION:
+            # On the step itself, and again when the drive left the state on its own; never while it is enabled.
+            if self.controlword != ENABLE_OPERATION or (self._was_enabled and state is not _ENABLED):
+                self.latch()
+            self._was_enabled = state is _ENABLED
+        elif word == FAULT_RESET:
+            # Only a rising edge resets (CiA 402-2, transition 15); held for a while, then tried anew.
+            self._reset_calls += 1
+            if self._reset_calls > _RESET_HOLD:
+                self._reset_calls = 0
+                word = DISABLE_VOLTAGE
+        else:
+            self._reset_calls = 0
+        self.controlword = word
+        return state in REACHED[goal]
+
+    def latch(self) -> None:
+        """Set the target position to the actual one, the other targets to zero: on enabling, on entering CSP."""
+        self.target_position = self.position
+        self.target_velocity = self.target_torque = 0.0
+
+    def encode(self) -> bytes:
+        """Return the outputs of the cycle.
+
+        Velocity (in CSP: the speed limit) and torque are sent only while the drive is enabled and displays the mode
+        that is commanded: on the way from CSV to CSP it would take the speed limit for a target velocity, and run.
+        A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.
+        """
+        fields = self._fields
+        control, position, velocity, torque, mode = self._out
+        by_position, by_velocity, by_torque = self._scales
+        fields[control] = self.controlword
+        fields[mode] = commanded = self.mode
+        fields[position] = self._counts(self.target_position * by_position, 0, fields[position])
+        speed = effort = 0
+        if commanded == self.mode_display and self.state is _ENABLED:
+            if commanded == _CSP:
+                speed = self._counts(self.speed_limit * by_velocity, 1, fields[velocity])
+            elif commanded == _CSV:
+                speed = self._counts(self.target_velocity * by_velocity, 1, fields[velocity])
+            elif commanded == _CST:
+                effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
+        fields[velocity] = speed
+        fields[torque] = effort
+        return self._pack(*fields)
+
+    def _counts(self, value: float, which: int, last: int) -> int:
+        low, high = self._limits[which]
+        if low <= value <= high:
+            return round(value)
+        if value - value != 0.0:
+            # Not a number, or infinite: the last counts that were sent.
+            return last
+        return low if value < low else high
+
+    def stuck_sentence(self, goal: DriveGoal, timeout_s: float) -> str:
+        """Return where the drive stands after `timeout_s` seconds on the way to `goal`, in words."""
+        error = f", error code 0x{self.error_code:04X}: {error_meaning(self.error_code)}" if self.error_code else ""
+        return (
+            f"drive {self.name} was not {goal.value} within {timeout_s:g} s: it is stuck in `{self.state.value}` "
+            f"(statusword 0x{self.statusword:04X}, controlword 0x{self.controlword:04X}, mode {self.mode_display} "
+            f"of {self.mode} commanded{error})"
+        )

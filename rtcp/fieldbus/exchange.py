@@ -1,0 +1,96 @@
+"""The exchange of process data through SOEM: one frame a cycle, and never an old answer taken for a new one."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+from rtcp.fieldbus.fence import Fence, drain
+
+_LARGEST_FRAME_DATA = 1466
+"""Bytes of process data that fit one frame beside the clock's datagram (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
+
+
+class SoemProcessData:
+    """ProcessData over a configured pysoem master. `receive` holds the interpreter and polls, at most `receive_us`.
+
+    After an exchange without an answer the next `send` first lets a fence pass, throws away what came back before it
+    and only then sends: the answer that follows can only be the new one. While the fence does not come back, outputs
+    are still sent (a drive that hears the master must get its targets), but no answer is taken.
+    """
+
+    def __init__(
+        self, master: Any, slaves: Sequence[Any], socket_fd: int, fence: Fence, receive_us: int, fence_us: int
+    ) -> None:
+        """Take over the image of `slaves` (pysoem's), outputs zero.
+
+        Args:
+            master: pysoem's master after `config_map`.
+            slaves: its slaves.
+            socket_fd: a duplicate of SOEM's packet socket, non-blocking.
+            fence: the fence on the same interface.
+            receive_us: how long an answer is waited for.
+            fence_us: how long the fence is waited for.
+        """
+        self.expected_wkc = int(master.expected_wkc)
+        self.missed = 0
+        self.stale = 0
+        self._master = master
+        self._slaves = tuple(slaves)
+        self._fd = socket_fd
+        self._fence = fence
+        self._receive_us = receive_us
+        self._fence_ns = fence_us * 1000
+        self._inputs = [bytes(slave.input) for slave in slaves]
+        self._outputs = [bytes(len(slave.output)) for slave in slaves]
+        self._lengths = tuple(len(output) for output in self._outputs)
+        self._with_inputs = tuple((i, slave) for i, slave in enumerate(slaves) if self._inputs[i])
+        self._with_outputs = tuple((i, slave) for i, slave in enumerate(slaves) if self._outputs[i])
+        self._several_frames = sum(map(len, self._inputs + self._outputs)) > _LARGEST_FRAME_DATA
+        self._buffer = ctypes.create_string_buffer(1518)
+        # SOEM sends frames again while it configures: their late answers are around at the start.
+        self._doubtful = True
+        self._blind = False
+        self.dc_time = int(master.dc_time)
+
+    def send(self) -> None:
+        """Send the outputs that were set."""
+        if self._doubtful:
+            self._blind = not self._fence.pass_through(self._fence_ns)
+            self.stale += drain(self._fd, self._buffer)
+        outputs = self._outputs
+        # All of them, each time: SOEM copies what comes back, also an older frame's outputs, over its image.
+        for i, slave in self._with_outputs:
+            slave.output = outputs[i]
+        self._master.send_processdata()
+
+    def receive(self) -> int:
+        """Return the working counter of the answer, -1 where none came in time; then inputs and `dc_time` stay."""
+        if self._blind:
+            self.stale += drain(self._fd, self._buffer)
+            # Only gives SOEM's buffer back; whatever it finds is not known to be new.
+            self._master.receive_processdata(0)
+            self._blind = False
+            self.missed += 1
+            return -1
+        wkc = int(self._master.receive_processdata(self._receive_us))
+        if wkc < 0:
+            self._doubtful = True
+            self.missed += 1
+            return -1
+        self._doubtful = self._several_frames and wkc != self.expected_wkc
+        inputs = self._inputs
+        for i, slave in self._with_inputs:
+            inputs[i] = slave.input
+        self.dc_time = self._master.dc_time
+        return wkc
+
+    def input(self, index: int) -> bytes:
+        """Return the inputs of slave `index` of the last answer."""
+        return self._inputs[index]
+
+    def set_output(self, index: int, data: bytes) -> None:
+        """Set the outputs of slave `index` for the next `send`; data of another length is not taken."""
+        if len(data) == self._lengths[index]:
+            self._outputs[index] = data

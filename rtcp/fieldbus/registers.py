@@ -1,0 +1,144 @@
+"""Registers of the slaves, read and written beside the cycle by a socket of their own.
+
+SOEM's functions hold the interpreter while they wait for a frame; a thread that waits here does not. Datagram indices
+from 0x80 up tell these frames from SOEM's, which uses 0 to 15 (EC_MAXBUF); a filter in the kernel gives each socket its
+own answers only. Frames: ETG.1000.4, 5.4 and 5.5.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import socket
+import struct
+import threading
+import time
+from enum import IntEnum
+from typing import NamedTuple
+
+from rtcp.fieldbus.bus import BusError
+
+ETHERTYPE = 0x88A4
+FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
+"""Datagram indices of this port; those above are the fence's."""
+_INDEX_AT = 17
+_DATA_AT = 26
+_SMALLEST_FRAME = 60
+_SO_ATTACH_FILTER = 26
+_HEADER = struct.Struct("<6s6s2sHBBHHHH")
+_SOURCE = bytes((0x02, 0, 0, 0x52, 0x54, 0x43))
+
+
+class Command(IntEnum):
+    """EtherCAT commands used here (ETG.1000.4, table 8)."""
+
+    NOP = 0
+    FPRD = 4
+    FPWR = 5
+    BRD = 7
+    BWR = 8
+
+
+class Answer(NamedTuple):
+    """What came back: data and working counter, -1 where no frame came."""
+
+    data: bytes
+    wkc: int
+
+
+def build_frame(command: Command, index: int, station: int, address: int, data: bytes) -> bytes:
+    """Return an Ethernet frame with one datagram."""
+    header = _HEADER.pack(
+        b"\xff" * 6, _SOURCE, ETHERTYPE.to_bytes(2, "big"), 0x1000 | (12 + len(data)),
+        command, index, station, address, len(data), 0,
+    )  # fmt: skip
+    return (header + data + b"\0\0").ljust(_SMALLEST_FRAME, b"\0")
+
+
+def open_socket(interface: str, first: int, last: int) -> socket.socket:
+    """Return a packet socket that receives EtherCAT frames whose first datagram's index is in `first`..`last`.
+
+    Raises:
+        BusError: no such interface, or no right to raw sockets.
+    """
+    try:
+        port = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+    except PermissionError as error:
+        raise BusError(f"a raw socket on {interface} needs the capability CAP_NET_RAW (or root): {error}") from error
+    try:
+        attach_filter(port, first, last)
+        # Bound last: with protocol 0 the socket receives nothing before its filter stands.
+        port.bind((interface, ETHERTYPE))
+    except OSError as error:
+        port.close()
+        raise BusError(f"interface {interface} cannot be opened: {error.strerror}") from error
+    return port
+
+
+def attach_filter(port: socket.socket, first: int, last: int) -> None:
+    """Let packet socket `port` receive frames only whose first datagram's index is in `first`..`last`."""
+    # Classic BPF: A = byte 17; below `first` or above `last`: drop; else accept.
+    lines = ((0x30, 0, 0, _INDEX_AT), (0x35, 0, 2, first), (0x25, 1, 0, last), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0))
+    program = b"".join(struct.pack("=HBBI", *line) for line in lines)
+    buffer = ctypes.create_string_buffer(program, len(program))
+    port.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 5, ctypes.addressof(buffer)))
+
+
+class RegisterPort:
+    """Single datagrams to one slave or to all of them. Its methods may be called from any thread."""
+
+    def __init__(self, interface: str) -> None:
+        """Open the port; raises BusError where the interface cannot be opened."""
+        self._socket = open_socket(interface, FIRST_INDEX, LAST_INDEX)
+        self._lock = threading.Lock()
+        self._index = LAST_INDEX
+
+    def exchange(
+        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
+    ) -> Answer:
+        """Send a datagram and wait for it to come back; a lost frame is sent again, `tries` times in all."""
+        with self._lock:
+            for _ in range(tries):
+                # A new index each time: a late answer to the former try is not taken for this one's.
+                self._index = FIRST_INDEX if self._index >= LAST_INDEX else self._index + 1
+                frame = build_frame(command, self._index, station, address, data)
+                try:
+                    self._socket.send(frame)
+                    answer = self._wait(command, len(data), time.monotonic() + timeout_s)
+                except OSError as error:
+                    raise BusError(f"the interface does not take frames any more: {error.strerror}") from error
+                if answer is not None:
+                    return answer
+        return Answer(b"", -1)
+
+    def _wait(self, command: Command, length: int, deadline: float) -> Answer | None:
+        while (left := deadline - time.monotonic()) > 0:
+            self._socket.settimeout(left)
+            try:
+                frame = self._socket.recv(1518)
+            except TimeoutError:
+                return None
+            if len(frame) >= _DATA_AT + length + 2 and frame[16] == command and frame[_INDEX_AT] == self._index:
+                end = _DATA_AT + length
+                return Answer(frame[_DATA_AT:end], int.from_bytes(frame[end : end + 2], "little"))
+        return None
+
+    def read(self, station: int, address: int, length: int, *, tries: int = 3) -> bytes | None:
+        """Return registers of the slave at configured address `station` (FPRD), None where it does not answer."""
+        data, wkc = self.exchange(Command.FPRD, station, address, bytes(length), tries=tries)
+        return data if wkc == 1 else None
+
+    def write(self, station: int, address: int, data: bytes) -> bool:
+        """Write registers of the slave at configured address `station` (FPWR); return whether it took them."""
+        return self.exchange(Command.FPWR, station, address, data).wkc == 1
+
+    def read_all(self, address: int, length: int) -> Answer:
+        """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""
+        return self.exchange(Command.BRD, 0, address, bytes(length))
+
+    def write_all(self, address: int, data: bytes) -> int:
+        """Write registers of all slaves (BWR); return the working counter, -1 where no frame came back."""
+        return self.exchange(Command.BWR, 0, address, data).wkc
+
+    def close(self) -> None:
+        """Close the port; may be called twice."""
+        self._socket.close()

@@ -1,0 +1,196 @@
+"""What a slave tells of itself: registers (ETG.1000.4), EEPROM (ETG.1000.6, 5.4; ETG.2010), object dictionary."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from typing import Any
+
+from pysoem import pysoem
+
+from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, code_meaning, state_name
+from rtcp.fieldbus.bus import BusError, MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, SyncManagerInfo
+from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.sdo import SdoClient
+from rtcp.fieldbus.states import read_al
+
+RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
+_DEVICE_NAME = 0x1008
+_ESC_FMMUS = 0x0004
+_ALIAS = 0x0012
+_ESC_FEATURES = 0x0008
+_FEATURE_DC = 0x04
+_DL_STATUS = 0x0110
+_EEPROM_CONFIG = 0x0500
+_SYNC_MANAGERS = 0x0800
+_DC_DELAY = 0x0928
+_SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
+_PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
+"""Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
+_SYNC_MANAGER = struct.Struct("<HHBBBB")
+
+
+def read_mailbox(slave: Any) -> MailboxInfo | None:
+    """Return what the EEPROM of pysoem's `slave` says about its mailbox, None where it has none."""
+    receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE))
+    send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND))
+    if not receive_size:
+        return None
+    bits = slave.eeprom_read(_SII_PROTOCOLS)[0]
+    protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)
+    return MailboxInfo(receive_start, receive_size, send_start, send_size or receive_size, protocols)
+
+
+def read_serial(slave: Any) -> int:
+    """Return the serial number in the EEPROM."""
+    return int.from_bytes(slave.eeprom_read(_SII_SERIAL), "little")
+
+
+def eeprom_to_device(port: RegisterPort, station: int) -> None:
+    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2)."""
+    port.write(station, _EEPROM_CONFIG, b"\x01\x00")
+
+
+def read_assignment(sdo: SdoClient, assignment: int) -> tuple[PdoInfo, ...]:
+    """Return the PDOs that 0x1C12 or 0x1C13 lists and what is mapped into them; names are left empty.
+
+    Raises:
+        BusError: the slave refuses or does not answer.
+    """
+    pdos = []
+    for number in range(1, sdo.read_int(assignment, 0) + 1):
+        pdo = sdo.read_int(assignment, number)
+        entries = []
+        for i in range(1, sdo.read_int(pdo, 0) + 1):
+            mapped = sdo.read_int(pdo, i)
+            entries.append(PdoEntryInfo(mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF, ""))
+        pdos.append(PdoInfo(pdo, tuple(entries)))
+    return tuple(pdos)
+
+
+class _Names:
+    """Names of objects by SDO information, as far as the slave offers it (ETG.1000.6, 5.6.3)."""
+
+    def __init__(self, slave: Any) -> None:
+        try:
+            self._objects = {found.index: found for found in slave.od}
+        except (pysoem.SdoInfoError, pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError, pysoem.WkcError):
+            self._objects = {}
+
+    def of(self, index: int, sub_index: int) -> str:
+        found = self._objects.get(index)
+        if found is None:
+            return ""
+        try:
+            entries = found.entries
+            name = entries[sub_index].name if sub_index < len(entries) else found.name
+        except pysoem.SdoInfoError:
+            return ""
+        return name.decode("latin-1") if isinstance(name, bytes) else str(name)
+
+    def fill(self, pdos: tuple[PdoInfo, ...]) -> tuple[PdoInfo, ...]:
+        return tuple(
+            PdoInfo(
+                pdo.index,
+                tuple(
+                    PdoEntryInfo(e.index, e.sub_index, e.bits, self.of(e.index, e.sub_index) if e.index else "")
+                    for e in pdo.entries
+                ),
+            )
+            for pdo in pdos
+        )
+
+
+def _ports(dl_status: int) -> tuple[str, ...]:
+    # DL status (ETG.1000.4, table 34): bit 4 + n: link; bits 8 + 2n, 9 + 2n: loop closed, communication established.
+    words = []
+    for port in range(4):
+        link, loop, talks = dl_status >> 4 + port & 1, dl_status >> 8 + 2 * port & 1, dl_status >> 9 + 2 * port & 1
+        words.append("open" if talks and not loop else "closed" if link else "no link")
+    return tuple(words)
+
+
+def parents(ports: list[tuple[str, ...]]) -> list[int]:
+    """Return the parent (position, 0: the master) of each slave, given its ports in the order of the frame's way."""
+    result: list[int] = []
+    free: list[list[int]] = []  # [position, ports still without a child], innermost last
+    for i, port in enumerate(ports):
+        while free and free[-1][1] == 0:
+            free.pop()
+        result.append(free[-1][0] if free else i)
+        if free:
+            free[-1][1] -= 1
+        free.append([i + 1, max(port.count("open") - 1, 0)])
+    return result
+
+
+def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, ...]:
+    data = port.read(station, _SYNC_MANAGERS, 4 * _SYNC_MANAGER.size)
+    if data is None:
+        return ()
+    found = []
+    for number, (start, length, control, _status, activate, _pdi) in enumerate(_SYNC_MANAGER.iter_unpack(data)):
+        if start:
+            found.append(SyncManagerInfo(number, start, length, control, bool(activate & 1)))
+    return tuple(found)
+
+
+def describe(
+    slave: Any, sdo: SdoClient, port: RegisterPort, station: int, mailbox: MailboxInfo | None, serial: int
+) -> SlaveInfo:
+    """Return what can be read of a slave; what it does not tell is empty.
+
+    Args:
+        slave: pysoem's slave, in PRE-OP where it has a mailbox.
+        sdo: SDO access to it.
+        port: the port for its registers.
+        station: its configured address.
+        mailbox: what its EEPROM says about the mailbox.
+        serial: the serial number in its EEPROM.
+    """
+
+    def register(address: int, length: int) -> int:
+        return int.from_bytes(port.read(station, address, length) or b"", "little")
+
+    state, error, code = read_al(port, station)
+    has_coe = mailbox is not None and mailbox.has_coe
+    name = str(slave.name)
+    outputs: tuple[PdoInfo, ...] = ()
+    inputs: tuple[PdoInfo, ...] = ()
+    if has_coe and state in {AlState.PREOP, AlState.SAFEOP, AlState.OP}:
+        # SOEM reads the EEPROM's strings once for all slaves of one identity, which may differ in the name.
+        with contextlib.suppress(BusError):
+            name = sdo.read(_DEVICE_NAME, 0).rstrip(b"\0").decode("latin-1")
+        try:
+            names = _Names(slave)
+            outputs = names.fill(read_assignment(sdo, RX_ASSIGN))
+            inputs = names.fill(read_assignment(sdo, TX_ASSIGN))
+        except BusError:
+            # A slave need not have assignment objects (ETG.1000.6, 5.6.7.4): its PDOs are then fixed in its EEPROM.
+            outputs, inputs = (), ()
+    dc = bool(register(_ESC_FEATURES, 2) & _FEATURE_DC)
+    return SlaveInfo(
+        position=sdo.position,
+        station=station,
+        name=name,
+        vendor_id=slave.man,
+        product_code=slave.id,
+        revision=slave.rev,
+        serial=serial,
+        alias=register(_ALIAS, 2),
+        state=state_name(state | (ERROR_BIT if error else 0)),
+        al_status_code=code,
+        al_status=code_meaning(code),
+        has_coe=has_coe,
+        mailbox=mailbox,
+        outputs=outputs,
+        inputs=inputs,
+        output_bits=sum(pdo.bits for pdo in outputs),
+        input_bits=sum(pdo.bits for pdo in inputs),
+        sync_managers=_sync_managers(port, station),
+        fmmus=register(_ESC_FMMUS, 1),
+        dc=dc,
+        delay_ns=register(_DC_DELAY, 4) if dc else 0,
+        ports=_ports(register(_DL_STATUS, 2)),
+        parent=0,
+    )

@@ -1,0 +1,324 @@
+"""The bus behind pysoem: a network interface, real or one end of the virtual segment's pair."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Any
+
+from pysoem import pysoem
+
+from rtcp.config.model import SlaveConfig
+from rtcp.fieldbus import states
+from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.bus import BusError, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.clocks import DC_ACTIVATE, start_clocks
+from rtcp.fieldbus.configure import configure_slave, identity_faults
+from rtcp.fieldbus.emergency import Emergency, parse
+from rtcp.fieldbus.exchange import SoemProcessData
+from rtcp.fieldbus.fence import Fence
+from rtcp.fieldbus.interface import check_interface, open_master
+from rtcp.fieldbus.mailbox import Mailbox
+from rtcp.fieldbus.namespace import enter
+from rtcp.fieldbus.pdo import layout, layout_faults
+from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.scan import describe, eeprom_to_device, parents, read_mailbox, read_serial
+from rtcp.fieldbus.sdo import SdoClient
+
+_SM1_STATUS, _MAILBOX_FULL = 0x080D, 0x08
+_LEAVE_OP_S, _INIT_S = 0.2, 1.0
+_MESSAGES_A_POLL = 8
+
+
+class SoemBus:
+    """`Bus` over pysoem. One thread exchanges process data; another may call the other methods meanwhile."""
+
+    def __init__(
+        self,
+        interface: str,
+        receive_fraction: float = 0.3,
+        *,
+        namespace_pid: int | None = None,
+        state_timeout_s: float = 5.0,
+    ) -> None:
+        """Prepare a bus; nothing is touched before `open`.
+
+        Args:
+            interface: network interface.
+            receive_fraction: how long an answer is waited for, as a fraction of the period.
+            namespace_pid: process whose network (and user) namespace has the interface.
+            state_timeout_s: seconds for a slave to change its state on the way to SAFE-OP.
+        """
+        self.interface = interface
+        self.notes: list[str] = []
+        self._fraction = receive_fraction
+        self._pid = namespace_pid
+        self._state_timeout_s = state_timeout_s
+        self._master: Any = None
+        self._socket: socket.socket | None = None
+        self._port: RegisterPort | None = None
+        self._fence: Fence | None = None
+        self._sdo_lock = threading.RLock()
+        self._names: list[str] = []
+        self._mailboxes: list[MailboxInfo | None] = []
+        self._emergencies: deque[Emergency] = deque(maxlen=256)
+
+    def __enter__(self) -> SoemBus:
+        self.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:  # fmt: skip
+        self.close()
+
+    @property
+    def port(self) -> RegisterPort:
+        """The port for registers; raises BusError while the bus is closed."""
+        if self._port is None:
+            raise BusError(f"the bus on {self.interface} is not open")
+        return self._port
+
+    def open(self) -> None:
+        """Join the namespace, open the interface.
+
+        Raises:
+            BusError: no such interface, the interface is down, or no right to open it.
+        """
+        if self._master is not None:
+            return
+        if self._pid is not None:
+            enter(self._pid)
+        check_interface(self.interface)
+        try:
+            self._port = RegisterPort(self.interface)
+            self._fence = Fence(self.interface)
+            self._master, self._socket = open_master(self.interface)
+        except BaseException:
+            self.close()
+            raise
+
+    def scan(self) -> tuple[SlaveInfo, ...]:
+        """Find the slaves, bring them to PRE-OP, measure delays; return what is known of each.
+
+        Raises:
+            BusError: no slave answers.
+        """
+        self._discover()
+        serials = [read_serial(slave) for slave in self._master.slaves]
+        self._to_preop()
+        self._master.config_dc()
+        found = [
+            describe(slave, self._sdo(i + 1), self.port, station_of(i + 1), self._mailboxes[i], serials[i])
+            for i, slave in enumerate(self._master.slaves)
+        ]
+        before = parents([info.ports for info in found])
+        return tuple(replace(info, parent=parent) for info, parent in zip(found, before, strict=True))
+
+    def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> SoemProcessData:
+        """Lead the slaves from INIT to SAFE-OP as the configuration says; outputs are zero.
+
+        Args:
+            slaves: the slaves expected, in the order of the cable.
+            period_ns: the cycle.
+
+        Raises:
+            BusError: what is on the bus differs from the configuration, or a slave refuses.
+        """
+        faults = [fault for config in slaves for fault in layout_faults(config.device)]
+        if faults:
+            raise BusError(*dict.fromkeys(faults))
+        self.notes.clear()
+        self._discover()
+        faults = identity_faults(self._master.slaves, slaves)
+        if faults:
+            raise BusError(*faults)
+        self._names = [config.name for config in slaves]
+        if faults := list(self._to_preop()):
+            raise BusError(*faults)
+        for i, config in enumerate(slaves):
+            try:
+                self.notes += self._configure_slave(i, config, period_ns)
+            except BusError as error:
+                faults += error.sentences
+        if faults:
+            raise BusError(*faults)
+        self._map(slaves)
+        start_clocks(self._master, self.port, slaves, period_ns)
+        data = self._process_data(period_ns)
+        # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
+        data.send()
+        data.receive()
+        self.request_state(AlState.SAFEOP)
+        if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
+            raise BusError(*refused)
+        return data
+
+    def _discover(self) -> None:
+        if self._master is None:
+            raise BusError(f"the bus on {self.interface} is not open")
+        # Also stops SYNC0 and SYNC1 that the last run left active, and resets FMMUs and sync managers (SOEM#60).
+        if self._master.config_init() <= 0:
+            raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
+        found = self._master.slaves
+        self._names = [slave.name for slave in found]
+        self._mailboxes = [read_mailbox(slave) for slave in found]
+        for position in range(1, len(found) + 1):
+            eeprom_to_device(self.port, station_of(position))
+        left = self.port.read_all(DC_ACTIVATE, 1).data
+        if any(left):
+            raise BusError(f"SYNC0 of a slave on {self.interface} is still active and cannot be switched off")
+
+    def _to_preop(self) -> tuple[str, ...]:
+        stations = self._stations(i + 1 for i, mailbox in enumerate(self._mailboxes) if mailbox is not None)
+        return self._lead(AlState.PREOP, stations) if stations else ()
+
+    def _lead(self, state: AlState, stations: dict[int, str]) -> tuple[str, ...]:
+        states.request_state(self.port, stations, state)
+        return states.wait_for_state(self.port, stations, state, self._state_timeout_s)
+
+    def _configure_slave(self, i: int, config: SlaveConfig, period_ns: int) -> list[str]:
+        return configure_slave(self._sdo(i + 1), self.port, station_of(i + 1), config, period_ns)
+
+    def _map(self, slaves: Sequence[SlaveConfig]) -> None:
+        try:
+            self._master.config_map()
+        except pysoem.ConfigMapError as error:
+            # An emergency that SOEM meets is in its list too, as an error of no kind.
+            known = (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError)
+            met = [fault for fault in error.error_list if isinstance(fault, known)]
+            if met:
+                raise BusError(
+                    *(f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
+                ) from error
+        faults = []
+        for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
+            label = slave_label(i + 1, config.name)
+            images = (("rpdo", config.device.rpdo, slave.output), ("tpdo", config.device.tpdo, slave.input))
+            for key, pdos, image in images:
+                if len(image) != (expected := layout(pdos).bytes):
+                    faults.append(f"{label}: expected {expected} bytes of {key}, found {len(image)} bytes")
+        if faults:
+            raise BusError(*faults)
+
+    def _process_data(self, period_ns: int) -> SoemProcessData:
+        assert self._socket is not None
+        assert self._fence is not None
+        period_us = period_ns / 1000
+        receive_us = max(1, round(self._fraction * period_us))
+        fence_us = max(1, round(min(receive_us, 0.75 * period_us - receive_us)))
+        return SoemProcessData(
+            self._master, self._master.slaves, self._socket.fileno(), self._fence, receive_us, fence_us
+        )  # fmt: skip
+
+    def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
+        """Request `state` of the slaves at `positions` (from 1), None: of all; nothing is waited for."""
+        states.request_state(self.port, self._stations(positions), state)
+
+    def wait_for_state(
+        self, state: AlState, timeout_s: float, positions: Iterable[int] | None = None
+    ) -> tuple[str, ...]:
+        """Wait until the slaves are in `state`; return a sentence for each that is not."""
+        return states.wait_for_state(self.port, self._stations(positions), state, timeout_s)
+
+    def acknowledge(self, position: int) -> None:
+        """Acknowledge a slave's error; it stays in the state that it is in."""
+        states.acknowledge(self.port, station_of(position))
+
+    def read_states(self) -> tuple[SlaveState, ...]:
+        """Return what every slave's AL status register says; while all are in OP it takes one frame."""
+        all_of_them = self.port.read_all(states.AL_STATUS, 2)
+        in_op = all_of_them.wkc == len(self._names) and all_of_them.data == b"\x08\x00"
+        result = []
+        for position, name in enumerate(self._names, 1):
+            station = station_of(position)
+            state, error, code = (AlState.OP, False, 0) if in_op else states.read_al(self.port, station)
+            result.append(SlaveState(position, station, name, state, error, code))
+        return tuple(result)
+
+    def emergencies(self) -> tuple[Emergency, ...]:
+        """Return the emergency messages that came since the last call; without any it takes one frame."""
+        full = self.port.read_all(_SM1_STATUS, 1).data
+        # While an SDO is under way its answer is in the mailbox; whoever waits for it then meets emergencies too.
+        if any(byte & _MAILBOX_FULL for byte in full) and self._sdo_lock.acquire(blocking=False):
+            try:
+                self._empty_mailboxes()
+            finally:
+                self._sdo_lock.release()
+        result = []
+        while self._emergencies:
+            result.append(self._emergencies.popleft())
+        return tuple(result)
+
+    def _empty_mailboxes(self) -> None:
+        for position, info in enumerate(self._mailboxes, 1):
+            if info is not None:
+                self._empty(Mailbox(self.port, station_of(position), info), position)
+
+    def _empty(self, mailbox: Mailbox, position: int) -> None:
+        try:
+            for _ in range(_MESSAGES_A_POLL):
+                message = mailbox.receive()
+                if message is None:
+                    return
+                self._keep_message(message, position)
+        except BusError as error:
+            raise BusError(
+                f"{slave_label(position, self._names[position - 1])}, reading its mailbox: {error}"
+            ) from error
+
+    def _keep_message(self, message: bytes, position: int) -> None:
+        found = parse(message, position, self._names[position - 1])
+        if found is not None:
+            self._emergencies.append(found)
+
+    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
+        """Return an object's value; raises SdoAborted (the slave refused) or BusError (no answer)."""
+        return self._sdo(position).read(index, subindex)
+
+    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
+        """Write an object's value; raises as `sdo_read`."""
+        self._sdo(position).write(index, subindex, data)
+
+    def _sdo(self, position: int) -> SdoClient:
+        if not 1 <= position <= len(self._names):
+            raise BusError(f"there is no slave {position}; the bus has slaves 1 to {len(self._names)}")
+        info = self._mailboxes[position - 1]
+        mailbox = Mailbox(self.port, station_of(position), info) if info is not None and info.has_coe else None
+        return SdoClient(mailbox, position, self._names[position - 1], self._sdo_lock, self._keep_message)
+
+    def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
+        wanted = range(1, len(self._names) + 1) if positions is None else positions
+        return {station_of(position): slave_label(position, self._names[position - 1]) for position in wanted}
+
+    def close(self) -> None:
+        """Bring the slaves back to INIT, switch SYNC off, close everything; may be called at any time, also twice."""
+        try:
+            if self._port is not None and self._names:
+                self._to_init(self._port)
+        except BusError as error:
+            self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
+        finally:
+            for part in (self._port, self._fence, self._socket):
+                if part is not None:
+                    part.close()
+            if self._master is not None:
+                self._master.close()
+            self._port = self._fence = self._socket = self._master = None
+            self._names = []
+
+    def _to_init(self, port: RegisterPort) -> None:
+        everyone = self._stations(None)
+        if states.broadcast_state(port, AlState.SAFEOP) < 0:
+            raise BusError("no frame comes back")
+        # Slaves that were below SAFE-OP refuse it: what matters is that none is left in OP.
+        states.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
+        states.broadcast_state(port, AlState.INIT)
+        left = states.wait_for_state(port, everyone, AlState.INIT, _INIT_S)
+        port.write_all(DC_ACTIVATE, b"\0")
+        if left:
+            raise BusError(*left)

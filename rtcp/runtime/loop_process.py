@@ -1,0 +1,199 @@
+"""The loop's process: from a session file to a bus in INIT again, with the cycle between.
+
+It reports on a pipe, a JSON object a line: `phase` sentences, then `ready` with the facts of the start, or `error`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rtcp.config.model import ArmConfig
+from rtcp.devices.cia402 import Cia402Drive, DriveGoal
+from rtcp.devices.codec import DeviceError
+from rtcp.devices.io_box import IoBox
+from rtcp.fieldbus.bus import BusError, ProcessData
+from rtcp.fieldbus.soem import SoemBus
+from rtcp.realtime import scheduling
+from rtcp.realtime.discipline import Discipline
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.behaviour import Behaviour
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.loop import Loop
+from rtcp.runtime.orders import Orders
+from rtcp.runtime.paths import blackboard_file
+from rtcp.runtime.record import Recorder
+from rtcp.runtime.service import Service
+from rtcp.runtime.session import Session, read_session
+
+_SCARE_CYCLES = 20
+
+
+class Report:
+    """Tells the launcher how the start goes; silent once nobody listens."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def tell(self, event: str, **facts: Any) -> None:
+        """Write one line; a launcher that has gone is no error."""
+        if self._descriptor < 0:
+            return
+        line = json.dumps({"event": event, **facts}).encode() + b"\n"
+        try:
+            os.write(self._descriptor, line)
+        except OSError:
+            self._descriptor = -1
+
+    def close(self) -> None:
+        """Close the pipe: nothing more is told."""
+        if self._descriptor >= 0:
+            with contextlib.suppress(OSError):
+                os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def main() -> int:
+    """Run the loop's process; return 0 after an orderly end, 2 where the bus refused, 1 after a defect of ours."""
+    parser = argparse.ArgumentParser(prog="rtcp.runtime.loop_process")
+    parser.add_argument("--directory", type=Path, required=True)
+    parser.add_argument("--ready-fd", type=int, required=True)
+    given = parser.parse_args()
+    report = Report(given.ready_fd)
+    session = read_session(given.directory / "session.pickle")
+    # Until the cycle runs, SIGTERM unwinds what was opened; then it asks for a controlled stop.
+    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    fraction = session.config.bus.receive_fraction
+    bus = SoemBus(session.interface, fraction, namespace_pid=session.segment_pid or None)
+    try:
+        bus.open()
+        _work(bus, session, given.directory, report)
+    except (BusError, DeviceError) as error:
+        sentences = list(error.sentences) if isinstance(error, BusError) else [str(error)]
+        report.tell("error", sentences=sentences)
+        sys.stderr.write("\n".join(sentences) + "\n")
+        return 2
+    finally:
+        bus.close()
+    return 0
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> None:
+    config = session.config
+    period_ns = round(config.cycle.period_us * 1000)
+    found = bus.scan()
+    report.tell("phase", text=f"{len(found)} slaves on {session.interface}")
+    (directory / "scan.json").write_text(json.dumps([dataclasses.asdict(slave) for slave in found]))
+    data = bus.configure(config.slaves, period_ns)
+    for note in bus.notes:
+        report.tell("phase", text=note)
+    report.tell("phase", text="all slaves in SAFE-OP")
+    drives = _drives(config)
+    box = _box(config)
+    discipline = _discipline(config, period_ns)
+    blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
+    cpu = scheduling.choose_cpu(config.cycle.cpu)
+    scheduling.share_interpreter_quickly()
+    service = Service(
+        bus,
+        blackboard,
+        [slot + 1 for slot, _ in drives],
+        [joint.name for joint in config.joints],
+        config.bus.op_timeout_s,
+        cpu,
+    )
+    arm = Arm(config, drives)
+    behaviour = Behaviour(config, arm, blackboard, service, discipline)
+    only_box = None if box is None else box[1]
+    orders = Orders(arm, only_box, behaviour, blackboard, service)
+    recorder = Recorder(data, arm, only_box, behaviour, blackboard, service, discipline)
+    loop = Loop(period_ns, data, arm, box, behaviour, orders, recorder, blackboard, discipline)
+    realtime = scheduling.Realtime()
+
+    def started() -> None:
+        facts = {
+            "realtime": {
+                "scheduler": realtime.scheduler,
+                "memory_locked": realtime.memory_locked,
+                "cpu": realtime.cpu,
+                "notes": realtime.notes,
+            },
+            "start_to_op_s": round((time.monotonic_ns() - session.began_ns) * 1e-9, 3),
+        }
+        (directory / "started.json").write_text(json.dumps(facts))
+        report.tell("ready", pid=os.getpid(), **facts)
+        report.close()
+
+    service.on_op = started
+    service.on_refused = loop.shut_down
+    service.start()
+    signal.signal(signal.SIGTERM, lambda number, frame: loop.shut_down())
+    scheduling.prepare(realtime, config.cycle.priority, config.cycle.cpu)
+    try:
+        loop.run()
+        if service.refused:
+            raise BusError(*service.refused)
+    except BusError:
+        raise
+    except BaseException:
+        # A defect in the cycle: the drives are told to stop before the bus goes away.
+        _scare(data, drives)
+        raise
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        service.finish()
+        scheduling.release(realtime)
+
+
+def _drives(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
+    slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
+    return [
+        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity))
+        for joint in config.joints
+    ]
+
+
+def _box(config: ArmConfig) -> tuple[int, IoBox] | None:
+    for slot, slave in enumerate(config.slaves):
+        if slave.device.kind == "io":
+            return slot, IoBox(slave)
+    return None
+
+
+def _discipline(config: ArmConfig, period_ns: int) -> Discipline | None:
+    shifts = [slave.device.sync0_shift_us for slave in config.slaves if slave.device.assign_activate]
+    if not shifts:
+        return None
+    return Discipline(period_ns, round(shifts[0] * 1000 + config.bus.send_phase * period_ns))
+
+
+def _scare(data: ProcessData, drives: list[tuple[int, Cia402Drive]]) -> None:
+    for _ in range(_SCARE_CYCLES):
+        for slot, drive in drives:
+            drive.decode(data.input(slot))
+            drive.advance(DriveGoal.DISABLED)
+            data.set_output(slot, drive.encode())
+        data.send()
+        data.receive()
+        time.sleep(0.001)
+
+
+if __name__ == "__main__":
+    code = main()
+    sys.stderr.flush()
+    # Past the interpreter's own end: with the collector off, ruckig's objects would be reported as leaked there.
+    os._exit(code)

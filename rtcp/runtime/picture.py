@@ -1,0 +1,175 @@
+"""The picture of the running platform that `rtcp status` shows, made from the blackboard."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.realtime.statistics import SlidingPercentiles
+from rtcp.runtime.layout import FLAG_DC_LOCKED
+from rtcp.runtime.machine import Code, State
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.sentences import FAULTS, Sentences
+from rtcp.runtime.session import Processes, Session, is_ours
+
+MODE_NAMES = {8: "csp", 9: "csv", 10: "cst"}
+AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
+_MESSAGES = 50
+_STALE_S = 1.0
+
+
+def al_name(status: int) -> str:
+    """Return the AL state in words (ETG.1000.6, table 9); `no answer` for 0."""
+    if status == 0:
+        return "no answer"
+    return AL_NAMES.get(status & 0x0F, f"0x{status:02X}") + (" + ERROR" if status & 0x10 else "")
+
+
+class Picture:
+    """Follows the blackboard: statistics of the cycle, the last sentences, the state.
+
+    Args:
+        observer: the blackboard.
+        session: what was started.
+        started: facts of the start that the loop reported (realtime, start to OP).
+    """
+
+    def __init__(self, observer: Observer, session: Session, started: dict[str, Any]) -> None:
+        self._observer = observer
+        self._session = session
+        self._started = started
+        self._sentences = Sentences(session.config)
+        self._at = max(observer.head - 1, 0)
+        self._event = 0
+        self._text = 0
+        self._wakeup = SlidingPercentiles()
+        self._exchange = SlidingPercentiles()
+        self._compute = SlidingPercentiles()
+        self._offset = SlidingPercentiles()
+        self._filtered = SlidingPercentiles()
+        self._enables = 0
+        self._unread = 0
+        self.fault = ""
+        self.message = ""
+        self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
+        self.loop_lives = True
+
+    def follow(self) -> list[str]:
+        """Read what is new; return the sentences that have come since the last call."""
+        records, lost = self._observer.since(self._at)
+        self._unread += lost
+        if len(records):
+            self._at = int(records[-1]["number"])
+            self._count(records)
+        return self._listen()
+
+    def _count(self, records: npt.NDArray[np.void]) -> None:
+        now = time.monotonic()
+        if int(records[-1]["enables"]) != self._enables:
+            self._enables = int(records[-1]["enables"])
+            for figure in (self._wakeup, self._exchange, self._compute, self._offset, self._filtered):
+                figure.reset()
+            records = records[records["enables"] == self._enables]
+        self._wakeup.add(now, records["wakeup_ns"] / 1e3)
+        self._exchange.add(now, records["exchange_ns"] / 1e3)
+        self._compute.add(now, records["compute_ns"] / 1e3)
+        self._offset.add(now, np.abs(records["dc_offset_ns"]) / 1e3)
+        self._filtered.add(now, np.abs(records["dc_filtered_ns"]) / 1e3)
+
+    def _listen(self) -> list[str]:
+        said: list[tuple[int, str]] = []
+        for event in self._observer.events_since(self._event):
+            self._event = event.number
+            sentence = self._sentences.event(event.code, event.axis, event.value, event.limit)
+            said.append((event.time_ns, sentence))
+            if Code(event.code) in FAULTS:
+                self.fault = sentence
+            elif event.code == Code.RESET:
+                self.fault = ""
+        for text in self._observer.texts_since(self._text):
+            self._text = text.number
+            said.append((text.time_ns, text.sentence))
+        said.sort()
+        self.messages.extend(said)
+        if said:
+            self.message = said[-1][1]
+        return [sentence for _, sentence in said]
+
+    def refusal(self, code: int, axis: int, value: float, limit: float) -> str:
+        """Return the sentence for the loop's refusal."""
+        return self._sentences.refusal(code, axis, value, limit)
+
+    def state(self) -> State | None:
+        """Return the machine's state, or None before the first cycle."""
+        latest = self._observer.latest()
+        return None if latest is None else State(int(latest[0]["state"]))
+
+    def status(self, processes: Processes) -> dict[str, Any]:
+        """Return the whole picture as `rtcp status --json` prints it."""
+        latest = self._observer.latest()
+        config = self._session.config
+        if latest is None:
+            raise RuntimeError("the loop has published no cycle yet")
+        record = latest[0]
+        state = State(int(record["state"])).name.lower()
+        message = self.fault or self.message
+        silent_s = (time.monotonic_ns() - int(record["time_ns"])) * 1e-9
+        if not self.loop_lives:
+            state = "fault"
+            message = (
+                f"the loop (process {self._observer.loop_pid}) ended unexpectedly; the drives' watchdog stops them: "
+                "`rtcp stop`, then `rtcp start`"
+            )
+        elif silent_s > _STALE_S:
+            state = "fault"
+            message = f"the loop (process {self._observer.loop_pid}) has published nothing for {silent_s:.1f} s"
+        slaves = [
+            {"position": i + 1, "name": slave.name, "state": al_name(al), "al_status_code": code}
+            for i, (slave, (al, code)) in enumerate(
+                zip(config.slaves, self._observer.slaves(len(config.slaves)), strict=True)
+            )
+        ]
+        return {
+            "state": state,
+            "message": message,
+            "mode": MODE_NAMES.get(int(record["mode"]), str(int(record["mode"]))),
+            "bus": self._session.bus,
+            "cycle_ns": self._observer.period_ns,
+            "cycles": int(record["cycle"]),
+            "time_ns": int(record["time_ns"]),
+            "missed": int(record["missed"]),
+            "wkc": {"expected": int(record["wkc_expected"]), "actual": int(record["wkc"])},
+            "slaves": slaves,
+            "joint_names": [joint.name for joint in config.joints],
+            "joints": {
+                name: [round(float(value), 7) for value in record[name]]
+                for name in ("position", "velocity", "torque", "target")
+            },
+            "statuswords": [int(word) for word in record["statusword"]],
+            "inputs": int(record["inputs"]),
+            "outputs": int(record["outputs"]),
+            "counter": int(record["counter"]),
+            "wakeup_us": self._wakeup.read().as_json(),
+            "exchange_us": self._exchange.read().as_json(),
+            "compute_us": self._compute.read().as_json(),
+            "dc": {
+                "locked": bool(int(record["flags"]) & FLAG_DC_LOCKED),
+                "offset_ns": int(record["dc_offset_ns"]),
+                "filtered_ns": int(record["dc_filtered_ns"]),
+                "offset_us": self._offset.read().as_json(),
+                "filtered_us": self._filtered.read().as_json(),
+            },
+            "realtime": self._started.get("realtime", {}),
+            "start_to_op_s": self._started.get("start_to_op_s"),
+            "lease": {"holder": self._observer.holder()},
+            "pids": {
+                "loop": processes.loop if self.loop_lives else 0,
+                "gateway": processes.gateway,
+                "segment": processes.segment if is_ours(processes.segment) else 0,
+            },
+            "messages": [sentence for _, sentence in list(self.messages)[-10:]],
+        }

@@ -1,0 +1,111 @@
+"""The cycle record: gathered once a cycle into one preallocated list, in the order of the layout."""
+
+from __future__ import annotations
+
+from rtcp.devices.io_box import IoBox
+from rtcp.fieldbus.bus import ProcessData
+from rtcp.realtime.discipline import Discipline
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.behaviour import Behaviour
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, FLAG_ENABLED, PER_JOINT, SCALARS
+from rtcp.runtime.machine import Code
+from rtcp.runtime.service import Service
+
+_LONGEST_NS = 2_000_000_000
+_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
+
+
+class Recorder:
+    """Publishes a record a cycle.
+
+    Args:
+        data: the process image.
+        arm: the joints.
+        box: the IO box, or None.
+        behaviour: the machine's state.
+        blackboard: where the records go.
+        service: knows whether all slaves are in OP.
+        discipline: knows the clock's offset, or None.
+    """
+
+    def __init__(
+        self,
+        data: ProcessData,
+        arm: Arm,
+        box: IoBox | None,
+        behaviour: Behaviour,
+        blackboard: Blackboard,
+        service: Service,
+        discipline: Discipline | None,
+    ) -> None:
+        self._data = data
+        self._arm = arm
+        self._box = box
+        self._behaviour = behaviour
+        self._blackboard = blackboard
+        self._service = service
+        self._discipline = discipline
+        self._values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * len(arm.drives))
+        self._values[_AT["wkc_expected"]] = data.expected_wkc
+        self._locked = False
+        self.missed = 0
+        """Ticks of the grid at which no frame was sent."""
+        self.compute_ns = 0
+        """From an answer to the end of its cycle: known only after that cycle's record, so the next one carries it."""
+
+    def publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
+        """Publish the cycle that was planned at `planned`, woke at `woken` and had its answer at `received` (ns)."""
+        values, behaviour, discipline, box = self._values, self._behaviour, self._discipline, self._box
+        flags = FLAG_ALL_OP if self._service.all_op else 0
+        offset = filtered = 0
+        if discipline is not None:
+            offset, filtered = discipline.raw_ns, int(discipline.filtered_ns)
+            if discipline.locked:
+                flags |= FLAG_DC_LOCKED
+            if discipline.locked is not self._locked:
+                self._locked = discipline.locked
+                self._blackboard.event(Code.DC_LOCKED if self._locked else Code.DC_UNLOCKED)
+        if behaviour.all_enabled:
+            flags |= FLAG_ENABLED
+        inputs = outputs = counter = 0
+        if box is not None:
+            inputs, outputs, counter = box.inputs, box.outputs, box.counter
+        generator = self._arm.generator
+        # One slice, in the order of layout.SCALARS: cheaper than an index a field.
+        values[: len(_AT)] = (
+            behaviour.cycle,
+            woken,
+            self._data.dc_time,
+            behaviour.state,
+            self._arm.mode,
+            flags,
+            wkc,
+            self._data.expected_wkc,
+            self.missed,
+            behaviour.lost,
+            min(woken - planned, _LONGEST_NS),
+            min(received - woken, _LONGEST_NS),
+            min(self.compute_ns, _LONGEST_NS),
+            offset,
+            filtered,
+            inputs,
+            outputs,
+            counter,
+            behaviour.fault,
+            self._arm.guard.held,
+            behaviour.enables,
+            behaviour.moves,
+            generator.elapsed_s,
+            generator.duration_s,
+        )
+        at = len(_AT)
+        n = len(self._arm.drives)
+        target = generator.position
+        for i, drive in enumerate(self._arm.drives):
+            values[at + i] = drive.position
+            values[at + n + i] = drive.velocity
+            values[at + 2 * n + i] = drive.torque
+            values[at + 3 * n + i] = target[i]
+            values[at + 4 * n + i] = drive.statusword
+        self._blackboard.publish(values)

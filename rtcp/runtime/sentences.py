@@ -1,0 +1,146 @@
+"""Refusals and events of the loop in words: what, where, found, allowed, and the key that sets it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from rtcp.config.model import ArmConfig
+from rtcp.runtime.machine import ALLOWED, Code, Command, Refusal, State
+
+
+class Matter(NamedTuple):
+    """What a refusal or an event is about."""
+
+    axis: int
+    value: float
+    limit: float
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+class Sentences:
+    """Words for codes.
+
+    Args:
+        config: names the joints and the file in which limits stand.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        self._config = config
+        self._refusals: dict[Refusal, Callable[[Matter], str]] = {
+            Refusal.NOT_IN_THIS_STATE: self._not_in_this_state,
+            Refusal.NO_LEASE: lambda _: "the lease has run out or is another commander's: nothing was moved",
+            Refusal.POSITION_LIMIT: self._position_limit,
+            Refusal.NOT_A_NUMBER: lambda m: f"{self._joint(m.axis)}: target {m.value} is not a finite number",
+            Refusal.SPEED: lambda m: (
+                f"speed {_number(m.value)} rad/s is not allowed: more than 0 and at most {_number(m.limit)} rad/s "
+                f"(joints[].velocity in {self._file})"
+            ),
+            Refusal.MODE: lambda m: f"mode {_number(m.value)} is not one of csp (8), csv (9), cst (10)",
+            Refusal.OUTSIDE_LIMITS: self._outside_limits,
+            Refusal.OUTPUT: lambda m: f"output {_number(m.value)} does not exist: 1 to {_number(m.limit)}",
+            Refusal.NO_OUTPUTS: lambda _: f"no IO box is configured (slaves in {self._file})",
+            Refusal.UNKNOWN: lambda m: f"command {_number(m.value)} is unknown to this loop",
+            Refusal.NOT_IN_OP: lambda _: "not all slaves are in OP: see `rtcp status`, then `rtcp reset`",
+        }
+        self._events: dict[Code, Callable[[Matter], str]] = {
+            Code.BUS_LOST: lambda m: (
+                f"process data lost: {_number(m.value)} cycles in a row without the expected working counter, more "
+                f"than {_number(m.limit)} are allowed (bus.lost_cycles in {self._file}); the arm holds, "
+                "`rtcp reset` goes on when the slaves answer"
+            ),
+            Code.DRIVE_LEFT_ENABLED: lambda m: (
+                f"{self._joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
+                "the other joints hold, `rtcp reset` goes on"
+            ),
+            Code.ENABLE_STUCK: lambda m: (
+                f"{self._joint(m.axis)}: enabling stuck for {self._config.enable_timeout_s:g} s at statusword "
+                f"0x{int(m.value):04X} (enable_timeout_s in {self._file})"
+            ),
+            Code.DISABLE_STUCK: lambda m: (
+                f"{self._joint(m.axis)}: the drive does not give up Operation Enabled (statusword 0x{int(m.value):04X})"
+            ),
+            Code.SLAVE_NOT_OP: lambda m: (
+                f"slave {m.axis} ({self._slave(m.axis)}) left OP; the arm holds, `rtcp reset` brings it back"
+            ),
+            Code.RESET_STUCK: self._reset_stuck,
+            Code.GENERATOR: lambda _: "the trajectory generator refused its input: the arm holds",
+            Code.GUARD_HELD: lambda m: f"the guard held back {self._joint(m.axis)}",
+            Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
+            Code.MODE_STUCK: lambda m: (
+                f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for 1 s ago"
+            ),
+            Code.LATE: lambda m: f"{int(m.value)} ticks were skipped",
+            Code.READY: lambda _: "all slaves are in OP",
+            Code.ENABLED: lambda _: "all drives are enabled, the arm holds",
+            Code.DISABLED: lambda _: "all drives are disabled",
+            Code.RESET: lambda _: "reset: the fault is gone, drives are disabled",
+            Code.ARRIVED: lambda _: "the move has arrived",
+            Code.STOPPED: lambda _: "the arm has stopped and holds",
+            Code.DC_LOCKED: lambda _: "the cycle follows the reference clock",
+            Code.DC_UNLOCKED: lambda _: "the cycle has lost the reference clock's phase",
+        }
+
+    @property
+    def _file(self) -> str:
+        return self._config.source.name or "the configuration"
+
+    def _joint(self, axis: int) -> str:
+        joints = self._config.joints
+        return joints[axis].name if 0 <= axis < len(joints) else f"joint {axis + 1}"
+
+    def _slave(self, position: int) -> str:
+        slaves = self._config.slaves
+        return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
+
+    def _not_in_this_state(self, matter: Matter) -> str:
+        command, state = Command(int(matter.value)), State(matter.axis)
+        allowed = ", ".join(sorted(other.name.lower() for other in ALLOWED[command]))
+        return f"{command.name.lower()} is not possible while {state.name.lower()}; it is while: {allowed}"
+
+    def _position_limit(self, matter: Matter) -> str:
+        joint = self._config.joints[matter.axis]
+        return (
+            f"{joint.name}: target {_number(matter.value)} rad is outside its range "
+            f"{joint.position.min:g} to {joint.position.max:g} rad (joints[{matter.axis}].position in {self._file})"
+        )
+
+    def _outside_limits(self, matter: Matter) -> str:
+        joint = self._config.joints[matter.axis]
+        return (
+            f"{joint.name} stands at {_number(matter.value)} rad, outside its range {joint.position.min:g} to "
+            f"{joint.position.max:g} rad (joints[{matter.axis}].position in {self._file}): it is not enabled there"
+        )
+
+    def _reset_stuck(self, matter: Matter) -> str:
+        if matter.axis < 0:
+            return "reset did not succeed within 3 s: not all slaves came back to OP"
+        return (
+            f"{self._joint(matter.axis)}: the drive stays in fault after reset (statusword 0x{int(matter.value):04X})"
+        )
+
+    def refusal(self, code: int, axis: int, value: float, limit: float) -> str:
+        """Return the sentence for a refusal."""
+        return self._refusals[Refusal(code)](Matter(axis, value, limit))
+
+    def event(self, code: int, axis: int, value: float, limit: float) -> str:
+        """Return the sentence for an event."""
+        return self._events[Code(code)](Matter(axis, value, limit))
+
+
+FAULTS = frozenset(
+    {
+        Code.BUS_LOST,
+        Code.DRIVE_LEFT_ENABLED,
+        Code.ENABLE_STUCK,
+        Code.DISABLE_STUCK,
+        Code.SLAVE_NOT_OP,
+        Code.RESET_STUCK,
+        Code.GENERATOR,
+        Code.MODE_STUCK,
+    }
+)
+"""Events that are why the machine is in the state FAULT."""

@@ -1,0 +1,165 @@
+"""The mailbox of a slave: headers, counters, error replies and the queue of what waits to be sent (ETG.1000.4, 5.6)."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from enum import IntEnum
+
+from rtcp.virtual.coe import ABORT, CoeService, SdoServer, emergency_message
+from rtcp.virtual.device import Emergency
+from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.sdo_info import SdoInformation
+
+_HEADER = struct.Struct("<HHBB")
+_ERROR_REPLY = struct.Struct("<HH")
+_ERROR_COMMAND = 0x0001
+_SERVICES = frozenset(CoeService)
+MINIMUM_SIZE = 16
+"""Smallest mailbox: header, CoE header and an expedited SDO."""
+MAX_WAITING = 64
+"""Answers that may wait before the mailbox has no more memory."""
+
+
+class MailboxType(IntEnum):
+    """Protocols of a mailbox message (ETG.1000.4, table 29)."""
+
+    ERROR = 0x0
+    AOE = 0x1
+    EOE = 0x2
+    COE = 0x3
+    FOE = 0x4
+    SOE = 0x5
+    VOE = 0xF
+
+
+class MailboxError(IntEnum):
+    """Why a mailbox message was refused (ETG.1000.4, table 30)."""
+
+    SYNTAX = 0x0001
+    """The six bytes of the mailbox header are wrong."""
+    UNSUPPORTED_PROTOCOL = 0x0002
+    INVALID_CHANNEL = 0x0003
+    SERVICE_NOT_SUPPORTED = 0x0004
+    """The protocol knows the service, this slave does not."""
+    INVALID_HEADER = 0x0005
+    """The header of the protocol (not the mailbox header) is wrong."""
+    SIZE_TOO_SHORT = 0x0006
+    NO_MORE_MEMORY = 0x0007
+    INVALID_SIZE = 0x0008
+    """The length in the header does not fit the data."""
+
+
+class Mailbox:
+    """The mailbox service of a slave: what the master writes to SM0, and what it finds in SM1."""
+
+    def __init__(
+        self, objects: ObjectDictionary, emergencies: deque[Emergency], receive_size: int, send_size: int
+    ) -> None:
+        """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes.
+
+        Raises:
+            ValueError: a mailbox smaller than 16 bytes.
+        """
+        for name, size in (("receive", receive_size), ("send", send_size)):
+            if size < MINIMUM_SIZE:
+                raise ValueError(f"the {name} mailbox has {size} bytes, allowed are {MINIMUM_SIZE} and more")
+        self._emergencies = emergencies
+        self._receive_size = receive_size
+        self._sdo = SdoServer(objects, send_size)
+        self._information = SdoInformation(objects, send_size)
+        self._waiting: deque[tuple[MailboxType, int, bytes]] = deque()
+        self._master_counter = 0
+        self._own_counter = 0
+
+    def receive(self, data: bytes, state: int) -> None:
+        """Take what the master wrote to SM0 (the whole buffer); `state` is the AL state, for the access rights.
+
+        Malformed messages are answered with a mailbox error; a message with the counter of the one before is the
+        master's repetition of it and not answered twice.
+        """
+        if len(data) < _HEADER.size:
+            self._refuse(0, MailboxError.SYNTAX)
+            return
+        length, address, channel, kind = _HEADER.unpack_from(data)
+        counter = kind >> 4 & 0x7
+        if counter and counter == self._master_counter:
+            return
+        self._master_counter = counter
+        if len(self._waiting) >= MAX_WAITING:
+            if self._waiting[-1][2] != _error(MailboxError.NO_MORE_MEMORY):
+                self._refuse(address, MailboxError.NO_MORE_MEMORY)
+        elif length > min(len(data), self._receive_size) - _HEADER.size:
+            self._refuse(address, MailboxError.INVALID_SIZE)
+        elif kind & 0xF != MailboxType.COE:
+            self._refuse(address, MailboxError.UNSUPPORTED_PROTOCOL)
+        elif channel & 0x3F:
+            self._refuse(address, MailboxError.INVALID_CHANNEL)
+        else:
+            self._coe(address, bytes(data[_HEADER.size : _HEADER.size + length]), state)
+
+    def pending(self) -> bool:
+        """Return whether a message waits to be put in SM1."""
+        return bool(self._waiting or self._emergencies)
+
+    def next_message(self) -> bytes | None:
+        """Return the next message for SM1, with its mailbox header, at most `send_size` bytes; None when none waits.
+
+        Emergencies go before answers. What follows the message in SM1's buffer has no meaning.
+        """
+        if self._emergencies:
+            kind, address, content = MailboxType.COE, 0, emergency_message(self._emergencies.popleft())
+        elif self._waiting:
+            kind, address, content = self._waiting.popleft()
+        else:
+            return None
+        self._own_counter = self._own_counter % 7 + 1
+        return _HEADER.pack(len(content), address, 0, self._own_counter << 4 | kind) + content
+
+    def reset(self) -> None:
+        """Forget messages, emergencies, transfers and counters: the slave went to INIT."""
+        self._waiting.clear()
+        self._emergencies.clear()
+        self._sdo.reset()
+        self._master_counter = 0
+        self._own_counter = 0
+
+    def _refuse(self, address: int, error: MailboxError) -> None:
+        self._waiting.append((MailboxType.ERROR, address, _error(error)))
+
+    def _coe(self, address: int, content: bytes, state: int) -> None:
+        """Serve a CoE message; its header holds a number of 9 bits and above it the service (ETG.1000.6, 5.6.1)."""
+        if len(content) < 2:
+            self._refuse(address, MailboxError.SIZE_TOO_SHORT)
+            return
+        service = content[1] >> 4
+        if service == CoeService.SDO_REQUEST:
+            self._sdo_request(address, content, state)
+        elif service == CoeService.SDO_INFORMATION:
+            self._sdo_information(address, content)
+        elif service in _SERVICES:
+            self._refuse(address, MailboxError.SERVICE_NOT_SUPPORTED)
+        else:
+            self._refuse(address, MailboxError.INVALID_HEADER)
+
+    def _sdo_request(self, address: int, content: bytes, state: int) -> None:
+        if len(content) < SdoServer.MINIMUM_REQUEST:
+            self._refuse(address, MailboxError.SIZE_TOO_SHORT)
+            return
+        answer = self._sdo.answer(content[2:], state)
+        if answer is not None:
+            # An abort is a request of the server's to the client (ETG.1000.6, 5.6.2.7): masters tell it by that.
+            service = CoeService.SDO_REQUEST if answer[0] == ABORT else CoeService.SDO_RESPONSE
+            self._waiting.append((MailboxType.COE, address, service.header + answer))
+
+    def _sdo_information(self, address: int, content: bytes) -> None:
+        if len(content) < SdoInformation.MINIMUM_REQUEST:
+            self._refuse(address, MailboxError.SIZE_TOO_SHORT)
+            return
+        for answer in self._information.answer(content[2:]):
+            self._waiting.append((MailboxType.COE, address, CoeService.SDO_INFORMATION.header + answer))
+
+
+def _error(error: MailboxError) -> bytes:
+    """Return the content of an error reply (ETG.1000.4, table 30)."""
+    return _ERROR_REPLY.pack(_ERROR_COMMAND, error)

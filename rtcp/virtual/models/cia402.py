@@ -1,0 +1,119 @@
+"""The power state machine of a CiA 402 drive, seen from the drive (CiA 402-2 and ETG.6010), as tables."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from types import MappingProxyType
+
+
+class State(IntEnum):
+    """States of the power state machine (CiA 402-2, power drive system)."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+
+
+class Command(IntEnum):
+    """What a controlword asks for; switch on and disable operation share one bit pattern (CiA 402-2, object 0x6040)."""
+
+    NONE = 0
+    SHUTDOWN = 1
+    SWITCH_ON = 2
+    ENABLE_OPERATION = 3
+    DISABLE_VOLTAGE = 4
+    QUICK_STOP = 5
+    FAULT_RESET = 6
+
+
+class Status(IntFlag):
+    """Bits of the statusword outside the state (CiA 402-2, object 0x6041)."""
+
+    VOLTAGE_ENABLED = 0x0010
+    WARNING = 0x0080
+    REMOTE = 0x0200
+    TARGET_REACHED = 0x0400
+    INTERNAL_LIMIT = 0x0800
+    MODE_SPECIFIC = 0x1000
+    """Set-point acknowledged, speed zero, homing attained, or: the drive follows the command value."""
+    MODE_ERROR = 0x2000
+    """Following error or homing error."""
+
+
+STATE_BITS = MappingProxyType({
+    State.NOT_READY_TO_SWITCH_ON: 0x00,
+    State.SWITCH_ON_DISABLED: 0x40,
+    State.READY_TO_SWITCH_ON: 0x21,
+    State.SWITCHED_ON: 0x23,
+    State.OPERATION_ENABLED: 0x27,
+    State.QUICK_STOP_ACTIVE: 0x07,
+    State.FAULT_REACTION_ACTIVE: 0x0F,
+    State.FAULT: 0x08,
+})  # fmt: skip
+"""Statusword bits 0..3, 5 and 6 of each state (CiA 402-2, object 0x6041)."""
+
+_COMMANDS = (
+    (0x87, 0x06, Command.SHUTDOWN),
+    (0x8F, 0x07, Command.SWITCH_ON),
+    (0x8F, 0x0F, Command.ENABLE_OPERATION),
+    (0x82, 0x00, Command.DISABLE_VOLTAGE),
+    (0x86, 0x02, Command.QUICK_STOP),
+)
+"""Mask and value of the controlword for each command (CiA 402-2, 0x6040); the fault reset is an edge, see below."""
+
+TRANSITIONS = MappingProxyType({
+    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): (2, State.READY_TO_SWITCH_ON),
+    (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): (3, State.SWITCHED_ON),
+    # 0x0F in Ready To Switch On is transition 3 with an automatic transition 4 behind it.
+    (State.READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): (3, State.SWITCHED_ON),
+    (State.SWITCHED_ON, Command.ENABLE_OPERATION): (4, State.OPERATION_ENABLED),
+    (State.OPERATION_ENABLED, Command.SWITCH_ON): (5, State.SWITCHED_ON),
+    (State.SWITCHED_ON, Command.SHUTDOWN): (6, State.READY_TO_SWITCH_ON),
+    (State.READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): (7, State.SWITCH_ON_DISABLED),
+    (State.READY_TO_SWITCH_ON, Command.QUICK_STOP): (7, State.SWITCH_ON_DISABLED),
+    (State.OPERATION_ENABLED, Command.SHUTDOWN): (8, State.READY_TO_SWITCH_ON),
+    (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): (9, State.SWITCH_ON_DISABLED),
+    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): (10, State.SWITCH_ON_DISABLED),
+    (State.SWITCHED_ON, Command.QUICK_STOP): (10, State.SWITCH_ON_DISABLED),
+    (State.OPERATION_ENABLED, Command.QUICK_STOP): (11, State.QUICK_STOP_ACTIVE),
+    (State.QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): (12, State.SWITCH_ON_DISABLED),
+    (State.FAULT, Command.FAULT_RESET): (15, State.SWITCH_ON_DISABLED),
+    (State.QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): (16, State.OPERATION_ENABLED),
+})  # fmt: skip
+"""(state, command) -> (number of the transition, next state) (CiA 402-2, power drive system).
+
+The drive itself makes 0 and 1 (start, self-test), 12 (end of a quick stop that disables), 13 and 14 (fault, end of the
+fault reaction)."""
+
+
+def _decode(low_byte: int) -> Command:
+    for mask, value, command in _COMMANDS:
+        if low_byte & mask == value:
+            return command
+    return Command.NONE
+
+
+_DECODED = tuple(_decode(low_byte) for low_byte in range(256))
+
+
+class StateMachine:
+    """Where the drive is, and what a controlword asks of it there."""
+
+    def __init__(self) -> None:
+        self.state = State.NOT_READY_TO_SWITCH_ON
+        self._previous = 0
+
+    def request(self, controlword: int) -> tuple[int, State] | None:
+        """Return the transition (its number, the next state) that `controlword` asks for now; None where it asks none.
+
+        To be called for every controlword: the fault reset is the rising edge of bit 7 (CiA 402-2, object 0x6040).
+        """
+        rising = controlword & ~self._previous & 0x80
+        self._previous = controlword
+        command = Command.FAULT_RESET if rising else _DECODED[controlword & 0xFF]
+        return TRANSITIONS.get((self.state, command))

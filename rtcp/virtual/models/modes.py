@@ -1,0 +1,248 @@
+"""The cyclic synchronous modes and the stop that may take over from any mode (CiA 402-2, ETG.6010).
+
+A mode is entered, then updated once a step: `count` sub-steps of `h` seconds each. `bits` are the bits of the
+statusword that the mode owns.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from rtcp.virtual.models.axis import Axis
+from rtcp.virtual.models.cia402 import Status
+from rtcp.virtual.models.drive_objects import UNIT
+from rtcp.virtual.models.number import number
+from rtcp.virtual.models.profile import ramp
+from rtcp.virtual.objects import ObjectDictionary
+
+# Plain ints: flag arithmetic is too slow for every step.
+_REACHED = int(Status.TARGET_REACHED)
+_LIMIT = int(Status.INTERNAL_LIMIT)
+_FOLLOWS = int(Status.MODE_SPECIFIC)
+_CATCHING_UP = 1.02
+_CREEP = 0.005
+"""What the position loop may add to the speed limit to make good what it lags behind: a factor, and rad/s."""
+_STANDSTILL = 0.005
+"""Speed, rad/s, below which a stopped joint counts as standing."""
+_STOP_PATIENCE = 0.5
+"""A joint that still moves so long (s) after its ramp has ended is moved by something else: the stop is over."""
+
+
+class Motion(Protocol):
+    """What moves the axis while the power stage is on."""
+
+    bits: int
+    closed: bool
+    """Whether the position loop is closed: only then is the following error watched."""
+
+    def enter(self) -> None:
+        """Begin anew: nothing is left of an earlier target."""
+
+    def resume(self) -> None:
+        """Go on after a halt."""
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Let `count` times `h` seconds pass."""
+
+
+class Hold:
+    """No mode chosen yet (0x6061 = 0): the joint is held where it is."""
+
+    closed = True
+
+    def __init__(self, axis: Axis) -> None:
+        self.bits = 0
+        self._axis = axis
+
+    def enter(self) -> None:
+        """Hold here."""
+        self._axis.synchronise()
+        self._axis.reference_velocity = 0.0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Stay."""
+        for _ in range(count):
+            self._axis.follow(h)
+
+
+class CyclicPosition:
+    """CSP (8): interpolates from set-point to set-point over 0x60C2; 0x60FF limits its speed, 0 means no motion."""
+
+    closed = True
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._target = number(objects, 0x607A)
+        self._offset = number(objects, 0x60B0)
+        self._speed = number(objects, 0x60FF)
+        self._top = number(objects, 0x607F)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+        self._period = number(objects, 0x60C2, 1)
+        self._exponent = number(objects, 0x60C2, 2)
+        self._set_point: int | None = None
+        self._limit = 0
+        self._goal = 0.0
+        self._slope = 0.0
+        self._fastest = _CREEP
+        self._clamped = self._held_back = False
+
+    def enter(self) -> None:
+        """Start from where the joint is; after a halt, on to the set-point again."""
+        self._set_point = None
+        self.bits = 0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Move the demand along the line to the set-point, and the joint after it."""
+        axis = self._axis
+        counts = self._target.value + self._offset.value
+        limit = self._speed.value
+        if counts != self._set_point or limit != self._limit:
+            self._take(counts, limit, h * count)
+        slope = self._slope
+        fastest = self._fastest
+        if slope:
+            goal = self._goal
+            move = slope * h
+            for _ in range(count):
+                left = goal - axis.demand
+                if (left - move) * move <= 1e-12:
+                    axis.demand = goal
+                    self._slope = move = 0.0
+                else:
+                    axis.demand += move
+                axis.track(fastest, h)
+        else:
+            for _ in range(count):
+                axis.track(fastest, h)
+        bits = _FOLLOWS
+        if self._clamped or (self._held_back and axis.demand != self._goal):
+            bits |= _LIMIT
+        self.bits = bits
+
+    def _take(self, counts: int, limit: int, step: float) -> None:
+        self._set_point, self._limit = counts, limit
+        allowed = max(self._low.value, min(self._high.value, counts))
+        self._clamped = allowed != counts
+        self._goal = allowed * UNIT
+        period = self._period.value * 10.0**self._exponent.value or step
+        top = min(abs(limit), self._top.value) * UNIT
+        slope = (self._goal - self._axis.demand) / period
+        self._slope = max(-top, min(top, slope))
+        self._held_back = self._slope != slope
+        self._fastest = top * _CATCHING_UP + _CREEP
+
+
+class CyclicVelocity:
+    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
+
+    closed = False
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._target = number(objects, 0x60FF)
+        self._offset = number(objects, 0x60B1)
+        self._top = number(objects, 0x607F)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+        self._deceleration = number(objects, 0x6085)
+
+    def enter(self) -> None:
+        """Begin with the next target."""
+        self.bits = 0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Run at the velocity commanded."""
+        axis = self._axis
+        wanted = (self._target.value + self._offset.value) * UNIT
+        top = self._top.value * UNIT
+        low, high, deceleration = self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+        allowed = wanted
+        for _ in range(count):
+            slowest, fastest = axis.velocity_range(low, high, deceleration)
+            allowed = max(slowest, -top, min(fastest, top, wanted))
+            axis.run(allowed, h)
+        axis.synchronise()
+        axis.reference_velocity = allowed
+        self.bits = _FOLLOWS if allowed == wanted else _FOLLOWS | _LIMIT
+
+
+class CyclicTorque:
+    """CST (10): applies 0x6071 + 0x60B2 within 0x6072, and stops at the software position limits."""
+
+    closed = False
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._target = number(objects, 0x6071)
+        self._offset = number(objects, 0x60B2)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+        self._deceleration = number(objects, 0x6085)
+
+    def enter(self) -> None:
+        """Begin with the next target."""
+        self.bits = 0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Apply the torque commanded."""
+        axis = self._axis
+        wanted = (self._target.value + self._offset.value) * UNIT
+        low, high, deceleration = self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+        for _ in range(count):
+            slowest, fastest = axis.velocity_range(low, high, deceleration)
+            axis.push(wanted, slowest, fastest, h)
+        axis.synchronise()
+        self.bits = _FOLLOWS | _LIMIT if axis.saturated else _FOLLOWS
+
+
+class Stop:
+    """A ramp to rest, then the joint is held: halt, quick stop, disabling and fault reaction, in every mode alike.
+
+    `deceleration` (rad/s^2) is set before `enter`; `done` tells that the joint stands.
+    """
+
+    closed = True
+
+    def __init__(self, axis: Axis) -> None:
+        self.bits = 0
+        self.done = False
+        self.deceleration = 1.0
+        self._axis = axis
+        self._waited = 0.0
+
+    def enter(self) -> None:
+        """Begin to slow down from the joint's own position and velocity."""
+        self.bits = 0
+        self.done = False
+        self._waited = 0.0
+        self._axis.synchronise()
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Slow down, then hold."""
+        axis = self._axis
+        deceleration = self.deceleration
+        for _ in range(count):
+            velocity = axis.reference_velocity
+            if velocity:
+                velocity = ramp(velocity, 0.0, deceleration, deceleration, h)
+                axis.reference_velocity = velocity
+                axis.demand = axis.reference = axis.reference + velocity * h
+            axis.follow(h)
+        if not self.done and axis.reference_velocity == 0.0:
+            self._waited += h * count
+            self.done = abs(axis.mechanics.velocity) < _STANDSTILL or self._waited > _STOP_PATIENCE
+        self.bits = _REACHED if self.done else 0

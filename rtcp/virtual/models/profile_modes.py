@@ -1,0 +1,308 @@
+"""The modes in which the drive makes its own motion: profile position, profile velocity, homing (CiA 402-2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from math import floor, pi
+
+from rtcp.virtual.models.axis import Axis
+from rtcp.virtual.models.cia402 import Status
+from rtcp.virtual.models.drive_objects import HOMING_METHODS, UNIT
+from rtcp.virtual.models.mechanics import GEAR_RATIO
+from rtcp.virtual.models.number import number
+from rtcp.virtual.models.profile import approach, ramp
+from rtcp.virtual.objects import ObjectDictionary
+
+_REACHED = int(Status.TARGET_REACHED)
+_LIMIT = int(Status.INTERNAL_LIMIT)
+_SPECIFIC = int(Status.MODE_SPECIFIC)
+_ERROR = int(Status.MODE_ERROR)
+
+_START = 0x10
+"""Controlword bit 4: new set-point, homing operation start."""
+_CHANGE_IMMEDIATELY = 0x20
+_RELATIVE = 0x40
+
+
+@dataclass(frozen=True)
+class SetPoint:
+    """A target of profile position with the profile that was in force when it was accepted (SI units)."""
+
+    position: float
+    velocity: float
+    acceleration: float
+    deceleration: float
+    limited: bool
+
+
+class Profile:
+    """The objects that shape a profile, in SI units; 0x60C5 and 0x607F bound what the master asks for."""
+
+    def __init__(self, objects: ObjectDictionary) -> None:
+        self._velocity = number(objects, 0x6081)
+        self._acceleration = number(objects, 0x6083)
+        self._deceleration = number(objects, 0x6084)
+        self._most = number(objects, 0x60C5)
+        self._top = number(objects, 0x607F)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+
+    @property
+    def velocity(self) -> float:
+        """Profile velocity, rad/s."""
+        return min(self._velocity.value, self._top.value) * UNIT
+
+    @property
+    def top(self) -> float:
+        """Largest velocity of any profile, rad/s."""
+        return self._top.value * UNIT
+
+    @property
+    def acceleration(self) -> float:
+        """Profile acceleration, rad/s^2, never zero."""
+        return max(1, min(self._acceleration.value, self._most.value)) * UNIT
+
+    @property
+    def deceleration(self) -> float:
+        """Profile deceleration, rad/s^2, never zero."""
+        return max(1, min(self._deceleration.value, self._most.value)) * UNIT
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The software position limits, rad."""
+        return self._low.value * UNIT, self._high.value * UNIT
+
+
+class ProfilePosition:
+    """Profile position (1): set-points by the handshake of controlword bit 4 and statusword bit 12; one is buffered."""
+
+    closed = True
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._profile = Profile(objects)
+        self._target = number(objects, 0x607A)
+        self._window = number(objects, 0x6067)
+        self._window_time = number(objects, 0x6068)
+        self._active: SetPoint | None = None
+        self._queued: SetPoint | None = None
+        self._last = 0.0
+        self._start: int | None = None
+        self._inside = 0.0
+
+    def enter(self) -> None:
+        """Forget every set-point; bit 4 must rise anew."""
+        self._active = self._queued = None
+        self._last = self._axis.demand
+        self._start = None
+        self._inside = 0.0
+        self.bits = 0
+
+    def resume(self) -> None:
+        """Go on to the active set-point."""
+        self._inside = 0.0
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Take a set-point when one is offered; move towards the active one."""
+        self._handshake(controlword)
+        axis = self._axis
+        for _ in range(count):
+            point = self._active
+            if point is None:
+                deceleration = self._profile.deceleration
+                axis.reference_velocity = ramp(axis.reference_velocity, 0.0, deceleration, deceleration, h)
+                axis.reference += axis.reference_velocity * h
+            else:
+                axis.reference, axis.reference_velocity = approach(
+                    axis.reference, axis.reference_velocity, point.position, point.velocity, point.acceleration,
+                    point.deceleration, h,
+                )  # fmt: skip
+                if axis.reference == point.position and self._queued is not None:
+                    self._active, self._queued = self._queued, None
+            axis.demand = axis.reference
+            axis.follow(h)
+        self._report(h * count)
+
+    def _handshake(self, controlword: int) -> None:
+        start = controlword & _START
+        if self._start is None:
+            self._start = start
+        if start and not self._start:
+            busy = self._active is not None and self._axis.reference != self._active.position
+            if controlword & _CHANGE_IMMEDIATELY or not busy:
+                self._active, self._queued = self._set_point(controlword), None
+            elif self._queued is None:
+                self._queued = self._set_point(controlword)
+            self.bits |= _SPECIFIC
+        elif not start and self._queued is None:
+            self.bits &= ~_SPECIFIC
+        self._start = start
+
+    def _set_point(self, controlword: int) -> SetPoint:
+        profile = self._profile
+        wanted = self._target.value * UNIT
+        if controlword & _RELATIVE:
+            wanted += self._last
+        low, high = profile.range
+        self._last = max(low, min(high, wanted))
+        return SetPoint(
+            self._last, profile.velocity, profile.acceleration, profile.deceleration, limited=self._last != wanted
+        )
+
+    def _report(self, dt: float) -> None:
+        point = self._active
+        bits = self.bits & _SPECIFIC
+        if point is not None:
+            arrived = self._queued is None and self._axis.reference == point.position
+            if arrived and abs(point.position - self._axis.position) <= self._window.value * UNIT:
+                self._inside += dt
+            else:
+                self._inside = 0.0
+            if self._inside * 1000.0 >= self._window_time.value and arrived:
+                bits |= _REACHED
+            if point.limited:
+                bits |= _LIMIT
+        self.bits = bits
+
+
+class ProfileVelocity:
+    """Profile velocity (3): 0x60FF by ramps of 0x6083 and 0x6084, stopping at the software position limits."""
+
+    closed = False
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._profile = Profile(objects)
+        self._target = number(objects, 0x60FF)
+        self._window = number(objects, 0x606D)
+        self._window_time = number(objects, 0x606E)
+        self._threshold = number(objects, 0x606F)
+        self._threshold_time = number(objects, 0x6070)
+        self._inside = self._still = 0.0
+
+    def enter(self) -> None:
+        """Ramp from the joint's own velocity."""
+        self._inside = self._still = 0.0
+        self.bits = 0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Ramp towards the target velocity and keep it."""
+        axis, profile = self._axis, self._profile
+        wanted = self._target.value * UNIT
+        low, high = profile.range
+        acceleration, deceleration = profile.acceleration, profile.deceleration
+        target = max(-profile.top, min(profile.top, wanted))
+        velocity, limited = axis.reference_velocity, target != wanted
+        for _ in range(count):
+            slowest, fastest = axis.velocity_range(low, high, deceleration)
+            free = ramp(velocity, target, acceleration, deceleration, h)
+            velocity = max(slowest, min(fastest, free))
+            limited = limited or velocity != free
+            axis.run(velocity, h)
+        axis.synchronise()
+        axis.reference_velocity = velocity
+        actual, dt = axis.mechanics.velocity, h * count
+        self._inside = self._inside + dt if abs(wanted - actual) <= self._window.value * UNIT else 0.0
+        self._still = self._still + dt if abs(actual) <= self._threshold.value * UNIT else 0.0
+        bits = _LIMIT if limited else 0
+        if self._inside and self._inside * 1000.0 >= self._window_time.value:
+            bits |= _REACHED
+        if self._still and self._still * 1000.0 >= self._threshold_time.value:
+            bits |= _SPECIFIC
+        self.bits = bits
+
+
+class Phase(Enum):
+    """How far a homing procedure is (statusword bits 10, 12 and 13 of CiA 402-2)."""
+
+    IDLE = _REACHED
+    SEARCHING = 0
+    STOPPING = _SPECIFIC
+    ATTAINED = _SPECIFIC | _REACHED
+    FAILED = _ERROR | _REACHED
+
+
+_INDEX_PITCH = 2 * pi / GEAR_RATIO
+"""The index pulse comes once a turn of the motor: so far apart (rad) at the output."""
+
+
+class Homing:
+    """Homing (6) by methods 33, 34 (next index pulse), 35 and 37 (where it stands): home then reads 0x607C."""
+
+    closed = True
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._method = number(objects, 0x6098)
+        self._home_offset = number(objects, 0x607C)
+        self._speed = number(objects, 0x6099, 2)
+        self._acceleration = number(objects, 0x609A)
+        self._phase = Phase.IDLE
+        self._start: int | None = None
+        self._velocity = 0.0
+        self._index = 0.0
+
+    def enter(self) -> None:
+        """Wait for the start (controlword bit 4 rising)."""
+        self._phase = Phase.IDLE
+        self._start = None
+        self.bits = 0
+
+    def resume(self) -> None:
+        """Go on searching."""
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Start or interrupt as bit 4 says; search; stop."""
+        start = controlword & _START
+        if self._start is None:
+            self._start = start
+        if start and not self._start:
+            self._begin()
+        elif not start and self._phase in (Phase.SEARCHING, Phase.STOPPING):
+            self._phase = Phase.IDLE
+        self._start = start
+        axis = self._axis
+        acceleration = max(1, self._acceleration.value) * UNIT
+        for _ in range(count):
+            wanted = self._velocity if self._phase is Phase.SEARCHING else 0.0
+            axis.reference_velocity = ramp(axis.reference_velocity, wanted, acceleration, acceleration, h)
+            axis.reference += axis.reference_velocity * h
+            axis.demand = axis.reference
+            axis.follow(h)
+            if self._phase is Phase.SEARCHING:
+                self._search()
+        standing = axis.reference_velocity == 0.0 and abs(axis.mechanics.velocity) < 0.01
+        if self._phase is Phase.STOPPING and standing:
+            self._phase = Phase.ATTAINED
+        self.bits = self._phase.value if standing else self._phase.value & ~_REACHED
+
+    def _begin(self) -> None:
+        method, position = self._method.value, self._axis.mechanics.position
+        if method in (35, 37):
+            self._attain(position)
+        elif method not in HOMING_METHODS or self._speed.value == 0:
+            self._phase = Phase.FAILED
+        else:
+            turn = floor(position / _INDEX_PITCH)
+            if method == 33:
+                self._index = (turn if turn * _INDEX_PITCH < position else turn - 1) * _INDEX_PITCH
+            else:
+                self._index = (turn + 1) * _INDEX_PITCH
+            self._velocity = self._speed.value * UNIT * (-1.0 if method == 33 else 1.0)
+            self._phase = Phase.SEARCHING
+
+    def _search(self) -> None:
+        position = self._axis.mechanics.position
+        if position >= self._index if self._velocity > 0.0 else position <= self._index:
+            self._attain(self._index)
+
+    def _attain(self, home: float) -> None:
+        axis = self._axis
+        axis.shift(self._home_offset.value * UNIT - (home + axis.offset))
+        self._phase = Phase.STOPPING

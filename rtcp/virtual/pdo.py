@@ -1,0 +1,279 @@
+"""Process data objects: sync managers, PDO assignment and mapping, process images (ETG.1000.6, 5.6.5 and 5.6.7.4)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+from rtcp.virtual.abort import AbortCode
+from rtcp.virtual.encoding import from_bits, struct_code, to_bits
+from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary, SdoAbort, Value
+
+SM_TYPES = 0x1C00
+"""Sync manager communication type (ETG.1000.6, table 67)."""
+RX_ASSIGN = 0x1C12
+TX_ASSIGN = 0x1C13
+RX_MAPPINGS = range(0x1600, 0x1800)
+TX_MAPPINGS = range(0x1A00, 0x1C00)
+MAX_BYTES = 256
+"""Largest process image of one sync manager: three buffers of it fit between the start addresses below."""
+MAX_MAPPED = 16
+"""Entries that a free mapping object has room for."""
+MAX_ASSIGNED = 4
+"""PDOs that a free assignment object has room for."""
+
+Mapped = tuple[int, int, int]
+"""A mapped entry: index (0: a gap), subindex, bits."""
+Buffer = bytes | bytearray | memoryview
+
+
+class SyncManagerType(IntEnum):
+    """What a sync manager carries (ETG.1000.6, 5.6.7.4; the same numbers in the SII, ETG.2010)."""
+
+    UNUSED = 0
+    MAILBOX_RECEIVE = 1
+    MAILBOX_SEND = 2
+    OUTPUTS = 3
+    INPUTS = 4
+
+
+@dataclass(frozen=True)
+class SyncManager:
+    """Default settings of one sync manager, by its registers (ETG.1000.4, 6.7.2)."""
+
+    start: int
+    """Physical start address in the ESC's memory."""
+    length: int
+    """Bytes; 0 where the PDO assignment decides."""
+    control: int
+    """Mode (0: three buffers, 2: mailbox), direction (4: the master writes), interrupt 0x20, watchdog trigger 0x40."""
+    type: SyncManagerType
+    activate: int = 0x01
+
+
+@dataclass(frozen=True)
+class SyncManagerLayout:
+    """The four sync managers of a slave with mailbox, as its SII tells them."""
+
+    mailbox_receive: SyncManager = SyncManager(0x1000, 128, 0x26, SyncManagerType.MAILBOX_RECEIVE)
+    """SM0: the master writes, the slave receives."""
+    mailbox_send: SyncManager = SyncManager(0x1080, 128, 0x22, SyncManagerType.MAILBOX_SEND)
+    """SM1: the slave sends, the master reads."""
+    outputs: SyncManager = SyncManager(0x1100, 0, 0x64, SyncManagerType.OUTPUTS)
+    """SM2: RxPDOs, triggers the process-data watchdog."""
+    inputs: SyncManager = SyncManager(0x1400, 0, 0x20, SyncManagerType.INPUTS)
+    """SM3: TxPDOs."""
+
+    @property
+    def all(self) -> tuple[SyncManager, SyncManager, SyncManager, SyncManager]:
+        """SM0 to SM3."""
+        return (self.mailbox_receive, self.mailbox_send, self.outputs, self.inputs)
+
+
+class PdoImage:
+    """The process image of one sync manager: which entries stand at which bits.
+
+    Made by `from_assignment`, it stays as it was when objects are mapped anew.
+    """
+
+    __slots__ = ("_bits", "_struct", "bit_length", "byte_length", "entries")
+
+    def __init__(self, fields: Sequence[tuple[Entry | None, int]]) -> None:
+        """Lay out `fields`, each an entry (None: a gap) and its number of bits, from bit 0 upwards."""
+        self.bit_length = sum(bits for _, bits in fields)
+        self.byte_length = (self.bit_length + 7) // 8
+        self.entries = tuple(entry for entry, _ in fields if entry is not None)
+        self._struct = _compile(fields)
+        self._bits: list[tuple[Entry, int, int]] = []
+        offset = 0
+        for entry, bits in fields:
+            if entry is not None:
+                self._bits.append((entry, offset, (1 << bits) - 1))
+            offset += bits
+
+    @classmethod
+    def from_assignment(cls, objects: ObjectDictionary, assignment: int) -> PdoImage:
+        """Return the image of the PDOs that `assignment` (0x1C12 or 0x1C13) lists.
+
+        Raises:
+            SdoAbort: an object, a subindex or a mapping that does not exist or may not be mapped.
+            ValueError: the image is longer than 256 bytes.
+        """
+        wanted = Access.RXPDO if assignment == RX_ASSIGN else Access.TXPDO
+        mappings = [mapping for pdo in listed(objects, assignment) for mapping in listed(objects, pdo)]
+        image = cls([_field(objects, mapping, wanted) for mapping in mappings])
+        if image.byte_length > MAX_BYTES:
+            raise ValueError(
+                f"the PDOs assigned in 0x{assignment:04X} take {image.byte_length} bytes, allowed are {MAX_BYTES}"
+            )
+        return image
+
+    def unpack(self, data: Buffer, offset: int = 0) -> None:
+        """Store the values in `data` (`byte_length` bytes from `offset`) in the entries.
+
+        Raises:
+            struct.error: `data` is shorter than that (of an image whose entries all fill whole bytes).
+        """
+        if self._struct is not None:
+            for entry, value in zip(self.entries, self._struct.unpack_from(data, offset), strict=True):
+                entry.value = value
+            return
+        image = int.from_bytes(data[offset : offset + self.byte_length], "little")
+        for entry, shift, mask in self._bits:
+            entry.value = from_bits(entry, image >> shift & mask)
+
+    def pack(self, target: bytearray | memoryview, offset: int = 0) -> None:
+        """Write the entries' values to `target` from `offset` on; gaps become zero.
+
+        Raises:
+            struct.error: a value out of its type's range, or `target` too short.
+        """
+        if self._struct is not None:
+            self._struct.pack_into(target, offset, *[entry.value for entry in self.entries])
+            return
+        image = 0
+        for entry, shift, _ in self._bits:
+            image |= to_bits(entry) << shift
+        target[offset : offset + self.byte_length] = image.to_bytes(self.byte_length, "little")
+
+
+def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None:
+    """Return one struct for all of `fields`, None where any of them is not made of whole bytes."""
+    codes = []
+    for entry, bits in fields:
+        code = struct_code(entry) if entry is not None else (f"{bits // 8}x" if bits % 8 == 0 else None)
+        if code is None:
+            return None
+        codes.append(code)
+    return struct.Struct("<" + "".join(codes))
+
+
+def listed(objects: ObjectDictionary, index: int) -> list[int]:
+    """Return what the used subindices of an assignment or mapping object hold.
+
+    Raises:
+        SdoAbort: there is no such object, or subindex 0 counts more than there are.
+    """
+    count = int(objects[index, 0].value)
+    return [int(objects[index, subindex].value) for subindex in range(1, count + 1)]
+
+
+def split_mapping(mapping: int) -> Mapped:
+    """Return index, subindex and bits of an entry of a mapping object (ETG.1000.6, table 73)."""
+    return mapping >> 16, mapping >> 8 & 0xFF, mapping & 0xFF
+
+
+def _field(objects: ObjectDictionary, mapping: int, wanted: Access) -> tuple[Entry | None, int]:
+    """Return entry (None: a gap) and bits of a mapping."""
+    index, subindex, bits = split_mapping(mapping)
+    if index == 0:
+        # A gap; without bits it is an unused place of the mapping object.
+        if subindex or not bits:
+            raise SdoAbort(AbortCode.NO_OBJECT)
+        return None, bits
+    entry = objects[index, subindex]
+    if not entry.access & wanted:
+        raise SdoAbort(AbortCode.NOT_MAPPABLE)
+    if entry.bit_length != bits:
+        raise SdoAbort(AbortCode.PDO_LENGTH)
+    return entry, bits
+
+
+def define_pdo_objects(
+    objects: ObjectDictionary,
+    rx: Mapping[int, Sequence[Mapped]],
+    tx: Mapping[int, Sequence[Mapped]],
+    assign_rx: Sequence[int],
+    assign_tx: Sequence[int],
+    fixed: bool,
+) -> None:
+    """Add the mapping objects `rx` (0x1600..) and `tx` (0x1A00..), 0x1C00, 0x1C12 and 0x1C13 to `objects`.
+
+    Written by SDO, they keep these rules: only in PRE-OP (else 0x08000022); subindex 0 must be 0 before another one is
+    written (0x06010003); a mapped entry exists (0x06020000, 0x06090011), may be mapped in this direction (0x06040041),
+    has the bits that the mapping tells and fits in 256 bytes with the others (0x06040042); an assigned PDO exists
+    (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
+    """
+    types = (*(sm.type for sm in SyncManagerLayout().all),)
+    objects.record(
+        SM_TYPES, "Sync manager type",
+        [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(t)) for n, t in enumerate(types, 1)],
+        code=ObjectCode.ARRAY,
+    )  # fmt: skip
+    for index, mapped in rx.items():
+        _define_mapping(objects, index, f"RxPDO mapping {index - 0x15FF}", mapped, Access.RXPDO, fixed)
+    for index, mapped in tx.items():
+        _define_mapping(objects, index, f"TxPDO mapping {index - 0x19FF}", mapped, Access.TXPDO, fixed)
+    _define_assignment(objects, RX_ASSIGN, "RxPDO assign", assign_rx, rx.keys(), tx.keys(), fixed)
+    _define_assignment(objects, TX_ASSIGN, "TxPDO assign", assign_tx, tx.keys(), rx.keys(), fixed)
+
+
+def _define_mapping(
+    objects: ObjectDictionary, index: int, name: str, mapped: Sequence[Mapped], wanted: Access, fixed: bool
+) -> None:
+    def check_entry(_: Entry, value: Value) -> None:
+        if objects[index, 0].value:
+            raise SdoAbort(AbortCode.SUBINDEX_0_NOT_ZERO)
+        if value:
+            _field(objects, int(value), wanted)
+
+    def check_count(_: Entry, value: Value) -> None:
+        places = [int(objects[index, subindex].value) for subindex in range(1, int(value) + 1)]
+        _check_length(sum(_field(objects, place, wanted)[1] for place in places))
+
+    access = Access.RO if fixed else Access.RW_PREOP
+    values = [at << 16 | subindex << 8 | bits for at, subindex, bits in mapped]
+    used = len(values)
+    if not fixed:
+        values += [0] * (MAX_MAPPED - used)
+    entries = [
+        Entry(index, n, f"Mapped object {n}", DataType.UNSIGNED32, value, access, on_write=check_entry)
+        for n, value in enumerate(values, 1)
+    ]
+    count = objects.record(index, name, entries, count_access=access).entries[0]
+    count.value, count.maximum, count.on_write = used, len(values), check_count
+
+
+def _define_assignment(
+    objects: ObjectDictionary, index: int, name: str, assigned: Sequence[int],
+    own: Collection[int], opposite: Collection[int], fixed: bool,
+) -> None:  # fmt: skip
+    def check_pdo(pdo: int) -> None:
+        if pdo in opposite:
+            raise SdoAbort(AbortCode.NOT_MAPPABLE)
+        if pdo not in own:
+            raise SdoAbort(AbortCode.NO_OBJECT)
+
+    def check_entry(_: Entry, value: Value) -> None:
+        if objects[index, 0].value:
+            raise SdoAbort(AbortCode.SUBINDEX_0_NOT_ZERO)
+        if value:
+            check_pdo(int(value))
+
+    def check_count(_: Entry, value: Value) -> None:
+        bits = 0
+        for subindex in range(1, int(value) + 1):
+            pdo = int(objects[index, subindex].value)
+            check_pdo(pdo)
+            bits += sum(mapping & 0xFF for mapping in listed(objects, pdo))
+        _check_length(bits)
+
+    access = Access.RO if fixed else Access.RW_PREOP
+    values = list(assigned)
+    used = len(values)
+    if not fixed:
+        values += [0] * (MAX_ASSIGNED - used)
+    entries = [
+        Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, value, access, on_write=check_entry)
+        for n, value in enumerate(values, 1)
+    ]
+    count = objects.record(index, name, entries, code=ObjectCode.ARRAY, count_access=access).entries[0]
+    count.value, count.maximum, count.on_write = used, len(values), check_count
+
+
+def _check_length(bits: int) -> None:
+    """Refuse process data that do not fit in a sync manager's buffer."""
+    if bits > 8 * MAX_BYTES:
+        raise SdoAbort(AbortCode.PDO_LENGTH)

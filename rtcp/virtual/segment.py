@@ -1,0 +1,129 @@
+"""A chain of virtual slaves: frames in and out, and the events that time brings."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+
+from rtcp.virtual.slave import Slave
+from rtcp.virtual.wire import Wire
+
+IDLE_TICK = 1_000_000
+"""Longest time in ns between two looks at watchdogs and devices."""
+TOGETHER = 2_000
+"""SYNC0 pulses that lie within this many ns are handled at once."""
+REPLAYED_PULSES = 20
+"""SYNC0 pulses made up for after the process was stopped; older ones pass unseen."""
+
+
+class Segment:
+    """The slaves of a segment, driven by three calls.
+
+    `process` answers a frame in place, `settle` does what the frame asked of the slaves once the answer is on its way,
+    `tick` lets events in time happen. What takes long, the steps of the devices, waits in `step_one`, one at a time, so
+    that frames come in between. Instants are ns of the host's monotonic clock.
+    """
+
+    def __init__(self, slaves: Sequence[Slave], t: int) -> None:
+        self.slaves = tuple(slaves)
+        self._wire = Wire(slaves)
+        self._attention: list[Slave] = []
+        self._waiting: deque[Slave] = deque()
+        self._next_tick = t + IDLE_TICK
+        self.next_event = t + IDLE_TICK
+        """Instant of the next call of `tick` that is needed."""
+        for slave in self.slaves:
+            slave.esc.on_attention = self._attention_of(slave)
+
+    def _attention_of(self, slave: Slave) -> Callable[[], None]:
+        def call() -> None:
+            if slave not in self._attention:
+                self._attention.append(slave)
+
+        return call
+
+    def process(self, frame: bytearray, size: int, t: int) -> bool:
+        """Answer a frame in place, see `Wire.process`."""
+        return self._wire.process(frame, size, t)
+
+    def settle(self, t: int) -> None:
+        """Do what the frames since the last call, the last of which arrived at `t`, asked of the slaves."""
+        for followers, reference, at in self._wire.references:
+            for slave in followers:
+                if slave.clock is not None:
+                    slave.clock.follow(at + slave.delay, reference)
+        self._wire.references.clear()
+        if self._wire.done:
+            # A SYNC0 before this frame that nobody has noticed yet comes first.
+            if self.next_event <= t:
+                self.tick(t)
+            for plan in self._wire.done:
+                for esc, manager in plan.written:
+                    esc.on_outputs(manager, t)
+            self._wire.done.clear()
+            for slave in self.slaves:
+                if not slave.application.by_sync0:
+                    slave.application.latch()
+                    self._queue(slave, t)
+        if self._attention:
+            asking, self._attention = self._attention, []
+            for slave in asking:
+                slave.application.attend(t)
+            self._next_tick = min(self._next_tick, t)
+            self.next_event = self._next_tick
+
+    def tick(self, now: int) -> None:
+        """Handle every SYNC0 up to `now`, and once a millisecond watchdogs and the devices that no SYNC0 steps."""
+        earliest = now + IDLE_TICK
+        idle = now >= self._next_tick
+        for slave in self.slaves:
+            application = slave.application
+            dc = slave.esc.dc
+            if dc is not None and (due := dc.sync0.due) is not None:
+                if due <= now + TOGETHER:
+                    due = self._pulse(slave, now)
+                if due is not None and due < earliest:
+                    earliest = due
+            if idle:
+                application.watch(now)
+                if not application.by_sync0 or not application.sync.running:
+                    application.latch()
+                    self._queue(slave, now)
+        if idle:
+            self._next_tick = now + IDLE_TICK
+        self.next_event = min(earliest, self._next_tick)
+
+    def _pulse(self, slave: Slave, now: int) -> int | None:
+        """Handle the SYNC0 pulses of `slave` that are due at `now`; return the instant of its next one."""
+        dc = slave.esc.dc
+        if dc is None:
+            return None
+        sync0 = dc.sync0
+        cycle = sync0.cycle
+        if sync0.due is not None and cycle and now - sync0.due > REPLAYED_PULSES * cycle:
+            sync0.skip_to(now - REPLAYED_PULSES * cycle)
+        while (due := sync0.due) is not None and due <= now + TOGETHER:
+            sync0.fire()
+            if slave.application.by_sync0:
+                slave.application.pulse(now - due < cycle)
+                self._queue(slave, due)
+        return sync0.due
+
+    def _queue(self, slave: Slave, t: int) -> None:
+        if slave.queued_until is None:
+            self._waiting.append(slave)
+        slave.queued_until = t
+
+    @property
+    def busy(self) -> bool:
+        """Whether devices wait to be stepped."""
+        return bool(self._waiting)
+
+    def step_one(self) -> None:
+        """Step the device that has waited longest."""
+        if not self._waiting:
+            return
+        slave = self._waiting.popleft()
+        until, slave.queued_until = slave.queued_until, None
+        if until is not None:
+            slave.application.advance(until)

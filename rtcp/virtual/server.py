@@ -1,0 +1,199 @@
+"""The segment's process: a raw socket on its end of the cable, and a loop that answers first and works after."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+import select
+import signal
+import socket
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import FrameType
+
+from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.virtual.frame import ETHERTYPE
+from rtcp.virtual.models import create
+from rtcp.virtual.network import private_pair, public_pair
+from rtcp.virtual.segment import Segment
+from rtcp.virtual.slave import make_slaves
+
+DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
+"""Propagation delays in ns from the master to the slaves of the robot (facts of the machine)."""
+FURTHER_DELAY = 840
+"""What every slave after these adds, in ns."""
+PRIORITY = 70
+PR_SET_TIMERSLACK = 29
+SO_TIMESTAMPNS = 35
+TIMESPEC = struct.Struct("@qq")
+ANCILLARY = socket.CMSG_SPACE(TIMESPEC.size)
+BUFFER = 2048
+OLDEST = 1_000_000_000
+"""A receive time stamp more than this many ns old, or from the future, means that the wall clock was set: not used."""
+RECEIVE_BUFFER = 1 << 20
+REST_SHARE = 8
+"""Polling sleeps for this part of the time between frames, right after one: a FIFO thread that never sleeps would be
+throttled by the kernel for 50 ms in every second (sched_rt_runtime_us)."""
+LONGEST_REST = 250_000
+SILENCE = 20_000_000
+"""Without frames for this many ns polling stops until the next one comes."""
+FOR_EVER = 1 << 63
+
+Ready = Callable[[dict[str, int | str | bool]], None]
+
+
+def default_delays(count: int) -> tuple[int, ...]:
+    """Propagation delays in ns for a chain of `count` slaves."""
+    further = range(max(0, count - len(DELAYS)))
+    return (DELAYS + tuple(DELAYS[-1] + FURTHER_DELAY * (n + 1) for n in further))[:count]
+
+
+def make_segment(config: SegmentConfig, t: int) -> Segment:
+    """Build the slaves that `config` lists; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
+
+    Raises:
+        ValueError: an unknown model or option, or delays that fall along the chain; the message is a sentence.
+    """
+    delays: list[int] = []
+    for position, (entry, usual) in enumerate(zip(config.slaves, default_delays(len(config.slaves)), strict=True)):
+        delay = usual if entry.delay_ns is None else entry.delay_ns
+        if delays and delay < delays[-1]:
+            raise ValueError(
+                f"slave {position + 1} has delay_ns {delay}, less than the {delays[-1]} ns of the slave before it"
+            )
+        delays.append(delay)
+    devices = [create(entry.model, **entry.options) for entry in config.slaves]
+    drifts = [entry.drift_ppm for entry in config.slaves]
+    aliases = [entry.alias for entry in config.slaves]
+    return Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+
+
+class Server:
+    """Answers frames on one interface until `stop` is called."""
+
+    def __init__(self, segment: Segment, interface: str) -> None:
+        self.segment = segment
+        self._running = True
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
+        self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        self._socket.bind((interface, ETHERTYPE))
+
+    def stop(self) -> None:
+        """Let `serve` return soon."""
+        self._running = False
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def serve(self, poll: bool) -> None:
+        """Answer frames until stopped; with `poll` sleep no longer than it takes not to be throttled."""
+        segment = self.segment
+        frame = bytearray(BUFFER)
+        view = memoryview(frame)
+        receive, send = self._socket.recvmsg_into, self._socket.send
+        descriptors = [self._socket.fileno()]
+        monotonic, wait = time.monotonic_ns, select.select
+        arrived = 0
+        awake_from = 0 if poll else FOR_EVER
+        while self._running:
+            try:
+                size, stamps, _, _ = receive([view], ANCILLARY)
+            except BlockingIOError:
+                size = 0
+            if size:
+                before, arrived = arrived, _arrival(stamps)
+                if segment.process(frame, size, arrived):
+                    # A full queue of the interface loses the frame, as a cable would.
+                    with suppress(BlockingIOError):
+                        send(view[:size])
+                    segment.settle(arrived)
+                if poll:
+                    awake_from = monotonic() + min((arrived - before) // REST_SHARE, LONGEST_REST)
+                continue
+            if segment.busy:
+                segment.step_one()
+                continue
+            now = monotonic()
+            left = segment.next_event - now
+            if left <= 0:
+                segment.tick(now)
+            elif now < awake_from:
+                wait(descriptors, (), (), min(left, awake_from - now) * 1e-9)
+            elif now - arrived > SILENCE:
+                wait(descriptors, (), (), left * 1e-9)
+
+
+def _stamp(data: bytes) -> tuple[int, int]:
+    seconds, nanoseconds = TIMESPEC.unpack_from(data)
+    return seconds, nanoseconds
+
+
+def _arrival(stamps: list[tuple[int, int, bytes]]) -> int:
+    """The instant (CLOCK_MONOTONIC, ns) at which a frame arrived, by the kernel's receive time stamp."""
+    now = time.monotonic_ns()
+    if stamps:
+        seconds, nanoseconds = _stamp(stamps[0][2])
+        age = time.time_ns() - seconds * 1_000_000_000 - nanoseconds
+        if 0 <= age < OLDEST:
+            return now - age
+    return now
+
+
+def _run_on(cpu: int) -> None:
+    try:
+        os.sched_setaffinity(0, {cpu})
+    except (OSError, ValueError, OverflowError) as error:
+        raise ValueError(f"--cpu {cpu} cannot be used, there are CPUs 0 to {(os.cpu_count() or 1) - 1}") from error
+
+
+def _prefer() -> None:
+    """Ask for prompt scheduling; without the right to it the segment runs on as it is."""
+    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    with suppress(PermissionError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+
+def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, ready: Ready) -> None:
+    """Run a segment until SIGTERM or SIGINT.
+
+    `interface` names the master's end in the caller's network; None: everything in a namespace of the segment's own.
+    `poll` hardly sleeps while frames come, best with a `cpu` of its own. `ready` is called once with "pid", "interface", "namespace" and
+    "slaves" when frames are answered.
+
+    Raises:
+        ConfigError, ValueError, NetworkError: with sentences for the user.
+    """
+    config = load_segment(config_path)
+    if cpu is not None:
+        _run_on(cpu)
+    segment = make_segment(config, time.monotonic_ns())
+    pair = private_pair() if interface is None else public_pair(interface)
+    with pair as (master_end, segment_end):
+        server = Server(segment, segment_end)
+
+        def stop(number: int, at: FrameType | None) -> None:
+            server.stop()
+
+        signal.signal(signal.SIGTERM, stop)
+        signal.signal(signal.SIGINT, stop)
+        _prefer()
+        ready({
+            "pid": os.getpid(),
+            "interface": master_end,
+            "namespace": interface is None,
+            "slaves": len(segment.slaves),
+        })  # fmt: skip
+        try:
+            server.serve(poll)
+        finally:
+            server.close()

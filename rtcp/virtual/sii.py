@@ -1,0 +1,230 @@
+"""The slave information interface: the EEPROM image that tells what a device is (ETG.1000.6, 5.4; ETG.2010)."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable
+from enum import IntEnum, IntFlag
+
+from rtcp.virtual.device import Device
+from rtcp.virtual.objects import Access, ObjectDictionary
+from rtcp.virtual.pdo import (
+    RX_ASSIGN,
+    RX_MAPPINGS,
+    TX_ASSIGN,
+    TX_MAPPINGS,
+    PdoImage,
+    SyncManager,
+    SyncManagerLayout,
+    SyncManagerType,
+    listed,
+    split_mapping,
+)
+
+_CATEGORIES_AT = 2 * 0x40
+"""Byte address of the first category (ETG.2010, table 2)."""
+_END = 0xFFFF
+_ERASED = b"\xff"
+_CONFIG = struct.Struct("<5H4x")
+_CONTROL = 0x0080
+"""PDI control: on-chip bus, for there is no other processor interface here (ETG.1000.4, 6.2)."""
+_SYNC_PULSE = 100
+"""Length of a SYNC pulse in units of 10 ns."""
+_IDENTITY = struct.Struct("<4L")
+_MAILBOXES = struct.Struct("<8x9H")
+_COE = 0x0004
+"""Mailbox protocol CoE (ETG.1000.6, table 18)."""
+_VERSION = 1
+_SMALLEST_KBIT = 16
+_GENERAL = struct.Struct("<4Bx5BxBhxx2H12x")
+_PORTS = 0x0011
+"""Ports 0 and 1 are MII, the others absent; one nibble a port."""
+_SYNC_MANAGER = struct.Struct("<HHBBBB")
+_PDO = struct.Struct("<HBBBBH")
+_PDO_ENTRY = struct.Struct("<HBBBBH")
+_DC_MODE = struct.Struct("<3LhHhBB4x")
+_NOT_ASSIGNED = 0xFF
+"""Sync manager of a PDO that is not assigned."""
+_DC_SYNC0 = 0x0300
+"""AssignActivate: cyclic operation and SYNC0."""
+
+
+class Category(IntEnum):
+    """Categories of the SII (ETG.1000.6, table 19)."""
+
+    STRINGS = 10
+    GENERAL = 30
+    FMMU = 40
+    SYNC_MANAGER = 41
+    TXPDO = 50
+    RXPDO = 51
+    DC = 60
+
+
+class CoeDetail(IntFlag):
+    """What a device can do over CoE (ETG.1000.6, table 21)."""
+
+    SDO = 0x01
+    SDO_INFORMATION = 0x02
+    PDO_ASSIGN = 0x04
+    PDO_CONFIGURATION = 0x08
+    UPLOAD_AT_STARTUP = 0x10
+    COMPLETE_ACCESS = 0x20
+
+
+class FmmuUse(IntEnum):
+    """What an FMMU is for (ETG.1000.6, table 23)."""
+
+    OUTPUTS = 1
+    INPUTS = 2
+    MAILBOX_STATE = 3
+
+
+_COE_DETAILS = CoeDetail.SDO | CoeDetail.SDO_INFORMATION | CoeDetail.UPLOAD_AT_STARTUP | CoeDetail.COMPLETE_ACCESS
+_FMMUS = (FmmuUse.OUTPUTS, FmmuUse.INPUTS, FmmuUse.MAILBOX_STATE)
+
+
+class _Strings:
+    """The strings of an image, each once; number 0 is the empty string."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[bytes, int] = {}
+
+    def number(self, text: str) -> int:
+        """Return the number of `text`, which becomes a string of the image; 0 where there is no room for another."""
+        encoded = text.encode("ascii", "replace")[:255]
+        if not encoded or (encoded not in self._numbers and len(self._numbers) == 255):
+            return 0
+        return self._numbers.setdefault(encoded, len(self._numbers) + 1)
+
+    def content(self) -> bytes:
+        """Return the category: the number of strings, and each with its length before it."""
+        parts = (bytes((len(text),)) + text for text in self._numbers)
+        return bytes((len(self._numbers),)) + b"".join(parts)
+
+
+def crc8(data: bytes) -> int:
+    """Return the checksum of the configuration area: polynomial x^8 + x^2 + x + 1, start value 0xFF (ETG.2010)."""
+    crc = 0xFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ (0x07 if crc & 0x80 else 0)) & 0xFF
+    return crc
+
+
+def build_sii(device: Device, layout: SyncManagerLayout, alias: int) -> bytes:
+    """Return the whole EEPROM image of `device`, a power of two of bytes; words are little endian.
+
+    The PDO categories and the lengths of SM2 and SM3 are those of the PDO assignment at the time of the call.
+    `alias` is the configured station alias.
+
+    Raises:
+        SdoAbort: the device's PDO objects name objects that do not exist or may not be mapped.
+        ValueError: its process data are longer than a sync manager's buffer.
+    """
+    categories = b"".join(_category(number, content) for number, content in _contents(device, layout))
+    body = categories + struct.pack("<H", _END)
+    kbit = _SMALLEST_KBIT
+    while kbit * 128 < _CATEGORIES_AT + len(body):
+        kbit *= 2
+    image = _head(device, layout, alias, kbit) + body
+    return image.ljust(kbit * 128, _ERASED)
+
+
+def _head(device: Device, layout: SyncManagerLayout, alias: int, kbit: int) -> bytes:
+    """Return words 0 to 0x3F: configuration, identity, mailboxes, size and version (ETG.1000.6, table 16)."""
+    configuration = _CONFIG.pack(_CONTROL, 0, _SYNC_PULSE, 0, alias)
+    identity = device.identity
+    receive, send = layout.mailbox_receive, layout.mailbox_send
+    # The bootstrap mailboxes are 0: there is no BOOT state without FoE.
+    head = (
+        configuration
+        + struct.pack("<H", crc8(configuration))
+        + _IDENTITY.pack(identity.vendor_id, identity.product_code, identity.revision, identity.serial)
+        + _MAILBOXES.pack(0, 0, 0, 0, receive.start, receive.length, send.start, send.length, _COE)
+    )
+    return head.ljust(_CATEGORIES_AT - 4, b"\0") + struct.pack("<HH", kbit - 1, _VERSION)
+
+
+def _category(number: Category, content: bytes) -> bytes:
+    """Return a category with its header; its length counts words."""
+    content += bytes(len(content) % 2)
+    return struct.pack("<HH", number, len(content) // 2) + content
+
+
+def _contents(device: Device, layout: SyncManagerLayout) -> Iterable[tuple[Category, bytes]]:
+    """Return the categories in order; those of a device without PDOs of a direction or without DC are left out."""
+    strings = _Strings()
+    # SOEM and others take string 1 as the name.
+    strings.number(device.identity.name)
+    later: list[tuple[Category, bytes]] = [
+        (Category.GENERAL, _general(device, strings)),
+        (Category.FMMU, bytes((*_FMMUS, 0xFF))),
+        (Category.SYNC_MANAGER, b"".join(_sync_manager(device.objects, sm) for sm in layout.all)),
+    ]
+    for category, mappings, assignment in (
+        (Category.TXPDO, TX_MAPPINGS, TX_ASSIGN),
+        (Category.RXPDO, RX_MAPPINGS, RX_ASSIGN),
+    ):
+        pdos = _pdos(device.objects, mappings, assignment, strings)
+        if pdos:
+            later.append((category, pdos))
+    if device.supports_dc:
+        later.append((Category.DC, _dc(strings)))
+    return [(Category.STRINGS, strings.content()), *later]
+
+
+def _general(device: Device, strings: _Strings) -> bytes:
+    """Return the category General (ETG.1000.6, table 21)."""
+    group = strings.number(device.identity.group)
+    order = strings.number(device.identity.order_code)
+    name = strings.number(device.identity.name)
+    # Group, image, order, name; CoE, FoE, EoE, SoE and DS402 details; flags; Ebus current; ports; identity address.
+    return _GENERAL.pack(group, 0, order, name, _coe_details(device.objects), 0, 0, 0, 0, 0, 0, _PORTS, 0)
+
+
+def _coe_details(objects: ObjectDictionary) -> CoeDetail:
+    """Return what the device can do over CoE; its PDOs can be assigned and configured where they can be written."""
+    details = _COE_DETAILS
+    if any(objects[index, 0].access & Access.WO for index in (RX_ASSIGN, TX_ASSIGN)):
+        details |= CoeDetail.PDO_ASSIGN
+    for found in objects:
+        if (found.index in RX_MAPPINGS or found.index in TX_MAPPINGS) and found.entries[0].access & Access.WO:
+            details |= CoeDetail.PDO_CONFIGURATION
+    return details
+
+
+def _sync_manager(objects: ObjectDictionary, sm: SyncManager) -> bytes:
+    """Return one sync manager (ETG.1000.6, table 24), the length of process data by the assignment."""
+    assignment = {SyncManagerType.OUTPUTS: RX_ASSIGN, SyncManagerType.INPUTS: TX_ASSIGN}.get(sm.type)
+    length = sm.length if assignment is None else PdoImage.from_assignment(objects, assignment).byte_length
+    return _SYNC_MANAGER.pack(sm.start, length, sm.control, 0, sm.activate, sm.type)
+
+
+def _pdos(objects: ObjectDictionary, mappings: range, assignment: int, strings: _Strings) -> bytes:
+    """Return the PDOs of one direction, by their mapping objects (ETG.1000.6, table 25)."""
+    assigned = listed(objects, assignment)
+    content = b""
+    for found in objects:
+        if found.index not in mappings:
+            continue
+        mapped = listed(objects, found.index)
+        # 0x1C10 + n assigns the PDOs of sync manager n.
+        sync_manager = assignment - 0x1C10 if found.index in assigned else _NOT_ASSIGNED
+        content += _PDO.pack(found.index, len(mapped), sync_manager, 0, strings.number(found.name), 0)
+        for mapping in mapped:
+            index, subindex, bits = split_mapping(mapping)
+            name, data_type = 0, 0
+            if index:
+                entry = objects[index, subindex]
+                name, data_type = strings.number(entry.name), int(entry.data_type)
+            content += _PDO_ENTRY.pack(index, subindex, name, data_type, bits, 0)
+    return content
+
+
+def _dc(strings: _Strings) -> bytes:
+    """Return the operation modes with SYNC0 and without it (ETG.2010, table 15); the master chooses the cycle."""
+    synchron = _DC_MODE.pack(0, 0, 0, 0, _DC_SYNC0, 1, strings.number("DC Synchron"), 0)
+    free = _DC_MODE.pack(0, 0, 0, 0, 0, 0, strings.number("SM Synchron"), 0)
+    return synchron + free

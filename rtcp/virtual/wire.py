@@ -1,0 +1,236 @@
+"""What a chain of slaves makes of a frame: datagrams, addressing, working counters (ETG.1000.4, clause 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rtcp.virtual.frame import (
+    COUNTER,
+    DATAGRAM_HEADER,
+    FIRST_DATAGRAM,
+    HEADER,
+    LENGTH_MASK,
+    LOCAL_BIT,
+    MORE_FOLLOWS,
+    TYPE_DATAGRAMS,
+    Command,
+)
+from rtcp.virtual.logical import Plan, compile_plan, transfer
+from rtcp.virtual.registers import Register
+from rtcp.virtual.slave import Slave
+from rtcp.virtual.syncmanager import SyncManager
+
+_AUTO = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
+_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
+_BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
+_FIRST_LOGICAL, _LAST_LOGICAL = int(Command.LRD), int(Command.LRW)
+_MULTIPLE_WRITE = frozenset((Command.ARMW, Command.FRMW))
+_TIME_LENGTHS = (4, 8)
+_TIME_64 = (1 << 64) - 1
+_READS = frozenset((Command.APRD, Command.APRW, Command.FPRD, Command.FPRW, Command.BRD, Command.BRW))
+_WRITES = frozenset((Command.APWR, Command.APRW, Command.FPWR, Command.FPRW, Command.BWR, Command.BRW))
+_READ_WRITES = frozenset((Command.APRW, Command.FPRW, Command.BRW))
+
+
+class Wire:
+    """Answers frames in place. What frames ask of clocks and firmware is noted for `Segment.settle`."""
+
+    def __init__(self, slaves: Sequence[Slave]) -> None:
+        self.slaves = tuple(slaves)
+        self._escs = tuple(slave.esc for slave in slaves)
+        self._plans: dict[tuple[int, int, int], Plan] = {}
+        self._places: dict[SyncManager, int] = {}
+        self._outputs = bytearray()
+        self._inputs = bytearray()
+        self._event = 0
+        self._stations: dict[int, tuple[Slave, ...]] = {}
+        self._orders: dict[tuple[int, int, bool], list[tuple[list[Slave], Slave | None]]] = {}
+        self.references: list[tuple[list[Slave], int, int]] = []
+        """Clocks to steer: the slaves, the time they got (32 bits), the frame's arrival at the first slave."""
+        self.done: list[Plan] = []
+        """Logical datagrams that completed buffers of outputs, or may have done so."""
+        for esc in self._escs:
+            esc.on_layout = self._plans.clear
+            esc.on_address = self._forget_addresses
+            esc.on_event = self._collect_events
+
+    def _forget_addresses(self) -> None:
+        self._stations.clear()
+        self._orders.clear()
+
+    def _collect_events(self) -> None:
+        self._event = 0
+        for esc in self._escs:
+            self._event |= esc.event
+
+    def process(self, frame: bytearray, size: int, t: int) -> bool:
+        """Answer in place the frame of `size` bytes that arrived at `t`; False if it is no EtherCAT frame of datagrams.
+
+        A datagram that does not fit the frame ends the work: it and what follows go back as they came.
+        """
+        if size < FIRST_DATAGRAM or frame[12] != 0x88 or frame[13] != 0xA4:
+            return False
+        header = frame[14] | frame[15] << 8
+        end = FIRST_DATAGRAM + (header & LENGTH_MASK)
+        if header >> 12 != TYPE_DATAGRAMS or end > size:
+            return False
+        frame[6] |= LOCAL_BIT
+        at = FIRST_DATAGRAM
+        while at + DATAGRAM_HEADER + COUNTER <= end:
+            command, _, address, offset, flags, event = HEADER.unpack_from(frame, at)
+            length = flags & LENGTH_MASK
+            data = at + DATAGRAM_HEADER
+            behind = data + length
+            if behind + COUNTER > end:
+                break
+            if _FIRST_LOGICAL <= command <= _LAST_LOGICAL:
+                count = self._logical(frame, command, address | offset << 16, data, length, t)
+            elif command in _MULTIPLE_WRITE:
+                count = self._multiple(frame, command, at, address, offset, length, t)
+            else:
+                count = self._physical(frame, command, at, address, offset, length, t)
+            if count:
+                count += frame[behind] | frame[behind + 1] << 8
+                frame[behind] = count & 0xFF
+                frame[behind + 1] = count >> 8 & 0xFF
+            if self._event:
+                event |= self._event
+                frame[at + 8] = event & 0xFF
+                frame[at + 9] = event >> 8
+            if not flags & MORE_FOLLOWS:
+                break
+            at = behind + COUNTER
+        return True
+
+    def _logical(self, frame: bytearray, command: int, address: int, data: int, length: int, t: int) -> int:
+        plan = self._plans.get((command, address, length))
+        if plan is None:
+            plan = self._make_plan(command, address, length)
+        image = self._outputs
+        for at, place, size in plan.outputs:
+            image[place : place + size] = frame[data + at : data + at + size]
+        image = self._inputs
+        for at, place, size in plan.inputs:
+            frame[data + at : data + at + size] = image[place : place + size]
+        if plan.written or plan.others:
+            self.done.append(plan)
+        count = plan.counter
+        if plan.others:
+            content = frame[data : data + length]
+            for esc in plan.others:
+                count += transfer(esc, command, address, content, t)
+            frame[data : data + length] = content
+        return count
+
+    def _make_plan(self, command: int, address: int, length: int) -> Plan:
+        if not self._plans:
+            self._lay_out_images()
+        plan = compile_plan(self._escs, self._places, command, address, length)
+        self._plans[command, address, length] = plan
+        return plan
+
+    def _lay_out_images(self) -> None:
+        """Put all buffers of a direction, in the order of the wire, into one image, so that neighbours are one copy."""
+        images = {True: bytearray(), False: bytearray()}
+        self._places = {}
+        buffered = [m for esc in self._escs for m in esc.sync_managers if m.enabled and not m.mailbox]
+        for manager in buffered:
+            image = images[manager.master_writes]
+            self._places[manager] = len(image)
+            image += manager.buffer
+        for manager in buffered:
+            place = self._places[manager]
+            manager.buffer = memoryview(images[manager.master_writes])[place : place + manager.length]
+        self._outputs, self._inputs = images[True], images[False]
+
+    def _physical(self, frame: bytearray, command: int, at: int, address: int, offset: int, length: int,
+                  t: int) -> int:  # fmt: skip
+        """Handle a datagram by position, station or broadcast; return what it adds to the working counter."""
+        if command in _AUTO or command in _BROADCAST:
+            self._pass_position(frame, at, address)
+        data = at + DATAGRAM_HEADER
+        end = data + length
+        count = 0
+        write_weight = 2 if command in _READ_WRITES else 1
+        for slave in self._addressed(command, address):
+            incoming = bytes(frame[data:end])
+            here = t + slave.delay
+            if command in _READS:
+                content = slave.esc.read(offset, length, here)
+                if content is not None:
+                    count += 1
+                    if command in _BROADCAST:
+                        both = int.from_bytes(content, "little") | int.from_bytes(incoming, "little")
+                        content = both.to_bytes(length, "little")
+                    frame[data:end] = content
+            if command in _WRITES and slave.esc.write(offset, incoming, here):
+                count += write_weight
+        return count
+
+    def _pass_position(self, frame: bytearray, at: int, address: int) -> None:
+        """Every slave adds one to the position in the datagram."""
+        after = address + len(self.slaves)
+        frame[at + 2], frame[at + 3] = after & 0xFF, after >> 8 & 0xFF
+
+    def _addressed(self, command: int, address: int) -> Sequence[Slave]:
+        """The slaves that a datagram by position, station or broadcast means."""
+        if command in _BROADCAST:
+            return self.slaves
+        if command in _AUTO:
+            position = -address & 0xFFFF
+            return self.slaves[position : position + 1]
+        if command in _STATION:
+            found = self._stations.get(address)
+            if found is None:
+                found = tuple(slave for slave in self.slaves if slave.esc.answers_to(address))
+                self._stations[address] = found
+            return found
+        return ()
+
+    def _multiple(self, frame: bytearray, command: int, at: int, address: int, offset: int, length: int,
+                  t: int) -> int:  # fmt: skip
+        """ARMW and FRMW: the addressed slave reads, all others write what the datagram holds when it passes them."""
+        data = at + DATAGRAM_HEADER
+        end = data + length
+        count = 0
+        # The clocks are steered after the answer has left: nothing in it depends on that.
+        steering = offset == Register.DC_SYSTEM_TIME and length in _TIME_LENGTHS
+        for followers, reader in self._order(command, address, steering):
+            if steering:
+                if followers:
+                    self.references.append((followers, int.from_bytes(frame[data : data + 4], "little"), t))
+                    count += len(followers)
+            else:
+                content = bytes(frame[data:end])
+                count += sum(slave.esc.write(offset, content, t + slave.delay) for slave in followers)
+            if reader is None:
+                continue
+            here = t + reader.delay
+            if steering and reader.clock is not None:
+                frame[data:end] = (reader.clock.system(here) & _TIME_64).to_bytes(8, "little")[:length]
+                count += 1
+            elif (read := reader.esc.read(offset, length, here)) is not None:
+                frame[data:end] = read
+                count += 1
+        if command == Command.ARMW:
+            self._pass_position(frame, at, address)
+        return count
+
+    def _order(self, command: int, address: int, steering: bool) -> list[tuple[list[Slave], Slave | None]]:
+        """Who writes and who then reads, group by group along the wire; a slave without clock follows no time."""
+        key = (command, address, steering)
+        groups = self._orders.get(key)
+        if groups is not None:
+            return groups
+        groups = []
+        writers: list[Slave] = []
+        readers = self._addressed(command, address)
+        for slave in self.slaves:
+            if slave in readers:
+                groups.append((writers, slave))
+                writers = []
+            elif slave.clock is not None or not steering:
+                writers.append(slave)
+        groups.append((writers, None))
+        self._orders[key] = groups
+        return groups

@@ -1,0 +1,75 @@
+"""The command line as a whole."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from rtcp import __version__
+
+COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "mode", "move", "output", "scan", "sdo",
+            "segment", "demo")  # fmt: skip
+
+
+@pytest.mark.parametrize("option", ["-h", "--help"])
+def test_both_help_options_list_the_commands(rtcp: Callable[..., Any], option: str) -> None:
+    ended = rtcp(option)
+    assert ended.code == 0
+    assert all(command in ended.out for command in COMMANDS)
+    assert "4 not running" in " ".join(ended.out.split())
+
+
+def test_without_a_command_there_is_help(rtcp: Callable[..., Any]) -> None:
+    ended = rtcp()
+    assert ended.code == 0
+    assert "status" in ended.out
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("option", ["-h", "--help"])
+def test_every_command_has_help(rtcp: Callable[..., Any], command: str, option: str) -> None:
+    ended = rtcp(command, option)
+    assert (ended.code, ended.err) == (0, "")
+    assert f"rtcp {command}" in ended.out
+
+
+def test_the_version_is_the_packages(rtcp: Callable[..., Any]) -> None:
+    assert rtcp("--version").out == f"rtcp {__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("statu",), ("status", "--jsn"), ("status", "extra"), ("mode",), ("move",), ("output", "x", "on"),
+        ("start", "--mode", "pp"), ("start", "--cycle-us", "-5"), ("start", "--cycle-us", "nan"), ("sdo", "erase"),
+        ("sdo", "write", "1", "0x6060", "1"), ("segment",), ("demo", "--seconds", "0"), ("demo", "--seconds", "nan"),
+    ],
+)  # fmt: skip
+def test_a_mistake_on_the_command_line_is_a_sentence_and_exit_code_2(
+    rtcp: Callable[..., Any], arguments: tuple[str, ...]
+) -> None:
+    ended = rtcp(*arguments)
+    assert ended.code == 2
+    assert ended.out == ""
+    assert ended.trouble
+    assert "Traceback" not in ended.err
+
+
+def test_an_error_that_nobody_foresaw_is_one_line(rtcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(**options: Any) -> None:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("rtcp.cli.app.app", broken)
+    ended = rtcp("status")
+    assert ended.code == 1
+    assert ended.err == "rtcp: internal error: RuntimeError: a bug (RTCP_TRACEBACK=1 shows where)\n"
+
+
+def test_status_loads_nothing_that_starts_slowly() -> None:
+    heavy = ("numpy", "pydantic", "pysoem", "ruckig", "yaml", "pyroute2", "asyncio")
+    program = f"import sys, rtcp.cli.app; print(*[name for name in {heavy!r} if name in sys.modules])"
+    assert subprocess.check_output([sys.executable, "-c", program], text=True).split() == []

@@ -1,0 +1,192 @@
+"""`rtcp enable`, `disable`, `reset`, `mode`, `move`, `output`."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+HOME = ("0", "0", "0", "0", "0", "0")
+
+
+@pytest.mark.parametrize("verb", ["enable", "disable", "reset"])
+def test_a_plain_verb_is_passed_on_and_answered_with_a_sentence(
+    platform: Any, rtcp: Callable[..., Any], verb: str
+) -> None:
+    ended = rtcp(verb)
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.strip()
+    assert platform.asked(verb) == [{}]
+
+
+@pytest.mark.parametrize(
+    ("kind", "code"), [("invalid", 2), ("refused", 3), ("fault", 5), ("timeout", 5), ("internal", 1)]
+)
+def test_each_kind_of_error_has_its_exit_code(platform: Any, rtcp: Callable[..., Any], kind: str, code: int) -> None:
+    platform.refusals["enable"] = (kind, "drive3 stays in SWITCH ON DISABLED")
+    ended = rtcp("enable")
+    assert (ended.code, ended.out) == (code, "")
+    assert ended.err == "rtcp: drive3 stays in SWITCH ON DISABLED\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("enable",), ("disable",), ("reset",), ("mode", "csp"), ("move", *HOME), ("output", "3", "on"), ("stop",)],
+)
+def test_without_a_platform_every_command_exits_with_4(rtcp: Callable[..., Any], arguments: tuple[str, ...]) -> None:
+    ended = rtcp(*arguments)
+    assert ended.code == 4
+    assert "no platform is running" in ended.trouble
+
+
+def test_the_mode_is_passed_on_in_lower_case(platform: Any, rtcp: Callable[..., Any]) -> None:
+    assert rtcp("mode", "CSV").code == 0
+    assert platform.asked("mode") == [{"name": "csv"}]
+
+
+def test_an_output_is_switched_by_number(platform: Any, rtcp: Callable[..., Any]) -> None:
+    assert rtcp("output", "3", "on").code == 0
+    assert rtcp("output", "4", "OFF").code == 0
+    assert platform.asked("output") == [{"number": 3, "value": True}, {"number": 4, "value": False}]
+
+
+def test_a_state_that_is_neither_on_nor_off_is_refused(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("output", "3", "maybe")
+    assert ended.code == 2
+    assert "on or off" in ended.trouble
+    assert platform.asked("output") == []
+
+
+# -- move -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "speed"),
+    [
+        (("0", "-0.5", "1.57", "-.5", "-1e-1", "-2"), None),
+        (("--", "0", "-0.5", "1.57", "-.5", "-1e-1", "-2"), None),
+        (("0", "-0.5", "1.57", "-.5", "-1e-1", "-2", "--speed", "0.2"), 0.2),
+        (("--speed=0.2", "--", "0", "-0.5", "1.57", "-.5", "-1e-1", "-2"), 0.2),
+        (("0", "-0.5", "--speed", "0.2", "1.57", "-.5", "-1e-1", "-2"), 0.2),
+    ],
+)
+def test_negative_numbers_are_taken_as_they_are_written(
+    platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], speed: float | None
+) -> None:
+    assert rtcp("move", *arguments).code == 0
+    assert platform.asked("move") == [{"q": [0.0, -0.5, 1.57, -0.5, -0.1, -2.0], "speed": speed}]
+
+
+def test_a_move_prints_its_progress_and_the_largest_error(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("move", *HOME)
+    assert "moving:  50%" in ended.out
+    assert ended.out.splitlines()[-1] == "there, largest error 0.000420 rad"
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "-nan", "-INF", "1e999"])
+def test_a_position_that_is_not_finite_is_refused_with_its_joint(
+    platform: Any, rtcp: Callable[..., Any], value: str
+) -> None:
+    ended = rtcp("move", "0", "0", value, "0", "0", "0")
+    assert ended.code == 2
+    assert "joint 3" in ended.trouble
+    assert "finite" in ended.trouble
+    assert platform.requests == []
+
+
+def test_all_wrong_positions_are_named_at_once(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("move", "0", "zero", "0", "nan", "-0.5x", "0")
+    assert ended.code == 2
+    assert all(f"joint {joint}" in ended.trouble for joint in (2, 4, 5))
+    assert ended.err.count("\n") == 3
+
+
+@pytest.mark.parametrize("option", ["--sped", "--sped=0.1", "-s", "--spee"])
+def test_a_misspelt_option_among_the_numbers_is_refused(platform: Any, rtcp: Callable[..., Any], option: str) -> None:
+    ended = rtcp("move", *HOME, option, "0.1")
+    assert ended.code == 2
+    assert option.split("=", maxsplit=1)[0] in ended.trouble
+    assert "--speed" in ended.trouble
+    assert platform.requests == []
+
+
+@pytest.mark.parametrize("count", [1, 5, 7])
+def test_a_wrong_number_of_joints_is_refused_with_the_right_one(
+    platform: Any, rtcp: Callable[..., Any], count: int
+) -> None:
+    ended = rtcp("move", *["-0.1"] * count)
+    assert ended.code == 2
+    assert f"{count} positions for an arm of 6 joints" in ended.trouble
+    assert platform.asked("move") == []
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf", "fast"])
+def test_a_speed_that_is_none_is_refused(platform: Any, rtcp: Callable[..., Any], speed: str) -> None:
+    ended = rtcp("move", *HOME, "--speed", speed)
+    assert ended.code == 2
+    assert "--speed" in ended.trouble
+    assert platform.asked("move") == []
+
+
+@pytest.mark.parametrize("help_option", ["-h", "--help"])
+def test_help_is_help_among_the_numbers_too(rtcp: Callable[..., Any], help_option: str) -> None:
+    ended = rtcp("move", "0", "-0.5", help_option)
+    assert ended.code == 0
+    assert "--speed" in ended.out
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_interrupted_move_closes_its_connection_and_says_that_the_arm_stops(
+    platform: Any,
+    rtcp_process: Callable[..., Any],
+    wait_until: Callable[..., None],
+    number: signal.Signals,
+    code: int,
+) -> None:
+    platform.move_steps, platform.step_s = 10_000, 0.01
+    moving = rtcp_process("move", *HOME)
+    assert "moving" in moving.stdout.readline()
+    moving.send_signal(number)
+    _, trouble = moving.communicate()
+    assert moving.returncode == code
+    assert trouble == "rtcp: interrupted: the connection is closed, so the arm comes to a controlled stop\n"
+    wait_until(platform.left_while_moving.is_set)
+
+
+def test_a_platform_that_ends_during_a_move_is_a_fault(platform: Any, rtcp_process: Callable[..., Any]) -> None:
+    platform.move_steps, platform.step_s = 10_000, 0.01
+    moving = rtcp_process("move", *HOME)
+    assert platform.moving.wait(20)
+    platform.end()
+    _, trouble = moving.communicate()
+    assert moving.returncode == 5
+    assert "closed the connection" in trouble
+
+
+def test_a_move_goes_on_when_the_reader_of_its_lines_goes_away(platform: Any, rtcp_process: Callable[..., Any]) -> None:
+    platform.move_steps = 20
+    moving = rtcp_process("move", *HOME)
+    moving.stdout.close()
+    trouble = moving.stderr.read()
+    assert (moving.wait(), trouble) == (0, "")
+    assert not platform.left_while_moving.is_set()
+
+
+def test_on_a_terminal_a_move_draws_a_bar(platform: Any, rtcp_process: Callable[..., Any]) -> None:
+    mine, its = pty.openpty()
+    moving = rtcp_process("move", *HOME, stdout=its, env={**os.environ, "TERM": "xterm", "COLUMNS": "80"})
+    os.close(its)
+    shown = b""
+    try:
+        while chunk := os.read(mine, 4096):
+            shown += chunk
+    except OSError:
+        pass  # EIO: the terminal's last writer has gone
+    os.close(mine)
+    assert moving.wait() == 0
+    assert "━".encode() in shown
+    assert b"there, largest error" in shown

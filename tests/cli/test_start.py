@@ -1,0 +1,69 @@
+"""`rtcp start` and `rtcp stop`, where no bus is needed; the whole way up and down is tested with the platform."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.runtime.session import Processes
+
+
+@pytest.fixture
+def loop(directory: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A process that the runtime directory names as the loop."""
+    program = "import time; time.sleep(600)  # stands for rtcp.runtime.loop_process"
+    process = subprocess.Popen([sys.executable, "-c", program])
+    Processes(loop=process.pid).write(directory)
+    yield process
+    process.kill()
+    process.wait()
+
+
+@pytest.mark.parametrize("detach", [(), ("--detach",)])
+def test_a_configuration_that_is_not_there_is_a_sentence_and_exit_code_2(
+    rtcp: Callable[..., Any], tmp_path: Path, detach: tuple[str, ...]
+) -> None:
+    ended = rtcp("start", "--config", str(tmp_path / "none.yaml"), *detach)
+    assert ended.code == 2
+    assert "none.yaml" in ended.trouble
+    assert "does not exist" in ended.trouble
+
+
+def test_every_mistake_of_a_configuration_has_a_line_of_its_own(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    file = tmp_path / "arm.yaml"
+    file.write_text("name: arm\nslaves: []\njoints: []\n")
+    ended = rtcp("start", "--config", str(file))
+    assert ended.code == 2
+    assert len(ended.err.splitlines()) >= 2
+    assert all(line.startswith("rtcp: ") for line in ended.err.splitlines())
+
+
+def test_a_runtime_directory_that_cannot_be_made_is_named(
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path / "file" / "run"))
+    for arguments in (("start",), ("start", "--detach")):
+        ended = rtcp(*arguments)
+        assert ended.code == 2
+        assert str(tmp_path / "file" / "run") in ended.trouble
+
+
+def test_a_demo_is_refused_while_a_platform_runs(rtcp: Callable[..., Any], loop: subprocess.Popen[bytes]) -> None:
+    ended = rtcp("demo")
+    assert ended.code == 3
+    assert f"loop process {loop.pid}" in ended.trouble
+    assert loop.poll() is None
+
+
+def test_stop_ends_a_loop_that_has_lost_its_gateway(
+    rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
+) -> None:
+    assert rtcp("stop").code == 0
+    assert loop.wait(20) != 0
+    assert rtcp("stop").code == 4

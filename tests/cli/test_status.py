@@ -1,0 +1,86 @@
+"""`rtcp status`."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+
+def test_status_shows_state_joints_slaves_times_and_clocks(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("status")
+    assert ended.code == 0
+    for shown in (
+        "HOLDING", "csp on virtual", "every 500 us", "123 456 cycles, 2 missed", "enabled: the arm holds",
+        "joint6", "-1.2346", "+3.0000", "drive6", "105.5", "working counter 21 of 21", "locked, offset -3.2 us",
+        "filtered +0.4 us", "0000 0000 0011 1111", "1000 0000 0000 0001", "FIFO 80, memory locked, CPU 1", "loop 11",
+    ):  # fmt: skip
+        assert shown in ended.out
+
+
+def test_status_fits_eighty_columns_without_colour_in_a_pipe(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status["message"] = "a long sentence about what went wrong with the drive of joint 3 " * 3
+    platform.status["realtime"]["notes"] = ["SCHED_FIFO is refused to this user: allow it by rtprio in limits.conf"] * 2
+    ended = rtcp("status")
+    assert "\x1b" not in ended.out
+    assert max(len(line) for line in ended.out.splitlines()) <= 80
+
+
+def test_square_brackets_in_a_message_are_shown_as_they_are(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status["message"] = "slaves[3].device is [red]wrong[/red]"
+    assert "slaves[3].device is [red]wrong[/red]" in rtcp("status").out
+
+
+def test_the_json_is_the_platforms_own_answer_on_one_line(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("status", "--json")
+    assert ended.code == 0
+    assert ended.out.count("\n") == 1
+    assert json.loads(ended.out) == platform.status
+
+
+def test_a_platform_that_tells_little_is_still_shown(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status = {"state": "starting", "dc": None, "realtime": {}, "pids": {"loop": 11, "segment": None}}
+    ended = rtcp("status")
+    assert ended.code == 0
+    assert "STARTING" in ended.out
+
+
+def test_without_a_platform_status_says_so_and_exits_with_4(rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("status", "--json")
+    assert ended.code == 4
+    assert ended.out == ""
+    assert "no platform is running" in ended.trouble
+    assert "rtcp start" in ended.trouble
+
+
+def test_a_watch_in_json_prints_an_object_a_line_until_ctrl_c(platform: Any, rtcp_process: Callable[..., Any]) -> None:
+    watching = rtcp_process("status", "--json", "--watch")
+    lines = [watching.stdout.readline() for _ in range(3)]
+    watching.send_signal(signal.SIGINT)
+    _, trouble = watching.communicate()
+    assert all(json.loads(line) == platform.status for line in lines)
+    assert (watching.returncode, trouble) == (0, "")
+
+
+def test_a_watch_ends_with_4_when_the_platform_ends(
+    platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    watching = rtcp_process("status", "--watch")
+    wait_until(lambda: len(platform.asked("status")) > 0)
+    platform.end()
+    _, trouble = watching.communicate()
+    assert watching.returncode == 4
+    assert "the platform has ended" in trouble
+
+
+@pytest.mark.parametrize("arguments", [("status", "--json", "--watch"), ("status", "--watch"), ("status",)])
+def test_a_reader_that_goes_away_ends_the_command_quietly(
+    platform: Any, rtcp_process: Callable[..., Any], arguments: tuple[str, ...]
+) -> None:
+    process = rtcp_process(*arguments)
+    process.stdout.close()
+    trouble = process.stderr.read()
+    assert (process.wait(), trouble) == (0, "")

@@ -1,0 +1,39 @@
+"""A copy of the shipped configuration that a test may spoil."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import ConfigError, load
+
+SHIPPED = Path(__file__).resolve().parents[2] / "config"
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The shipped configuration in the working directory, so that sentences show short paths."""
+    shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def problems_after(directory: Path) -> Callable[..., list[str]]:
+    """Put `new` for the first `old` of a file, load the arm's file and return the sentences."""
+
+    def spoil(file: str, *changes: tuple[str, str]) -> list[str]:
+        path = directory / file
+        text = path.read_text()
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new, 1)
+        path.write_text(text)
+        with pytest.raises(ConfigError) as caught:
+            load(Path("assistive_arm.yaml"))
+        return caught.value.problems
+
+    return spoil

@@ -1,0 +1,206 @@
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+
+from rtcp.devices import Cia402Drive, DeviceError, DriveGoal, DriveState
+
+from .conftest import RPDO, TPDO, slave
+
+S = DriveState
+DISABLED, READY, SWITCHED_ON, ENABLED, QUICK_STOP = 0x0250, 0x0231, 0x0233, 0x0237, 0x0217
+FAULT_REACTION, FAULT = 0x021F, 0x0218
+
+
+@pytest.mark.parametrize(
+    ("word", "state"),
+    [
+        (0x0000, S.NOT_READY_TO_SWITCH_ON), (0x0220, S.NOT_READY_TO_SWITCH_ON), (0x0040, S.SWITCH_ON_DISABLED),
+        (DISABLED, S.SWITCH_ON_DISABLED), (0x0060, S.SWITCH_ON_DISABLED), (READY, S.READY_TO_SWITCH_ON),
+        (SWITCHED_ON, S.SWITCHED_ON), (ENABLED, S.OPERATION_ENABLED), (0x1637, S.OPERATION_ENABLED),
+        (QUICK_STOP, S.QUICK_STOP_ACTIVE), (FAULT_REACTION, S.FAULT_REACTION_ACTIVE), (0x023F, S.FAULT_REACTION_ACTIVE),
+        (FAULT, S.FAULT), (0x0238, S.FAULT), (0x0001, S.UNKNOWN), (0x0061, S.UNKNOWN),
+    ],
+)  # fmt: skip
+def test_the_statusword_tells_the_state(drive, wire, word, state):
+    wire.says(word)
+    assert drive.state is state
+
+
+def test_every_state_has_a_controlword_for_every_goal(drive, wire):
+    for word in range(0x80):
+        for goal in DriveGoal:
+            wire.says(word)
+            drive.advance(goal)
+
+
+@pytest.mark.parametrize(
+    ("goal", "steps"),
+    [
+        (DriveGoal.ENABLED, [(DISABLED, 0x06), (READY, 0x07), (SWITCHED_ON, 0x0F), (ENABLED, 0x0F)]),
+        (DriveGoal.DISABLED, [(ENABLED, 0x07), (SWITCHED_ON, 0x06), (READY, 0x00), (DISABLED, 0x00)]),
+        (DriveGoal.RESET, [(FAULT_REACTION, 0x00), (FAULT, 0x80), (DISABLED, 0x00)]),
+        (DriveGoal.ENABLED, [(FAULT, 0x00), (FAULT, 0x00), (FAULT, 0x00)]),
+        (DriveGoal.ENABLED, [(QUICK_STOP, 0x0F), (ENABLED, 0x0F)]),
+    ],
+)
+def test_each_step_is_decided_by_the_state_found(drive, wire, goal, steps):
+    for status, control in steps:
+        wire.says(status)
+        drive.advance(goal)
+        assert wire.hears()[0] == control
+
+
+def test_a_drive_that_stays_where_it_is_gets_the_same_step_again(drive, wire):
+    for _ in range(20):
+        wire.says(READY)
+        assert not drive.advance(DriveGoal.ENABLED)
+        assert wire.hears()[0] == 0x07
+
+
+@pytest.mark.parametrize(
+    ("goal", "status", "reached"),
+    [
+        (DriveGoal.ENABLED, ENABLED, True), (DriveGoal.ENABLED, SWITCHED_ON, False), (DriveGoal.ENABLED, FAULT, False),
+        (DriveGoal.DISABLED, DISABLED, True), (DriveGoal.DISABLED, ENABLED, False), (DriveGoal.DISABLED, FAULT, True),
+        (DriveGoal.DISABLED, QUICK_STOP, False), (DriveGoal.RESET, FAULT, False), (DriveGoal.RESET, DISABLED, True),
+    ],
+)  # fmt: skip
+def test_advance_tells_whether_the_goal_is_reached(drive, wire, goal, status, reached):
+    wire.says(status)
+    assert drive.advance(goal) is reached
+
+
+def test_the_fault_reset_is_repeated_as_an_edge(drive, wire):
+    words = []
+    for _ in range(24):
+        wire.says(FAULT)
+        drive.advance(DriveGoal.RESET)
+        words.append(wire.hears()[0])
+    edges = sum(1 for before, now in zip([0, *words], words, strict=False) if now & 0x80 and not before & 0x80)
+    assert set(words) == {0x00, 0x80}
+    assert edges == 4
+
+
+def test_the_target_follows_the_position_until_the_drive_is_enabled(drive, wire):
+    for status, position in ((DISABLED, 100), (READY, 200), (SWITCHED_ON, 300)):
+        wire.says(status, position)
+        assert wire.hears()[1] == position
+        drive.advance(DriveGoal.ENABLED)
+
+
+def test_the_target_is_latched_once_on_the_step_to_operation_enabled(drive, wire):
+    wire.says(SWITCHED_ON, 12345)
+    drive.advance(DriveGoal.ENABLED)
+    sent = [wire.hears()[1]]
+    # The arm sags by a count a cycle: a target that were copied would sag with it.
+    for position in range(12344, 12300, -1):
+        wire.says(SWITCHED_ON if position > 12340 else ENABLED, position)
+        drive.advance(DriveGoal.ENABLED)
+        sent.append(wire.hears()[1])
+    assert set(sent) == {12345}
+
+
+def test_the_target_is_latched_anew_after_a_fault_reset(drive, wire):
+    for status, position, goal in (
+        (SWITCHED_ON, 1000, DriveGoal.ENABLED), (ENABLED, 1000, DriveGoal.ENABLED), (FAULT, 4000, DriveGoal.ENABLED),
+        (FAULT, 5000, DriveGoal.RESET), (DISABLED, 6000, DriveGoal.ENABLED), (READY, 7000, DriveGoal.ENABLED),
+        (SWITCHED_ON, 8000, DriveGoal.ENABLED), (ENABLED, 8001, DriveGoal.ENABLED),
+    ):  # fmt: skip
+        wire.says(status, position)
+        drive.advance(goal)
+    assert wire.hears()[:2] == (0x0F, 8000)
+
+
+def test_the_target_is_latched_anew_when_the_drive_left_the_enabled_state_on_its_own(drive, wire):
+    for status, position in ((SWITCHED_ON, 1000), (ENABLED, 1000), (SWITCHED_ON, 9000), (ENABLED, 9001)):
+        wire.says(status, position)
+        drive.advance(DriveGoal.ENABLED)
+    assert wire.hears()[1] == 9000
+
+
+def test_latching_forgets_a_velocity_and_a_torque_of_before(drive, wire):
+    drive.target_velocity, drive.target_torque = 1.0, 5.0
+    wire.says(SWITCHED_ON)
+    drive.advance(DriveGoal.ENABLED)
+    assert (drive.target_velocity, drive.target_torque) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "velocity", "torque"), [(8, 5000, 0), (9, 2500, 0), (10, 0, 12_0000), (1, 0, 0), (0, 0, 0)]
+)
+def test_each_mode_sends_its_own_fields(drive, wire, mode, velocity, torque):
+    drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
+    wire.says(ENABLED, mode=mode)
+    assert wire.hears()[2:] == (velocity, torque, mode)
+
+
+@pytest.mark.parametrize("commanded", [8, 9, 10])
+@pytest.mark.parametrize("displayed", [0, 1, 3, 6, 8, 9, 10])
+def test_no_speed_and_no_torque_is_sent_to_a_drive_in_another_mode(drive, wire, commanded, displayed):
+    drive.mode, drive.target_velocity, drive.target_torque = commanded, 0.25, 12.0
+    wire.says(ENABLED, mode=displayed)
+    _, _, velocity, torque, mode = wire.hears()
+    assert mode == commanded
+    assert (velocity or torque) == 0 or commanded == displayed
+
+
+@pytest.mark.parametrize("status", [DISABLED, READY, SWITCHED_ON, QUICK_STOP, FAULT])
+def test_no_speed_and_no_torque_is_sent_to_a_drive_that_is_not_enabled(drive, wire, status):
+    for mode in (8, 9, 10):
+        drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
+        wire.says(status, mode=mode)
+        assert wire.hears()[2:4] == (0, 0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_target_that_is_no_number_leaves_what_was_sent(drive, wire, bad):
+    wire.says(SWITCHED_ON, 700)
+    drive.advance(DriveGoal.ENABLED)
+    drive.mode = 9
+    wire.says(ENABLED, mode=9)
+    drive.advance(DriveGoal.ENABLED)
+    drive.target_velocity = 0.1
+    assert wire.hears()[1:3] == (700, 1000)
+    drive.target_position = drive.target_velocity = bad
+    assert wire.hears()[1:3] == (700, 1000)
+
+
+@pytest.mark.parametrize(("target", "counts"), [(1e9, 2**31 - 1), (-1e9, -(2**31)), (214748.3647, 2**31 - 1)])
+def test_a_target_out_of_the_field_is_cut_to_it(drive, wire, target, counts):
+    wire.says(ENABLED)
+    drive.target_position = target
+    assert wire.hears()[1] == counts
+
+
+def test_values_are_in_si_units(drive, wire):
+    wire.says(ENABLED, 12345, -678, 90)
+    assert (drive.position, drive.velocity, drive.torque) == pytest.approx((1.2345, -0.0678, 0.009))
+
+
+def test_widths_and_order_are_those_of_the_description():
+    tpdo = (("torque", 0x6077, "int16", 0.1), TPDO[0], ("error_code", 0x603F, "uint16", 1.0), *TPDO[1:3], TPDO[4])
+    rpdo = (RPDO[4], ("target_torque", 0x6071, "int16", 0.1), *RPDO[:3], ("offset", 0x60B1, "int32", 1.0))
+    drive = Cia402Drive(slave(rpdo, tpdo))
+    drive.decode(struct.pack("<hHHiib", -5, ENABLED, 0x8611, 20000, 1, 10))
+    assert (drive.torque, drive.error_code, drive.position) == pytest.approx((-0.5, 0x8611, 2.0))
+    drive.mode, drive.target_torque, drive.target_position, drive.controlword = 10, 3.0, 2.0, 0x0F
+    assert drive.encode() == struct.pack("<bhHiii", 10, 30, 0x0F, 20000, 0, 0)
+
+
+def test_missing_channels_are_all_named_at_the_start():
+    with pytest.raises(DeviceError, match=r"`rpdo` maps no target_torque, modes_of_operation"):
+        Cia402Drive(slave(rpdo=RPDO[:3]))
+    with pytest.raises(DeviceError, match=r"`tpdo` maps no modes_of_operation_display"):
+        Cia402Drive(slave(tpdo=TPDO[:4]))
+
+
+def test_a_stuck_drive_is_told_with_state_statusword_and_error(drive, wire):
+    wire.says(READY)
+    drive.advance(DriveGoal.ENABLED)
+    drive.error_code = 0x3220
+    sentence = drive.stuck_sentence(DriveGoal.ENABLED, 3.0)
+    for part in ("joint1", "3 s", "ready to switch on", "0x0231", "0x0007", "0x3220", "under-voltage"):
+        assert part in sentence

@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.devices import DeviceError, IoBox
+
+OUTPUTS = (PdoEntry(0x7000, 1, "uint16", "outputs"),)
+INPUTS = (PdoEntry(0x6000, 1, "uint16", "inputs"), PdoEntry(0x6010, 1, "int32", "counter"))
+
+
+def make_box(outputs=OUTPUTS, inputs=INPUTS) -> IoBox:
+    device = DeviceDescription("a box", "io", 1, 2, (Pdo(0x1600, outputs),), (Pdo(0x1A00, inputs),))
+    return IoBox(SlaveConfig("io", device))
+
+
+def test_inputs_and_counter_are_decoded():
+    box = make_box()
+    box.decode(struct.pack("<Hi", 0xFF3E, -70000))
+    assert (box.inputs, box.counter) == (0xFF3E, -70000)
+
+
+def test_each_output_is_a_bit():
+    box = make_box()
+    for number in (1, 16, 3):
+        box.set_output(number, True)
+    box.set_output(3, False)
+    assert box.encode() == b"\x01\x80"
+
+
+def test_outputs_between_other_channels_stand_at_their_place():
+    padding = (PdoEntry(0, 0, "uint8", "gap"),)
+    box = make_box(outputs=padding + OUTPUTS + padding)
+    box.outputs = 0x1234
+    assert box.encode() == b"\x00\x34\x12\x00"
+    assert len(box.encode()) == box.output_bytes
+
+
+@pytest.mark.parametrize("number", [0, 17, -1])
+def test_an_output_that_does_not_exist_is_refused_with_the_range(number):
+    with pytest.raises(DeviceError, match="it has 1 to 16"):
+        make_box().set_output(number, True)
+
+
+def test_a_box_without_counter_is_refused():
+    with pytest.raises(DeviceError, match="`tpdo` maps no counter"):
+        make_box(inputs=INPUTS[:1])
+
+
+def test_inputs_as_single_bits_are_refused():
+    with pytest.raises(DeviceError, match="channel inputs is bool"):
+        make_box(inputs=(PdoEntry(0x6000, 1, "bool", "inputs"), INPUTS[1]))

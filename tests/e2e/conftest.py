@@ -1,0 +1,153 @@
+"""A whole platform on its virtual segment: real processes, a real socket, real frames."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).parent
+WIRE = HERE / "wire.py"
+
+
+class Platform:
+    """One runtime directory and the commands that a user would type in it."""
+
+    def __init__(self) -> None:
+        # Short, and in memory: a control socket's path has 107 bytes at most.
+        self.directory = Path(tempfile.mkdtemp(prefix="rtcp-e2e-", dir="/tmp"))
+        self.environment = {**os.environ, "RTCP_RUNTIME_DIR": str(self.directory), "COLUMNS": "100"}
+
+    def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
+        """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""
+        done = subprocess.run(
+            [sys.executable, "-m", "rtcp.cli", *arguments],
+            env=self.environment,
+            text=True,
+            capture_output=True,
+            check=False,
+        )
+        if check is not None:
+            assert done.returncode == check, (
+                f"{arguments} -> {done.returncode}\n{done.stdout}\n{done.stderr}\n{self.logs()}"
+            )
+        assert "Traceback" not in done.stdout + done.stderr, done.stdout + done.stderr
+        return done
+
+    def background(self, *arguments: str) -> subprocess.Popen[str]:
+        """Start `rtcp` with `arguments`."""
+        return subprocess.Popen(
+            [sys.executable, "-m", "rtcp.cli", *arguments],
+            env=self.environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+
+    def status(self) -> dict[str, Any]:
+        """Return `rtcp status --json`."""
+        found: dict[str, Any] = json.loads(self.rtcp("status", "--json").stdout)
+        return found
+
+    def until(self, met: Callable[[dict[str, Any]], bool], what: str, patience_s: float = 20.0) -> dict[str, Any]:
+        """Ask for the status until `met`; the patience only keeps a broken platform from hanging the tests."""
+        end = time.monotonic() + patience_s
+        while True:
+            found = self.status()
+            if met(found):
+                return found
+            assert time.monotonic() < end, f"{what} did not come: {found}\n{self.logs()}"
+            time.sleep(0.05)
+
+    def wire(self, *arguments: str) -> str:
+        """Run the independent look at the wire, in the segment's namespace."""
+        segment = self.pids()["segment"]
+        done = subprocess.run(
+            [sys.executable, str(WIRE), str(segment), *arguments], text=True, capture_output=True, check=True
+        )
+        return done.stdout
+
+    def al_states(self) -> list[int]:
+        """Return the AL status of every slave, read with frames of the tests' own."""
+        return [int(word) for word in json.loads(self.wire("al"))]
+
+    def pids(self) -> dict[str, int]:
+        """Return the process ids that the platform wrote down."""
+        found: dict[str, int] = json.loads((self.directory / "processes.json").read_text())
+        return found
+
+    def logs(self) -> str:
+        """Return what the processes wrote."""
+        return "\n".join(f"== {path.name}\n{path.read_text()[-2000:]}" for path in self.directory.glob("*.log"))
+
+    def end(self) -> None:
+        """Stop whatever runs and remove the directory."""
+        self.rtcp("stop", check=None)
+        shutil.rmtree(self.directory, ignore_errors=True)
+
+
+def lives(pid: int) -> bool:
+    """Whether a process lives and is no zombie."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def gone(pid: int) -> None:
+    """Wait until a process has ended."""
+    end = time.monotonic() + 20
+    while lives(pid):
+        assert time.monotonic() < end, f"process {pid} does not end"
+        time.sleep(0.02)
+
+
+def kill(pid: int, number: signal.Signals = signal.SIGKILL) -> None:
+    """Send a signal to a process and wait for its end."""
+    os.kill(pid, number)
+    gone(pid)
+
+
+@pytest.fixture
+def platform() -> Iterator[Platform]:
+    """A platform that is not started."""
+    made = Platform()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def running(platform: Platform) -> Platform:
+    """A platform of its own, started: for tests that break it."""
+    platform.rtcp("start", "--detach")
+    return platform
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Platform]:
+    """A started platform for the tests of a module that leave it as they found it."""
+    made = Platform()
+    made.rtcp("start", "--detach")
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def enabled(shared: Platform) -> Iterator[Platform]:
+    """The shared platform, in CSP, enabled; disabled afterwards."""
+    if shared.status()["state"] == "fault":
+        shared.rtcp("reset")
+    shared.rtcp("mode", "csp")
+    shared.rtcp("enable")
+    yield shared
+    shared.rtcp("disable", check=None)

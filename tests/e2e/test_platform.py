@@ -1,0 +1,194 @@
+"""INIT to OP, enable, move in every mode, disable: on a real socket between real processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tests.e2e.conftest import WIRE, Platform
+
+Q = ["0.3", "-0.2", "0.4", "-0.1", "0.25", "-0.35"]
+
+
+def distance(status: dict, q: list[str]) -> float:  # type: ignore[type-arg]
+    return max(abs(have - float(want)) for have, want in zip(status["joints"]["position"], q, strict=True))
+
+
+def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> None:
+    status = shared.status()
+    assert status["state"] == "ready"
+    assert [slave["state"] for slave in status["slaves"]] == ["OP"] * 7
+    assert shared.al_states() == [8] * 7
+    assert status["wkc"]["actual"] == status["wkc"]["expected"] == 21
+    assert status["dc"]["locked"]
+    assert status["cycle_ns"] == 500_000
+
+
+def test_the_status_has_every_promised_field(shared: Platform) -> None:
+    status = shared.status()
+    assert {"state", "mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "inputs", "outputs",
+            "wakeup_us", "exchange_us", "compute_us", "dc", "realtime", "pids"} <= set(status)  # fmt: skip
+    assert {"position", "name", "state"} <= set(status["slaves"][0])
+    assert all(len(status["joints"][name]) == 6 for name in ("position", "velocity", "torque", "target"))
+    assert all({"p50", "p99", "max"} <= set(status[name]) for name in ("wakeup_us", "exchange_us", "compute_us"))
+    assert {"locked", "offset_ns"} <= set(status["dc"])
+    assert {"scheduler", "memory_locked", "cpu"} <= set(status["realtime"])
+    assert set(status["pids"]) == {"loop", "gateway", "segment"}
+    assert status["inputs"] & 0xFF == 63
+
+
+def test_the_mapping_that_was_written_is_read_back_over_sdo(shared: Platform) -> None:
+    def read(slave: str, where: str) -> int:
+        answer = json.loads(shared.rtcp("sdo", "read", slave, where, "--type", "uint32", "--json", check=None).stdout)
+        return int(answer["value"])
+
+    def short(slave: str, where: str, kind: str) -> int:
+        printed = shared.rtcp("sdo", "read", slave, where, "--type", kind).stdout
+        return int(printed.split()[0], 0)
+
+    assert short("2", "0x1C12:0", "uint8") == 1
+    assert short("2", "0x1C12:1", "uint16") == 0x1600
+    assert short("2", "0x1C13:1", "uint16") == 0x1A00
+    mapped = [short("2", f"0x1600:{i}", "uint32") for i in range(1, 6)]
+    assert mapped == [0x60400010, 0x607A0020, 0x60FF0020, 0x60710020, 0x60600008]
+    mapped = [short("drive6", f"0x1A00:{i}", "uint32") for i in range(1, 6)]
+    assert mapped == [0x60410010, 0x60640020, 0x606C0020, 0x60770020, 0x60610008]
+
+
+def test_an_sdo_that_the_slave_refuses_is_a_sentence(shared: Platform) -> None:
+    done = shared.rtcp("sdo", "read", "2", "0x5FFF:0", check=3)
+    assert "5FFF" in done.stderr.upper()
+    done = shared.rtcp("sdo", "write", "2", "0x6041:0", "1", "--type", "uint16", check=3)
+    assert "read" in done.stderr
+
+
+@pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
+def test_a_move_ends_within_a_milliradian(enabled: Platform, mode: str) -> None:
+    enabled.rtcp("mode", mode)
+    enabled.rtcp("move", *Q)
+    status = enabled.until(lambda found: distance(found, Q) < 1e-3, f"arrival in {mode}")
+    assert status["mode"] == mode
+    assert status["state"] == "holding"
+    enabled.rtcp("move", "--", *["-0.05"] * 6)
+    enabled.until(lambda found: distance(found, ["-0.05"] * 6) < 1e-3, f"arrival in {mode}")
+
+
+def test_the_arm_holds_between_commands(enabled: Platform) -> None:
+    for mode in ("csp", "csv", "cst"):
+        enabled.rtcp("mode", mode)
+        before = enabled.status()["joints"]["position"]
+        time.sleep(0.5)
+        after = enabled.status()["joints"]["position"]
+        assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 1e-3, mode
+
+
+def test_enabling_does_not_move_the_arm(shared: Platform) -> None:
+    before = shared.status()["joints"]["position"]
+    shared.rtcp("enable")
+    status = shared.status()
+    assert status["state"] == "holding"
+    assert max(abs(a - b) for a, b in zip(before, status["joints"]["position"], strict=True)) < 1e-3
+    assert max(abs(a - b) for a, b in zip(before, status["joints"]["target"], strict=True)) < 1e-3
+    shared.rtcp("disable")
+    assert shared.status()["state"] == "ready"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["move", "9", "0", "0", "0", "0", "0"], 3, "outside its range -3.1 to 3.1 rad (joints[0].position"),
+        (["move", "0", "0", "0", "0", "0", "0", "--speed", "50"], 3, "speed 50 rad/s is not allowed"),
+        (["move", "0", "0", "0"], 2, "6"),
+        (["move", "nan", "0", "0", "0", "0", "0"], None, "nan"),
+        (["mode", "sideways"], None, "csp"),
+    ],
+)
+def test_what_is_not_allowed_is_refused_and_nothing_moves(
+    enabled: Platform, arguments: list[str], code: int | None, said: str
+) -> None:
+    before = enabled.status()["joints"]["target"]
+    done = enabled.rtcp(*arguments, check=code)
+    assert done.returncode in (2, 3)
+    assert said in " ".join(done.stderr.split())
+    assert enabled.status()["joints"]["target"] == before
+
+
+def test_a_move_without_enabling_is_refused(shared: Platform) -> None:
+    done = shared.rtcp("move", *Q, check=3)
+    assert "not possible while ready" in done.stderr
+
+
+def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) -> None:
+    moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+    enabled.until(lambda found: found["state"] == "moving", "motion")
+    done = enabled.rtcp("move", *Q, check=3)
+    assert f"pid {moving.pid}" in done.stderr
+    assert moving.wait() == 0
+    enabled.rtcp("move", *["0"] * 6)
+
+
+def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform) -> None:
+    moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+    enabled.until(lambda found: found["state"] == "moving" and abs(found["joints"]["velocity"][0]) > 0.1, "motion")
+    moving.kill()
+    moving.wait()
+    status = enabled.until(lambda found: found["state"] == "holding", "standstill")
+    assert 0.0 < status["joints"]["position"][0] < 1.4
+    assert any("controlled stop" in sentence for sentence in status["messages"])
+    enabled.rtcp("move", *["0"] * 6)
+
+
+def test_the_control_socket_is_its_owners_alone(shared: Platform) -> None:
+    assert stat.S_IMODE(os.stat(shared.directory).st_mode) == 0o700
+    assert stat.S_IMODE(os.stat(shared.directory / "control.sock").st_mode) == 0o600
+
+
+def test_a_second_start_is_refused(shared: Platform) -> None:
+    assert "running already" in shared.rtcp("start", "--detach", check=3).stderr
+
+
+def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_speed_limit(
+    enabled: Platform, tmp_path: object
+) -> None:
+    from tests.e2e.wire import COUNTS_PER_RAD, outputs
+
+    path = enabled.directory / "frames"
+    segment = enabled.pids()["segment"]
+    sniffer = subprocess.Popen(
+        [sys.executable, str(WIRE), str(segment), "capture", str(path)], stdout=subprocess.PIPE, text=True
+    )
+    assert sniffer.stdout is not None
+    assert sniffer.stdout.readline() == "ready\n"
+    enabled.rtcp("move", *Q)
+    enabled.rtcp("move", "3.2", "0", "0", "0", "0", "0", check=3)
+    enabled.rtcp("move", *["0"] * 6)
+    enabled.rtcp("disable")
+    enabled.rtcp("enable")
+    sniffer.send_signal(signal.SIGTERM)
+    assert sniffer.wait() == 0
+    limits = [(-3.1, 3.1), (-2.0, 2.0), (-2.4, 2.4), (-3.1, 3.1), (-2.0, 2.0), (-3.1, 3.1)]
+    # 0.5 rad/s at 500 us are 2.5 counts a cycle: a step on the wire is at most three.
+    largest = 0.5 * 500e-6 * COUNTS_PER_RAD
+    before: list[int] | None = None
+    seen = moved = 0
+    for _, drives in outputs(path):
+        seen += 1
+        for i, drive in enumerate(drives):
+            low, high = limits[i]
+            assert low * COUNTS_PER_RAD <= drive.position <= high * COUNTS_PER_RAD
+            assert abs(drive.velocity) <= 0.5 * COUNTS_PER_RAD
+            assert drive.torque == 0
+            if before is not None:
+                step = abs(drive.position - before[i])
+                moved += step
+                assert step <= largest + 0.5
+        before = [drive.position for drive in drives]
+    assert seen > 4000
+    assert moved > 2 * 10_000 * sum(abs(float(q)) for q in Q) * 0.99

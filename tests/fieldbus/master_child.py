@@ -1,0 +1,315 @@
+"""The master's side of a test, a process of its own: only a process of one thread may join a user namespace.
+
+Takes a scenario and its arguments as JSON in its first argument, writes what came of it as JSON to standard output.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from rtcp.config.model import Pdo, PdoEntry, SlaveConfig, StartupSdo
+from rtcp.config.schema import load
+from rtcp.devices import Cia402Drive, DriveGoal
+from rtcp.fieldbus import AlState, BusError, SdoAborted
+from rtcp.fieldbus.bus import ProcessData, station_of
+from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.soem import SoemBus
+
+ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
+INTERFACE = "ecat0"
+
+
+def arm(count: int) -> list[SlaveConfig]:
+    return list(load(ARM).slaves[:count])
+
+
+def with_device(config: SlaveConfig, **changes: Any) -> SlaveConfig:
+    return dataclasses.replace(config, device=dataclasses.replace(config.device, **changes))
+
+
+class Cycle:
+    """Exchanges process data on a grid while `beside` runs in a second thread, as the loop and its service do."""
+
+    def __init__(self, data: ProcessData, period_ns: int) -> None:
+        self.data = data
+        self.period_ns = period_ns
+        self.wkcs: list[int] = []
+        self.before: Any = lambda: None
+
+    def once(self) -> int:
+        self.data.send()
+        self.wkcs.append(self.data.receive())
+        self.before()
+        return self.wkcs[-1]
+
+    def run(self, beside: Any) -> Any:
+        result: list[Any] = []
+        thread = threading.Thread(target=lambda: result.append(beside()))
+        thread.start()
+        due = time.monotonic_ns()
+        while thread.is_alive():
+            self.once()
+            due = max(due + self.period_ns, time.monotonic_ns() - self.period_ns)
+            time.sleep(max(due - time.monotonic_ns(), 0) * 1e-9)
+        thread.join()
+        return result[0]
+
+    def for_cycles(self, count: int) -> None:
+        self.run(lambda: time.sleep(count * self.period_ns * 1e-9))
+
+
+def to_op(bus: SoemBus, cycle: Cycle) -> None:
+    refused = cycle.run(lambda: bus.request_state(AlState.OP) or bus.wait_for_state(AlState.OP, 5.0))
+    if refused:
+        raise BusError(*refused)
+
+
+def fresh(cycle: Cycle) -> tuple[int, int]:
+    """Exchange until an answer comes; return the reference clock's time in it and the host's."""
+    for _ in range(2000):
+        if cycle.once() >= 0:
+            break
+        time.sleep(0.001)
+    return cycle.data.dc_time, time.monotonic_ns()
+
+
+def registers_after() -> dict[str, Any]:
+    """Return what the segment's registers say once the bus is closed."""
+    port = RegisterPort(INTERFACE)
+    try:
+        return {"al_status": port.read_all(0x0130, 2).data[:1].hex(), "sync": port.read_all(0x0981, 1).data.hex()}
+    finally:
+        port.close()
+
+
+def scan(bus: SoemBus, count: int) -> Any:
+    return [dataclasses.asdict(info) for info in bus.scan()]
+
+
+def op(bus: SoemBus, count: int, period_ns: int) -> Any:
+    data = bus.configure(arm(count), period_ns)
+    safe_op = [state.words() for state in bus.read_states()]
+    cycle = Cycle(data, period_ns)
+    to_op(bus, cycle)
+    cycle.wkcs.clear()
+    first = fresh(cycle)
+    found = cycle.run(
+        lambda: {
+            "mapping": [
+                bus.sdo_read(2, 0x1600, i).hex() for i in range(bus.sdo_read(2, 0x1600, 0)[0] + 1)
+            ],
+            "assigned": [bus.sdo_read(2, 0x1C12, 0).hex(), bus.sdo_read(2, 0x1C12, 1).hex()],
+            "following_window": int.from_bytes(bus.sdo_read(2, 0x6065, 0), "little"),
+            "watchdog": int.from_bytes(bus.port.read(station_of(2), 0x0420, 2) or b"", "little"),
+            "sync0_cycle_ns": int.from_bytes(bus.port.read(station_of(2), 0x09A0, 4) or b"", "little"),
+            "states": [state.words() for state in bus.read_states()],
+        }
+    )  # fmt: skip
+    last = fresh(cycle)
+    return {
+        **found, "safe_op": safe_op, "notes": bus.notes, "expected_wkc": data.expected_wkc, "wkcs": cycle.wkcs,
+        "dc_passed_ns": last[0] - first[0], "host_passed_ns": last[1] - first[1],
+    }  # fmt: skip
+
+
+def refused(bus: SoemBus, count: int, how: str) -> Any:
+    slaves = arm(count)
+    if how == "swapped":
+        slaves[0], slaves[1] = slaves[1], slaves[0]
+    elif how == "missing":
+        slaves = arm(count + 1)
+    elif how == "surplus":
+        slaves.pop()
+    elif how == "longer":
+        pdo = slaves[0].device.tpdo[0]
+        slaves[0] = with_device(
+            slaves[0], tpdo=(Pdo(pdo.index, (*pdo.channels, PdoEntry(0x6020, 1, "uint16", "more"))),)
+        )  # fmt: skip
+    elif how == "unmappable":
+        slaves[1] = with_device(slaves[1], rpdo=(Pdo(0x1600, (PdoEntry(0x1018, 1, "uint32", "vendor"),)),))
+    elif how == "absent objects":
+        absent = StartupSdo(0x5FFF, 1, "uint16", 7, "no such thing")
+        slaves[1] = with_device(slaves[1], sdo=(absent,))
+        slaves[2] = with_device(slaves[2], sdo=(absent,))
+    elif how == "clock":
+        slaves[1] = with_device(slaves[1], assign_activate=0x0100)
+    bus.configure(slaves, 1_000_000)
+    return None
+
+
+def optional(bus: SoemBus, count: int) -> Any:
+    slaves = arm(count)
+    slaves[1] = with_device(slaves[1], sdo=(StartupSdo(0x5FFF, 1, "uint16", 7, "a luxury", optional=True),))
+    bus.configure(slaves, 1_000_000)
+    return bus.notes
+
+
+def straight_to_op(bus: SoemBus, count: int) -> Any:
+    bus.scan()
+    bus.request_state(AlState.OP, [2])
+    sentences = bus.wait_for_state(AlState.OP, 5.0, [2])
+    bus.acknowledge(2)
+    return {"sentences": sentences, "after": [state.words() for state in bus.read_states()]}
+
+
+def sdo(bus: SoemBus, count: int) -> Any:
+    bus.scan()
+    aborted, absent = "", ""
+    try:
+        bus.sdo_read(2, 0x5FFF, 0)
+    except SdoAborted as error:
+        aborted = f"{error} / {error.code:08X}"
+    try:
+        bus.sdo_read(9, 0x1000, 0)
+    except BusError as error:
+        absent = str(error)
+    bus.sdo_write(2, 0x6065, 0, (1234).to_bytes(4, "little"))
+    return {"name": bus.sdo_read(2, 0x1008, 0).decode(), "kept": bus.sdo_read(2, 0x6065, 0).hex(),
+            "aborted": aborted, "absent": absent}  # fmt: skip
+
+
+def failing(bus: SoemBus, count: int) -> Any:
+    data = bus.configure(arm(count), 1_000_000)
+    to_op(bus, Cycle(data, 1_000_000))
+    raise BusError("something broke in the cycle")
+
+
+def abandoned(bus: SoemBus, count: int) -> Any:
+    data = bus.configure(arm(count), 1_000_000)
+    to_op(bus, Cycle(data, 1_000_000))
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def stopped(bus: SoemBus, count: int, pid: int, period_ns: int) -> Any:
+    """Stop the segment for 50 ms and let the cycle go on; tell how old each answer was, by the reference clock."""
+    data = bus.configure(arm(count), period_ns)
+    cycle = Cycle(data, period_ns)
+    to_op(bus, cycle)
+    rows = []
+    due = time.monotonic_ns()
+    stop, go = 200, 200 + 50_000_000 // period_ns
+    for n in range(go + 300):
+        if n in {stop, go}:
+            os.kill(pid, signal.SIGSTOP if n == stop else signal.SIGCONT)
+        due += period_ns
+        time.sleep(max(due - time.monotonic_ns(), 0) * 1e-9)
+        sent = time.monotonic_ns()
+        wkc = cycle.once()
+        rows.append((wkc, data.dc_time - sent, time.monotonic_ns() - sent, data.dc_time))
+    return {"rows": rows, "stop": stop, "go": go, "stale": data.stale, "missed": data.missed,
+            "expected_wkc": data.expected_wkc}  # fmt: skip
+
+
+def beside(bus: SoemBus, count: int) -> Any:
+    """Registers and SDOs read from a second thread while the cycle runs."""
+    data = bus.configure(arm(count), 2_000_000)
+    cycle = Cycle(data, 2_000_000)
+    to_op(bus, cycle)
+    cycle.wkcs.clear()
+
+    def reads() -> Any:
+        aliases = [bus.port.read(station_of(p), 0x0010, 2) for _ in range(100) for p in range(1, count + 1)]
+        names = [bus.sdo_read(2, 0x1008, 0).decode() for _ in range(20)]
+        return {"stations": sorted({int.from_bytes(a or b"", "little") for a in aliases}), "names": sorted(set(names))}
+
+    return {**cycle.run(reads), "wkcs": sorted(set(cycle.wkcs)), "expected_wkc": data.expected_wkc}
+
+
+def outputs(bus: SoemBus, count: int) -> Any:
+    """Outputs of a wrong length are not taken; nothing spills into the next slave's."""
+    data = bus.configure(arm(count), 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    to_op(bus, cycle)
+    data.set_output(0, b"\x34\x12")
+    data.set_output(0, b"\xff" * 40)
+    data.set_output(0, b"\xff")
+    # A drive's mode of operation is the last byte of its outputs, shown among its inputs.
+    data.set_output(1, bytes(14) + b"\x09")
+    cycle.for_cycles(20)
+    return {"box": bus.sdo_read(1, 0x7000, 1).hex(), "display": data.input(1)[14]}
+
+
+def emergency(bus: SoemBus, count: int) -> Any:
+    """A drive that is enabled loses its outputs: it faults and says so."""
+    slaves = arm(count)
+    data = bus.configure(slaves, 1_000_000)
+    cycle = Cycle(data, 1_000_000)
+    drive = Cia402Drive(slaves[1])
+    steps = []
+
+    def control() -> None:
+        drive.decode(data.input(1))
+        drive.advance(DriveGoal.ENABLED)
+        data.set_output(1, drive.encode())
+        if not steps or steps[-1] != drive.state.value:
+            steps.append(drive.state.value)
+
+    to_op(bus, cycle)
+    cycle.before = control
+    cycle.run(lambda: wait(lambda: steps[-1:] == ["operation enabled"]))
+    found: list[Any] = []
+    wait(lambda: found.extend(bus.emergencies()) or found)
+    return {"steps": steps, "sentences": [message.sentence() for message in found],
+            "states": [state.words() for state in bus.read_states()]}  # fmt: skip
+
+
+def killed(bus: SoemBus, count: int, pid: int) -> Any:
+    """The segment dies for good while the cycle runs."""
+    cycle = Cycle(bus.configure(arm(count), 1_000_000), 1_000_000)
+    to_op(bus, cycle)
+    os.kill(pid, signal.SIGKILL)
+    cycle.for_cycles(30)
+    return {"wkc": cycle.wkcs[-1], "states": cycle.run(lambda: [state.words() for state in bus.read_states()])}
+
+
+def wait(condition: Any, timeout_s: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+
+
+SCENARIOS = {
+    f.__name__: f
+    for f in (
+        scan,
+        op,
+        refused,
+        optional,
+        straight_to_op,
+        sdo,
+        failing,
+        abandoned,
+        stopped,
+        beside,
+        outputs,
+        emergency,
+        killed,
+    )
+}
+
+
+def main() -> None:
+    question = json.loads(sys.argv[1])
+    bus = SoemBus(INTERFACE, question.get("receive_fraction", 0.3), namespace_pid=question["pid"])
+    answer: dict[str, Any] = {}
+    try:
+        with bus:
+            answer["result"] = SCENARIOS[question["scenario"]](bus, question["count"], **question["arguments"])
+    except BusError as error:
+        answer["error"] = error.sentences
+    answer["left"] = bus.notes
+    bus.close()
+    answer["after"] = registers_after()
+    print(json.dumps(answer))
+
+
+if __name__ == "__main__":
+    main()

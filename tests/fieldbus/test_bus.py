@@ -1,0 +1,153 @@
+"""The SOEM bus against a virtual segment: real processes, real sockets, real frames."""
+
+from __future__ import annotations
+
+import pytest
+
+OP_MAPPING = ["05", "10004060", "20007a60", "2000ff60", "20007160", "08006060"]
+INIT, NO_SYNC = "01", "00"
+
+
+def test_seven_slaves_go_from_init_to_op_with_clocks_and_a_mapping_that_reads_back(start_segment):
+    answer = start_segment(7).master("op", receive_fraction=0.5, period_ns=1_000_000)
+    result = answer["result"]
+    assert result["safe_op"] == ["SAFE-OP"] * 7
+    assert result["states"] == ["OP"] * 7
+    assert result["expected_wkc"] == 21
+    assert set(result["wkcs"]) <= {21, -1}
+    assert 21 in result["wkcs"]
+    assert result["mapping"] == OP_MAPPING
+    assert result["assigned"] == ["01", "0016"]
+    assert result["following_window"] == 2000
+    assert result["watchdog"] == 200
+    assert result["sync0_cycle_ns"] == 1_000_000
+    # The reference clock is the first slave's: it drifts by ppm, not by per cent.
+    assert abs(result["dc_passed_ns"] - result["host_passed_ns"]) < 0.1 * result["host_passed_ns"] + 20_000_000
+
+
+def test_close_leaves_the_slaves_in_init_without_sync(segment):
+    answer = segment.master("op", receive_fraction=0.5, period_ns=1_000_000)
+    assert answer["left"] == []
+    assert answer["after"] == {"al_status": INIT, "sync": NO_SYNC}
+
+
+def test_an_error_in_the_cycle_leaves_the_slaves_in_init_too(segment):
+    answer = segment.master("failing")
+    assert answer["error"] == ["something broke in the cycle"]
+    assert answer["after"] == {"al_status": INIT, "sync": NO_SYNC}
+
+
+def test_slaves_left_in_op_with_sync_by_a_killed_master_start_again(segment):
+    assert segment.master("abandoned") == {}
+    assert segment.master("op", receive_fraction=0.5, period_ns=1_000_000)["result"]["states"] == ["OP"] * 3
+
+
+def test_a_scan_tells_identity_states_map_clocks_and_delays(start_segment):
+    found = start_segment(7).master("scan")["result"]
+    assert [slave["name"] for slave in found] == ["DIEWU 16DI16DO"] + ["Cubemars ORH70"] * 3 + [
+        "Cubemars ORH60", "Cubemars ORH50", "Cubemars ORH40"]  # fmt: skip
+    assert [slave["station"] for slave in found] == list(range(0x1001, 0x1008))
+    assert [slave["delay_ns"] for slave in found] == pytest.approx([0, 820, 1660, 2500, 3320, 4160, 5020], abs=20)
+    assert [slave["parent"] for slave in found] == list(range(7))
+    assert {slave["state"] for slave in found} == {"PRE-OP"}
+    assert [(slave["output_bits"], slave["input_bits"]) for slave in found] == [(16, 48)] + [(120, 120)] * 6
+    drive = found[1]
+    assert (drive["vendor_id"], drive["product_code"], drive["has_coe"], drive["dc"]) == (0xB5C, 0x40201, True, True)
+    first = drive["outputs"][0]["entries"][0]
+    assert (drive["outputs"][0]["index"], first["index"], first["bits"]) == (0x1600, 0x6040, 16)
+    assert first["name"].lower() == "controlword"
+    assert found[-1]["ports"][:2] == ["open", "no link"]
+
+
+@pytest.mark.parametrize(
+    ("how", "parts"),
+    [
+        ("swapped", ["position 1 (drive1)", "expected Cubemars ORH", "found DIEWU", "position 2 (io)"]),
+        ("missing", ["3 slaves answer", "lists 4", "position 4 (drive3)", "found nothing"]),
+        ("surplus", ["3 slaves answer", "lists 2", "position 3", "expected nothing", "found Cubemars"]),
+        ("longer", ["slave 1 (io)", "key `tpdo`", "expected 64 bits", "found 48 bits"]),
+        ("unmappable", ["slave 2 (drive1)", "refused", "0x1600", "abort code 0x060400"]),
+        ("absent objects", ["slave 2 (drive1)", "slave 3 (drive2)", "0x5FFF:1", "0x06020000", "does not exist"]),
+        ("clock", ["slave 2 (drive1)", "`assign_activate` 0x0100", "0x03"]),
+    ],
+)
+def test_what_differs_from_the_configuration_is_refused_in_sentences(segment, how, parts):
+    answer = segment.master("refused", how=how)
+    told = "\n".join(answer["error"])
+    for part in parts:
+        assert part in told
+    assert answer["after"]["al_status"] == INIT
+
+
+def test_an_optional_start_up_object_that_is_absent_becomes_a_note(segment):
+    notes = segment.master("optional")["result"]
+    assert any("slave 2 (drive1) has no 0x5FFF:1 (a luxury)" in note for note in notes)
+
+
+def test_a_refused_transition_is_told_with_its_code_in_words_and_can_be_acknowledged(segment):
+    result = segment.master("straight_to_op")["result"]
+    (sentence,) = result["sentences"]
+    for part in ("slave 2 (Cubemars ORH70)", "OP", "PRE-OP + ERROR", "0x0011", "invalid requested state change"):
+        assert part in sentence
+    assert result["after"] == ["PRE-OP"] * 3
+
+
+def test_sdo_access_reads_writes_and_tells_aborts_in_words(segment):
+    result = segment.master("sdo")["result"]
+    assert result["name"].startswith("Cubemars ORH70")
+    assert result["kept"] == "d2040000"
+    assert "slave 2" in result["aborted"]
+    assert "object does not exist / 06020000" in result["aborted"]
+    assert result["absent"] == "there is no slave 9; the bus has slaves 1 to 3"
+
+
+def test_outputs_of_a_wrong_length_are_not_taken(segment):
+    assert segment.master("outputs", receive_fraction=0.5)["result"] == {"box": "3412", "display": 9}
+
+
+def test_registers_and_sdos_read_beside_the_cycle_disturb_neither(segment):
+    result = segment.master("beside", receive_fraction=0.5)["result"]
+    assert result["stations"] == [0x1001, 0x1002, 0x1003]
+    assert result["names"] == ["Cubemars ORH70"]
+    assert set(result["wkcs"]) <= {result["expected_wkc"], -1}
+    assert result["expected_wkc"] in result["wkcs"]
+
+
+def test_a_drive_that_loses_its_outputs_is_told_by_emergency_and_watchdog(segment):
+    result = segment.master("emergency", receive_fraction=0.5)["result"]
+    assert result["steps"][-1] == "operation enabled"
+    assert result["steps"].index("ready to switch on") < result["steps"].index("switched on")
+    assert any("slave 2 (drive1) sent emergency 0x" in sentence for sentence in result["sentences"])
+    assert "SAFE-OP + ERROR (0x001B: sync manager watchdog)" in result["states"][1]
+
+
+def test_no_answer_from_before_a_silence_is_taken_for_a_new_one(start_segment):
+    segment = start_segment(7)
+    period = 500_000
+    result = segment.master("stopped", pid=segment.pid, period_ns=period)["result"]
+    rows, stop, go = result["rows"], result["stop"], result["go"]
+    taken = [(n, lag) for n, (wkc, lag, _, _) in enumerate(rows) if wkc >= 0]
+    lags = sorted(lag for n, lag in taken if n < stop)
+    usual = lags[len(lags) // 2]
+    # SOEM alone takes answers that are a multiple of 16 cycles old, 8 ms here, with a perfect working counter.
+    assert min(lag for _, lag in taken) > usual - 4_000_000
+    assert all(wkc == -1 for wkc, *_ in rows[stop + 1 : go])
+    assert any(n > go for n, _ in taken)
+    assert rows[-1][0] == result["expected_wkc"]
+    assert result["stale"] > 0
+
+
+def test_nothing_is_taken_in_while_the_segment_is_silent(start_segment):
+    segment = start_segment(3)
+    result = segment.master("stopped", pid=segment.pid, period_ns=500_000)["result"]
+    during = result["rows"][result["stop"] + 1 : result["go"]]
+    assert len({dc_time for *_, dc_time in during}) == 1
+    # The cycle's own share of a period: a receive that blocked would take a jiffy or two, 4 to 8 ms, each time.
+    spent = sorted(took for _, _, took, _ in during)
+    assert spent[len(spent) // 2] < 3_000_000
+
+
+def test_a_segment_that_dies_ends_in_no_answer_and_a_note(segment):
+    answer = segment.master("killed", pid=segment.pid)
+    assert answer["result"] == {"wkc": -1, "states": ["no answer"] * 3}
+    assert answer["left"] == ["the slaves on ecat0 could not be brought back to INIT: no frame comes back"]

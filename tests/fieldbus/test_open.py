@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from rtcp.fieldbus import AlState, BusError
+from rtcp.fieldbus.namespace import enter
+from rtcp.fieldbus.soem import SoemBus
+
+
+def test_an_interface_that_does_not_exist_is_told_with_those_that_do():
+    with pytest.raises(BusError, match=r"no network interface nonsense0 .*there are"):
+        SoemBus("nonsense0").open()
+
+
+def test_a_process_that_does_not_exist_has_no_namespace_to_join():
+    with pytest.raises(BusError, match=r"namespace of process 4194999 cannot be opened: .*is the segment running"):
+        enter(4194999)
+
+
+def test_the_namespaces_that_one_is_in_need_no_joining():
+    enter(os.getpid())
+
+
+def test_closing_a_bus_that_was_never_opened_does_nothing():
+    bus = SoemBus("nonsense0")
+    bus.close()
+    bus.close()
+    assert bus.notes == []
+
+
+def test_a_closed_bus_refuses_everything_in_a_sentence():
+    bus = SoemBus("nonsense0")
+    for use in (bus.scan, bus.read_states, bus.emergencies, lambda: bus.request_state(AlState.OP),
+                lambda: bus.acknowledge(1)):  # fmt: skip
+        with pytest.raises(BusError, match="the bus on nonsense0 is not open"):
+            use()
+    with pytest.raises(BusError, match="there is no slave 1"):
+        bus.sdo_read(1, 0x1000, 0)

@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from rtcp.fieldbus.abort import abort_meaning
+from rtcp.fieldbus.alstatus import AlState, code_meaning, refusal, state_name
+from rtcp.fieldbus.emergency import Emergency, error_meaning, parse
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (1, "INIT"), (2, "PRE-OP"), (4, "SAFE-OP"), (8, "OP"), (0x14, "SAFE-OP + ERROR"), (0, "no answer"),
+        (7, "unknown state 7"),
+    ],
+)  # fmt: skip
+def test_al_states_have_names(state, words):
+    assert state_name(state) == words
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (0x001B, "watchdog"), (0x001D, "output configuration"), (0x9001, "specific to the maker"),
+        (0x0999, "not in ETG.1020"),
+    ],
+)  # fmt: skip
+def test_al_status_codes_have_words(code, words):
+    assert words in code_meaning(code)
+
+
+def test_a_refusal_says_who_was_asked_what_was_found_why_and_what_to_do():
+    sentence = refusal("slave 3 (drive2)", AlState.SAFEOP, 0x12, 0x001D)
+    for part in (
+        "slave 3 (drive2)",
+        "SAFE-OP",
+        "PRE-OP + ERROR",
+        "0x001D",
+        "invalid output configuration",
+        "check `rpdo`",
+    ):
+        assert part in sentence
+
+
+def test_a_slave_that_is_gone_is_told_to_be_gone():
+    assert "does not answer" in refusal("slave 3 (drive2)", AlState.OP, 0, 0)
+
+
+@pytest.mark.parametrize(("code", "words"), [(0x06020000, "does not exist"), (0x12345678, "not in the standard")])
+def test_abort_codes_have_words(code, words):
+    assert words in abort_meaning(code)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (0x8611, "following error"), (0x3221, "DC link under-voltage"), (0x73FF, "sensor"),
+        (0xFF17, "specific to the maker"), (0x0000, "error reset"), (0x0007, "not in CiA 402"),
+        (0xB000, "not in CiA 402"),
+    ],
+)  # fmt: skip
+def test_error_codes_have_words_those_unknown_the_words_of_their_class(code, words):
+    assert words in error_meaning(code)
+
+
+def emergency_message(service=1):
+    return struct.pack("<HHB5s", service << 12, 0x8611, 0x21, b"\1\2\3\4\5")
+
+
+def test_an_emergency_message_is_read_out_of_a_mailbox():
+    found = parse(emergency_message(), 4, "drive3")
+    assert found == Emergency(4, "drive3", 0x8611, 0x21, b"\1\2\3\4\5")
+    assert "slave 4 (drive3) sent emergency 0x8611: following error" in found.sentence()
+
+
+@pytest.mark.parametrize("message", [emergency_message(service=3), emergency_message()[:-1], b""])
+def test_what_is_no_emergency_is_not_taken_for_one(message):
+    assert parse(message, 1, "io") is None

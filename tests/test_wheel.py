@@ -1,0 +1,88 @@
+"""A wheel built from this repository and installed elsewhere brings its configuration along."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built from a copy so that the checkout may be read-only."""
+    directory = tmp_path_factory.mktemp("wheel")
+    source = directory / "source"
+    source.mkdir()
+    for name in ("rtcp", "kinematics", "config"):
+        shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(REPOSITORY / name, source)
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(directory), str(source)]
+    if importlib.util.find_spec("hatchling"):
+        command.append("--no-build-isolation")
+    subprocess.run(command, check=True)
+    return next(directory.glob("rtcp-*.whl"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The interpreter of an environment that holds the wheel, with the dependencies of this one."""
+    directory = tmp_path_factory.mktemp("elsewhere")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(directory)], check=True)
+    purelib = subprocess.run(
+        [directory / "bin" / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
+        check=True, capture_output=True, text=True,
+    ).stdout.strip()  # fmt: skip
+    # A path file is processed for its directories only: the editable install of this repository is not taken over.
+    Path(purelib, "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    target = [sys.executable, "-m", "pip", "--python", str(directory / "bin" / "python")]
+    subprocess.run([*target, "install", "--quiet", "--no-deps", "--no-index", str(wheel)], check=True)
+    return directory / "bin" / "python"
+
+
+def run(python: Path, code: str) -> list[str]:
+    environment = {name: value for name, value in os.environ.items() if name not in ("RTCP_CONFIG", "PYTHONPATH")}
+    done = subprocess.run(
+        [python, "-P" if sys.version_info >= (3, 11) else "-E", "-c", code],
+        check=True, capture_output=True, text=True, cwd=python.parent, env=environment,
+    )  # fmt: skip
+    return done.stdout.splitlines()
+
+
+def test_a_wheel_holds_packages_configuration_and_licence(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        names = set(archive.namelist())
+    shipped = {path.relative_to(REPOSITORY / "config") for path in (REPOSITORY / "config").rglob("*.yaml")}
+    assert {f"rtcp/config/default/{path}" for path in shipped} <= names
+    assert {"rtcp/py.typed", "kinematics/py.typed"} <= names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
+
+
+def test_the_default_configuration_loads_from_an_installed_wheel(installed: Path) -> None:
+    code = """
+import rtcp
+from rtcp.config import default_config, load, load_segment, segment_path
+arm = load(default_config())
+print(rtcp.__file__)
+print(arm.source)
+print(len(arm.slaves), len(load_segment(segment_path(arm)).slaves))
+"""
+    package, source, counts = run(installed, code)
+    environment = installed.parents[1]
+    assert Path(package).is_relative_to(environment)
+    assert Path(source).is_relative_to(environment)
+    assert counts == "7 7"
+
+
+def test_the_command_of_an_installed_wheel_starts(installed: Path) -> None:
+    subprocess.run([installed.parent / "rtcp", "--help"], check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)

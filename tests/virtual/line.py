@@ -1,0 +1,181 @@
+"""A segment of tiny devices in simulated time, and the few things a master does to it, with hand-written datagrams."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from rtcp.virtual.device import Emergency, Identity
+from rtcp.virtual.frame import Command, Datagram, build, parse
+from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
+from rtcp.virtual.pdo import define_pdo_objects
+from rtcp.virtual.segment import Segment
+from rtcp.virtual.slave import make_slaves
+
+STATION = 0x1001
+MS = 1_000_000
+INIT, PRE_OP, BOOT, SAFE_OP, OP, ACK, ERROR = 1, 2, 3, 4, 8, 0x10, 0x10
+SM_MAILBOXES = bytes.fromhex("0010 8000 26 00 01 00  8010 8000 22 00 01 00")
+SM_OUTPUTS = bytes.fromhex("0011 0200 64 00 01 00")
+SM_INPUTS = bytes.fromhex("0014 0200 20 00 01 00")
+
+
+class TinyDevice:
+    """Two bytes each way: the input is the output plus one; `sync_limit` adds object 0x10F1:02."""
+
+    def __init__(self, supports_dc: bool = True, sync_limit: int | None = None, fixed: bool = False) -> None:
+        self.identity = Identity(0x0BAD, 0xCAFE, 1, 7, "Tiny", "Tests", "T1")
+        self.objects = ObjectDictionary()
+        self.emergencies: deque[Emergency] = deque()
+        self.supports_dc = supports_dc
+        self.valid: list[bool] = []
+        self.passed = 0.0
+        self.steps = 0
+        word = DataType.UNSIGNED16
+        self.out = Entry(0x7000, 1, "Out", word, 0, Access.RW | Access.RXPDO)
+        self.in_ = Entry(0x6000, 1, "In", word, 0, Access.RO | Access.TXPDO)
+        self.objects.record(0x7000, "Outputs", [self.out])
+        self.objects.record(0x6000, "Inputs", [self.in_])
+        if sync_limit is not None:
+            limit = Entry(0x10F1, 2, "Sync error counter limit", word, sync_limit, Access.RW)
+            self.objects.record(0x10F1, "Error settings", [Entry(0x10F1, 1, "Reaction", word), limit])
+        define_pdo_objects(self.objects, {0x1600: [(0x7000, 1, 16)]}, {0x1A00: [(0x6000, 1, 16)]},
+                           [0x1600], [0x1A00], fixed)  # fmt: skip
+
+    def step(self, dt: float) -> None:
+        self.passed += dt
+        self.steps += 1
+        self.in_.value = (int(self.out.value) + 1) & 0xFFFF
+
+    def set_outputs_valid(self, valid: bool) -> None:
+        self.valid.append(valid)
+        if not valid:
+            self.out.value = 0
+
+
+class Line:
+    """The segment, its devices and the time."""
+
+    def __init__(self, devices: Sequence[TinyDevice] | None = None, drifts: Sequence[float] | None = None,
+                 delays: Sequence[int] | None = None, aliases: Sequence[int] | None = None) -> None:  # fmt: skip
+        self.devices = [TinyDevice() for _ in range(3)] if devices is None else list(devices)
+        count = len(self.devices)
+        self.now = 50 * MS
+        self.slaves = make_slaves(
+            self.devices, drifts or [0.0] * count, delays or [820 * n for n in range(count)], aliases or [0] * count,
+            self.now,
+        )  # fmt: skip
+        self.segment = Segment(self.slaves, self.now)
+
+    def pass_time(self, ns: int) -> None:
+        """Let time pass, with every event at its instant."""
+        until = self.now + ns
+        while self.segment.next_event <= until:
+            self.now = max(self.now, self.segment.next_event)
+            self.segment.tick(self.now)
+            self._step()
+        self.now = until
+
+    def _step(self) -> None:
+        while self.segment.busy:
+            self.segment.step_one()
+
+    def raw(self, frame: bytes) -> bytes | None:
+        """Send a frame as it is; return it as it comes back, None if it does not."""
+        buffer = bytearray(frame)
+        answered = self.segment.process(buffer, len(frame), self.now)
+        self.segment.settle(self.now)
+        self._step()
+        return bytes(buffer) if answered else None
+
+    def send(self, *datagrams: Datagram, after: int = 100_000) -> list[Datagram]:
+        self.pass_time(after)
+        answer = self.raw(build(*datagrams))
+        assert answer is not None
+        return list(parse(answer))
+
+    def one(self, command: Command, address: int, offset: int, data: bytes) -> Datagram:
+        return self.send(Datagram(command, 0, address, offset, data))[0]
+
+    def logical(self, command: Command, address: int, data: bytes) -> Datagram:
+        return self.one(command, address & 0xFFFF, address >> 16, data)
+
+    def read(self, slave: int, offset: int, length: int) -> bytes:
+        """FPRD from slave number `slave`, counted from 0."""
+        answer = self.one(Command.FPRD, STATION + slave, offset, bytes(length))
+        assert answer.counter == 1
+        return answer.data
+
+    def write(self, slave: int, offset: int, data: bytes) -> None:
+        assert self.one(Command.FPWR, STATION + slave, offset, data).counter == 1
+
+    def number(self, slave: int, offset: int, length: int) -> int:
+        return int.from_bytes(self.read(slave, offset, length), "little")
+
+    def request(self, slave: int, state: int) -> tuple[int, int]:
+        """Write AL control, return AL status and AL status code."""
+        self.write(slave, 0x0120, state.to_bytes(2, "little"))
+        return self.al(slave)
+
+    def al(self, slave: int) -> tuple[int, int]:
+        raw = self.read(slave, 0x0130, 6)
+        return int.from_bytes(raw[0:2], "little"), int.from_bytes(raw[4:6], "little")
+
+    def address(self) -> None:
+        for number in range(len(self.devices)):
+            station = (STATION + number).to_bytes(2, "little")
+            assert self.one(Command.APWR, -number & 0xFFFF, 0x0010, station).counter == 1
+
+    def to_pre_op(self) -> None:
+        self.address()
+        for number in range(len(self.devices)):
+            self.write(number, 0x0800, SM_MAILBOXES)
+            assert self.request(number, PRE_OP) == (PRE_OP, 0)
+
+    def configure_process_data(self) -> None:
+        """SM2, SM3 and FMMUs: all outputs from logical 0 on, then all inputs, two bytes a slave."""
+        count = len(self.devices)
+        for number in range(count):
+            self.write(number, 0x0810, SM_OUTPUTS)
+            self.write(number, 0x0818, SM_INPUTS)
+            self.write(number, 0x0600, fmmu(2 * number, 2, 0x1100, write=True))
+            self.write(number, 0x0610, fmmu(2 * count + 2 * number, 2, 0x1400, write=False))
+
+    def to_safe_op(self) -> None:
+        self.to_pre_op()
+        self.configure_process_data()
+        for number in range(len(self.devices)):
+            assert self.request(number, SAFE_OP) == (SAFE_OP, 0)
+
+    def exchange(self, *outputs: int, after: int = MS) -> tuple[list[int], int]:
+        """One LRW with the outputs; return the inputs and the working counter."""
+        count = len(self.devices)
+        values = list(outputs) + [0] * (count - len(outputs))
+        data = b"".join(value.to_bytes(2, "little") for value in values) + bytes(2 * count)
+        answer = self.send(Datagram(Command.LRW, 0, 0, 0, data), after=after)[0]
+        inputs = answer.data[2 * count :]
+        return [int.from_bytes(inputs[2 * n : 2 * n + 2], "little") for n in range(count)], answer.counter
+
+    def to_op(self) -> None:
+        self.to_safe_op()
+        for number in range(len(self.devices)):
+            self.write(number, 0x0120, OP.to_bytes(2, "little"))
+        self.exchange()
+        assert [self.al(number) for number in range(len(self.devices))] == [(OP, 0)] * len(self.devices)
+
+
+def fmmu(logical: int, length: int, physical: int, *, write: bool, start_bit: int = 0, end_bit: int = 7,
+         physical_bit: int = 0) -> bytes:  # fmt: skip
+    """The 16 bytes of an FMMU."""
+    return (
+        logical.to_bytes(4, "little") + length.to_bytes(2, "little") + bytes((start_bit, end_bit))
+        + physical.to_bytes(2, "little") + bytes((physical_bit, 2 if write else 1, 1, 0, 0, 0))
+    )  # fmt: skip
+
+
+def start_sync0(line: Line, slave: int, cycle: int, first_in: int = 10 * MS) -> None:
+    """Start SYNC0 on a slave `first_in` ns from now."""
+    now = line.number(slave, 0x0910, 8)
+    line.write(slave, 0x0990, (now + first_in).to_bytes(8, "little"))
+    line.write(slave, 0x09A0, cycle.to_bytes(4, "little"))
+    line.write(slave, 0x0981, b"\x03")
