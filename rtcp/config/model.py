@@ -133,7 +133,7 @@ class BusConfig:
     """Slaves of the virtual segment; a path relative to the arm's file."""
     receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
     """How long a frame is waited for, as a fraction of the period."""
-    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 20
+    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """So many cycles in a row without a right working counter are a fault."""
     send_phase: Fraction = 0.5
     """Where between two SYNC0 the frame passes the reference slave, as a fraction of the period."""

@@ -124,7 +124,7 @@ class Behaviour:
             arm.hold_target()
             self._fail(Code.GENERATOR)
             return False
-        arm.lead(DriveGoal.ENABLED)
+        # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         arm.command()
         return True
 

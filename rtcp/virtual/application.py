@@ -85,6 +85,7 @@ class Application:
             if self._fed is None:
                 self.esc.memory[Register.WATCHDOG_STATUS] |= 0x01
             self._fed = t
+        self._try_op(t)
 
     def _control(self, request: int, t: int) -> None:
         wanted = request & STATE_MASK

@@ -67,16 +67,23 @@ class Clock:
         local = self._local + passed + whole
         error = (local + self.offset - self.delay - reference + HALF_RANGE) % RANGE_32 - HALF_RANGE
         self.difference = error
-        seconds = min((t - self._last) * 1e-9, LONGEST_STEP)
+        seconds = (t - self._last) * 1e-9
         self._last = t
         if seconds < 0.0:
             return
+        # In the cycle, once a slave: comparisons instead of calls of min and max.
+        if seconds > LONGEST_STEP:
+            seconds = LONGEST_STEP
         limit = seconds * 1e9 * SLEW_LIMIT
-        step = max(-limit, min(limit, error * PROPORTIONAL * seconds))
+        step = error * PROPORTIONAL * seconds
+        if step > limit:
+            step = limit
+        elif step < -limit:
+            step = -limit
         if -INTEGRATED_ERROR_LIMIT < error < INTEGRATED_ERROR_LIMIT:
             rate = self._rate - error * INTEGRAL * seconds * 1e-9
-            natural = self._natural
-            self._rate = max(natural - RATE_LIMIT, min(natural + RATE_LIMIT, rate))
+            if -RATE_LIMIT < rate - self._natural < RATE_LIMIT:
+                self._rate = rate
         fraction = moved - whole - step
         whole = int(fraction)
         self._t = t

@@ -68,7 +68,7 @@ class EepromInterface:
             self._reload()
         elif command:
             self._errors |= COMMAND_ERROR
-        if command in BUSY_NS and not self._errors & COMMAND_ERROR:
+        if command in BUSY_NS and not self._errors & (COMMAND_ERROR | WRITE_ENABLE_ERROR):
             self._busy_until = t + BUSY_NS[command]
         self._store_status()
 

@@ -18,7 +18,7 @@ from types import FrameType
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.virtual.frame import ETHERTYPE
 from rtcp.virtual.models import create
-from rtcp.virtual.network import private_pair, public_pair
+from rtcp.virtual.network import NetworkError, private_pair, public_pair
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import make_slaves
 
@@ -28,6 +28,7 @@ FURTHER_DELAY = 840
 """What every slave after these adds, in ns."""
 PRIORITY = 70
 PR_SET_TIMERSLACK = 29
+MCL_CURRENT, MCL_FUTURE = 1, 2
 SO_TIMESTAMPNS = 35
 TIMESPEC = struct.Struct("@qq")
 ANCILLARY = socket.CMSG_SPACE(TIMESPEC.size)
@@ -35,6 +36,9 @@ BUFFER = 2048
 OLDEST = 1_000_000_000
 """A receive time stamp more than this many ns old, or from the future, means that the wall clock was set: not used."""
 RECEIVE_BUFFER = 1 << 20
+STALE = 4_000_000
+"""A frame that waited this many ns, because the process was stopped, reaches the slaves but does not come back: SOEM
+has 16 frame numbers, would take an answer from the last round for the present one, and stay a round behind for ever."""
 REST_SHARE = 8
 """Polling sleeps for this part of the time between frames, right after one: a FIFO thread that never sleeps would be
 throttled by the kernel for 50 ms in every second (sched_rt_runtime_us)."""
@@ -72,28 +76,34 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     return Segment(make_slaves(devices, drifts, delays, aliases, t), t)
 
 
+class StopRequest:
+    """A handler of signals that remembers that one came."""
+
+    def __init__(self) -> None:
+        self.came = False
+
+    def __call__(self, number: int, at: FrameType | None) -> None:
+        """The signal has come."""
+        self.came = True
+
+
 class Server:
-    """Answers frames on one interface until `stop` is called."""
+    """Answers frames on one interface."""
 
     def __init__(self, segment: Segment, interface: str) -> None:
         self.segment = segment
-        self._running = True
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         self._socket.bind((interface, ETHERTYPE))
 
-    def stop(self) -> None:
-        """Let `serve` return soon."""
-        self._running = False
-
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
-    def serve(self, poll: bool) -> None:
-        """Answer frames until stopped; with `poll` sleep no longer than it takes not to be throttled."""
+    def serve(self, stop: StopRequest, poll: bool) -> None:
+        """Answer frames until `stop` came; with `poll` sleep no longer than it takes not to be throttled."""
         segment = self.segment
         frame = bytearray(BUFFER)
         view = memoryview(frame)
@@ -102,7 +112,7 @@ class Server:
         monotonic, wait = time.monotonic_ns, select.select
         arrived = 0
         awake_from = 0 if poll else FOR_EVER
-        while self._running:
+        while not stop.came:
             try:
                 size, stamps, _, _ = receive([view], ANCILLARY)
             except BlockingIOError:
@@ -110,20 +120,20 @@ class Server:
             if size:
                 before, arrived = arrived, _arrival(stamps)
                 if segment.process(frame, size, arrived):
-                    # A full queue of the interface loses the frame, as a cable would.
-                    with suppress(BlockingIOError):
-                        send(view[:size])
+                    if monotonic() - arrived < STALE:
+                        # A full queue of the interface loses the frame, as a cable would.
+                        with suppress(BlockingIOError):
+                            send(view[:size])
                     segment.settle(arrived)
                 if poll:
                     awake_from = monotonic() + min((arrived - before) // REST_SHARE, LONGEST_REST)
-                continue
-            if segment.busy:
-                segment.step_one()
                 continue
             now = monotonic()
             left = segment.next_event - now
             if left <= 0:
                 segment.tick(now)
+            elif segment.busy:
+                segment.step_one()
             elif now < awake_from:
                 wait(descriptors, (), (), min(left, awake_from - now) * 1e-9)
             elif now - arrived > SILENCE:
@@ -155,9 +165,12 @@ def _run_on(cpu: int) -> None:
 
 def _prefer() -> None:
     """Ask for prompt scheduling; without the right to it the segment runs on as it is."""
-    ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
+    libc = ctypes.CDLL(None)
+    libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     with suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    # Reclaimed pages of the interpreter's own text would cost milliseconds to read back; refused, it does without.
+    libc.mlockall(MCL_CURRENT | MCL_FUTURE)
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -167,8 +180,8 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
     """Run a segment until SIGTERM or SIGINT.
 
     `interface` names the master's end in the caller's network; None: everything in a namespace of the segment's own.
-    `poll` hardly sleeps while frames come, best with a `cpu` of its own. `ready` is called once with "pid", "interface", "namespace" and
-    "slaves" when frames are answered.
+    `poll` hardly sleeps while frames come, best with a `cpu` of its own. `ready` is called once with "pid",
+    "interface", "namespace" and "slaves" when frames are answered.
 
     Raises:
         ConfigError, ValueError, NetworkError: with sentences for the user.
@@ -177,15 +190,12 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
     if cpu is not None:
         _run_on(cpu)
     segment = make_segment(config, time.monotonic_ns())
+    stop = StopRequest()
+    signal.signal(signal.SIGTERM, stop)
+    signal.signal(signal.SIGINT, stop)
     pair = private_pair() if interface is None else public_pair(interface)
     with pair as (master_end, segment_end):
         server = Server(segment, segment_end)
-
-        def stop(number: int, at: FrameType | None) -> None:
-            server.stop()
-
-        signal.signal(signal.SIGTERM, stop)
-        signal.signal(signal.SIGINT, stop)
         _prefer()
         ready({
             "pid": os.getpid(),
@@ -194,6 +204,8 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
             "slaves": len(segment.slaves),
         })  # fmt: skip
         try:
-            server.serve(poll)
+            server.serve(stop, poll)
+        except OSError as error:
+            raise NetworkError(f"the cable at {master_end} is gone ({error.strerror}): was it removed?") from error
         finally:
             server.close()

@@ -79,7 +79,7 @@ IN_THE_ARM = {
         "cycle.priority: found true, allowed is an integer from 1 to 98",
     ),
     "a fraction for an integer": (
-        ("lost_cycles: 20", "lost_cycles: 2.5"),
+        ("lost_cycles: 40", "lost_cycles: 2.5"),
         "bus.lost_cycles: found 2.5, allowed is an integer from 1 to 1000",
     ),
     "no number": (

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+from rtcp.config.find import default_config
+
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
 
@@ -27,6 +29,23 @@ class Platform:
         # Short, and in memory: a control socket's path has 107 bytes at most.
         self.directory = Path(tempfile.mkdtemp(prefix="rtcp-e2e-", dir="/tmp"))
         self.environment = {**os.environ, "RTCP_RUNTIME_DIR": str(self.directory), "COLUMNS": "100"}
+
+    def be_patient(self) -> None:
+        """Use the shipped configuration with room for a host that takes the CPU away for a tenth of a second.
+
+        For tests of what the platform does, not of when it gives up.
+        """
+        mine = self.directory / "config"
+        shutil.copytree(default_config().parent, mine)
+        arm = mine / "assistive_arm.yaml"
+        arm.write_text(
+            arm.read_text().replace("lost_cycles: 40", "lost_cycles: 400").replace("lease_s: 0.5", "lease_s: 3.0")
+        )
+        drive = mine / "devices" / "cubemars-orh.yaml"
+        drive.write_text(
+            drive.read_text().replace("watchdog_ms: 20", "watchdog_ms: 100").replace("value: 120,", "value: 1200,")
+        )
+        self.environment["RTCP_CONFIG"] = str(arm)
 
     def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
         """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""
@@ -137,6 +156,7 @@ def running(platform: Platform) -> Platform:
 def shared() -> Iterator[Platform]:
     """A started platform for the tests of a module that leave it as they found it."""
     made = Platform()
+    made.be_patient()
     made.rtcp("start", "--detach")
     yield made
     made.end()

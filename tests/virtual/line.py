@@ -36,6 +36,8 @@ class TinyDevice:
         self.in_ = Entry(0x6000, 1, "In", word, 0, Access.RO | Access.TXPDO)
         self.objects.record(0x7000, "Outputs", [self.out])
         self.objects.record(0x6000, "Inputs", [self.in_])
+        self.objects.record(0x1018, "Identity", [Entry(0x1018, 1, "Vendor", DataType.UNSIGNED32, 0x0BAD),
+                                                 Entry(0x1018, 2, "Product", DataType.UNSIGNED32, 0xCAFE)])  # fmt: skip
         if sync_limit is not None:
             limit = Entry(0x10F1, 2, "Sync error counter limit", word, sync_limit, Access.RW)
             self.objects.record(0x10F1, "Error settings", [Entry(0x10F1, 1, "Reaction", word), limit])

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from tests.virtual.line import SM_MAILBOXES, STATION, Line, fmmu
 
 from rtcp.virtual.frame import Command, Datagram, build
+from tests.virtual.line import SM_MAILBOXES, STATION, Line, fmmu
 
 USER_RAM = 0x0F80
 TYPE = 0x0000
@@ -13,7 +13,9 @@ TYPE = 0x0000
 
 def frame(hex_datagrams: str, length: int) -> bytes:
     header = "ffffffffffff 010101010101 88a4"
-    return (bytes.fromhex(header) + (length | 0x1000).to_bytes(2, "little") + bytes.fromhex(hex_datagrams)).ljust(60, b"\0")
+    return (bytes.fromhex(header) + (length | 0x1000).to_bytes(2, "little") + bytes.fromhex(hex_datagrams)).ljust(
+        60, b"\0"
+    )
 
 
 @pytest.fixture
@@ -65,9 +67,7 @@ def test_each_command_counts_reads_once_and_writes_as_the_standard_says(
     assert line.one(command, address, USER_RAM, b"\x11\x22").counter == counter
 
 
-@pytest.mark.parametrize(
-    ("command", "counter"), [(Command.LRD, 3), (Command.LWR, 3), (Command.LRW, 9)], ids=lambda value: str(value)
-)
+@pytest.mark.parametrize(("command", "counter"), [(Command.LRD, 3), (Command.LWR, 3), (Command.LRW, 9)], ids=str)
 def test_logical_commands_count_one_for_a_read_and_two_for_a_write_of_an_lrw(
     line: Line, command: Command, counter: int
 ) -> None:

@@ -1,0 +1,208 @@
+"""The segment as a process: a real master over a real cable, namespaces, signals, refusals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CHILD = Path(__file__).with_name("soem_child.py")
+FACTS = [0, 820, 1660, 2500, 3320, 4160, 5020]
+NOBODY = 65534
+needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root may leave an interface in the caller's network")
+
+Segment = tuple["subprocess.Popen[str]", dict[str, Any]]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "segment.yaml"
+    models = ["diewu-io", *["cubemars-orh70"] * 6]
+    drifts = [3.0, -12.0, 17.5, -20.0, 8.0, -5.5, 20.0]
+    lines = [f"  - {{model: {model}, drift_ppm: {drift}}}" for model, drift in zip(models, drifts, strict=True)]
+    path.write_text("slaves:\n" + "\n".join(lines) + "\n", encoding="utf-8")
+    for folder in (tmp_path, *tmp_path.parents[:2]):
+        folder.chmod(folder.stat().st_mode | 0o055)
+    return path
+
+
+def start(config: Path, *options: str, user: int | None = None) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rtcp.virtual", "--config", str(config), *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, user=user, group=user,
+        extra_groups=None if user is None else [],
+    )  # fmt: skip
+
+
+@contextmanager
+def running(config: Path, *options: str, user: int | None = None) -> Iterator[Segment]:
+    segment = start(config, *options, user=user)
+    try:
+        assert segment.stdout is not None
+        line = segment.stdout.readline()
+        assert line, segment.communicate()[1]
+        yield segment, json.loads(line)
+    finally:
+        segment.kill()
+        segment.communicate()
+
+
+def master(pid: str, interface: str, cycles: int, *more: str, user: int | None = None) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, str(CHILD), pid, interface, str(cycles), *more],
+        stdout=subprocess.PIPE, text=True, check=True, timeout=60, user=user, group=user,
+        extra_groups=None if user is None else [],
+    )  # fmt: skip
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+def interfaces() -> set[str]:
+    return {name for _, name in socket.if_nameindex()}
+
+
+def wait_until_gone(name: str) -> bool:
+    for _ in range(100):
+        if name not in interfaces():
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def assert_all_in_op(result: dict[str, Any]) -> None:
+    assert result["found"] == 7
+    assert result["delays"] == FACTS
+    assert result["safe_op"] == 4
+    assert result["sizes"] == [[2, 6], *[[15, 15]] * 6]
+    assert (result["state"], result["codes"]) == (8, [0] * 7)
+    assert result["expected"] == 21
+    # A frame that this machine delays beyond the master's patience (-1) is no wrong counter.
+    assert {*result["counters"]} <= {21, -1}
+    assert result["counters"].count(21) > 0.9 * len(result["counters"])
+    assert result["init"] == 1
+
+
+def test_a_real_master_brings_seven_slaves_to_op_with_their_delays_and_a_full_working_counter(config: Path) -> None:
+    with running(config) as (segment, ready):
+        assert ready == {"pid": segment.pid, "interface": "ecat0", "namespace": True, "slaves": 7}
+        result = master(str(segment.pid), "ecat0", 300)
+    assert_all_in_op(result)
+    assert max(result["differences"][1:]) < 1000
+
+
+def test_a_segment_that_polls_answers_too(config: Path) -> None:
+    with running(config, "--poll", "--cpu", str(max(os.sched_getaffinity(0)))) as (segment, _):
+        assert_all_in_op(master(str(segment.pid), "ecat0", 100))
+
+
+def test_the_next_master_finds_the_slaves_as_the_first_one_did(config: Path) -> None:
+    with running(config) as (segment, _):
+        for _ in range(2):
+            assert_all_in_op(master(str(segment.pid), "ecat0", 50))
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="an ordinary user runs every test of this file this way")
+def test_an_ordinary_user_gets_the_same_from_user_namespaces(config: Path) -> None:
+    with running(config, user=NOBODY) as (segment, _):
+        assert_all_in_op(master(str(segment.pid), "ecat0", 100, user=NOBODY))
+
+
+def test_slaves_stay_in_op_when_the_process_is_stopped_for_50_ms(config: Path) -> None:
+    with running(config) as (segment, _):
+        result = master(str(segment.pid), "ecat0", 150, str(segment.pid))
+    assert (result["state"], result["codes"]) == (8, [0] * 7)
+    assert result["counters"][:20].count(-1) >= 15
+    assert result["counters"][-50:].count(21) > 40
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_process_with_code_0(config: Path, number: signal.Signals) -> None:
+    with running(config) as (segment, _):
+        segment.send_signal(number)
+        assert segment.communicate(timeout=10)[1] == ""
+        assert segment.returncode == 0
+
+
+def test_the_cable_is_not_seen_in_the_callers_network(config: Path) -> None:
+    before = interfaces()
+    with running(config):
+        assert interfaces() == before
+
+
+@needs_root
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_with_interface_the_masters_end_is_here_under_its_name_until_the_process_ends(
+    config: Path, number: signal.Signals
+) -> None:
+    before = interfaces()
+    with running(config, "--interface", "rtcp-t0") as (segment, ready):
+        assert ready == {"pid": segment.pid, "interface": "rtcp-t0", "namespace": False, "slaves": 7}
+        assert interfaces() - before == {"rtcp-t0"}
+        assert_all_in_op(master("-", "rtcp-t0", 50))
+        segment.send_signal(number)
+        segment.wait(10)
+        assert wait_until_gone("rtcp-t0")
+
+
+@needs_root
+def test_a_cable_that_is_removed_ends_the_process_with_a_sentence(config: Path) -> None:
+    from pyroute2 import IPRoute
+
+    with running(config, "--interface", "rtcp-t2") as (segment, _):
+        with IPRoute() as links:
+            links.link("del", index=socket.if_nametoindex("rtcp-t2"))
+        _, said = segment.communicate(timeout=10)
+        assert segment.returncode == 2
+        assert said == "the cable at rtcp-t2 is gone (Network is down): was it removed?\n"
+
+
+@needs_root
+def test_an_interface_that_exists_is_refused_and_left_alone(config: Path) -> None:
+    with running(config, "--interface", "rtcp-t1") as (first, _):
+        second = start(config, "--interface", "rtcp-t1")
+        _, said = second.communicate(timeout=20)
+        assert second.returncode == 2
+        assert said == (
+            "--interface rtcp-t1 exists already: choose another name, or remove it with 'ip link del'\n"
+        )  # fmt: skip
+        assert "rtcp-t1" in interfaces()
+        first.terminate()
+        first.wait(10)
+        assert wait_until_gone("rtcp-t1")
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "expected"),
+    [
+        ("slaves:\n  - {model: toaster}\n", [], "toaster"),
+        ("slaves:\n  - {model: diewu-io, options: {colour: 3}}\n", [], "colour"),
+        ("slaves:\n  - {model: diewu-io, delay_ns: 900}\n  - {model: diewu-io, delay_ns: 800}\n", [],
+         "slave 2 has delay_ns 800, less than the 900 ns of the slave before it"),
+        ("slaves: []\n", [], "slaves"),
+        ("slaves:\n  - {model: diewu-io}\n", ["--interface", "a/b"], "'a/b' is no interface name"),
+        ("slaves:\n  - {model: diewu-io}\n", ["--interface", "far-too-long-a-name"], "is no interface name"),
+        ("slaves:\n  - {model: diewu-io}\n", ["--cpu", "9999"], "--cpu 9999 cannot be used"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_in_a_sentence_with_code_2(
+    tmp_path: Path, text: str, options: list[str], expected: str
+) -> None:
+    path = tmp_path / "segment.yaml"
+    path.write_text(text, encoding="utf-8")
+    segment = start(path, *options)
+    out, said = segment.communicate(timeout=20)
+    assert (segment.returncode, out) == (2, "")
+    assert expected in said
+    assert "Traceback" not in said
+    assert said.count("\n") == 1
