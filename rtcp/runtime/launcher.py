@@ -261,7 +261,7 @@ class Running:
                 signal.signal(number, handler)
 
     def _ended_orderly(self) -> bool:
-        """Whether another `rtcp stop` ended the loop: the directory may be a new platform's by now and is left alone."""
+        """Whether another `rtcp stop` ended the loop: the directory, maybe a new platform's by now, is left alone."""
         loop = next((child for child in self._children if child.pid == self.processes.loop), None)
         return loop is not None and loop.wait() == 0
 

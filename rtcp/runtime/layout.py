@@ -9,14 +9,14 @@
 | 512 | request and answer of the service thread | commander; service thread |
 | 1024 | slave states | service thread |
 | 8192 | service text, texts, events, commands, cycle records | loop and commanders |
+
+Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
 """
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-
-import numpy as np
 
 MAGIC = 0x5254_4350_0000_0001
 HEADER = struct.Struct("<QIIIIIIQIi")
@@ -105,7 +105,7 @@ FLAG_ENABLED = 4
 
 @dataclass(frozen=True)
 class RecordLayout:
-    """The cycle record for a number of joints: as a struct for the writer, as a numpy dtype for readers."""
+    """The cycle record for a number of joints, as a struct; readers make a numpy type of it (`observer`)."""
 
     joints: int
 
@@ -119,19 +119,6 @@ class RecordLayout:
     def size(self) -> int:
         """Size of a record in the ring: a multiple of 64 bytes."""
         return (struct.calcsize(self.format) + 63) & ~63
-
-    @property
-    def dtype(self) -> np.dtype[np.void]:
-        """The same as a numpy record type, padded to `size`."""
-        codes = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
-                 "d": "<f8"}  # fmt: skip
-        fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [(name, codes[code]) for name, code in SCALARS]
-        fields += [(name, codes[code], (self.joints,)) for name, code in PER_JOINT]
-        fields.append(("number_again", "<u8"))
-        padding = self.size - struct.calcsize(self.format)
-        if padding:
-            fields.append(("padding", "u1", (padding,)))
-        return np.dtype(fields)
 
     @property
     def file_size(self) -> int:

@@ -6,6 +6,7 @@ import fcntl
 import json
 import mmap
 import os
+import struct
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -32,9 +33,11 @@ from rtcp.runtime.layout import (
     LEASE,
     LEASE_AT,
     MAGIC,
+    PER_JOINT,
     RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
+    SCALARS,
     SERVICE,
     SERVICE_STATE_AT,
     SERVICE_TEXT_AT,
@@ -47,6 +50,20 @@ from rtcp.runtime.layout import (
     TEXTS_HEAD_AT,
     RecordLayout,
 )
+
+_NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
+                "d": "<f8"}  # fmt: skip
+
+
+def record_type(layout: RecordLayout) -> np.dtype[np.void]:
+    """Return the numpy type of a cycle record: the layout's fields, padded to its size."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [(name, _NUMPY_CODES[code]) for name, code in SCALARS]
+    fields += [(name, _NUMPY_CODES[code], (layout.joints,)) for name, code in PER_JOINT]
+    fields.append(("number_again", "<u8"))
+    padding = layout.size - struct.calcsize(layout.format)
+    if padding:
+        fields.append(("padding", "u1", (padding,)))
+    return np.dtype(fields)
 
 
 class BlackboardError(Exception):
@@ -120,7 +137,7 @@ class Observer:
         self.joints = int(joints)
         self.period_ns = int(period)
         self.loop_pid = int(pid)
-        self._dtype = layout.dtype
+        self._dtype = record_type(layout)
         self._records = np.frombuffer(self._map, dtype=self._dtype, count=RECORDS, offset=RECORDS_AT)
 
     def close(self) -> None:

@@ -71,9 +71,7 @@ class Clock:
         self._last = t
         if seconds < 0.0:
             return
-        # In the cycle, once a slave: comparisons instead of calls of min and max.
-        if seconds > LONGEST_STEP:
-            seconds = LONGEST_STEP
+        seconds = min(seconds, LONGEST_STEP)
         limit = seconds * 1e9 * SLEW_LIMIT
         step = error * PROPORTIONAL * seconds
         if step > limit:

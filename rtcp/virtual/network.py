@@ -40,6 +40,12 @@ def _unshare(flags: int) -> None:
         raise OSError(number, os.strerror(number))
 
 
+def _forbidden(error: OSError) -> NetworkError:
+    return NetworkError(
+        f"the system refuses a network namespace of the segment's own ({error.strerror}): {WHAT_TO_ALLOW}"
+    )
+
+
 def _own_namespace() -> None:
     """Leave the caller's network for one of this process's own; with a user namespace where rights are missing.
 
@@ -51,6 +57,8 @@ def _own_namespace() -> None:
         return
     except PermissionError:
         pass
+    except OSError as error:
+        raise _forbidden(error) from error
     uid, gid = os.getuid(), os.getgid()
     try:
         _unshare(CLONE_NEWUSER | CLONE_NEWNET)
@@ -58,9 +66,7 @@ def _own_namespace() -> None:
         Path("/proc/self/uid_map").write_text(f"{uid} {uid} 1", encoding="ascii")
         Path("/proc/self/gid_map").write_text(f"{gid} {gid} 1", encoding="ascii")
     except OSError as error:
-        raise NetworkError(
-            f"the system refuses a network namespace of the segment's own ({error.strerror}): {WHAT_TO_ALLOW}"
-        ) from error
+        raise _forbidden(error) from error
 
 
 def _prepare(links: Any, name: str) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rtcp.runtime.layout import RecordLayout
-from rtcp.runtime.observer import Observer
+from rtcp.runtime.observer import Observer, record_type
 from rtcp.runtime.paths import blackboard_file
 from tests.e2e.conftest import Platform, gone, kill, lives
 
@@ -159,7 +159,7 @@ def test_a_terminated_process_is_no_traceback(running: Platform, name: str) -> N
 
 def test_the_record_layout_is_the_same_for_writer_and_reader() -> None:
     for joints in (1, 6, 7):
-        assert RecordLayout(joints).dtype.itemsize == RecordLayout(joints).size
+        assert record_type(RecordLayout(joints)).itemsize == RecordLayout(joints).size
 
 
 def test_a_lost_terminal_does_not_leave_a_loop_behind(platform: Platform) -> None:

@@ -182,6 +182,32 @@ def test_an_interface_that_exists_is_refused_and_left_alone(config: Path) -> Non
         assert wait_until_gone("rtcp-t1")
 
 
+# A user namespace that allows no further ones; the program in it has lost its rights by exec.
+WITHOUT_NAMESPACES = """
+import ctypes, os, sys
+uid, gid = os.getuid(), os.getgid()
+assert ctypes.CDLL(None).unshare(0x10000000) == 0
+for path, text in (("/proc/self/setgroups", "deny"), ("/proc/self/uid_map", f"{uid} {uid} 1"),
+                   ("/proc/self/gid_map", f"{gid} {gid} 1"), ("/proc/sys/user/max_user_namespaces", "0"),
+                   ("/proc/sys/user/max_net_namespaces", "0")):
+    with open(path, "w") as file:
+        file.write(text)
+os.execv(sys.executable, [sys.executable, "-m", "rtcp.virtual", *sys.argv[1:]])
+"""
+
+
+def test_where_namespaces_are_forbidden_one_sentence_says_what_to_allow(config: Path) -> None:
+    user = NOBODY if os.getuid() == 0 else None
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_NAMESPACES, "--config", str(config)], capture_output=True, text=True, cwd=ROOT,
+        user=user, group=user, extra_groups=None if user is None else [], timeout=20, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "the system refuses a network namespace of the segment's own" in done.stderr
+    assert "user.max_user_namespaces" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("text", "options", "expected"),
     [

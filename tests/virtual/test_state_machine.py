@@ -7,6 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from rtcp.virtual.frame import Command
+from rtcp.virtual.objects import DataType, Entry
 from tests.virtual.line import (
     ACK,
     BOOT,
@@ -145,6 +146,16 @@ def test_sync_pulses_that_the_device_cannot_work_by_are_refused(activation: int,
     line.write(0, 0x09A0, cycle.to_bytes(4, "little"))
     line.write(0, 0x0981, bytes((activation,)))
     assert line.request(0, SAFE_OP) == (PRE_OP | ERROR, code)
+
+
+def test_a_sync0_cycle_below_the_devices_minimum_in_0x1c32_is_refused_with_0x0035() -> None:
+    device = TinyDevice()
+    minimum = Entry(0x1C32, 5, "Minimum cycle time", DataType.UNSIGNED32, 250_000)
+    device.objects.record(0x1C32, "Output parameters", [minimum])
+    line = set_up(Line([device]))
+    line.write(0, 0x09A0, (200_000).to_bytes(4, "little"))
+    line.write(0, 0x0981, b"\x03")
+    assert line.request(0, SAFE_OP) == (PRE_OP | ERROR, 0x0035)
 
 
 def test_sync0_left_on_by_the_last_master_whose_time_is_set_anew_is_a_fatal_sync_error() -> None:
