@@ -122,6 +122,8 @@ class CycleConfig:
     priority: Annotated[int, Ge(1), Le(98)] = 80
     cpu: Annotated[int, Ge(0)] | None = None
     """CPU of the cycle; None: the last one that the process may use."""
+    spin_us: Annotated[float, Ge(0), Le(50)] = 40.0
+    """The timer wakes so long before the tick; the rest is waited for awake, which takes the timer's jitter out."""
 
 
 @dataclass(frozen=True)

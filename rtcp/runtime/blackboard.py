@@ -17,24 +17,24 @@ from pathlib import Path
 from rtcp.runtime.layout import (
     ANSWER,
     ANSWER_AT,
+    ANSWER_NUMBER_AT,
     COMMAND,
     COMMAND_HEAD_AT,
     COMMAND_TAKEN_AT,
     COMMANDS,
     COMMANDS_AT,
-    COUNTER,
     EVENT,
     EVENTS,
     EVENTS_AT,
     EVENTS_HEAD_AT,
     HEADER,
-    LEASE,
-    LEASE_AT,
+    LEASE_DURATION_AT,
+    LEASE_ID_AT,
+    LEASE_RENEWED_AT,
     MAGIC,
     RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
-    SLAVE,
     SLAVES_AT,
     SLAVES_MAX,
     TEXT,
@@ -43,6 +43,7 @@ from rtcp.runtime.layout import (
     TEXTS_HEAD_AT,
     RecordLayout,
 )
+from rtcp.runtime.words import Words
 
 
 class Blackboard:
@@ -73,13 +74,11 @@ class Blackboard:
         self._record_size = layout.size
         # The record without its first number, which is published last.
         self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
-        self._pack_counter = COUNTER.pack_into
-        self._unpack_counter = COUNTER.unpack_from
+        self._words = Words(self._map)
         self._records = 0
         self._events = 0
         self._texts = 0
         self._taken = 0
-        self._lock = threading.Lock()
         self._text_lock = threading.Lock()
         # Every page is touched now, so that none is faulted in by the cycle.
         for page in range(0, layout.file_size, mmap.PAGESIZE):
@@ -89,30 +88,22 @@ class Blackboard:
         """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
         number = self._records + 1
         at = RECORDS_AT + (number % RECORDS) * self._record_size
-        target = self._map
-        self._pack_counter(target, at, 0)
-        self._fence()
-        self._pack_record(target, at + 8, *values, number)
-        self._fence()
-        self._pack_counter(target, at, number)
-        self._pack_counter(target, RECORDS_HEAD_AT, number)
+        words = self._words
+        words[at] = 0
+        words.fence()
+        self._pack_record(self._map, at + 8, *values, number)
+        words.fence()
+        words[at] = number
+        words[RECORDS_HEAD_AT] = number
         self._records = number
-
-    def _fence(self) -> None:
-        # Two passes through a lock order the stores before against those after on weakly ordered CPUs (aarch64).
-        lock = self._lock
-        lock.acquire()
-        lock.release()
-        lock.acquire()
-        lock.release()
 
     def event(self, code: int, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         """Append an event: a code that readers put into words."""
         number = self._events + 1
         at = EVENTS_AT + (number % EVENTS) * EVENT.size
         EVENT.pack_into(self._map, at, number, time.time_ns(), code, axis, value, limit)
-        self._fence()
-        self._pack_counter(self._map, EVENTS_HEAD_AT, number)
+        self._words.fence()
+        self._words[EVENTS_HEAD_AT] = number
         self._events = number
 
     def text(self, sentence: str) -> None:
@@ -122,45 +113,50 @@ class Blackboard:
             number = self._texts + 1
             at = TEXTS_AT + (number % TEXTS) * TEXT.size
             TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), encoded)
-            self._fence()
-            self._pack_counter(self._map, TEXTS_HEAD_AT, number)
+            self._words.fence()
+            self._words[TEXTS_HEAD_AT] = number
             self._texts = number
 
     def slave(self, position: int, al_status: int, al_status_code: int) -> None:
         """Note the state of the slave at `position` (from 1)."""
         if 1 <= position <= SLAVES_MAX:
-            SLAVE.pack_into(self._map, SLAVES_AT + (position - 1) * SLAVE.size, al_status, al_status_code)
+            self._words[SLAVES_AT + (position - 1) * 8] = al_status | al_status_code << 16
 
     def lease(self) -> tuple[int, int, int]:
         """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""
-        found = LEASE.unpack_from(self._map, LEASE_AT)
-        return found[0], found[1], found[2]
+        words = self._words
+        return words[LEASE_ID_AT], words[LEASE_RENEWED_AT], words[LEASE_DURATION_AT]
 
     def command_waits(self) -> bool:
         """Whether a command waits to be taken."""
-        waits: bool = self._unpack_counter(self._map, COMMAND_HEAD_AT)[0] != self._taken
-        return waits
+        return self._words[COMMAND_HEAD_AT] != self._taken
 
     def take_command(self) -> tuple[float, ...]:
         """Take the next command: number, lease id, kind, twelve numbers. Only when `command_waits`."""
         number = self._taken + 1
         found = COMMAND.unpack_from(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size)
         self._taken = number
-        self._pack_counter(self._map, COMMAND_TAKEN_AT, number)
+        self._words[COMMAND_TAKEN_AT] = number
         return found
 
     def answer(self, number: int, refusal: int = 0, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         """Answer the command `number`: accepted (0) or the code of a refusal with what it is about."""
         # The number goes in last: a reader that finds its own number finds the whole answer.
-        ANSWER.pack_into(self._map, ANSWER_AT, 0, refusal, axis, value, limit)
-        self._fence()
-        self._pack_counter(self._map, ANSWER_AT, number)
+        ANSWER.pack_into(self._map, ANSWER_AT, refusal, axis, value, limit)
+        self._words.fence()
+        self._words[ANSWER_NUMBER_AT] = number
 
     @property
     def memory(self) -> mmap.mmap:
         """The mapped file, for the service thread's own part."""
         return self._map
 
+    @property
+    def words(self) -> Words:
+        """The same by words."""
+        return self._words
+
     def close(self) -> None:
         """Unmap; the file stays for those who read what happened last."""
+        self._words.close()
         self._map.close()

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from rtcp.config.find import find_config
 from rtcp.config.model import ArmConfig, DriveModeName
-from rtcp.config.schema import load, segment_path
+from rtcp.config.schema import load, segment_path, with_period
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.paths import (
@@ -135,9 +135,7 @@ def _configured(options: StartOptions) -> ArmConfig:
     if options.bus is not None:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, interface=options.bus))
     if options.cycle_us is not None:
-        if not 100 <= options.cycle_us <= 100_000:
-            raise StartError(f"--cycle-us {options.cycle_us:g} is not allowed: 100 to 100000", "usage")
-        config = dataclasses.replace(config, cycle=dataclasses.replace(config.cycle, period_us=options.cycle_us))
+        config = with_period(config, options.cycle_us)
     return config
 
 

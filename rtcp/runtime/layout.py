@@ -22,30 +22,35 @@ MAGIC = 0x5254_4350_0000_0001
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
-LEASE_AT = 128
-LEASE = struct.Struct("<QqQ64s")
-"""id (0: free), renewed at (CLOCK_MONOTONIC ns), duration ns, holder"""
+LEASE_ID_AT = 128
+"""0: free. Written last when the lease is taken."""
+LEASE_RENEWED_AT = 136
+"""CLOCK_MONOTONIC, ns"""
+LEASE_DURATION_AT = 144
+"""ns"""
+LEASE_HOLDER_AT = 152
+LEASE_HOLDER_SIZE = 64
 
 COMMAND_HEAD_AT = 256
 COMMAND_TAKEN_AT = 264
-ANSWER_AT = 272
-ANSWER = struct.Struct("<QIidd")
-"""command's number, refusal (0: accepted), axis, value, limit"""
+ANSWER_NUMBER_AT = 272
+"""Number of the command that the answer belongs to; written last."""
+ANSWER_AT = 280
+ANSWER = struct.Struct("<Iidd")
+"""refusal (0: accepted), axis, value, limit"""
 
 RECORDS_HEAD_AT = 384
 EVENTS_HEAD_AT = 392
 TEXTS_HEAD_AT = 400
-COUNTER = struct.Struct("<Q")
 
 SERVICE_STATE_AT = 512
-SERVICE = struct.Struct("<II")
-"""state (0 idle, 1 asked, 2 answered), length of the JSON text"""
+"""0 idle, 1 asked, 2 answered"""
+SERVICE_LENGTH_AT = 520
 SERVICE_TEXT_AT = 8192
 SERVICE_TEXT_SIZE = 8192
 
 SLAVES_AT = 1024
-SLAVE = struct.Struct("<HH")
-"""AL status (state, error bit), AL status code; a state of 0: no answer"""
+"""A word a slave: AL status (state, error bit; 0: no answer), AL status code << 16."""
 SLAVES_MAX = 256
 
 TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE

@@ -23,6 +23,7 @@ class Loop:
 
     Args:
         period_ns: the cycle.
+        spin_ns: how long before the tick the timer wakes; the rest is waited for awake.
         data: the process image, slaves in SAFE-OP.
         arm: the joints.
         box: the IO box and the index of its slave, or None.
@@ -36,6 +37,7 @@ class Loop:
     def __init__(
         self,
         period_ns: int,
+        spin_ns: int,
         data: ProcessData,
         arm: Arm,
         box: tuple[int, IoBox] | None,
@@ -46,6 +48,7 @@ class Loop:
         discipline: Discipline | None,
     ) -> None:
         self._period_ns = period_ns
+        self._spin_ns = spin_ns
         self._data = data
         self._arm = arm
         self._box_slot = -1 if box is None else box[0]
@@ -66,13 +69,14 @@ class Loop:
         data, arm, box, box_slot = self._data, self._arm, self._box, self._box_slot
         behaviour, orders, recorder = self._behaviour, self._orders, self._recorder
         discipline, command_waits = self._discipline, self._blackboard.command_waits
-        period, expected = self._period_ns, data.expected_wkc
+        period, spin, expected = self._period_ns, self._spin_ns, data.expected_wkc
         sleep = Sleeper().until
         half = period // 2
         planned = monotonic_ns() + period
         while not behaviour.done:
-            sleep(planned)
-            woken = monotonic_ns()
+            sleep(planned - spin)
+            while (woken := monotonic_ns()) < planned:
+                pass
             data.send()
             wkc = data.receive()
             received = monotonic_ns()

@@ -121,7 +121,8 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     only_box = None if box is None else box[1]
     orders = Orders(arm, only_box, behaviour, blackboard, service)
     recorder = Recorder(data, arm, only_box, behaviour, blackboard, service, discipline)
-    loop = Loop(period_ns, data, arm, box, behaviour, orders, recorder, blackboard, discipline)
+    spin_ns = round(config.cycle.spin_us * 1000)
+    loop = Loop(period_ns, spin_ns, data, arm, box, behaviour, orders, recorder, blackboard, discipline)
     realtime = scheduling.Realtime()
 
     def started() -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import mmap
 import os
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,30 +20,32 @@ import numpy.typing as npt
 from rtcp.runtime.layout import (
     ANSWER,
     ANSWER_AT,
+    ANSWER_NUMBER_AT,
     COMMAND,
     COMMAND_HEAD_AT,
     COMMAND_TAKEN_AT,
     COMMANDS,
     COMMANDS_AT,
-    COUNTER,
     EVENT,
     EVENTS,
     EVENTS_AT,
     EVENTS_HEAD_AT,
     HEADER,
-    LEASE,
-    LEASE_AT,
+    LEASE_DURATION_AT,
+    LEASE_HOLDER_AT,
+    LEASE_HOLDER_SIZE,
+    LEASE_ID_AT,
+    LEASE_RENEWED_AT,
     MAGIC,
     PER_JOINT,
     RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
     SCALARS,
-    SERVICE,
+    SERVICE_LENGTH_AT,
     SERVICE_STATE_AT,
     SERVICE_TEXT_AT,
     SERVICE_TEXT_SIZE,
-    SLAVE,
     SLAVES_AT,
     TEXT,
     TEXTS,
@@ -50,6 +53,7 @@ from rtcp.runtime.layout import (
     TEXTS_HEAD_AT,
     RecordLayout,
 )
+from rtcp.runtime.words import Words
 
 _NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
                 "d": "<f8"}  # fmt: skip
@@ -129,6 +133,7 @@ class Observer:
             os.close(self._descriptor)
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
+        self._words = Words(self._map)
         magic, joints, record_size, _, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
         layout = RecordLayout(joints)
         if magic != MAGIC or record_size != layout.size or size != layout.file_size:
@@ -144,6 +149,7 @@ class Observer:
         """Let go of the file."""
         if hasattr(self, "_records"):
             del self._records
+        self._words.close()
         self._map.close()
         os.close(self._descriptor)
 
@@ -152,10 +158,7 @@ class Observer:
     @property
     def head(self) -> int:
         """Number of the last record published; 0 before the first."""
-        return self._counter(RECORDS_HEAD_AT)
-
-    def _counter(self, at: int) -> int:
-        return int(COUNTER.unpack_from(self._map, at)[0])
+        return self._words[RECORDS_HEAD_AT]
 
     def latest(self) -> npt.NDArray[np.void] | None:
         """Return the last record, shape (1,), or None before the first."""
@@ -188,7 +191,7 @@ class Observer:
 
     def events_since(self, number: int) -> list[Event]:
         """Return the events after `number`, oldest first."""
-        head = self._counter(EVENTS_HEAD_AT)
+        head = self._words[EVENTS_HEAD_AT]
         found = []
         for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
             values = EVENT.unpack_from(self._map, EVENTS_AT + (wanted % EVENTS) * EVENT.size)
@@ -198,7 +201,7 @@ class Observer:
 
     def texts_since(self, number: int) -> list[Text]:
         """Return the sentences after `number`, oldest first."""
-        head = self._counter(TEXTS_HEAD_AT)
+        head = self._words[TEXTS_HEAD_AT]
         found = []
         for wanted in range(max(number + 1, head - TEXTS + 1, 1), head + 1):
             made, when, length, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
@@ -208,16 +211,28 @@ class Observer:
 
     def slaves(self, count: int) -> list[tuple[int, int]]:
         """Return AL status and AL status code of the first `count` slaves."""
-        return [SLAVE.unpack_from(self._map, SLAVES_AT + i * SLAVE.size) for i in range(count)]
+        found = [self._words[SLAVES_AT + i * 8] for i in range(count)]
+        return [(word & 0xFFFF, word >> 16 & 0xFFFF) for word in found]
 
     # -- the lease ----------------------------------------------------------------------------------------------
 
     def holder(self) -> str:
         """Return the name of who holds a lease that has not run out, or an empty string."""
-        lease, renewed, duration, name = LEASE.unpack_from(self._map, LEASE_AT)
-        if lease == 0 or time.monotonic_ns() - renewed > duration:
+        if self._words[LEASE_ID_AT] == 0 or self._run_out():
             return ""
-        return bytes(name).rstrip(b"\0").decode(errors="replace")
+        name = bytes(self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE])
+        return name.rstrip(b"\0").decode(errors="replace")
+
+    def _run_out(self) -> bool:
+        return time.monotonic_ns() - self._words[LEASE_RENEWED_AT] > self._words[LEASE_DURATION_AT]
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        try:
+            yield
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def acquire(self, name: str, duration_s: float) -> int:
         """Take the lease for `name`; return its id.
@@ -225,37 +240,32 @@ class Observer:
         Raises:
             LeaseRefused: while another holds it.
         """
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-        try:
+        with self._alone():
             if holder := self.holder():
                 raise LeaseRefused(holder)
-            lease = time.monotonic_ns()
-            LEASE.pack_into(self._map, LEASE_AT, lease, lease, int(duration_s * 1e9), name.encode()[:64])
-            return lease
-        finally:
-            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+            words, now = self._words, time.monotonic_ns()
+            words[LEASE_ID_AT] = 0
+            encoded = (name or "an unnamed commander").encode()[:LEASE_HOLDER_SIZE].ljust(LEASE_HOLDER_SIZE, b"\0")
+            self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE] = encoded
+            words[LEASE_DURATION_AT] = int(duration_s * 1e9)
+            words[LEASE_RENEWED_AT] = now
+            words.fence()
+            words[LEASE_ID_AT] = now
+            return now
 
     def renew(self, lease: int) -> bool:
         """Renew the lease; return False where it is no longer this one or has run out."""
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-        try:
-            held, renewed, duration, name = LEASE.unpack_from(self._map, LEASE_AT)
-            now = time.monotonic_ns()
-            if held != lease or now - renewed > duration:
+        with self._alone():
+            if self._words[LEASE_ID_AT] != lease or self._run_out():
                 return False
-            LEASE.pack_into(self._map, LEASE_AT, held, now, duration, name)
+            self._words[LEASE_RENEWED_AT] = time.monotonic_ns()
             return True
-        finally:
-            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def release(self, lease: int) -> None:
         """Give the lease back; does nothing where it is another's by now."""
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
-        try:
-            if LEASE.unpack_from(self._map, LEASE_AT)[0] == lease:
-                LEASE.pack_into(self._map, LEASE_AT, 0, 0, 0, b"")
-        finally:
-            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+        with self._alone():
+            if self._words[LEASE_ID_AT] == lease:
+                self._words[LEASE_ID_AT] = 0
 
     # -- commands -----------------------------------------------------------------------------------------------
 
@@ -265,18 +275,20 @@ class Observer:
         Raises:
             BlackboardError: where the loop takes no commands any more (the ring is full).
         """
-        number = self._counter(COMMAND_HEAD_AT) + 1
-        if number - self._counter(COMMAND_TAKEN_AT) > COMMANDS:
+        number = self._words[COMMAND_HEAD_AT] + 1
+        if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
             raise BlackboardError("the loop takes no commands: its process hangs or is gone")
         padded = [*numbers, *([0.0] * (12 - len(numbers)))]
         COMMAND.pack_into(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size, number, lease, kind, *padded)
-        COUNTER.pack_into(self._map, COMMAND_HEAD_AT, number)
+        self._words.fence()
+        self._words[COMMAND_HEAD_AT] = number
         return number
 
     def answer(self, number: int) -> Answer | None:
         """Return the loop's answer to the command `number`, or None while there is none."""
-        found = ANSWER.unpack_from(self._map, ANSWER_AT)
-        return Answer(*found[1:]) if found[0] == number else None
+        if self._words[ANSWER_NUMBER_AT] != number:
+            return None
+        return Answer(*ANSWER.unpack_from(self._map, ANSWER_AT))
 
     # -- the service thread -------------------------------------------------------------------------------------
 
@@ -286,13 +298,15 @@ class Observer:
         if len(text) > SERVICE_TEXT_SIZE:
             raise BlackboardError(f"the request is {len(text)} bytes long, at most {SERVICE_TEXT_SIZE} fit")
         self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
-        SERVICE.pack_into(self._map, SERVICE_STATE_AT, 1, len(text))
+        self._words[SERVICE_LENGTH_AT] = len(text)
+        self._words.fence()
+        self._words[SERVICE_STATE_AT] = 1
 
     def service_answer(self) -> dict[str, Any] | None:
         """Return the service thread's answer, or None while there is none."""
-        state, length = SERVICE.unpack_from(self._map, SERVICE_STATE_AT)
-        if state != 2:
+        if self._words[SERVICE_STATE_AT] != 2:
             return None
+        length = self._words[SERVICE_LENGTH_AT]
         found: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
-        SERVICE.pack_into(self._map, SERVICE_STATE_AT, 0, 0)
+        self._words[SERVICE_STATE_AT] = 0
         return found

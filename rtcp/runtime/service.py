@@ -14,7 +14,7 @@ from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import Bus, BusError, SlaveState
 from rtcp.realtime.scheduling import ordinary_thread
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import SERVICE, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
+from rtcp.runtime.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
 
 _TURN_S = 0.01
 _WATCH_TURNS = 10
@@ -186,10 +186,10 @@ class Service(threading.Thread):
             self._blackboard.text(f"{name} (slave {position}): the drive's error code is 0x{code:04X}")
 
     def _answer_request(self) -> None:
-        memory = self._blackboard.memory
-        state, length = SERVICE.unpack_from(memory, SERVICE_STATE_AT)
-        if state != 1:
+        memory, words = self._blackboard.memory, self._blackboard.words
+        if words[SERVICE_STATE_AT] != 1:
             return
+        length = words[SERVICE_LENGTH_AT]
         try:
             answer = self._serve(json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length])))
         except BusError as error:
@@ -200,7 +200,9 @@ class Service(threading.Thread):
         if len(text) > SERVICE_TEXT_SIZE:
             text = json.dumps({"error": f"the answer is {len(text)} bytes long, {SERVICE_TEXT_SIZE} fit"}).encode()
         memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
-        SERVICE.pack_into(memory, SERVICE_STATE_AT, 2, len(text))
+        words[SERVICE_LENGTH_AT] = len(text)
+        words.fence()
+        words[SERVICE_STATE_AT] = 2
 
     def _serve(self, request: dict[str, Any]) -> dict[str, Any]:
         position, index, subindex = int(request["slave"]), int(request["index"]), int(request["subindex"])

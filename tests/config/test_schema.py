@@ -121,7 +121,7 @@ IN_THE_ARM = {
     ),
     "an unknown key that resembles none": (
         ("priority: 80", "zzz: 1"),
-        "cycle.zzz: this key is not known here; allowed are period_us, priority, cpu",
+        "cycle.zzz: this key is not known here; allowed are period_us, priority, cpu, spin_us",
     ),
     "the program's own key": (
         ("lease_s: 0.5", "source: here"),

@@ -146,6 +146,28 @@ def test_a_lease_that_is_not_renewed_is_free_again(observer: Observer) -> None:
     assert observer.holder() == "second"
 
 
+def test_a_lease_that_is_being_renewed_never_looks_free_to_another_process(board: Blackboard, path: Path) -> None:
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        observer = Observer(path)
+        lease = observer.acquire("renewer", 60.0)
+        os.write(writing, b"!")
+        for _ in range(50_000):
+            observer.renew(lease)
+        os._exit(0)
+    os.read(reading, 1)
+    seen = set()
+    while os.waitpid(child, os.WNOHANG)[0] == 0:
+        for _ in range(2000):
+            lease, renewed, duration = board.lease()
+            seen.add((lease, duration))
+            assert renewed >= lease
+    assert len(seen) == 1
+    os.close(reading)
+    os.close(writing)
+
+
 def test_commands_are_taken_in_order_and_answered(board: Blackboard, observer: Observer) -> None:
     lease = observer.acquire("test", 10.0)
     assert not board.command_waits()
