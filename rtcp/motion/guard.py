@@ -28,9 +28,9 @@ class Guard:
         self._last = [0.0] * len(self._low)
         self.held = 0
 
-    def latch(self, position: Sequence[float]) -> None:
-        """Take `position` (rad, shape (n,)) as the targets sent last: on enabling, target = actual."""
-        self._last = list(position)
+    def latch(self, axis: int, position: float) -> None:
+        """Take `position` (rad) as the target sent last: while a drive has no torque, its target is where it is."""
+        self._last[axis] = position
 
     def check(self, drives: Sequence[Commanded]) -> None:
         """Clamp every target of every drive in place."""

@@ -87,12 +87,11 @@ class Arm:
 
     def follow(self) -> None:
         """Let set-point and guard follow the drives that have no torque: their target is where they are."""
-        position = self.generator.position
+        position, latch = self.generator.position, self.guard.latch
         for i, drive in enumerate(self.drives):
             if drive.state is not _ENABLED:
-                position[i] = drive.position
-                drive.target_position = drive.position
-        self.guard.latch(position)
+                position[i] = drive.target_position = drive.position
+                latch(i, drive.position)
 
     def command(self) -> None:
         """Write the targets of this cycle: set-point, law, guard."""

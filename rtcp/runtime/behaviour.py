@@ -207,17 +207,22 @@ class Behaviour:
             self._fail_drive(Code.DISABLE_STUCK, axis)
 
     def _faulted(self, good: bool) -> None:
-        # Healthy drives stop and hold against gravity.
         self.all_enabled = False
         if good:
-            self._arm.generator.update()
-            self._arm.lead_healthy()
-            self._arm.follow()
-            self._arm.command()
+            self._stop_healthy()
+
+    def _stop_healthy(self) -> None:
+        """Let healthy drives stop and hold against gravity."""
+        self._arm.generator.update()
+        self._arm.lead_healthy()
+        self._arm.follow()
+        self._arm.command()
 
     def _resetting(self, good: bool) -> None:
         arm, service = self._arm, self._service
-        if good and service.all_op:
+        if good and not arm.still:
+            self._stop_healthy()
+        elif good and service.all_op:
             arm.lead(DriveGoal.RESET)
             arm.follow()
             if arm.first_not_resting() < 0:

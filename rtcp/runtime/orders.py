@@ -92,7 +92,6 @@ class Orders:
 
     def _reset(self, lease: int, numbers: Sequence[float]) -> Verdict:
         if self._behaviour.state is State.FAULT:
-            self._arm.hold_target()
             self._service.recover()
             self._behaviour.enter(State.RESETTING)
         return _DONE

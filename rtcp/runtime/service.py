@@ -70,7 +70,7 @@ class Service(threading.Thread):
         self.on_op: Callable[[], None] = _nothing
         """Called once, from this thread, when all slaves are in OP for the first time."""
         self.on_refused: Callable[[], None] = _nothing
-        """Called once, from this thread, when the start has failed."""
+        """Called once, from this thread, when the start has failed or the thread cannot go on."""
 
     # -- what the cycle asks: a plain store each ----------------------------------------------------------------
 
@@ -96,7 +96,15 @@ class Service(threading.Thread):
     # -- the thread ---------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Take turns until `finish`."""
+        """Take turns until `finish`. A defect in here ends the loop: nobody would watch the slaves."""
+        try:
+            self._take_turns()
+        except Exception as error:
+            self._blackboard.text(f"the service thread met a defect ({type(error).__name__}: {error}): the loop ends")
+            self.on_refused()
+            raise
+
+    def _take_turns(self) -> None:
         ordinary_thread(self._cycle_cpu)
         turn = 0
         while not self._end.wait(_TURN_S):

@@ -30,7 +30,7 @@ class Drive:
 
 def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
     guard = Guard([JOINT], PERIOD)
-    guard.latch([last])
+    guard.latch(0, last)
     guard.check([drive])
     return drive, guard.held
 
@@ -71,7 +71,7 @@ def test_beyond_the_range_speed_only_leads_back() -> None:
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
 def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float], start: float) -> None:
     guard, drive, before = Guard([JOINT], PERIOD), Drive(), start
-    guard.latch([start])
+    guard.latch(0, start)
     for target in wanted:
         drive.target_position = target
         guard.check([drive])
