@@ -32,7 +32,7 @@ from rtcp.config.find import find_config
 from rtcp.config.schema import load
 from rtcp.realtime.scheduling import choose_cpu
 from rtcp.realtime.statistics import percentiles
-from rtcp.runtime.client import ControlClient
+from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.launcher import Running, StartOptions, start
 from rtcp.runtime.layout import RECORDS
 from rtcp.runtime.observer import Observer
@@ -86,12 +86,16 @@ def cyclictest(cpu: int, priority: int, interval_us: int, seconds: float) -> Arr
 
 
 def wander(stop: threading.Event) -> None:
-    """Move the arm to and fro until `stop`."""
+    """Move the arm to and fro until `stop`; a move that fails is told, and ends the wandering."""
     poses = ([0.4, -0.3, 0.5, 0.2, -0.4, 0.3], [0.0] * 6)
     turn = 0
     with ControlClient("benchmark") as client:
         while not stop.is_set():
-            client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+            try:
+                client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+            except ControlError as error:
+                sys.stderr.write(f"the arm stopped moving: {error.message}\n")
+                return
             turn += 1
 
 
@@ -198,12 +202,15 @@ def compare(cycle_us: int, seconds: float, rounds: int, *, poll: bool, console: 
     periods = np.concatenate([run.period for run in runs])
     error = (periods.mean() - cycle_us) / cycle_us * 100
     cycles = sum(run.period.size for run in runs)
+    ticks = cycles + sum(run.missed for run in runs)
+    grid_error = (periods.sum() / ticks - cycle_us) / cycle_us * 100
     console.print(
-        f"mean cycle {periods.mean():.4f} us (error {error:+.4f} %), ticks skipped {sum(r.missed for r in runs)} of "
-        f"{cycles}; start to OP {statistics.median(r.start_to_op_s for r in runs):.2f} s; "
+        f"mean cycle {periods.mean():.4f} us (error {error:+.4f} %), of the grid, with the {ticks - cycles} ticks of "
+        f"{ticks} that were skipped: error {grid_error:+.5f} %; "
+        f"start to OP {statistics.median(r.start_to_op_s for r in runs):.2f} s; "
         f"loop process {max(r.rss_mb for r in runs):.0f} MB resident"
     )
-    result |= {"mean_us": float(periods.mean()), "error_percent": float(error)}
+    result |= {"mean_us": float(periods.mean()), "error_percent": float(error), "grid_error_percent": float(grid_error)}
     return result
 
 

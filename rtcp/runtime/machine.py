@@ -62,26 +62,21 @@ class Code(IntEnum):
     BUS_LOST = 1
     DRIVE_LEFT_ENABLED = 2
     ENABLE_STUCK = 3
-    SLAVE_NOT_OP = 4
-    RESET_STUCK = 5
-    GENERATOR = 6
-    GUARD_HELD = 7
-    LEASE_ENDED = 8
-    MODE_STUCK = 9
-    LATE = 10
-    READY = 11
-    ENABLED = 12
-    DISABLED = 13
-    RESET = 14
-    ARRIVED = 15
-    STOPPED = 16
-    DC_LOCKED = 17
-    DC_UNLOCKED = 18
-    DISABLE_STUCK = 19
+    DISABLE_STUCK = 4
+    SLAVE_NOT_OP = 5
+    RESET_STUCK = 6
+    GENERATOR = 7
+    MODE_STUCK = 8
+    LEASE_ENDED = 9
+    READY = 10
+    ENABLED = 11
+    DISABLED = 12
+    RESET = 13
+    ARRIVED = 14
+    STOPPED = 15
+    DC_LOCKED = 16
+    DC_UNLOCKED = 17
 
-
-POWERED = frozenset({State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING})
-"""States in which a drive that leaves Operation Enabled by itself is a fault (once all were enabled)."""
 
 ALLOWED: dict[Command, frozenset[State]] = {
     Command.ENABLE: frozenset({State.READY}),

@@ -68,12 +68,10 @@ class Sentences:
             ),
             Code.RESET_STUCK: self._reset_stuck,
             Code.GENERATOR: lambda _: "the trajectory generator refused its input: the arm holds",
-            Code.GUARD_HELD: lambda m: f"the guard held back {self._joint(m.axis)}",
             Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
             Code.MODE_STUCK: lambda m: (
                 f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for 1 s ago"
             ),
-            Code.LATE: lambda m: f"{int(m.value)} ticks were skipped",
             Code.READY: lambda _: "all slaves are in OP",
             Code.ENABLED: lambda _: "all drives are enabled, the arm holds",
             Code.DISABLED: lambda _: "all drives are disabled",
