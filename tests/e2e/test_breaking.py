@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from rtcp.runtime.layout import RecordLayout
+from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.runtime.observer import Observer, record_type
 from rtcp.runtime.paths import blackboard_file
 from tests.e2e.conftest import Platform, gone, kill, lives
@@ -35,6 +35,18 @@ def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> N
     assert not (running.directory / "control.sock").exists()
     assert "no platform is running" in running.rtcp("stop", check=4).stderr
     assert "no platform is running" in running.rtcp("status", check=4).stderr
+
+
+def test_the_cycle_locks_onto_drifting_clocks_within_two_seconds_of_cycles(running: Platform) -> None:
+    observer = observe(running)
+    records, _ = observer.since(0)
+    observer.close()
+    locked = (records["flags"] & FLAG_DC_LOCKED) != 0
+    assert int(records["cycle"][0]) < 100
+    assert locked.any()
+    assert int(records["cycle"][np.argmax(locked)]) * 500e-6 < 2.0
+    # The slaves were asked to go to OP only then.
+    assert not ((records["flags"] & FLAG_ALL_OP) != 0)[: np.argmax(locked)].any()
 
 
 def test_a_second_run_starts_right_after_the_first(running: Platform) -> None:
