@@ -105,9 +105,19 @@ def resident_mb(pid: int) -> float:
     return int(found.group(1)) / 1024 if found else float("nan")
 
 
-def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool) -> Round:
+def timer_alone(directory: Path) -> Path:
+    """Copy the default configuration to `directory`, without the waiting awake before a tick; return the arm's file."""
+    copied = directory / "timer-alone"
+    shutil.copytree(find_config(None).parent, copied)
+    arm = copied / find_config(None).name
+    arm.write_text(re.sub(r"spin_us: \d+", "spin_us: 0", arm.read_text()))
+    return arm
+
+
+def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool, config: Path | None = None) -> Round:
     """Start the platform, enable, let it run (moving or holding), stop; return what the cycle records tell."""
-    running: Running = start(StartOptions(cycle_us=float(cycle_us), poll=poll), lambda sentence: None)
+    options = StartOptions(config=config, cycle_us=float(cycle_us), poll=poll)
+    running: Running = start(options, lambda sentence: None)
     try:
         observer = Observer(blackboard_file(runtime_directory()))
         with ControlClient("benchmark") as client:
@@ -165,22 +175,27 @@ def spread(samples: list[Array], name: str) -> str:
     return f"{min(values):.0f} to {max(values):.0f}"
 
 
-def compare(cycle_us: int, seconds: float, rounds: int, *, poll: bool, console: Console) -> dict[str, object]:
+def compare(
+    cycle_us: int, seconds: float, rounds: int, directory: Path, *, poll: bool, console: Console
+) -> dict[str, object]:
     """Alternate cyclictest and the platform; print the table; return the figures."""
     config = load(find_config(None))
     cpu, priority = choose_cpu(config.cycle.cpu), config.cycle.priority
-    reference, runs = [], []
+    sleeper = timer_alone(directory)
+    reference, runs, sleeping = [], [], []
     for _ in range(rounds):
         measured = cyclictest(cpu, priority, cycle_us, seconds)
         if measured is not None:
             reference.append(measured)
         runs.append(platform_round(cycle_us, seconds, poll=poll, move=True))
+        sleeping.append(platform_round(cycle_us, seconds, poll=poll, move=True, config=sleeper))
     table = Table(title=f"{cycle_us} us cycle, {rounds} rounds of {seconds:g} s, CPU {cpu}, priority {priority}; us")
     for heading in ("", "p50", "p99", "p99.9", "max", "p99 over the rounds"):
         table.add_column(heading, justify="left" if not heading else "right")
     rows = {
         "cyclictest wake-up": reference,
-        "loop wake-up": [run.wakeup for run in runs],
+        f"loop wake-up (spin_us {config.cycle.spin_us:g})": [run.wakeup for run in runs],
+        "loop wake-up (spin_us 0)": [run.wakeup for run in sleeping],
         "loop exchange": [run.exchange for run in runs],
         "loop compute": [run.compute for run in runs],
         "DC offset, raw": [run.offset for run in runs],
@@ -196,9 +211,9 @@ def compare(cycle_us: int, seconds: float, rounds: int, *, poll: bool, console: 
         table.add_row(name, *(f"{found[key]:.1f}" for key in ("p50", "p99", "p99.9", "max")), spread(samples, "p99"))
     console.print(table)
     if reference:
-        ratio = figures([run.wakeup for run in runs])["p99"] / figures(reference)["p99"]
-        result["ratio"] = ratio
-        console.print(f"wake-up p99, loop / cyclictest: {ratio:.2f}")
+        ratios = [figures([run.wakeup for run in each])["p99"] / figures(reference)["p99"] for each in (runs, sleeping)]
+        result["ratio"], result["ratio_timer_alone"] = ratios
+        console.print(f"wake-up p99, loop / cyclictest: {ratios[0]:.2f}; with the timer alone: {ratios[1]:.2f}")
     periods = np.concatenate([run.period for run in runs])
     error = (periods.mean() - cycle_us) / cycle_us * 100
     cycles = sum(run.period.size for run in runs)
@@ -259,8 +274,8 @@ def main() -> int:
     console.print(f"{machine}, {date.today().isoformat()}")
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
         os.environ["RTCP_RUNTIME_DIR"] = directory
-        found = {"machine": machine, "date": date.today().isoformat()}
-        found |= compare(given.cycle_us, given.seconds, given.rounds, poll=given.poll, console=console)
+        found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
+        found |= compare(given.cycle_us, given.seconds, given.rounds, Path(directory), poll=given.poll, console=console)
         if not given.no_targets:
             found["targets"] = targets(given.seconds / 2, poll=given.poll, console=console)
     if given.json:

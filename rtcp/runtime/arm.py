@@ -86,12 +86,16 @@ class Arm:
         self.generator.latch(self.generator.position)
 
     def follow(self) -> None:
-        """Let set-point and guard follow the drives that have no torque: their target is where they are."""
+        """Let set-point and guard follow the drives that have no torque: their target is where they are.
+
+        A joint that stands outside its range is followed to the edge of it only; it is not enabled there.
+        """
         position, latch = self.generator.position, self.guard.latch
         for i, drive in enumerate(self.drives):
             if drive.state is not _ENABLED:
-                position[i] = drive.target_position = drive.position
-                latch(i, drive.position)
+                low, high, here = self.low[i], self.high[i], drive.position
+                position[i] = drive.target_position = high if here > high else low if here < low else here
+                latch(i, drive.target_position)
 
     def command(self) -> None:
         """Write the targets of this cycle: set-point, law, guard."""

@@ -246,10 +246,8 @@ class Behaviour:
             return
         if arm.generator.motion is Motion.MOVE:
             arm.generator.stop()
-        if not arm.still and arm.first_not_enabled() < 0:
-            arm.generator.update()
-            arm.lead(DriveGoal.ENABLED)
-            arm.command()
+        if not arm.still:
+            self._stop_healthy()
             return
         arm.lead(DriveGoal.DISABLED)
         arm.follow()
