@@ -148,7 +148,7 @@ class ArmConfig:
 
     name: Name
     slaves: Annotated[tuple[SlaveConfig, ...], MinLen(1)]
-    joints: Annotated[tuple[Joint, ...], MinLen(1)]
+    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(11)]
     cycle: CycleConfig
     bus: BusConfig
     mode: DriveModeName = "csp"

@@ -17,6 +17,7 @@ BITS = {
 }  # fmt: skip
 
 _NUMERIC = tuple(name for name in BITS if name != "bool")
+_INTEGERS = tuple(name for name in _NUMERIC if "int" in name)
 
 # The channels that a driver of each kind reads and writes, and the types that it can take them in. CiA 402-2 fixes
 # 0x6040 and 0x6041 as UINT16, 0x6060 and 0x6061 as INT8; the other widths are the device's own choice.
@@ -24,9 +25,9 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
     "cia402": {
         "rpdo": {
             "controlword": ("uint16",),
-            "target_position": _NUMERIC,
-            "target_velocity": _NUMERIC,
-            "target_torque": _NUMERIC,
+            "target_position": _INTEGERS,
+            "target_velocity": _INTEGERS,
+            "target_torque": _INTEGERS,
             "modes_of_operation": ("int8",),
         },
         "tpdo": {

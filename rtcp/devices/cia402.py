@@ -29,6 +29,8 @@ class DriveGoal(Enum):
     """Where a drive is led; the value names it in sentences."""
 
     DISABLED = "disabled"
+    QUICK_STOPPED = "stopped by quick stop"
+    """Ramps down by itself and holds (0x605A = 6) until it is led to DISABLED; a drive without torque stays without."""
     ENABLED = "enabled"
     RESET = "free of faults"
     """Resets a fault and takes the drive no further than `switch on disabled`."""
@@ -46,7 +48,8 @@ STATES: dict[tuple[int, int], DriveState] = {
     (0x4F, 0x08): DriveState.FAULT,
 }
 
-DISABLE_VOLTAGE, SHUTDOWN, SWITCH_ON, ENABLE_OPERATION, FAULT_RESET = 0x0000, 0x0006, 0x0007, 0x000F, 0x0080
+DISABLE_VOLTAGE, QUICK_STOP, SHUTDOWN, SWITCH_ON = 0x0000, 0x0002, 0x0006, 0x0007
+ENABLE_OPERATION, FAULT_RESET = 0x000F, 0x0080
 """Commands of the controlword (CiA 402-2, table 27)."""
 
 _S = DriveState
@@ -77,13 +80,23 @@ CONTROLWORDS |= {
     for state in DriveState
 }
 
+_RAMPING = (_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE)
+CONTROLWORDS |= {
+    (state, DriveGoal.QUICK_STOPPED): QUICK_STOP if state in _RAMPING else CONTROLWORDS[state, DriveGoal.DISABLED]
+    for state in DriveState
+}
+
 # States in which a goal is reached.
 REACHED: dict[DriveGoal, frozenset[DriveState]] = {
     DriveGoal.ENABLED: frozenset({_S.OPERATION_ENABLED}),
     DriveGoal.DISABLED: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
+    DriveGoal.QUICK_STOPPED: frozenset(
+        {_S.QUICK_STOP_ACTIVE, _S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}
+    ),
     DriveGoal.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
 }
 
+_TARGET_STANDS = (ENABLE_OPERATION, QUICK_STOP)
 _STATE_BITS = 0x6F
 _STATE_OF = tuple(
     next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
@@ -95,6 +108,7 @@ _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque"
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 _CSP, _CSV, _CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
+_WITH_SPEED = (_CSP, _CSV)
 _ENABLED = DriveState.OPERATION_ENABLED
 
 
@@ -164,7 +178,7 @@ class Cia402Drive:
         self.state = _STATE_OF[word & _STATE_BITS]
         if self._error_slot >= 0:
             self.error_code = int(values[self._error_slot])
-        if self.controlword != ENABLE_OPERATION:
+        if self.controlword not in _TARGET_STANDS:
             self.target_position = self.position
 
     def advance(self, goal: DriveGoal) -> bool:
@@ -195,8 +209,9 @@ class Cia402Drive:
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
-        Velocity (in CSP: the speed limit) and torque are sent only while the drive is enabled and displays the mode
-        that is commanded: on the way from CSV to CSP it would take the speed limit for a target velocity, and run.
+        Velocity and torque are sent only to a drive that is enabled and told to be. The velocity (in CSP: the speed
+        limit) waits until the drive displays the mode that is commanded: on the way from CSV to CSP it would take the
+        limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
         A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.
         """
         fields = self._fields
@@ -206,13 +221,12 @@ class Cia402Drive:
         fields[mode] = commanded = self.mode
         fields[position] = self._counts(self.target_position * by_position, 0, fields[position])
         speed = effort = 0
-        if commanded == self.mode_display and self.state is _ENABLED:
-            if commanded == _CSP:
-                speed = self._counts(self.speed_limit * by_velocity, 1, fields[velocity])
-            elif commanded == _CSV:
-                speed = self._counts(self.target_velocity * by_velocity, 1, fields[velocity])
-            elif commanded == _CST:
+        if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
+            if commanded == _CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
+            elif commanded == self.mode_display and commanded in _WITH_SPEED:
+                wanted = self.speed_limit if commanded == _CSP else self.target_velocity
+                speed = self._counts(wanted * by_velocity, 1, fields[velocity])
         fields[velocity] = speed
         fields[torque] = effort
         return self._pack(*fields)

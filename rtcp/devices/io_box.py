@@ -50,15 +50,19 @@ class IoBox:
         before, after = self._image
         return before + self._outputs.pack(self.outputs) + after
 
+    @property
+    def output_count(self) -> int:
+        """How many outputs there are."""
+        return 8 * self._outputs.size
+
     def set_output(self, number: int, value: bool) -> None:
         """Switch output `number` (1 to 16) on or off.
 
         Raises:
             DeviceError: there is no such output.
         """
-        highest = 8 * self._outputs.size
-        if not 1 <= number <= highest:
-            raise DeviceError(f"{self.name} has no output {number}; it has 1 to {highest}")
+        if not 1 <= number <= self.output_count:
+            raise DeviceError(f"{self.name} has no output {number}; it has 1 to {self.output_count}")
         bit = 1 << number - 1
         self.outputs = self.outputs | bit if value else self.outputs & ~bit
 

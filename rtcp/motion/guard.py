@@ -42,24 +42,35 @@ class Guard:
             step = self._step[i]
             low = max(self._low[i], before - step)
             high = min(self._high[i], before + step)
+            if low > high:
+                # The last target lay outside the range: step by step back into it.
+                low = high = before - step if before > self._high[i] else before + step
             # A comparison with NaN is false: what is no number fails the first test and the target stays.
             if not (low <= wanted <= high):
                 held |= 1 << i
-                wanted = high if wanted > high else low if wanted < low else before
+                wanted = high if wanted > high else low if wanted < low else min(max(before, low), high)
             last[i] = drive.target_position = wanted
             speed = drive.target_velocity
             bound = self._speed[i]
             if not (-bound <= speed <= bound):
                 held |= 1 << i
                 speed = bound if speed > bound else -bound if speed < -bound else 0.0
-            if (drive.position > self._high[i] and speed > 0.0) or (drive.position < self._low[i] and speed < 0.0):
-                held |= 1 << i
-                speed = 0.0
-            drive.target_velocity = speed
             torque = drive.target_torque
             bound = self._torque[i]
             if not (-bound <= torque <= bound):
                 held |= 1 << i
                 torque = bound if torque > bound else -bound if torque < -bound else 0.0
+            # Beyond the range nothing drives further out.
+            if drive.position > self._high[i]:
+                outward = speed > 0.0 or torque > 0.0
+                speed, torque = min(speed, 0.0), min(torque, 0.0)
+            elif drive.position < self._low[i]:
+                outward = speed < 0.0 or torque < 0.0
+                speed, torque = max(speed, 0.0), max(torque, 0.0)
+            else:
+                outward = False
+            if outward:
+                held |= 1 << i
+            drive.target_velocity = speed
             drive.target_torque = torque
         self.held = held

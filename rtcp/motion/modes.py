@@ -26,6 +26,7 @@ class Commanded(Protocol):
 
     position: float
     velocity: float
+    torque: float
     target_position: float
     target_velocity: float
     target_torque: float
@@ -36,7 +37,7 @@ class ModeLaw(Protocol):
 
     mode: DriveMode
 
-    def start(self) -> None:
+    def start(self, drives: Sequence[Commanded]) -> None:
         """Begin at standstill: forget what an earlier use left behind."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
@@ -48,7 +49,7 @@ class PositionLaw:
 
     mode = DriveMode.CSP
 
-    def start(self) -> None:
+    def start(self, drives: Sequence[Commanded]) -> None:
         """Nothing is kept."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
@@ -67,7 +68,7 @@ class VelocityLaw:
     def __init__(self, joints: Sequence[Joint]) -> None:
         self._gain = [joint.csv_gain for joint in joints]
 
-    def start(self) -> None:
+    def start(self, drives: Sequence[Commanded]) -> None:
         """Nothing is kept."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
@@ -91,10 +92,11 @@ class TorqueLaw:
         self._bound = [joint.torque for joint in joints]
         self._integral = [0.0] * len(self._bound)
 
-    def start(self) -> None:
-        """Begin with an empty integral."""
-        for i in range(len(self._integral)):
-            self._integral[i] = 0.0
+    def start(self, drives: Sequence[Commanded]) -> None:
+        """Begin with the torque that holds the arm now, so that it does not sag on the change."""
+        for i, drive in enumerate(drives):
+            bound = self._bound[i]
+            self._integral[i] = min(max(drive.torque, -bound), bound)
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target torques (Nm)."""

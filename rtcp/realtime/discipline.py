@@ -21,6 +21,8 @@ _PHASE_GAIN = 0.02
 # Critically damped for that phase gain.
 _RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
 _SHOWN_GAIN = 1 / 32
+_RATE_BOUND = 500e-6
+"""No two oscillators differ by more: a bound that keeps a jump of the reference from winding the rate up."""
 
 
 class Discipline:
@@ -32,8 +34,8 @@ class Discipline:
     """
 
     __slots__ = (
-        "_base", "_difference", "_good_cycles", "_measured", "_period", "_phase", "_rate", "_seen", "aligned",
-        "filtered_ns", "locked", "raw_ns",
+        "_base", "_difference", "_good_cycles", "_measured", "_period", "_phase", "_rate", "_reference", "_seen",
+        "aligned", "filtered_ns", "locked", "raw_ns",
     )  # fmt: skip
 
     def __init__(self, period_ns: int, phase_ns: int) -> None:
@@ -43,6 +45,7 @@ class Discipline:
         self._base = 0
         self._difference = 0.0
         self._rate = 0.0
+        self._reference = -1
         self._measured = [0] * MEASURE_CYCLES
         self._seen = 0
         self._good_cycles = 0
@@ -55,6 +58,11 @@ class Discipline:
 
     def observe(self, sent_ns: int, reference_ns: int) -> None:
         """Take in one frame: the master's time just before sending and the reference's when it passed."""
+        if reference_ns == self._reference:
+            # The reference slave did not answer: what came back is what was sent.
+            self.coast()
+            return
+        self._reference = reference_ns
         period = self._period
         offset = (reference_ns - self._phase) % period
         self.raw_ns = offset - period if 2 * offset > period else offset
@@ -63,9 +71,15 @@ class Discipline:
             return
         self._difference += self._rate
         residual = reference_ns - sent_ns - self._base - self._difference
+        if abs(residual) > period:
+            # The reference was set: only its phase within the period matters, whole periods are taken over at once.
+            whole = round(residual / period) * period
+            self._base += whole
+            residual -= whole
         bounded = min(max(residual, -_RESIDUAL_BOUND_NS), _RESIDUAL_BOUND_NS)
         self._difference += _PHASE_GAIN * bounded
-        self._rate += _RATE_GAIN * bounded
+        limit = _RATE_BOUND * period
+        self._rate = min(max(self._rate + _RATE_GAIN * bounded, -limit), limit)
         self.filtered_ns += _SHOWN_GAIN * (min(max(residual, -period / 2), period / 2) - self.filtered_ns)
         self._judge()
 

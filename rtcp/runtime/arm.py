@@ -15,6 +15,10 @@ MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
 """Drive states without torque and without a fault."""
 _ENABLED = DriveState.OPERATION_ENABLED
+_HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+"""Drive states with torque: the target stands."""
+_STILL_RAD_S = 0.01
+_RANGE_TOLERANCE_RAD = 1e-3
 
 
 class Arm:
@@ -52,7 +56,7 @@ class Arm:
         """Let the drives change to `mode`; only at standstill."""
         self.mode = mode
         self._law = self._laws[mode]
-        self._law.start()
+        self._law.start(self.drives)
         for drive in self.drives:
             drive.mode = mode
 
@@ -71,15 +75,9 @@ class Arm:
         for drive in self.drives:
             drive.advance(goal)
 
-    def lead_healthy(self) -> None:
-        """Keep the drives enabled that are; ask none back that has left Operation Enabled."""
-        for drive in self.drives:
-            drive.advance(DriveGoal.ENABLED if drive.state is _ENABLED else DriveGoal.DISABLED)
-
     def begin(self) -> None:
         """Hold where the joints are, from standstill without torque."""
         self.generator.latch([drive.position for drive in self.drives])
-        self._law.start()
 
     def hold_target(self) -> None:
         """Hold at the set-point that was made last."""
@@ -92,7 +90,7 @@ class Arm:
         """
         position, latch = self.generator.position, self.guard.latch
         for i, drive in enumerate(self.drives):
-            if drive.state is not _ENABLED:
+            if drive.state not in _HOLDING:
                 low, high, here = self.low[i], self.high[i], drive.position
                 position[i] = drive.target_position = high if here > high else low if here < low else here
                 latch(i, drive.target_position)
@@ -122,6 +120,28 @@ class Arm:
         mode = self.mode
         for axis, drive in enumerate(self.drives):
             if drive.mode_display != mode:
+                return axis
+        return -1
+
+    def first_in_fault(self) -> int:
+        """Return the first joint whose drive is in fault, or -1."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state is DriveState.FAULT:
+                return axis
+        return -1
+
+    def first_moving(self) -> int:
+        """Return the first joint that does not stand still, or -1."""
+        for axis, drive in enumerate(self.drives):
+            if abs(drive.velocity) > _STILL_RAD_S:
+                return axis
+        return -1
+
+    def first_outside(self) -> int:
+        """Return the first joint that stands outside its range, or -1."""
+        for axis, drive in enumerate(self.drives):
+            here = drive.position
+            if not self.low[axis] - _RANGE_TOLERANCE_RAD <= here <= self.high[axis] + _RANGE_TOLERANCE_RAD:
                 return axis
         return -1
 

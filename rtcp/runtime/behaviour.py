@@ -1,10 +1,15 @@
-"""What every state does in a cycle, and how it is left. One method a state; the tables are in `machine`."""
+"""What every state does in a cycle, and how it is left. One method a state; the tables are in `machine`.
+
+In a fault every drive is told to quick-stop: it ramps down by itself and holds (0x605A = 6), whatever the mode, whether
+or not frames come back, and comes back to Operation Enabled only by reset and enable.
+"""
 
 from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.generator import Motion
+from rtcp.motion.modes import DriveMode
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
@@ -15,6 +20,9 @@ from rtcp.runtime.service import Service
 _CLOSING_S = 2.0
 _RESET_S = 3.0
 _MODE_S = 1.0
+_CLOCK_S = 1.0
+_FAREWELL_CYCLES = 20
+"""Frames with quick stop for slaves that still listen when the bus is given up."""
 
 
 class Behaviour:
@@ -41,6 +49,8 @@ class Behaviour:
         self._reset_cycles = round(_RESET_S / period_s)
         self._closing_cycles = round(_CLOSING_S / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
+        self._clock_cycles = round(_CLOCK_S / period_s)
+        self._unlocked = 0
         self._since = 0
         self.state = State.STARTING
         self.cycle = 0
@@ -52,6 +62,10 @@ class Behaviour:
         self.all_enabled = False
         self.switching = False
         """Whether a mode change is under way."""
+        self.torque_off = False
+        """Whether the torque was asked to be taken off in a fault."""
+        self.wanted_mode = arm.mode
+        """The mode to hold in: drives are enabled in CSP, where target = actual means standstill, and change then."""
         self.lease = 0
         """Lease of the commander whose move is carried out."""
         self.done = False
@@ -79,6 +93,12 @@ class Behaviour:
         """Change to `state`."""
         self.state = state
         self._since = self.cycle
+        self.switching = False
+
+    @property
+    def clock_followed(self) -> bool:
+        """Whether there is no reference clock to follow, or it is followed."""
+        return self._discipline is None or self._discipline.locked
 
     @property
     def _waited(self) -> int:
@@ -86,7 +106,10 @@ class Behaviour:
 
     def _fail(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         self.fault = code
-        self.switching = False
+        self.torque_off = False
+        self.all_enabled = False
+        self._arm.hold_target()
+        self._arm.lead(DriveGoal.QUICK_STOPPED)
         self._blackboard.event(code, axis, value, limit)
         self.enter(State.FAULT)
 
@@ -96,14 +119,15 @@ class Behaviour:
 
     def _bus_fails(self, good: bool) -> bool:
         if not good and self.lost > self._lost_limit:
-            # What the generator made last is what the slaves were told last: hold there.
-            self._arm.hold_target()
             self._fail(Code.BUS_LOST, -1, float(self.lost), float(self._lost_limit))
             return True
-        lost_slave = self._service.lost_slave
-        if lost_slave:
-            self._arm.generator.stop()
-            self._fail(Code.SLAVE_NOT_OP, lost_slave)
+        if self._service.lost_slave:
+            self._fail(Code.SLAVE_NOT_OP, self._service.lost_slave)
+            return True
+        self._unlocked = 0 if self.clock_followed else self._unlocked + 1
+        if self._unlocked > self._clock_cycles:
+            self._unlocked = 0
+            self._fail(Code.CLOCK_LOST)
             return True
         return False
 
@@ -117,11 +141,9 @@ class Behaviour:
             return True
         axis = arm.first_not_enabled()
         if axis >= 0:
-            arm.generator.stop()
             self._fail_drive(Code.DRIVE_LEFT_ENABLED, axis)
             return False
         if not arm.generator.update():
-            arm.hold_target()
             self._fail(Code.GENERATOR)
             return False
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
@@ -131,8 +153,8 @@ class Behaviour:
     # -- one method a state -------------------------------------------------------------------------------------
 
     def _starting(self, good: bool) -> None:
-        discipline, service = self._discipline, self._service
-        if discipline is None or discipline.locked:
+        service = self._service
+        if self.clock_followed:
             service.want_op()
         self._arm.lead(DriveGoal.DISABLED)
         if good:
@@ -142,13 +164,23 @@ class Behaviour:
                 self.enter(State.READY)
 
     def _ready(self, good: bool) -> None:
-        if not self._bus_fails(good) and good:
-            self._arm.lead(DriveGoal.DISABLED)
-            self._arm.follow()
+        arm = self._arm
+        if self._bus_fails(good) or not good:
+            return
+        axis = arm.first_in_fault()
+        if axis >= 0:
+            self._fail_drive(Code.DRIVE_FAULT, axis)
+            return
+        arm.lead(DriveGoal.DISABLED)
+        arm.follow()
 
     def _enabling(self, good: bool) -> None:
         arm = self._arm
         if self._bus_fails(good) or not good:
+            return
+        axis = arm.first_outside()
+        if axis >= 0:
+            self._fail(Code.LEFT_RANGE, axis, arm.drives[axis].position)
             return
         arm.lead(DriveGoal.ENABLED)
         arm.follow()
@@ -161,8 +193,16 @@ class Behaviour:
             self.all_enabled = True
             self._blackboard.event(Code.ENABLED)
             self.enter(State.HOLDING)
+            if self.wanted_mode is not DriveMode.CSP:
+                self.change_mode(self.wanted_mode)
         elif self._waited > self._enable_cycles:
             self._fail_drive(Code.ENABLE_STUCK, axis)
+
+    def change_mode(self, mode: DriveMode) -> None:
+        """Let the enabled drives, at standstill, change to `mode`."""
+        self._arm.set_mode(mode)
+        self.enter(State.HOLDING)
+        self.switching = True
 
     def _holding(self, good: bool) -> None:
         if not self._track(good) or not self.switching:
@@ -192,6 +232,8 @@ class Behaviour:
     def _disabling(self, good: bool) -> None:
         arm = self._arm
         if not arm.still:
+            # The time for disabling begins when the arm stands.
+            self._since = self.cycle
             self._track(good)
             return
         if self._bus_fails(good) or not good:
@@ -207,23 +249,18 @@ class Behaviour:
             self._fail_drive(Code.DISABLE_STUCK, axis)
 
     def _faulted(self, good: bool) -> None:
-        self.all_enabled = False
+        # Also without frames that come back: slaves that still hear must not go on with the last speed or torque.
+        self._arm.lead(DriveGoal.DISABLED if self.torque_off else DriveGoal.QUICK_STOPPED)
         if good:
-            self._stop_healthy()
-
-    def _stop_healthy(self) -> None:
-        """Let healthy drives stop and hold against gravity."""
-        self._arm.generator.update()
-        self._arm.lead_healthy()
-        self._arm.follow()
-        self._arm.command()
+            self._arm.follow()
 
     def _resetting(self, good: bool) -> None:
-        arm, service = self._arm, self._service
-        if good and not arm.still:
-            self._stop_healthy()
-        elif good and service.all_op:
-            arm.lead(DriveGoal.RESET)
+        arm = self._arm
+        if not (good and self._service.all_op and self.clock_followed):
+            self._faulted(good)
+        else:
+            # What still moves is let come to rest first: its torque goes with the reset.
+            arm.lead(DriveGoal.RESET if arm.first_moving() < 0 else DriveGoal.QUICK_STOPPED)
             arm.follow()
             if arm.first_not_resting() < 0:
                 self.fault = Code.NONE
@@ -232,22 +269,28 @@ class Behaviour:
                 return
         if self._waited > self._reset_cycles:
             axis = arm.first_not_resting()
-            if axis >= 0 and service.all_op:
+            if axis >= 0 and self._service.all_op:
                 self._fail_drive(Code.RESET_STUCK, axis)
             else:
                 self._fail(Code.RESET_STUCK)
 
     def _closing(self, good: bool) -> None:
         arm = self._arm
-        if self._waited > self._closing_cycles or self.lost > self._lost_limit:
+        if self.lost > self._lost_limit:
+            arm.lead(DriveGoal.QUICK_STOPPED)
+            self.done = self.lost > self._lost_limit + _FAREWELL_CYCLES
+            return
+        if self._waited > self._closing_cycles:
             self.done = True
             return
         if not good:
             return
         if arm.generator.motion is Motion.MOVE:
             arm.generator.stop()
-        if not arm.still:
-            self._stop_healthy()
+        if not arm.still and arm.first_not_enabled() < 0:
+            self._since = self.cycle
+            arm.generator.update()
+            arm.command()
             return
         arm.lead(DriveGoal.DISABLED)
         arm.follow()

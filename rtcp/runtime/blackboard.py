@@ -61,7 +61,8 @@ class Blackboard:
         self.joints = joints
         # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
         fresh = path.with_name(path.name + f".{os.getpid()}")
-        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+        fresh.unlink(missing_ok=True)
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         try:
             os.ftruncate(descriptor, layout.file_size)
             self._map = mmap.mmap(descriptor, layout.file_size)

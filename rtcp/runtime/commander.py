@@ -11,6 +11,7 @@ from typing import Any
 
 from rtcp.config.model import ArmConfig
 from rtcp.motion.modes import DriveMode
+from rtcp.runtime.layout import COMMAND_NUMBERS
 from rtcp.runtime.machine import Command, State
 from rtcp.runtime.observer import BlackboardError, LeaseRefused, Observer
 from rtcp.runtime.picture import Picture
@@ -18,6 +19,10 @@ from rtcp.runtime.picture import Picture
 Progress = Callable[[dict[str, Any]], Awaitable[None]]
 _POLL_S = 0.002
 _SAME_RAD = 1e-9
+_ENABLING = frozenset({State.ENABLING})
+_DISABLING = frozenset({State.HOLDING, State.MOVING, State.STOPPING, State.ENABLING, State.DISABLING})
+_RESETTING = frozenset({State.RESETTING})
+_MOVING = frozenset({State.MOVING, State.STOPPING})
 _ANSWER_S = 2.0
 _SERVICE_S = 5.0
 
@@ -85,17 +90,22 @@ class Commander:
         if not self._picture.loop_lives:
             raise CommandFailed("fault", f"the loop (process {self._observer.loop_pid}) has ended")
 
-    async def _until(self, wanted: State, patience_s: float, what: str, progress: Progress | None = None) -> None:
+    async def _until(
+        self, wanted: State, through: frozenset[State], patience_s: float, what: str, progress: Progress | None = None
+    ) -> None:
+        """Wait for the state `wanted`, which is reached through the states `through` only; any other ends the wait."""
         until = time.monotonic() + patience_s
         told = 0.0
-        while (state := self._picture.state()) is not wanted:
+        while (state := self._picture.state()) is not wanted or self._picture.switching():
             self._check_loop()
-            if state is State.FAULT:
+            if state is State.FAULT and wanted is not State.FAULT:
                 # The sentence may be a poll behind the state.
                 await asyncio.sleep(0.05)
-                raise CommandFailed("fault", self._picture.fault or "the machine went into fault")
+                raise CommandFailed("fault", self._picture.last_fault or "the machine went into fault")
+            name = "unknown" if state is None else state.name.lower()
+            if state is not wanted and state not in through:
+                raise CommandFailed("refused", f"{what} was ended by another command: the machine is {name}")
             if time.monotonic() > until:
-                name = "unknown" if state is None else state.name.lower()
                 raise CommandFailed("timeout", f"{what} took longer than {patience_s:.1f} s: the machine is {name}")
             if progress is not None and time.monotonic() - told > 0.1:
                 told = time.monotonic()
@@ -122,13 +132,15 @@ class Commander:
             return {}
         async with self._lease(client) as lease:
             await self._give(lease, Command.ENABLE)
-            await self._until(State.HOLDING, self._config.enable_timeout_s + 2.0, "enabling")
+            await self._until(State.HOLDING, _ENABLING, self._config.enable_timeout_s + 3.0, "enabling")
         return {}
 
     async def disable(self, client: str) -> dict[str, Any]:
         """Stop in a controlled way and take the torque off; needs no lease."""
+        faulty = self._picture.state() in (State.FAULT, State.RESETTING)
         await self._give(0, Command.DISABLE)
-        await self._until(State.READY, self._config.enable_timeout_s + 10.0, "disabling")
+        if not faulty:
+            await self._until(State.READY, _DISABLING, self._config.enable_timeout_s + 30.0, "disabling")
         return {}
 
     async def reset(self, client: str) -> dict[str, Any]:
@@ -138,7 +150,7 @@ class Commander:
             return {}
         async with self._lease(client) as lease:
             await self._give(lease, Command.RESET)
-            await self._until(State.READY, 6.0, "reset")
+            await self._until(State.READY, _RESETTING, 6.0, "reset")
         return {}
 
     async def mode(self, client: str, name: str) -> dict[str, Any]:
@@ -148,6 +160,8 @@ class Commander:
             raise CommandFailed("invalid", f"mode {name!r} is unknown: one of {', '.join(modes)}")
         async with self._lease(client) as lease:
             await self._give(lease, Command.MODE, [modes[name]])
+            if self._picture.state() is State.HOLDING:
+                await self._until(State.HOLDING, frozenset(), 3.0, "the mode change")
         return {"mode": name}
 
     async def move(self, client: str, q: Sequence[float], speed: float | None, progress: Progress) -> dict[str, Any]:
@@ -156,12 +170,13 @@ class Commander:
         if len(q) != len(joints):
             raise CommandFailed("invalid", f"{len(q)} joint positions were given, the arm has {len(joints)} joints")
         fastest = max(joint.velocity for joint in joints)
-        numbers = [*q, *([0.0] * (11 - len(q))), fastest if speed is None else speed]
+        numbers = [*q, *([0.0] * (COMMAND_NUMBERS - 1 - len(q))), fastest if speed is None else speed]
         async with self._lease(client) as lease:
             await self._give(lease, Command.MOVE, numbers)
             if speed is not None and math.isfinite(speed):
                 fastest = min(fastest, speed)
-            await self._until(State.HOLDING, 20.0 + 4 * 12.6 / fastest, "the move", progress)
+            # Twice round at that speed and some more: only a machine that hangs takes longer.
+            await self._until(State.HOLDING, _MOVING, 20.0 + 4 * math.tau / fastest, "the move", progress)
         # What was asked for and what the arm does differ by the following error, which dies away.
         await asyncio.sleep(0.2)
         return self._arrival(q)
@@ -178,7 +193,7 @@ class Commander:
     async def halt(self, client: str) -> dict[str, Any]:
         """Stop a motion in a controlled way; needs no lease."""
         await self._give(0, Command.STOP)
-        await self._until(State.HOLDING, 10.0, "stopping")
+        await self._until(State.HOLDING, _MOVING, 30.0, "stopping")
         return {}
 
     async def output(self, client: str, number: int, value: bool) -> dict[str, Any]:
@@ -187,9 +202,22 @@ class Commander:
             await self._give(lease, Command.OUTPUT, [number, value])
         return {}
 
-    def shut_down(self) -> None:
+    async def shut_down(self) -> None:
         """Tell the loop to stop, disable and end; its process's end is the answer."""
-        self._observer.command(0, Command.SHUTDOWN)
+        async with self._ring:
+            self._observer.command(0, Command.SHUTDOWN)
+
+    async def sdo_write(self, client: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Write an object, under the lease and only while no drive has torque.
+
+        What a drive does in a fault or beyond a limit stands in its objects: they do not change under a moving arm.
+        """
+        state = self._picture.state()
+        if state is not State.READY:
+            name = "unknown" if state is None else state.name.lower()
+            raise CommandFailed("refused", f"an object is written while ready only, not while {name}: `rtcp disable`")
+        async with self._lease(client):
+            return await self.service(request)
 
     async def service(self, request: dict[str, Any]) -> dict[str, Any]:
         """Let the loop's service thread carry out an SDO access or a scan."""

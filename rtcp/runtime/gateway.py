@@ -19,7 +19,7 @@ from typing import Any
 
 from rtcp.runtime.commander import Commander, CommandFailed
 from rtcp.runtime.observer import BlackboardError, Observer
-from rtcp.runtime.paths import blackboard_file, control_socket, processes_file
+from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
 from rtcp.runtime.picture import Picture
 from rtcp.runtime.session import end, read_processes, read_session, wait_gone
 
@@ -56,7 +56,7 @@ class Gateway:
             "output": self._output,
             "scan": self._scan,
             "sdo_read": self._sdo,
-            "sdo_write": self._sdo,
+            "sdo_write": lambda client, args, tell: self._commander.sdo_write(client, args),
             "stop": self._stop,
         }
 
@@ -75,8 +75,9 @@ class Gateway:
         self._watch_loop(loop)
         self._following = asyncio.create_task(self._follow())
         ready()
-        async with server:
-            await self._ended.wait()
+        await self._ended.wait()
+        # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
+        server.close()
         self._following.cancel()
         path.unlink(missing_ok=True)
 
@@ -178,9 +179,10 @@ class Gateway:
 
     async def _stop(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
         processes = read_processes(self._directory)
+        stopping_mark(self._directory).touch(mode=0o600)
         if self._picture.loop_lives:
             with contextlib.suppress(BlackboardError):
-                self._commander.shut_down()
+                await self._commander.shut_down()
             # The blocking waits run beside, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_gone, processes.loop, 6.0):
                 await asyncio.to_thread(end, processes.loop, 4.0)

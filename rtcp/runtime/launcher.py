@@ -32,8 +32,9 @@ from rtcp.runtime.paths import (
     prepare,
     processes_file,
     runtime_directory,
+    stopping_mark,
 )
-from rtcp.runtime.session import Processes, Session, end, is_ours, read_processes
+from rtcp.runtime.session import Processes, Session, end, is_ours, read_processes, read_session
 
 VIRTUAL = "virtual"
 _SEGMENT_S = 15.0
@@ -95,13 +96,14 @@ def start(options: StartOptions, report: Report) -> Running:
     except RuntimeDirectoryError as error:
         raise StartError(str(error), "usage") from None
     with _alone(directory):
-        if adopted := _adopt(directory, report):
+        stopping_mark(directory).unlink(missing_ok=True)
+        if adopted := _adopt(directory, options, report):
             return adopted
         config = _configured(options)
         return _start_all(directory, config, options, began_ns, report)
 
 
-def _adopt(directory: Path, report: Report) -> Running | None:
+def _adopt(directory: Path, options: StartOptions, report: Report) -> Running | None:
     """Deal with what an earlier start left: refuse, give a lone loop its gateway back, or clear remnants away."""
     found = read_processes(directory)
     if is_ours(found.loop):
@@ -109,7 +111,13 @@ def _adopt(directory: Path, report: Report) -> Running | None:
             raise StartError(
                 f"the platform is running already (loop process {found.loop}): `rtcp status`, `rtcp stop`", "refused"
             )
-        running = Running(directory, found, {})
+        if options != StartOptions():
+            raise StartError(
+                f"the loop (process {found.loop}) is running without a gateway: `rtcp start` without options starts "
+                "one; for other options `rtcp stop` first",
+                "refused",
+            )
+        running = Running(directory, read_session(directory / "session.pickle").config, found)
         report(f"the loop (process {found.loop}) is running without a gateway: starting one")
         running.start_gateway()
         return running
@@ -143,11 +151,11 @@ def _start_all(
     directory: Path, config: ArmConfig, options: StartOptions, began_ns: int, report: Report
 ) -> Running:  # fmt: skip
     bus = config.bus.interface
-    running = Running(directory, Processes(), {})
+    running = Running(directory, config, Processes())
     try:
         interface, segment = bus, 0
         if bus == VIRTUAL:
-            facts = running.start_segment(segment_path(config), config, options.poll)
+            facts = running.start_segment(segment_path(config), options.poll)
             interface, segment = str(facts["interface"]), int(facts["pid"])
             report(f"segment of {facts['slaves']} virtual slaves (process {segment})")
         Session(config, bus, interface, segment, began_ns).write(directory / "session.pickle")
@@ -162,10 +170,11 @@ def _start_all(
 class Running:
     """A platform that runs; made by `start`."""
 
-    def __init__(self, directory: Path, processes: Processes, facts: dict[str, Any]) -> None:
+    def __init__(self, directory: Path, config: ArmConfig, processes: Processes) -> None:
         self.directory = directory
         self.processes = processes
-        self.facts = facts
+        self._config = config
+        self.facts: dict[str, Any] = {}
         """What the loop told of its start: realtime, start_to_op_s."""
         self._children: list[subprocess.Popen[bytes]] = []
 
@@ -188,11 +197,11 @@ class Running:
         self.processes.write(self.directory)
         return child, reading
 
-    def start_segment(self, path: Path, config: ArmConfig, poll: bool) -> dict[str, Any]:
+    def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line."""
         more = ["--poll"] if poll else []
         child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
-        self._keep_off(child.pid, config)
+        self._keep_off(child.pid)
         for line in _lines(reading, _SEGMENT_S, child):
             if "pid" in line:
                 return line
@@ -215,16 +224,14 @@ class Running:
     def start_gateway(self) -> None:
         """Start the gateway; return when the control socket listens."""
         child, reading = self._spawn("gateway", "rtcp.runtime.gateway", "--directory", str(self.directory))
-        with contextlib.suppress(OSError):
-            others = set(available_cpus()) - {choose_cpu(None)}
-            if others:
-                os.sched_setaffinity(child.pid, others)
+        self._keep_off(child.pid)
         for _ in _lines(reading, _GATEWAY_S, child):
             return
         raise StartError(self._last_words("gateway", child))
 
-    def _keep_off(self, pid: int, config: ArmConfig) -> None:
-        others = set(available_cpus()) - {choose_cpu(config.cycle.cpu)}
+    def _keep_off(self, pid: int) -> None:
+        """Keep a process off the cycle's CPU where there is another."""
+        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
         if others:
             with contextlib.suppress(OSError):
                 os.sched_setaffinity(pid, others)
@@ -261,7 +268,9 @@ class Running:
     def _ended_orderly(self) -> bool:
         """Whether another `rtcp stop` ended the loop: the directory, maybe a new platform's by now, is left alone."""
         loop = next((child for child in self._children if child.pid == self.processes.loop), None)
-        return loop is not None and loop.wait() == 0
+        if loop is not None and loop.wait() != 0:
+            return False
+        return stopping_mark(self.directory).exists() or not processes_file(self.directory).exists()
 
     def _reap(self, patience_s: float) -> None:
         for child in self._children:

@@ -64,8 +64,9 @@ EVENT = struct.Struct("<QqIidd")
 EVENTS = 256
 
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT.size
-COMMAND = struct.Struct("<QQI4x12d")
-"""number, lease id, kind, twelve numbers"""
+COMMAND_NUMBERS = 12
+COMMAND = struct.Struct(f"<QQI4x{COMMAND_NUMBERS}d")
+"""number, lease id, kind, numbers: of a move the joints' targets first and the speed last"""
 COMMANDS = 64
 
 RECORDS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
@@ -106,6 +107,7 @@ PER_JOINT = (("position", "d"), ("velocity", "d"), ("torque", "d"), ("target", "
 FLAG_DC_LOCKED = 1
 FLAG_ALL_OP = 2
 FLAG_ENABLED = 4
+FLAG_SWITCHING = 8
 
 
 @dataclass(frozen=True)

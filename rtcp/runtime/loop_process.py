@@ -35,7 +35,7 @@ from rtcp.runtime.record import Recorder
 from rtcp.runtime.service import Service
 from rtcp.runtime.session import Session, read_session
 
-_SCARE_CYCLES = 20
+_DISABLE_CYCLES = 20
 
 
 class Report:
@@ -152,7 +152,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         raise
     except BaseException:
         # A defect in the cycle: the drives are told to stop before the bus goes away.
-        _scare(data, drives)
+        _disable_blindly(data, drives)
         raise
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -182,8 +182,8 @@ def _discipline(config: ArmConfig, period_ns: int) -> Discipline | None:
     return Discipline(period_ns, round(shifts[0] * 1000 + config.bus.send_phase * period_ns))
 
 
-def _scare(data: ProcessData, drives: list[tuple[int, Cia402Drive]]) -> None:
-    for _ in range(_SCARE_CYCLES):
+def _disable_blindly(data: ProcessData, drives: list[tuple[int, Cia402Drive]]) -> None:
+    for _ in range(_DISABLE_CYCLES):
         for slot, drive in drives:
             drive.decode(data.input(slot))
             drive.advance(DriveGoal.DISABLED)

@@ -19,7 +19,7 @@ class State(IntEnum):
     """A controlled stop: down to standstill under the limits, then holding."""
     DISABLING = 7
     FAULT = 8
-    """Something was lost or broke. Healthy drives hold; nothing moves until reset."""
+    """Something was lost or broke. Every drive is told to quick-stop and hold; nothing moves until reset."""
     RESETTING = 9
     CLOSING = 10
     """On the way out: stop, disable, INIT."""
@@ -53,6 +53,9 @@ class Refusal(IntEnum):
     NO_OUTPUTS = 9
     UNKNOWN = 10
     NOT_IN_OP = 11
+    SWITCHING = 12
+    NOT_STILL = 13
+    CLOCK = 14
 
 
 class Code(IntEnum):
@@ -76,14 +79,16 @@ class Code(IntEnum):
     STOPPED = 15
     DC_LOCKED = 16
     DC_UNLOCKED = 17
+    DRIVE_FAULT = 18
+    CLOCK_LOST = 19
+    LEFT_RANGE = 20
+    TORQUE_OFF = 21
 
 
 ALLOWED: dict[Command, frozenset[State]] = {
     Command.ENABLE: frozenset({State.READY}),
-    Command.DISABLE: frozenset(
-        {State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING}
-    ),
-    Command.RESET: frozenset({State.FAULT, State.READY, State.HOLDING}),
+    Command.DISABLE: frozenset(State) - {State.STARTING, State.CLOSING},
+    Command.RESET: frozenset({State.FAULT}),
     Command.MODE: frozenset({State.READY, State.HOLDING}),
     Command.MOVE: frozenset({State.HOLDING, State.MOVING}),
     Command.STOP: frozenset({State.HOLDING, State.MOVING, State.STOPPING}),

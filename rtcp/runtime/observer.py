@@ -23,6 +23,7 @@ from rtcp.runtime.layout import (
     ANSWER_NUMBER_AT,
     COMMAND,
     COMMAND_HEAD_AT,
+    COMMAND_NUMBERS,
     COMMAND_TAKEN_AT,
     COMMANDS,
     COMMANDS_AT,
@@ -278,7 +279,7 @@ class Observer:
         number = self._words[COMMAND_HEAD_AT] + 1
         if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
             raise BlackboardError("the loop takes no commands: its process hangs or is gone")
-        padded = [*numbers, *([0.0] * (12 - len(numbers)))]
+        padded = [*numbers, *([0.0] * (COMMAND_NUMBERS - len(numbers)))]
         COMMAND.pack_into(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size, number, lease, kind, *padded)
         self._words.fence()
         self._words[COMMAND_HEAD_AT] = number

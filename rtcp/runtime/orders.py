@@ -11,7 +11,7 @@ from rtcp.realtime.clock import monotonic_ns
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Command, Refusal, State
+from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Code, Command, Refusal, State
 from rtcp.runtime.service import Service
 
 Verdict = tuple[Refusal] | tuple[Refusal, int, float] | tuple[Refusal, int, float, float]
@@ -62,9 +62,10 @@ class Orders:
         if command not in WITHOUT_LEASE and not self._holds(lease):
             return (Refusal.NO_LEASE,)
         state = self._behaviour.state
-        busy = self._behaviour.switching and command in (Command.MODE, Command.MOVE)
-        if busy or state not in ALLOWED[command]:
+        if state not in ALLOWED[command]:
             return Refusal.NOT_IN_THIS_STATE, int(state), float(command)
+        if self._behaviour.switching and command in (Command.MODE, Command.MOVE):
+            return (Refusal.SWITCHING,)
         return self._answers[command](lease, numbers)
 
     def _holds(self, lease: int) -> bool:
@@ -75,35 +76,47 @@ class Orders:
         arm = self._arm
         if not self._service.all_op:
             return (Refusal.NOT_IN_OP,)
+        if not self._behaviour.clock_followed:
+            return (Refusal.CLOCK,)
+        axis = arm.first_moving()
+        if axis >= 0:
+            return Refusal.NOT_STILL, axis, arm.drives[axis].velocity
         for axis, drive in enumerate(arm.drives):
             low, high = arm.low[axis], arm.high[axis]
             if not low <= drive.position <= high:
                 return Refusal.OUTSIDE_LIMITS, axis, drive.position, high if drive.position > high else low
+        arm.set_mode(DriveMode.CSP)
         arm.begin()
         self._behaviour.enter(State.ENABLING)
         return _DONE
 
     def _disable(self, lease: int, numbers: Sequence[float]) -> Verdict:
         behaviour = self._behaviour
-        if behaviour.state not in (State.READY, State.DISABLING):
+        if behaviour.state in (State.FAULT, State.RESETTING):
+            # The fault stays; only the torque goes.
+            behaviour.torque_off = True
+            behaviour.enter(State.FAULT)
+            self._blackboard.event(Code.TORQUE_OFF)
+        elif behaviour.state not in (State.READY, State.DISABLING):
             self._arm.generator.stop()
             behaviour.enter(State.DISABLING)
         return _DONE
 
     def _reset(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if self._behaviour.state is State.FAULT:
-            self._service.recover()
-            self._behaviour.enter(State.RESETTING)
+        self._service.recover()
+        self._behaviour.enter(State.RESETTING)
         return _DONE
 
     def _mode(self, lease: int, numbers: Sequence[float]) -> Verdict:
         wanted = numbers[0]
         if wanted not in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST):
             return Refusal.MODE, -1, wanted
-        self._arm.set_mode(DriveMode(int(wanted)))
-        if self._behaviour.state is State.HOLDING:
-            self._behaviour.enter(State.HOLDING)
-            self._behaviour.switching = True
+        behaviour, mode = self._behaviour, DriveMode(int(wanted))
+        behaviour.wanted_mode = mode
+        if behaviour.state is State.HOLDING:
+            behaviour.change_mode(mode)
+        else:
+            self._arm.set_mode(mode)
         return _DONE
 
     def _move(self, lease: int, numbers: Sequence[float]) -> Verdict:
@@ -135,7 +148,7 @@ class Orders:
         if self._box is None:
             return (Refusal.NO_OUTPUTS,)
         number, value = numbers[0], numbers[1]
-        highest = 8 * self._box.output_bytes
+        highest = self._box.output_count
         if number not in range(1, highest + 1):
             return Refusal.OUTPUT, -1, number, float(highest)
         self._box.set_output(int(number), bool(value))

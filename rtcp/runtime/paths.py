@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 import tempfile
@@ -57,7 +58,13 @@ def processes_file(directory: Path) -> Path:
     return directory / "processes.json"
 
 
+def stopping_mark(directory: Path) -> Path:
+    """Return the path of the mark that a stop is under way: a loop that ends then ends as it was told."""
+    return directory / "stopping"
+
+
 def blackboard_file(directory: Path) -> Path:
     """Return the path of the blackboard: always in memory, so that a disk never holds up the cycle."""
-    name = str(directory.resolve()).strip("/").replace("/", "-")
-    return Path("/dev/shm") / f"rtcp-{os.geteuid()}-{name}"
+    # A digest: two directories never share a name, however they are spelt.
+    digest = hashlib.sha256(os.fsencode(directory.resolve())).hexdigest()[:16]
+    return Path("/dev/shm") / f"rtcp-{os.geteuid()}-{digest}"

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.realtime.statistics import SlidingPercentiles
-from rtcp.runtime.layout import FLAG_DC_LOCKED
+from rtcp.runtime.layout import FLAG_DC_LOCKED, FLAG_SWITCHING
 from rtcp.runtime.machine import Code, State
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.sentences import FAULTS, Sentences
@@ -54,6 +54,8 @@ class Picture:
         self._enables = 0
         self._unread = 0
         self.fault = ""
+        """The first sentence of the present fault: why the machine is in it."""
+        self.last_fault = ""
         self.message = ""
         self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
         self.loop_lives = True
@@ -87,9 +89,12 @@ class Picture:
             sentence = self._sentences.event(event.code, event.axis, event.value, event.limit)
             said.append((event.time_ns, sentence))
             if Code(event.code) in FAULTS:
-                self.fault = sentence
+                self.fault = self.fault or sentence
+                self.last_fault = sentence
             elif event.code == Code.RESET:
                 self.fault = ""
+        """The first sentence of the present fault: why the machine is in it."""
+        self.last_fault = ""
         for text in self._observer.texts_since(self._text):
             self._text = text.number
             said.append((text.time_ns, text.sentence))
@@ -107,6 +112,11 @@ class Picture:
         """Return the machine's state, or None before the first cycle."""
         latest = self._observer.latest()
         return None if latest is None else State(int(latest[0]["state"]))
+
+    def switching(self) -> bool:
+        """Whether the drives are changing their mode."""
+        latest = self._observer.latest()
+        return latest is not None and bool(int(latest[0]["flags"]) & FLAG_SWITCHING)
 
     def status(self, processes: Processes) -> dict[str, Any]:
         """Return the whole picture as `rtcp status --json` prints it."""
@@ -128,7 +138,12 @@ class Picture:
             state = "fault"
             message = f"the loop (process {self._observer.loop_pid}) has published nothing for {silent_s:.1f} s"
         slaves = [
-            {"position": i + 1, "name": slave.name, "state": al_name(al), "al_status_code": code}
+            {
+                "position": i + 1,
+                "name": slave.name,
+                "state": al_name(al) if self.loop_lives else "unknown",
+                "al_status_code": code,
+            }
             for i, (slave, (al, code)) in enumerate(
                 zip(config.slaves, self._observer.slaves(len(config.slaves)), strict=True)
             )
@@ -142,7 +157,7 @@ class Picture:
             "cycles": int(record["cycle"]),
             "time_ns": int(record["time_ns"]),
             "missed": int(record["missed"]),
-            "wkc": {"expected": int(record["wkc_expected"]), "actual": int(record["wkc"])},
+            "wkc": {"expected": int(record["wkc_expected"]), "actual": int(record["wkc"]) if self.loop_lives else -1},
             "slaves": slaves,
             "joint_names": [joint.name for joint in config.joints],
             "joints": {
@@ -157,7 +172,7 @@ class Picture:
             "exchange_us": self._exchange.read().as_json(),
             "compute_us": self._compute.read().as_json(),
             "dc": {
-                "locked": bool(int(record["flags"]) & FLAG_DC_LOCKED),
+                "locked": self.loop_lives and bool(int(record["flags"]) & FLAG_DC_LOCKED),
                 "offset_ns": int(record["dc_offset_ns"]),
                 "filtered_ns": int(record["dc_filtered_ns"]),
                 "offset_us": self._offset.read().as_json(),

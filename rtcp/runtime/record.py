@@ -8,7 +8,7 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, FLAG_ENABLED, PER_JOINT, SCALARS
+from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, FLAG_ENABLED, FLAG_SWITCHING, PER_JOINT, SCALARS
 from rtcp.runtime.machine import Code
 from rtcp.runtime.service import Service
 
@@ -68,6 +68,8 @@ class Recorder:
                 self._blackboard.event(Code.DC_LOCKED if self._locked else Code.DC_UNLOCKED)
         if behaviour.all_enabled:
             flags |= FLAG_ENABLED
+        if behaviour.switching:
+            flags |= FLAG_SWITCHING
         inputs = outputs = counter = 0
         if box is not None:
             inputs, outputs, counter = box.inputs, box.outputs, box.counter

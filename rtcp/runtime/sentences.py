@@ -45,16 +45,21 @@ class Sentences:
             Refusal.NO_OUTPUTS: lambda _: f"no IO box is configured (slaves in {self._file})",
             Refusal.UNKNOWN: lambda m: f"command {_number(m.value)} is unknown to this loop",
             Refusal.NOT_IN_OP: lambda _: "not all slaves are in OP: see `rtcp status`, then `rtcp reset`",
+            Refusal.SWITCHING: lambda _: "the drives are changing their mode: try again when they show it",
+            Refusal.NOT_STILL: lambda m: (
+                f"{self._joint(m.axis)} turns at {_number(m.value)} rad/s: it is enabled at standstill only"
+            ),
+            Refusal.CLOCK: lambda _: "the cycle does not follow the reference clock yet (`rtcp status`, clocks)",
         }
         self._events: dict[Code, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
                 f"process data lost: {_number(m.value)} cycles in a row without the expected working counter, more "
-                f"than {_number(m.limit)} are allowed (bus.lost_cycles in {self._file}); the arm holds, "
-                "`rtcp reset` goes on when the slaves answer"
+                f"than {_number(m.limit)} are allowed (bus.lost_cycles in {self._file}); all drives are "
+                "told to stop, `rtcp reset` goes on when the slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
                 f"{self._joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
-                "the other joints hold, `rtcp reset` goes on"
+                "all joints are stopped, `rtcp reset` goes on"
             ),
             Code.ENABLE_STUCK: lambda m: (
                 f"{self._joint(m.axis)}: enabling stuck for {self._config.enable_timeout_s:g} s at statusword "
@@ -64,10 +69,23 @@ class Sentences:
                 f"{self._joint(m.axis)}: the drive does not give up Operation Enabled (statusword 0x{int(m.value):04X})"
             ),
             Code.SLAVE_NOT_OP: lambda m: (
-                f"slave {m.axis} ({self._slave(m.axis)}) left OP; the arm holds, `rtcp reset` brings it back"
+                f"slave {m.axis} ({self._slave(m.axis)}) left OP; all drives are told to stop, "
+                "`rtcp reset` brings it back"
             ),
             Code.RESET_STUCK: self._reset_stuck,
             Code.GENERATOR: lambda _: "the trajectory generator refused its input: the arm holds",
+            Code.DRIVE_FAULT: lambda m: (
+                f"{self._joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
+            ),
+            Code.CLOCK_LOST: lambda _: (
+                "the cycle has not followed the reference clock for 1 s; all drives are told to stop, "
+                "`rtcp reset` goes on"
+            ),
+            Code.LEFT_RANGE: lambda m: (
+                f"{self._joint(m.axis)} left its range while being enabled: it stands at {_number(m.value)} rad "
+                f"(joints[{m.axis}].position in {self._file})"
+            ),
+            Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
             Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
             Code.MODE_STUCK: lambda m: (
                 f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for 1 s ago"
@@ -115,7 +133,7 @@ class Sentences:
 
     def _reset_stuck(self, matter: Matter) -> str:
         if matter.axis < 0:
-            return "reset did not succeed within 3 s: not all slaves came back to OP"
+            return "reset did not succeed within 3 s: not all slaves came back to OP, or the clock is not followed"
         return (
             f"{self._joint(matter.axis)}: the drive stays in fault after reset (statusword 0x{int(matter.value):04X})"
         )
@@ -139,6 +157,9 @@ FAULTS = frozenset(
         Code.RESET_STUCK,
         Code.GENERATOR,
         Code.MODE_STUCK,
+        Code.DRIVE_FAULT,
+        Code.CLOCK_LOST,
+        Code.LEFT_RANGE,
     }
 )
 """Events that are why the machine is in the state FAULT."""

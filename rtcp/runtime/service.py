@@ -17,7 +17,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
 
 _TURN_S = 0.01
-_WATCH_TURNS = 10
+_MAIL_TURNS = 10
 _RECOVER_S = 2.0
 _LOCK_S = 5.0
 _ERROR_CODE = 0x603F
@@ -100,7 +100,9 @@ class Service(threading.Thread):
         try:
             self._take_turns()
         except Exception as error:
-            self._blackboard.text(f"the service thread met a defect ({type(error).__name__}: {error}): the loop ends")
+            sentence = f"the service thread met a defect ({type(error).__name__}: {error}): the loop ends"
+            self._blackboard.text(sentence)
+            self.refused = (sentence,)
             self.on_refused()
             raise
 
@@ -126,8 +128,10 @@ class Service(threading.Thread):
             axis, self._explain = self._explain, -1
             self._say_error(axis)
         self._answer_request()
-        if turn % _WATCH_TURNS == 0:
-            self._watch()
+        self._watch()
+        if turn % _MAIL_TURNS == 0:
+            for emergency in self._bus.emergencies():
+                self._blackboard.text(emergency.sentence())
 
     def _start(self, turn: int) -> None:
         if self._op_wanted:
@@ -149,8 +153,6 @@ class Service(threading.Thread):
     def _watch(self) -> None:
         states = self._bus.read_states()
         self._tell_states(states)
-        for emergency in self._bus.emergencies():
-            self._blackboard.text(emergency.sentence())
         if not self.all_op:
             return
         for slave in states:

@@ -231,7 +231,8 @@ IN_A_DEVICE = {
     "a bit for a torque": (
         DRIVE,
         (TORQUE, TORQUE.replace("int32", "bool")),
-        "rpdo[0].channels[3].type: found bool for target_torque, allowed is any type but bool",
+        "rpdo[0].channels[3].type: found bool for target_torque, allowed is int8 or uint8 or int16 or uint16 "
+        "or int32 or uint32 or int64 or uint64",
     ),
     "process data that end within a byte": (
         DRIVE,

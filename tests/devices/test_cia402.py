@@ -134,17 +134,39 @@ def test_latching_forgets_a_velocity_and_a_torque_of_before(drive, wire):
 def test_each_mode_sends_its_own_fields(drive, wire, mode, velocity, torque):
     drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
     wire.says(ENABLED, mode=mode)
+    drive.controlword = 0x0F
     assert wire.hears()[2:] == (velocity, torque, mode)
 
 
 @pytest.mark.parametrize("commanded", [8, 9, 10])
 @pytest.mark.parametrize("displayed", [0, 1, 3, 6, 8, 9, 10])
-def test_no_speed_and_no_torque_is_sent_to_a_drive_in_another_mode(drive, wire, commanded, displayed):
+def test_no_speed_is_sent_to_a_drive_in_another_mode_and_torque_only_on_the_way_to_cst(
+    drive, wire, commanded, displayed
+):
     drive.mode, drive.target_velocity, drive.target_torque = commanded, 0.25, 12.0
     wire.says(ENABLED, mode=displayed)
+    drive.controlword = 0x0F
     _, _, velocity, torque, mode = wire.hears()
     assert mode == commanded
-    assert (velocity or torque) == 0 or commanded == displayed
+    assert velocity == 0 or commanded == displayed
+    assert torque == (12_0000 if commanded == 10 else 0)
+
+
+def test_a_quick_stop_is_held_and_sends_neither_speed_nor_torque(drive, wire):
+    for mode in (8, 9, 10):
+        drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
+        for status in (ENABLED, QUICK_STOP, QUICK_STOP):
+            wire.says(status, mode=mode)
+            drive.advance(DriveGoal.QUICK_STOPPED)
+            assert wire.hears()[0] == 0x02
+            assert wire.hears()[2:4] == (0, 0)
+
+
+@pytest.mark.parametrize("status", [DISABLED, FAULT])
+def test_a_quick_stop_gives_no_torque_to_a_drive_without(drive, wire, status):
+    wire.says(status)
+    assert drive.advance(DriveGoal.QUICK_STOPPED)
+    assert wire.hears()[0] == 0x00
 
 
 @pytest.mark.parametrize("status", [DISABLED, READY, SWITCHED_ON, QUICK_STOP, FAULT])

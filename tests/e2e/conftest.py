@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -103,6 +104,21 @@ class Platform:
             [sys.executable, str(WIRE), str(segment), *arguments], text=True, capture_output=True, check=True
         )
         return done.stdout
+
+    @contextlib.contextmanager
+    def capture(self, path: Path) -> Iterator[None]:
+        """Write the frames that reach the segment meanwhile to a file."""
+        segment = str(self.pids()["segment"])
+        sniffer = subprocess.Popen(
+            [sys.executable, str(WIRE), segment, "capture", str(path)], stdout=subprocess.PIPE, text=True
+        )
+        assert sniffer.stdout is not None
+        assert sniffer.stdout.readline() == "ready\n"
+        try:
+            yield
+        finally:
+            sniffer.send_signal(signal.SIGTERM)
+            assert sniffer.wait() == 0
 
     def al_states(self) -> list[int]:
         """Return the AL status of every slave, read with frames of the tests' own."""

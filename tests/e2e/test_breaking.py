@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import time
 
 import numpy as np
@@ -14,6 +13,7 @@ from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.runtime.observer import Observer, record_type
 from rtcp.runtime.paths import blackboard_file
 from tests.e2e.conftest import Platform, gone, kill, lives
+from tests.e2e.wire import outputs
 
 OP, SAFE_OP_ERROR, INIT = 0x08, 0x14, 0x01
 
@@ -128,6 +128,97 @@ def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_g
     running.rtcp("move", *["0"] * 6)
 
 
+@pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
+def test_one_slave_that_is_lost_stops_the_joints_of_the_others(platform: Platform, mode: str) -> None:
+    platform.be_patient(20)
+    platform.rtcp("start", "--detach", "--mode", mode)
+    platform.rtcp("enable")
+    moving = platform.background("move", "1.5", "0.5", "0", "0", "0", "0", "--speed", "0.4")
+    platform.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.3, "motion")
+    # The IO box falls to INIT: the drives' frames go on, and their watchdogs are content.
+    platform.wire("init", "0")
+    assert moving.wait() == 5
+    status = platform.status()
+    assert status["state"] == "fault"
+    assert 0 < status["wkc"]["actual"] < 21
+
+    def positions() -> list[int]:
+        return [
+            int(platform.rtcp("sdo", "read", str(slave), "0x6064", "--type", "int32").stdout.split()[0])
+            for slave in range(2, 8)
+        ]
+
+    time.sleep(0.5)
+    before = positions()
+    time.sleep(0.5)
+    after = positions()
+    assert max(abs(a - b) for a, b in zip(before, after, strict=True)) <= 10
+    assert before[0] < 1.5e4
+    path = platform.directory / "frames"
+    with platform.capture(path):
+        time.sleep(0.2)
+    sent = [drives for _, drives in outputs(path)]
+    assert len(sent) > 100
+    assert {drive.controlword for drives in sent for drive in drives} == {0x0002}
+    assert {(drive.velocity, drive.torque) for drives in sent for drive in drives} == {(0, 0)}
+    platform.rtcp("disable")
+    assert "0x0000" not in platform.status()["message"]
+    assert platform.rtcp("reset", check=5).stderr
+    platform.rtcp("stop")
+
+
+def test_an_object_is_not_written_while_drives_have_torque(running: Platform) -> None:
+    running.rtcp("enable")
+    done = running.rtcp("sdo", "write", "2", "0x6065:0", "9999", "--type", "uint32", check=3)
+    assert "while ready only" in done.stderr
+    running.rtcp("disable")
+    running.rtcp("sdo", "write", "2", "0x6065:0", "2001", "--type", "uint32")
+    assert running.rtcp("sdo", "read", "2", "0x6065:0", "--type", "uint32").stdout.startswith("2001")
+
+
+def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platform) -> None:
+    running.rtcp("enable")
+    moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
+    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.15, "motion")
+    observer = observe(running)
+    gateway = running.pids()["gateway"]
+    os.kill(gateway, signal.SIGSTOP)
+    end = time.monotonic() + 20
+    while True:
+        latest = observer.latest()
+        assert latest is not None
+        if int(latest[0]["state"]) == 4:
+            break
+        assert time.monotonic() < end
+    os.kill(gateway, signal.SIGCONT)
+    observer.close()
+    assert moving.wait() == 5
+    assert any("fell silent" in sentence for sentence in running.status()["messages"])
+
+
+def test_a_loop_that_is_terminated_alone_is_a_fault_of_the_foreground_start(platform: Platform) -> None:
+    platform.be_patient(200)
+    foreground = platform.background("start")
+    end = time.monotonic() + 30
+    while platform.rtcp("status", check=None).returncode != 0:
+        assert time.monotonic() < end, platform.logs()
+    pids = platform.pids()
+    os.kill(pids["loop"], signal.SIGTERM)
+    foreground.communicate()
+    assert foreground.returncode == 5
+    assert not any(lives(pid) for pid in pids.values())
+
+
+def test_disabling_ends_another_clients_move_at_once(running: Platform) -> None:
+    running.rtcp("enable")
+    moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
+    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.15, "motion")
+    running.rtcp("disable")
+    assert "ended by another command" in moving.communicate()[1]
+    assert moving.returncode == 3
+    running.rtcp("enable")
+
+
 def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) -> None:
     running.rtcp("enable")
     pids = running.pids()
@@ -223,15 +314,11 @@ def test_the_record_layout_is_the_same_for_writer_and_reader() -> None:
 
 
 def test_a_lost_terminal_does_not_leave_a_loop_behind(platform: Platform) -> None:
-    foreground = subprocess.Popen(
-        ["sh", "-c", "exec python3 -c 'import signal,os,sys; os.execvp(sys.argv[1], sys.argv[1:])' \"$@\"", "sh",
-         *[os.fspath(part) for part in (os.sys.executable, "-m", "rtcp.cli", "start")]],  # type: ignore[attr-defined]
-        env=platform.environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
+    foreground = platform.background("start")
     end = time.monotonic() + 30
     while platform.rtcp("status", check=None).returncode != 0:
         assert time.monotonic() < end, platform.logs()
     pids = platform.pids()
     foreground.send_signal(signal.SIGHUP)
-    foreground.wait()
+    foreground.communicate()
     assert not any(lives(pid) for pid in pids.values())

@@ -1,6 +1,6 @@
 """A look at the wire that shares nothing with the platform: its own frames, its own decoder.
 
-Usage: python wire.py SEGMENT_PID al | capture FILE
+Usage: python wire.py SEGMENT_PID al | init POSITION | capture FILE
 The layout of the process image is that of the facts: an IO box (2 bytes out), then six drives (15 bytes out each).
 """
 
@@ -21,6 +21,7 @@ from pathlib import Path
 ETHERTYPE = 0x88A4
 LRW = 12
 APRD = 1
+APWR = 2
 BRD = 7
 DRIVE = struct.Struct("<Hiiib")
 BOX_OUT = 2
@@ -68,6 +69,13 @@ def al_states(interface: str) -> list[int]:
         port.settimeout(5)
         _, count = ask(port, BRD, 0, 0x0130, 2)
         return [int.from_bytes(ask(port, APRD, -position, 0x0130, 2)[0], "little") for position in range(count)]
+
+
+def to_init(interface: str, position: int) -> None:
+    """Send the slave at `position` (from 0) to INIT, as if it had lost its way."""
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
+        port.bind((interface, ETHERTYPE))
+        port.send(frame(APWR, 0xDD, -position, 0x0120, b"\x01\x00"))
 
 
 def capture(interface: str, path: str) -> None:
@@ -131,6 +139,8 @@ def main() -> None:
     enter(int(sys.argv[1]))
     if sys.argv[2] == "al":
         print(json.dumps(al_states("ecat0")))
+    elif sys.argv[2] == "init":
+        to_init("ecat0", int(sys.argv[3]))
     else:
         capture("ecat0-seg", sys.argv[3])
 
