@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rtcp.cli.connection import connect
+from rtcp.cli.launch import refuse_a_second_platform
 from rtcp.cli.outcome import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.runtime import offline
 from rtcp.runtime.client import ControlClient, ControlError
@@ -99,6 +100,7 @@ def bus_access(command: str, bus: str | None, config: Path | None) -> Iterator[B
             except ControlError as error:
                 if error.kind != "not running":
                     raise
+                refuse_a_second_platform()
                 yield OfflineBus(bus, config)
                 return
             with client:
@@ -116,7 +118,7 @@ def position_of(slave: str, access: BusAccess) -> int:
     Raises:
         CommandError: when there is no such name, with those that there are.
     """
-    if slave.isdecimal() and int(slave) > 0:
+    if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
         return int(slave)
     named = access.positions()
     if slave not in named:

@@ -20,6 +20,25 @@ _SDO_TIMEOUT_US = 700_000
 _SIOCGIFFLAGS, _IFF_UP = 0x8913, 0x1
 
 
+def claim(interface: str) -> socket.socket:
+    """Claim the interface for this process: two masters on one cable take the slaves from each other.
+
+    The claim is a name that the kernel keeps per network namespace and frees with the process.
+
+    Raises:
+        BusError: another process of this platform has it.
+    """
+    mine = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    try:
+        mine.bind(f"\0rtcp-bus-{interface}")
+    except OSError as error:
+        mine.close()
+        raise BusError(
+            f"interface {interface} is in use by another process of this platform: `rtcp stop` it first"
+        ) from error
+    return mine
+
+
 def check_interface(name: str) -> None:
     """Raise BusError where there is no such interface or it is down."""
     known = [found for _, found in socket.if_nameindex()]

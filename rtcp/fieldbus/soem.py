@@ -21,7 +21,7 @@ from rtcp.fieldbus.configure import configure_slave, identity_faults
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.exchange import SoemProcessData
 from rtcp.fieldbus.fence import Fence
-from rtcp.fieldbus.interface import check_interface, open_master
+from rtcp.fieldbus.interface import check_interface, claim, open_master
 from rtcp.fieldbus.mailbox import Mailbox
 from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.pdo import layout, layout_faults
@@ -60,6 +60,7 @@ class SoemBus:
         self._state_timeout_s = state_timeout_s
         self._master: Any = None
         self._socket: socket.socket | None = None
+        self._claim: socket.socket | None = None
         self._port: RegisterPort | None = None
         self._fence: Fence | None = None
         self._sdo_lock = threading.RLock()
@@ -94,6 +95,7 @@ class SoemBus:
         if self._pid is not None:
             enter(self._pid)
         check_interface(self.interface)
+        self._claim = claim(self.interface)
         try:
             self._port = RegisterPort(self.interface)
             self._fence = Fence(self.interface)
@@ -303,12 +305,12 @@ class SoemBus:
         except BusError as error:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
-            for part in (self._port, self._fence, self._socket):
+            for part in (self._port, self._fence, self._socket, self._claim):
                 if part is not None:
                     part.close()
             if self._master is not None:
                 self._master.close()
-            self._port = self._fence = self._socket = self._master = None
+            self._port = self._fence = self._socket = self._claim = self._master = None
             self._names = []
 
     def _to_init(self, port: RegisterPort) -> None:

@@ -18,7 +18,9 @@ _ENABLED = DriveState.OPERATION_ENABLED
 _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 """Drive states with torque: the target stands."""
 _STILL_RAD_S = 0.01
-_RANGE_TOLERANCE_RAD = 1e-3
+RANGE_MARGIN_RAD = 0.02
+"""So far beyond its range a joint may stand and still be enabled, to be brought back to the edge: an overshoot in CST
+must not leave an arm that no command can move."""
 
 
 class Arm:
@@ -76,8 +78,8 @@ class Arm:
             drive.advance(goal)
 
     def begin(self) -> None:
-        """Hold where the joints are, from standstill without torque."""
-        self.generator.latch([drive.position for drive in self.drives])
+        """Hold where the joints are, from standstill without torque; `follow` has seen to that each cycle."""
+        self.generator.latch(self.generator.position)
 
     def hold_target(self) -> None:
         """Hold at the set-point that was made last."""
@@ -141,7 +143,7 @@ class Arm:
         """Return the first joint that stands outside its range, or -1."""
         for axis, drive in enumerate(self.drives):
             here = drive.position
-            if not self.low[axis] - _RANGE_TOLERANCE_RAD <= here <= self.high[axis] + _RANGE_TOLERANCE_RAD:
+            if not self.low[axis] - RANGE_MARGIN_RAD <= here <= self.high[axis] + RANGE_MARGIN_RAD:
                 return axis
         return -1
 

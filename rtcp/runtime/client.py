@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Any, Literal, cast
 
 from rtcp.runtime.paths import control_socket, runtime_directory
+from rtcp.runtime.session import is_ours, read_processes
 
 ErrorKind = Literal["refused", "fault", "timeout", "invalid", "internal", "not running", "lost"]
 Progress = Callable[[Mapping[str, Any]], None]
@@ -155,9 +156,7 @@ def _connect(path: Path) -> socket.socket:
         connection.connect(os.fspath(path))
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError) as error:
         connection.close()
-        raise ControlError(
-            "not running", f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
-        ) from error
+        raise ControlError("not running", _who_runs(path)) from error
     except PermissionError as error:
         connection.close()
         raise ControlError("refused", f"the control socket {path} is another user's: only its owner may use it") from (
@@ -167,6 +166,13 @@ def _connect(path: Path) -> socket.socket:
         connection.close()
         raise ControlError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}") from error
     return connection
+
+
+def _who_runs(path: Path) -> str:
+    loop = read_processes(path.parent).loop
+    if is_ours(loop):
+        return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
+    return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
 
 
 def _silence(verb: str, timeout_s: float | None) -> ControlError:

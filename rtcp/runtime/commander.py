@@ -19,6 +19,7 @@ from rtcp.runtime.picture import Picture
 Progress = Callable[[dict[str, Any]], Awaitable[None]]
 _POLL_S = 0.002
 _SAME_RAD = 1e-9
+_SETTLED_RAD, _SETTLE_S = 5e-4, 3.0
 _ENABLING = frozenset({State.ENABLING})
 _DISABLING = frozenset({State.HOLDING, State.MOVING, State.STOPPING, State.ENABLING, State.DISABLING})
 _RESETTING = frozenset({State.RESETTING})
@@ -178,8 +179,10 @@ class Commander:
             # Twice round at that speed and some more: only a machine that hangs takes longer.
             await self._until(State.HOLDING, _MOVING, 20.0 + 4 * math.tau / fastest, "the move", progress)
         # What was asked for and what the arm does differ by the following error, which dies away.
-        await asyncio.sleep(0.2)
-        return self._arrival(q)
+        until = time.monotonic() + _SETTLE_S
+        while (arrival := self._arrival(q))["error"] > _SETTLED_RAD and time.monotonic() < until:
+            await asyncio.sleep(0.02)
+        return arrival
 
     def _arrival(self, q: Sequence[float]) -> dict[str, Any]:
         latest = self._observer.latest()

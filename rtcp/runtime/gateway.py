@@ -12,6 +12,7 @@ import json
 import logging
 import os
 import signal
+import struct
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -147,9 +148,16 @@ class Gateway:
             await _send(writer, {"id": number, "ok": True, "result": result})
         except CommandFailed as failed:
             await _send(writer, {"id": number, "ok": False, "error": {"kind": failed.kind, "message": str(failed)}})
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, struct.error, BlackboardError) as error:
             sentence = f"the request's arguments are not of the verb's form: {type(error).__name__} {error}"
             await _send(writer, {"id": number, "ok": False, "error": {"kind": "invalid", "message": sentence}})
+        except ConnectionError:
+            raise
+        except Exception as error:
+            # One request's defect is answered and logged; the others are served on.
+            log.exception("request %.200r", given)
+            sentence = f"the gateway met a defect: {type(error).__name__} {error}"
+            await _send(writer, {"id": number, "ok": False, "error": {"kind": "internal", "message": sentence}})
         if self._stopping:
             self._ended.set()
 

@@ -14,6 +14,7 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from rtcp.config.find import find_config
 from rtcp.config.model import ArmConfig, DriveModeName
 from rtcp.config.schema import load, segment_path, with_period
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
-from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.client import LONGEST_SOCKET_PATH, ControlClient, ControlError
 from rtcp.runtime.paths import (
     RuntimeDirectoryError,
     blackboard_file,
@@ -41,6 +42,7 @@ _SEGMENT_S = 15.0
 _LOOP_S = 60.0
 _GATEWAY_S = 15.0
 _STOP_S = 20.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Report = Callable[[str], None]
 Kind = Literal["refused", "fault", "usage", "timeout"]
 
@@ -91,6 +93,13 @@ def start(options: StartOptions, report: Report) -> Running:
     """
     began_ns = time.monotonic_ns()
     directory = runtime_directory()
+    length = len(os.fsencode(control_socket(directory)))
+    if length > LONGEST_SOCKET_PATH:
+        raise StartError(
+            f"the control socket's path {control_socket(directory)} has {length} bytes, at most {LONGEST_SOCKET_PATH} "
+            "are allowed: set RTCP_RUNTIME_DIR to a shorter one",
+            "usage",
+        )
     try:
         prepare(directory)
     except RuntimeDirectoryError as error:
@@ -162,9 +171,27 @@ def _start_all(
         running.start_loop(report)
         running.start_gateway()
     except BaseException:
-        running.stop()
+        with _undisturbed():
+            running.stop()
         raise
     return running
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Put off Ctrl-C and its kin until the block is done: what was started is known, or ended, by then."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda got, frame: came.append(got)) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])
 
 
 class Running:
@@ -182,7 +209,8 @@ class Running:
 
     def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
         reading, writing = os.pipe()
-        with open(self.directory / f"{name}.log", "wb") as log:
+        with open(self.directory / f"{name}.log", "wb") as log, _undisturbed():
+            # A signal between start and registration would leave a process that nobody knows of.
             child = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
                 stdin=subprocess.DEVNULL,
@@ -191,10 +219,10 @@ class Running:
                 pass_fds=(writing,),
                 start_new_session=True,
             )
-        os.close(writing)
-        self._children.append(child)
-        setattr(self.processes, name, child.pid)
-        self.processes.write(self.directory)
+            os.close(writing)
+            self._children.append(child)
+            setattr(self.processes, name, child.pid)
+            self.processes.write(self.directory)
         return child, reading
 
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
@@ -282,9 +310,6 @@ class Running:
         _ask_gateway(self.directory)
         clear(self.directory, self.processes)
         self._reap(2.0)
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def _ask_gateway(directory: Path) -> None:

@@ -56,6 +56,7 @@ class Refusal(IntEnum):
     SWITCHING = 12
     NOT_STILL = 13
     CLOCK = 14
+    NO_PLAN = 15
 
 
 class Code(IntEnum):

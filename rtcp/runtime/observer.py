@@ -114,6 +114,9 @@ class Answer:
     limit: float
 
 
+_LOCK_TURNS, _LOCK_WAIT_S = 50, 0.002
+
+
 class Observer:
     """Reads and commands a blackboard.
 
@@ -222,14 +225,22 @@ class Observer:
         if self._words[LEASE_ID_AT] == 0 or self._run_out():
             return ""
         name = bytes(self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE])
-        return name.rstrip(b"\0").decode(errors="replace")
+        shown = "".join(letter for letter in name.decode(errors="replace") if letter.isprintable())
+        return shown or "an unnamed commander"
 
     def _run_out(self) -> bool:
         return time.monotonic_ns() - self._words[LEASE_RENEWED_AT] > self._words[LEASE_DURATION_AT]
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[None]:
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX)
+        for turn in range(_LOCK_TURNS):
+            try:
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if turn == _LOCK_TURNS - 1:
+                    raise BlackboardError("the lease is locked by another process that does not let go") from None
+                time.sleep(_LOCK_WAIT_S)
         try:
             yield
         finally:
@@ -246,7 +257,7 @@ class Observer:
                 raise LeaseRefused(holder)
             words, now = self._words, time.monotonic_ns()
             words[LEASE_ID_AT] = 0
-            encoded = (name or "an unnamed commander").encode()[:LEASE_HOLDER_SIZE].ljust(LEASE_HOLDER_SIZE, b"\0")
+            encoded = name.encode()[:LEASE_HOLDER_SIZE].ljust(LEASE_HOLDER_SIZE, b"\0")
             self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE] = encoded
             words[LEASE_DURATION_AT] = int(duration_s * 1e9)
             words[LEASE_RENEWED_AT] = now

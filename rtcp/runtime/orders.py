@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from math import isfinite
 
 from rtcp.devices.io_box import IoBox
+from rtcp.motion.generator import LONGEST_S
 from rtcp.motion.modes import DriveMode
 from rtcp.realtime.clock import monotonic_ns
-from rtcp.runtime.arm import Arm
+from rtcp.runtime.arm import RANGE_MARGIN_RAD, Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Code, Command, Refusal, State
@@ -83,7 +84,7 @@ class Orders:
             return Refusal.NOT_STILL, axis, arm.drives[axis].velocity
         for axis, drive in enumerate(arm.drives):
             low, high = arm.low[axis], arm.high[axis]
-            if not low <= drive.position <= high:
+            if not low - RANGE_MARGIN_RAD <= drive.position <= high + RANGE_MARGIN_RAD:
                 return Refusal.OUTSIDE_LIMITS, axis, drive.position, high if drive.position > high else low
         arm.set_mode(DriveMode.CSP)
         arm.begin()
@@ -131,7 +132,8 @@ class Orders:
             if not low <= wanted <= high:
                 return Refusal.POSITION_LIMIT, axis, wanted, high if wanted > high else low
             target[axis] = wanted
-        arm.generator.move_to(target, speed)
+        if not arm.generator.move_to(target, speed):
+            return Refusal.NO_PLAN, -1, speed, LONGEST_S
         behaviour = self._behaviour
         behaviour.lease = lease
         behaviour.moves += 1

@@ -29,13 +29,14 @@ def runtime_directory() -> Path:
 
 
 def prepare(directory: Path) -> None:
-    """Make the directory, for its owner alone.
+    """Make the directory, for its owner alone; one that exists already is left as it is.
 
     Raises:
-        RuntimeDirectoryError: where it cannot be made, or is another user's.
+        RuntimeDirectoryError: where it cannot be made, is another user's, or others may write to it.
     """
     try:
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if not directory.exists():
+            directory.mkdir(mode=0o700, parents=True)
         found = directory.stat()
     except OSError as error:
         raise RuntimeDirectoryError(f"runtime directory {directory} cannot be made: {error.strerror}") from error
@@ -44,8 +45,11 @@ def prepare(directory: Path) -> None:
             f"runtime directory {directory} belongs to user {found.st_uid}, not to user {os.geteuid()}: "
             "set RTCP_RUNTIME_DIR to one of your own"
         )
-    if stat.S_IMODE(found.st_mode) != 0o700:
-        directory.chmod(0o700)
+    if not stat.S_ISDIR(found.st_mode) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise RuntimeDirectoryError(
+            f"runtime directory {directory} is no directory, or one that others may write to "
+            f"(mode {stat.S_IMODE(found.st_mode):04o}): set RTCP_RUNTIME_DIR to one of your own"
+        )
 
 
 def control_socket(directory: Path) -> Path:

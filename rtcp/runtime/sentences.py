@@ -49,6 +49,10 @@ class Sentences:
             Refusal.NOT_STILL: lambda m: (
                 f"{self._joint(m.axis)} turns at {_number(m.value)} rad/s: it is enabled at standstill only"
             ),
+            Refusal.NO_PLAN: lambda m: (
+                f"no trajectory of at most {_number(m.limit)} s was found to that target at {_number(m.value)} rad/s: "
+                "choose a higher speed or a nearer target"
+            ),
             Refusal.CLOCK: lambda _: "the cycle does not follow the reference clock yet (`rtcp status`, clocks)",
         }
         self._events: dict[Code, Callable[[Matter], str]] = {

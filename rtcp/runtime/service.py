@@ -204,7 +204,8 @@ class Service(threading.Thread):
             answer = self._serve(json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length])))
         except BusError as error:
             answer = {"error": "; ".join(error.sentences)}
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except Exception as error:
+            # Whatever is wrong with a request, it must not end the thread that watches the slaves.
             answer = {"error": f"the request is not of the service's form: {type(error).__name__} {error}"}
         text = json.dumps(answer).encode()
         if len(text) > SERVICE_TEXT_SIZE:
@@ -216,6 +217,8 @@ class Service(threading.Thread):
 
     def _serve(self, request: dict[str, Any]) -> dict[str, Any]:
         position, index, subindex = int(request["slave"]), int(request["index"]), int(request["subindex"])
+        if not (0 <= index <= 0xFFFF and 0 <= subindex <= 0xFF):
+            raise BusError(f"object {index}:{subindex} does not exist: index 0 to 65535, subindex 0 to 255")
         if request["do"] == "sdo_read":
             return {"hex": self._bus.sdo_read(position, index, subindex).hex()}
         if request["do"] == "sdo_write":

@@ -96,6 +96,9 @@ def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> i
         if part is None:
             continue
         first, end = part.physical // 8, (part.physical + part.bits + 7) // 8
+        if end > len(esc.memory):
+            # An FMMU that reaches beyond the memory maps nothing there.
+            continue
         if command in READS and fmmu.readable:
             content = esc.read(first, end - first, t)
             if content is not None:

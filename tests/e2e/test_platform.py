@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+import socket
 import stat
 import time
 
@@ -129,6 +131,35 @@ def test_what_is_not_allowed_is_refused_and_nothing_moves(
     assert done.returncode in (2, 3)
     assert said in " ".join(done.stderr.split())
     assert enabled.status()["joints"]["target"] == before
+
+
+def test_moves_that_the_generator_finds_hard_are_made_or_refused(enabled: Platform) -> None:
+    enabled.rtcp("move", "0.5", "0", "0", "0", "0", "0")
+    enabled.rtcp("move", "0.54", "0", "0", "0", "0", "0")
+    assert "no trajectory" in enabled.rtcp("move", *["0"] * 6, "--speed", "1e-6", check=3).stderr
+    assert enabled.status()["state"] == "holding"
+    enabled.rtcp("move", *["0"] * 6)
+
+
+def test_malformed_requests_are_answered_and_end_nothing(shared: Platform) -> None:
+    requests = [
+        b"garbage",
+        b"[]",
+        b'{"do": "nothing"}',
+        b'{"do": "move", "args": {"q": "x"}}',
+        b'{"do": "sdo_read", "args": {"slave": 2, "index": -1, "subindex": 0}}',
+        b'{"do": "sdo_read", "args": {"slave": 99, "index": 1, "subindex": 70000}}',
+        b'{"do": "sdo_write", "args": {"slave": 2, "index": 24677, "subindex": 0, "hex": "zz"}}',
+        b'{"do": "output", "args": {"number": 1' + b"0" * 400 + b', "value": 1}}',
+    ]
+    for request in requests:
+        with socket.socket(socket.AF_UNIX) as client:
+            client.connect(str(shared.directory / "control.sock"))
+            client.sendall(request + b"\n")
+            answer = json.loads(client.makefile().readline())
+            assert answer["ok"] is False
+            assert len(answer["error"]["message"]) > 10
+    assert shared.status()["state"] == "ready"
 
 
 def test_a_move_without_enabling_is_refused(shared: Platform) -> None:

@@ -98,3 +98,33 @@ def test_position_speed_and_acceleration_stay_bounded_under_any_sequence(script:
                 assert abs(made.position[i] - position[i]) <= SPEED[i] * PERIOD * (1 + 1e-6)
                 assert abs(made.velocity[i] - velocity[i]) <= ACCELERATION[i] * PERIOD * (1 + 1e-3) + 1e-9
             position, velocity = list(made.position), list(made.velocity)
+
+
+def test_a_distance_on_the_border_of_two_profiles_is_planned_and_reached() -> None:
+    # 2 a^3 / j^2: there ruckig finds no solution with exactly these bounds.
+    border = 2 * ACCELERATION[0] ** 3 / JERK[0] ** 2
+    for start in range(0, 5000, 37):
+        made = generator()
+        made.latch([start * 1e-4] * 6)
+        target = [start * 1e-4 + border, *([start * 1e-4] * 5)]
+        assert made.move_to(target, 0.5), start
+        while made.motion is Motion.MOVE:
+            assert made.update(), start
+        assert abs(made.position[0] - target[0]) < 1e-9
+
+
+def test_a_move_that_would_take_too_long_is_refused_and_nothing_moves() -> None:
+    made = generator()
+    for speed in (1e-3, 1e-5, 1e-7, 1e-12):
+        assert not made.move_to([1.0] * 6, speed)
+        assert made.motion is Motion.HOLD
+    assert made.move_to([1.0] * 6, 0.5)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.floats(1e-7, 0.5))
+def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> None:
+    made = generator()
+    if made.move_to(target, speed):
+        for _ in range(50):
+            assert made.update()
