@@ -5,6 +5,7 @@ Nothing here is a condition for running: what is refused becomes a note, said on
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import gc
 import os
@@ -127,12 +128,17 @@ def _fifo(made: Realtime, priority: int) -> None:
     made.scheduler = f"SCHED_FIFO {priority}"
 
 
-def ordinary_thread(avoid_cpu: int) -> None:
-    """Make the calling thread an ordinary one that stays off the cycle's CPU where there is another."""
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+def thread_beside(avoid_cpu: int, priority: int) -> None:
+    """Keep the calling thread off the cycle's CPU where there is another; SCHED_FIFO `priority` where allowed.
+
+    The thread shares the interpreter's lock with the cycle: taken off its CPU while it holds the lock, an ordinary
+    thread would let the cycle wait for as long as others run there.
+    """
     others = set(available_cpus()) - {avoid_cpu}
     if others:
         os.sched_setaffinity(0, others)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority, 1)))
 
 
 def share_interpreter_quickly() -> None:

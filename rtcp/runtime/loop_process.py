@@ -115,6 +115,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         [joint.name for joint in config.joints],
         config.bus.op_timeout_s,
         cpu,
+        config.cycle.priority,
     )
     arm = Arm(config, drives)
     behaviour = Behaviour(config, arm, blackboard, service, discipline)

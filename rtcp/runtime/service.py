@@ -12,12 +12,14 @@ from typing import Any
 
 from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import Bus, BusError, SlaveState
-from rtcp.realtime.scheduling import ordinary_thread
+from rtcp.realtime.scheduling import thread_beside
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
 
 _TURN_S = 0.01
-_MAIL_TURNS = 10
+_WATCH_TURNS = 10
+"""Slave states are read every 100 ms: a slave that is lost shows in the working counter of its cycle, and each turn
+that holds the interpreter is one for which the cycle may have to wait."""
 _RECOVER_S = 2.0
 _LOCK_S = 5.0
 _ERROR_CODE = 0x603F
@@ -38,6 +40,7 @@ class Service(threading.Thread):
         joint_names: their names.
         op_timeout_s: how long the slaves may take from SAFE-OP to OP.
         cycle_cpu: CPU of the cycle, which this thread keeps off.
+        cycle_priority: the cycle's; this thread's is one below, so that nobody else's work holds it up in mid-turn.
     """
 
     def __init__(
@@ -48,6 +51,7 @@ class Service(threading.Thread):
         joint_names: Sequence[str],
         op_timeout_s: float,
         cycle_cpu: int,
+        cycle_priority: int,
     ) -> None:
         super().__init__(name="service", daemon=True)
         self._bus = bus
@@ -56,6 +60,7 @@ class Service(threading.Thread):
         self._joint_names = joint_names
         self._op_timeout_s = op_timeout_s
         self._cycle_cpu = cycle_cpu
+        self._cycle_priority = cycle_priority
         self._op_wanted = False
         self._op_reached = False
         self._recovery_wanted = False
@@ -107,7 +112,7 @@ class Service(threading.Thread):
             raise
 
     def _take_turns(self) -> None:
-        ordinary_thread(self._cycle_cpu)
+        thread_beside(self._cycle_cpu, self._cycle_priority - 1)
         turn = 0
         while not self._end.wait(_TURN_S):
             turn += 1
@@ -128,8 +133,8 @@ class Service(threading.Thread):
             axis, self._explain = self._explain, -1
             self._say_error(axis)
         self._answer_request()
-        self._watch()
-        if turn % _MAIL_TURNS == 0:
+        if turn % _WATCH_TURNS == 0:
+            self._watch()
             for emergency in self._bus.emergencies():
                 self._blackboard.text(emergency.sentence())
 
