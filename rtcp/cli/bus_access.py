@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from rtcp.cli.connection import connect
 from rtcp.cli.launch import refuse_a_second_platform
 from rtcp.cli.outcome import CommandError, code_of, interruption_code, orderly_signals
+from rtcp.config.virtual import VIRTUAL
 from rtcp.runtime import offline
 from rtcp.runtime.client import ControlClient, ControlError
 
@@ -66,6 +67,11 @@ class OfflineBus:
     def __init__(self, bus: str | None, config: Path | None) -> None:
         self._config = config
         self.name = offline.configuration(config).bus.interface if bus is None else bus
+        if self.name == VIRTUAL:
+            from rtcp.config.schema import segment_path
+            from rtcp.virtual.check import check_segment
+
+            check_segment(segment_path(offline.configuration(config)))
 
     def positions(self) -> dict[str, int]:
         """Return the position of each slave by its configured name."""

@@ -10,7 +10,8 @@ from rtcp.config.errors import ConfigError
 from rtcp.runtime.paths import runtime_directory
 
 if TYPE_CHECKING:
-    from rtcp.runtime.launcher import Running, StartOptions
+    from rtcp.runtime.launcher import StartOptions
+    from rtcp.runtime.running import Running
 
 
 def refuse_a_second_platform() -> None:
@@ -36,11 +37,13 @@ def launch(options: StartOptions, report: Callable[[str], None]) -> Running:
         CommandError: with the launcher's sentence or the configuration's mistakes, or when a signal ended the start.
     """
     from rtcp.runtime import launcher
+    from rtcp.runtime.running import StartError
+    from rtcp.virtual.check import check_segment
 
     try:
         with orderly_signals():
-            return launcher.start(options, report)
-    except launcher.StartError as error:
+            return launcher.start(options, report, check_segment)
+    except StartError as error:
         raise CommandError(str(error), code_of(error.kind)) from error
     except ConfigError as error:
         raise CommandError(str(error), ExitCode.USAGE) from error

@@ -54,9 +54,10 @@ def _start(
 def _stop() -> None:
     """Stop the platform: drives disabled, slaves in INIT, processes ended."""
     from rtcp.runtime import launcher
+    from rtcp.runtime.running import StartError
 
     try:
         launcher.stop()
-    except launcher.StartError as error:
+    except StartError as error:
         raise CommandError(str(error), code_of(error.kind)) from error
     report("stopped")

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import fcntl
 import os
 import socket
-import struct
 from typing import Any
 
 from pysoem import pysoem
@@ -17,7 +14,6 @@ from rtcp.fieldbus.registers import attach_filter
 
 _SOEM_LAST_INDEX = 15
 _SDO_TIMEOUT_US = 700_000
-_SIOCGIFFLAGS, _IFF_UP = 0x8913, 0x1
 
 
 def claim(interface: str) -> socket.socket:
@@ -37,18 +33,6 @@ def claim(interface: str) -> socket.socket:
             f"interface {interface} is in use by another process of this platform: `rtcp stop` it first"
         ) from error
     return mine
-
-
-def check_interface(name: str) -> None:
-    """Raise BusError where there is no such interface or it is down."""
-    known = [found for _, found in socket.if_nameindex()]
-    if name not in known:
-        raise BusError(f"there is no network interface {name} (`interface`); there are {', '.join(known) or 'none'}")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        request = ctypes.create_string_buffer(struct.pack("16sH14x", name.encode(), 0), 40)
-        fcntl.ioctl(probe, _SIOCGIFFLAGS, request)
-    if not struct.unpack_from("16xH", request)[0] & _IFF_UP:
-        raise BusError(f"network interface {name} is down: `ip link set {name} up` brings it up")
 
 
 def open_master(interface: str) -> tuple[Any, socket.socket]:

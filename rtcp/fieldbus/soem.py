@@ -21,7 +21,8 @@ from rtcp.fieldbus.configure import configure_slave, identity_faults
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.exchange import SoemProcessData
 from rtcp.fieldbus.fence import Fence
-from rtcp.fieldbus.interface import check_interface, claim, open_master
+from rtcp.fieldbus.interface import claim, open_master
+from rtcp.fieldbus.link import PromiscuousMode, check_interface
 from rtcp.fieldbus.mailbox import Mailbox
 from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.pdo import layout, layout_faults
@@ -61,6 +62,7 @@ class SoemBus:
         self._master: Any = None
         self._socket: socket.socket | None = None
         self._claim: socket.socket | None = None
+        self._promiscuous: PromiscuousMode | None = None
         self._port: RegisterPort | None = None
         self._fence: Fence | None = None
         self._sdo_lock = threading.RLock()
@@ -99,6 +101,7 @@ class SoemBus:
         try:
             self._port = RegisterPort(self.interface)
             self._fence = Fence(self.interface)
+            self._promiscuous = PromiscuousMode(self.interface)
             self._master, self._socket = open_master(self.interface)
         except BaseException:
             self.close()
@@ -305,12 +308,11 @@ class SoemBus:
         except BusError as error:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
-            for part in (self._port, self._fence, self._socket, self._claim):
+            # The claim last: the next master must not find what this one still undoes.
+            for part in (self._port, self._fence, self._socket, self._master, self._promiscuous, self._claim):
                 if part is not None:
                     part.close()
-            if self._master is not None:
-                self._master.close()
-            self._port = self._fence = self._socket = self._claim = self._master = None
+            self._port = self._fence = self._socket = self._claim = self._promiscuous = self._master = None
             self._names = []
 
     def _to_init(self, port: RegisterPort) -> None:

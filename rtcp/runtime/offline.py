@@ -17,10 +17,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rtcp.config.virtual import VIRTUAL
+
 if TYPE_CHECKING:
     from rtcp.config.model import ArmConfig
-
-VIRTUAL = "virtual"
 
 SEGMENT_TIMEOUT_S = 10.0
 """A segment makes its namespace and its pair of interfaces in far less."""
@@ -88,6 +88,13 @@ def sdo_write(bus: str, config: Path | None, slave: int, index: int, subindex: i
 
 def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str, Any]:
     if bus != VIRTUAL:
+        from rtcp.fieldbus.bus import BusError
+        from rtcp.fieldbus.link import check_name
+
+        try:
+            check_name(bus)
+        except BusError as error:
+            raise OfflineError("usage", str(error)) from error
         return _question({**question, "interface": bus, "namespace_pid": None})
     from rtcp.config.schema import segment_path
 

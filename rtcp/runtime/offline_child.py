@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 import sys
+from types import FrameType
 from typing import Any
 
 from rtcp.fieldbus.bus import BusError, SdoAborted
@@ -54,6 +56,8 @@ def _plain(value: object) -> object:
 
 def main() -> int:
     """Answer the question on standard input; errors of the bus are answers too."""
+    # An interrupted command ends this process: the bus is closed on the way out.
+    signal.signal(signal.SIGTERM, _leave)
     question = json.loads(sys.stdin.buffer.read())
     try:
         found = answer(question)
@@ -63,6 +67,10 @@ def main() -> int:
         found = {"error": str(error), "kind": "fault"}
     print(json.dumps(found, default=_plain), flush=True)
     return 0
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
 
 
 if __name__ == "__main__":

@@ -62,6 +62,11 @@ def processes_file(directory: Path) -> Path:
     return directory / "processes.json"
 
 
+def starts_file(directory: Path) -> Path:
+    """Return the path of the file that tells when each of those processes started."""
+    return directory / "starts.json"
+
+
 def stopping_mark(directory: Path) -> Path:
     """Return the path of the mark that a stop is under way: a loop that ends then ends as it was told."""
     return directory / "stopping"

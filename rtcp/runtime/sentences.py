@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from rtcp.config.model import ArmConfig
+from rtcp.config.virtual import VIRTUAL
 from rtcp.runtime.machine import ALLOWED, Code, Command, Refusal, State
 
 
@@ -58,7 +59,7 @@ class Sentences:
         self._events: dict[Code, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
                 f"process data lost: {_number(m.value)} cycles in a row without the expected working counter, more "
-                f"than {_number(m.limit)} are allowed (bus.lost_cycles in {self._file}); all drives are "
+                f"than {_number(m.limit)} are allowed ({self._lost_cycles()} in {self._file}); all drives are "
                 "told to stop, `rtcp reset` goes on when the slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
@@ -107,6 +108,13 @@ class Sentences:
     @property
     def _file(self) -> str:
         return self._config.source.name or "the configuration"
+
+    def _lost_cycles(self) -> str:
+        bus = self._config.bus
+        widened = bus.interface == VIRTUAL and bus.virtual_patience != 1
+        return (
+            f"bus.lost_cycles times bus.virtual_patience, {bus.virtual_patience:g}," if widened else "bus.lost_cycles"
+        )
 
     def _joint(self, axis: int) -> str:
         joints = self._config.joints

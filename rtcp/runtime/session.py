@@ -1,4 +1,4 @@
-"""What the processes of one running platform know of each other: two small files in the runtime directory."""
+"""What the processes of one running platform know of each other: small files in the runtime directory."""
 
 from __future__ import annotations
 
@@ -8,65 +8,86 @@ import os
 import pickle
 import signal
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.paths import processes_file
+from rtcp.runtime.paths import processes_file, starts_file
+
+
+class Pid(int):
+    """A process id and when its process started, ticks since boot: together they are no later process's."""
+
+    started: int
+
+    def __new__(cls, number: int, started: int = 0) -> Pid:
+        """Make it of both; `identify` finds out when a process started."""
+        made = super().__new__(cls, number)
+        made.started = started
+        return made
+
+
+NONE = Pid(0)
+
+
+def identify(number: int) -> Pid:
+    """Return the pid of a process that is known to be there: a child, or the caller."""
+    return Pid(number, _stat(number)[1])
 
 
 @dataclass
 class Processes:
     """Process ids; 0: there is none."""
 
-    loop: int = 0
-    gateway: int = 0
-    segment: int = 0
+    loop: Pid = NONE
+    gateway: Pid = NONE
+    segment: Pid = NONE
 
     def write(self, directory: Path) -> None:
-        """Write `processes.json`, whole or not at all."""
-        path = processes_file(directory)
-        fresh = path.with_suffix(".new")
-        fresh.write_text(json.dumps(asdict(self)))
-        fresh.replace(path)
+        """Write `processes.json`, and beside it when each process started; each whole or not at all."""
+        # Ids without their starts are nobody's: the starts come first.
+        _replace(starts_file(directory), {str(pid): pid.started for pid in vars(self).values()})
+        _replace(processes_file(directory), vars(self))
 
 
 def read_processes(directory: Path) -> Processes:
-    """Return the processes that the file names; none where it is absent or damaged."""
+    """Return the processes that the files name; none where they are absent or damaged."""
     try:
-        found = json.loads(processes_file(directory).read_text())
-        return Processes(int(found["loop"]), int(found["gateway"]), int(found["segment"]))
-    except (OSError, ValueError, KeyError, TypeError):
+        numbers = json.loads(processes_file(directory).read_text())
+        starts = json.loads(starts_file(directory).read_text())
+        names = [field.name for field in fields(Processes)]
+        return Processes(*(Pid(int(numbers[name]), int(starts.get(str(numbers[name]), 0))) for name in names))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return Processes()
 
 
+def forget_processes(directory: Path) -> None:
+    """Remove what `Processes.write` wrote."""
+    for path in (processes_file(directory), starts_file(directory)):
+        path.unlink(missing_ok=True)
+
+
 def is_ours(pid: int) -> bool:
-    """Whether the process lives (a zombie does not) and is one of this platform's, not a later bearer of its number."""
-    if pid <= 0:
+    """Whether the process lives (a zombie does not) and is the one that was written down, no later bearer of its id."""
+    if not isinstance(pid, Pid) or pid <= 0:
         return False
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        command = Path(f"/proc/{pid}/cmdline").read_bytes()
-    except (OSError, IndexError):
-        return False
-    return state not in "ZX" and b"rtcp." in command
+    state, started = _stat(pid)
+    return state not in "ZX" and started == pid.started
 
 
-def end(pid: int, patience_s: float) -> bool:
+def end(pid: Pid, patience_s: float) -> bool:
     """End a process of ours by SIGTERM, after `patience_s` by SIGKILL; return whether it ended itself."""
     if not is_ours(pid):
         return True
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGTERM)
+    _signal(pid, signal.SIGTERM)
     if wait_gone(pid, patience_s):
         return True
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, signal.SIGKILL)
+    _signal(pid, signal.SIGKILL)
     wait_gone(pid, 2.0)
     return False
 
 
-def wait_gone(pid: int, patience_s: float) -> bool:
+def wait_gone(pid: Pid, patience_s: float) -> bool:
     """Wait until the process is gone; return whether it is."""
     until = time.monotonic() + patience_s
     while is_ours(pid):
@@ -74,6 +95,33 @@ def wait_gone(pid: int, patience_s: float) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+def _signal(pid: Pid, number: signal.Signals) -> None:
+    with contextlib.suppress(ProcessLookupError):
+        held = os.pidfd_open(pid)
+        try:
+            # What is held stays the same process from here on, whatever becomes of its id.
+            if is_ours(pid):
+                signal.pidfd_send_signal(held, number)
+        finally:
+            os.close(held)
+
+
+def _stat(number: int) -> tuple[str, int]:
+    """Return a process's state and start, ticks since boot (proc_pid_stat(5), fields 3 and 22); X where it is gone."""
+    try:
+        # Field 2, the name, may hold spaces and brackets.
+        fields = Path(f"/proc/{number}/stat").read_text(errors="replace").rpartition(")")[2].split()
+        return fields[0], int(fields[19])
+    except (OSError, IndexError):
+        return "X", 0
+
+
+def _replace(path: Path, content: dict[str, int]) -> None:
+    fresh = path.with_suffix(".new")
+    fresh.write_text(json.dumps(content))
+    fresh.replace(path)
 
 
 @dataclass(frozen=True)

@@ -54,16 +54,6 @@ def test_a_position_beyond_the_last_slave_is_refused_with_their_number(rtcp: Cal
     assert "has 7" in ended.trouble
 
 
-def test_a_segment_that_cannot_start_says_why(
-    rtcp: Callable[..., Any], arm: Path, processes_of: Callable[[Path], list[int]]
-) -> None:
-    (arm.parent / "segment.yaml").write_text("slaves:\n  - model: toaster\n")
-    ended = rtcp("scan", "--config", str(arm))
-    assert ended.code in (2, 5)
-    assert "toaster" in ended.trouble
-    assert processes_of(arm.parent) == []
-
-
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_scan_leaves_no_process(
     rtcp_process: Callable[..., Any],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.session import Processes
+from rtcp.runtime.session import Pid, Processes, identify
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def loop(directory: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A process that the runtime directory names as the loop."""
     program = "import time; time.sleep(600)  # stands for rtcp.runtime.loop_process"
     process = subprocess.Popen([sys.executable, "-c", program])
-    Processes(loop=process.pid).write(directory)
+    Processes(loop=identify(process.pid)).write(directory)
     yield process
     process.kill()
     process.wait()
@@ -41,6 +42,33 @@ def test_every_mistake_of_a_configuration_has_a_line_of_its_own(rtcp: Callable[.
     assert ended.code == 2
     assert len(ended.err.splitlines()) >= 2
     assert all(line.startswith("rtcp: ") for line in ended.err.splitlines())
+
+
+@pytest.mark.parametrize("command", [("start",), ("scan",), ("sdo", "read", "io", "0x1000")])
+def test_a_mistake_in_the_segments_file_is_named_with_file_line_and_key_and_exit_code_2(
+    rtcp: Callable[..., Any], arm: Path, command: tuple[str, ...]
+) -> None:
+    file = arm.parent / "segment.yaml"
+    file.write_text("slaves:\n- model: diewu-io\n- model: toaster\n  options: {colour: 3}\n")
+    ended = rtcp(*command, "--config", str(arm))
+    assert (ended.code, ended.out) == (2, "")
+    assert f'{file}:3: slaves[1].model: found the text "toaster", allowed is one of diewu-io' in ended.trouble
+
+
+@pytest.mark.parametrize("command", [("start",), ("scan",)])
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("nosuch0", "there is no network interface nosuch0 (`interface`); there are"),
+        ("lo", "interface lo (`interface`) is the loopback"),
+    ],
+)
+def test_an_interface_that_cannot_be_used_is_a_sentence_and_exit_code_2(
+    rtcp: Callable[..., Any], name: str, sentence: str, command: tuple[str, ...]
+) -> None:
+    ended = rtcp(*command, "--bus", name)
+    assert (ended.code, ended.out) == (2, "")
+    assert sentence in ended.trouble
 
 
 def test_a_runtime_directory_that_cannot_be_made_is_named(
@@ -67,3 +95,19 @@ def test_stop_ends_a_loop_that_has_lost_its_gateway(
     assert rtcp("stop").code == 0
     assert loop.wait(20) != 0
     assert rtcp("stop").code == 4
+
+
+def test_a_later_bearer_of_the_loops_pid_is_neither_taken_for_it_nor_signalled(
+    rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
+) -> None:
+    # As if the loop had ended and its id gone round: what bears it now started at another instant.
+    Processes(loop=Pid(loop.pid, identify(loop.pid).started - 1)).write(directory)
+    assert rtcp("stop").code == 4
+    assert "no platform is running" in rtcp("status").trouble
+    assert loop.poll() is None
+
+
+def test_the_pids_stand_in_their_file_as_plain_numbers_by_name(
+    loop: subprocess.Popen[bytes], directory: Path
+) -> None:  # fmt: skip
+    assert json.loads((directory / "processes.json").read_text()) == {"loop": loop.pid, "gateway": 0, "segment": 0}

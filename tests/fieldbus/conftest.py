@@ -25,10 +25,12 @@ class Segment:
         assert line, "the segment did not start"
         self.pid = json.loads(line)["pid"]
 
-    def master(self, scenario: str, *, receive_fraction: float = 0.3, **arguments) -> dict:
+    def master(
+        self, scenario: str, *, receive_fraction: float = 0.3, promiscuous: bool = False, **arguments
+    ) -> dict:  # fmt: skip
         """Run a scenario of `master_child`; return its answer, empty where it was killed."""
         question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": arguments,
-                    "receive_fraction": receive_fraction}  # fmt: skip
+                    "receive_fraction": receive_fraction, "promiscuous": promiscuous}  # fmt: skip
         done = subprocess.run(
             [sys.executable, str(CHILD), json.dumps(question)],
             stdout=subprocess.PIPE,

@@ -6,9 +6,13 @@ Takes a scenario and its arguments as JSON in its first argument, writes what ca
 from __future__ import annotations
 
 import dataclasses
+import fcntl
 import json
 import os
 import signal
+import socket
+import struct
+import subprocess
 import sys
 import threading
 import time
@@ -20,11 +24,14 @@ from rtcp.config.schema import load
 from rtcp.devices import Cia402Drive, DriveGoal
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
+from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.registers import RegisterPort
 from rtcp.fieldbus.soem import SoemBus
 
 ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
 INTERFACE = "ecat0"
+GET_FLAGS, SET_FLAGS, PROMISCUOUS = 0x8913, 0x8914, 0x100
+"""ioctl requests and IFF_PROMISC, netdevice(7)."""
 
 
 def arm(count: int) -> list[SlaveConfig]:
@@ -88,6 +95,16 @@ def registers_after() -> dict[str, Any]:
         return {"al_status": port.read_all(0x0130, 2).data[:1].hex(), "sync": port.read_all(0x0981, 1).data.hex()}
     finally:
         port.close()
+
+
+def interface_flags(set_bits: int = 0) -> int:
+    """Return the interface's flags, after setting some."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        name = INTERFACE.encode()
+        (flags,) = struct.unpack_from("16xH", fcntl.ioctl(probe, GET_FLAGS, struct.pack("16s24x", name)))
+        if set_bits:
+            fcntl.ioctl(probe, SET_FLAGS, struct.pack("16sH22x", name, flags | set_bits))
+        return flags | set_bits
 
 
 def scan(bus: SoemBus, count: int) -> Any:
@@ -270,6 +287,18 @@ def killed(bus: SoemBus, count: int, pid: int) -> Any:
     return {"wkc": cycle.wkcs[-1], "states": cycle.run(lambda: [state.words() for state in bus.read_states()])}
 
 
+def interrupted(bus: SoemBus, count: int, pid: int) -> Any:
+    """A scan in a process of its own is ended by a signal, as `rtcp scan` does on Ctrl-C; the bus is its alone."""
+    bus.close()
+    child = subprocess.Popen([sys.executable, "-m", "rtcp.runtime.offline_child"], stdin=subprocess.PIPE)
+    assert child.stdin is not None
+    child.stdin.write(json.dumps({"do": "scan", "interface": INTERFACE, "namespace_pid": pid}).encode())
+    child.stdin.close()
+    wait(lambda: child.poll() is not None or interface_flags() & PROMISCUOUS)
+    child.terminate()
+    return child.wait()
+
+
 def wait(condition: Any, timeout_s: float = 10.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not condition() and time.monotonic() < deadline:
@@ -292,6 +321,7 @@ SCENARIOS = {
         outputs,
         emergency,
         killed,
+        interrupted,
     )
 }
 
@@ -300,6 +330,8 @@ def main() -> None:
     question = json.loads(sys.argv[1])
     bus = SoemBus(INTERFACE, question.get("receive_fraction", 0.3), namespace_pid=question["pid"])
     answer: dict[str, Any] = {}
+    enter(question["pid"])
+    flags = interface_flags(PROMISCUOUS if question["promiscuous"] else 0)
     try:
         with bus:
             answer["result"] = SCENARIOS[question["scenario"]](bus, question["count"], **question["arguments"])
@@ -307,6 +339,7 @@ def main() -> None:
         answer["error"] = error.sentences
     answer["left"] = bus.notes
     bus.close()
+    answer["flags"] = [flags, interface_flags()]
     answer["after"] = registers_after()
     print(json.dumps(answer))
 

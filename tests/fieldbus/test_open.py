@@ -14,6 +14,15 @@ def test_an_interface_that_does_not_exist_is_told_with_those_that_do():
         SoemBus("nonsense0").open()
 
 
+def test_the_loopback_is_refused_as_no_interface_for_a_cable():
+    bus = SoemBus("lo")
+    try:
+        with pytest.raises(BusError, match=r"interface lo \(`interface`\) is the loopback.*Ethernet"):
+            bus.open()
+    finally:
+        bus.close()
+
+
 def test_a_process_that_does_not_exist_has_no_namespace_to_join():
     with pytest.raises(BusError, match=r"namespace of process 4194999 cannot be opened: .*is the segment running"):
         enter(4194999)

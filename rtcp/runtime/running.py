@@ -1,0 +1,209 @@
+"""The processes of a platform: each started and waited for until it says that it is ready, all of them ended.
+
+Each has a session of its own, so that a terminal's Ctrl-C reaches the launcher alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from rtcp.config.model import ArmConfig
+from rtcp.realtime.scheduling import available_cpus, choose_cpu
+from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
+from rtcp.runtime.session import Processes, end, forget_processes, identify, is_ours
+
+_SEGMENT_S = 15.0
+_LOOP_S = 60.0
+_GATEWAY_S = 15.0
+_STOP_S = 20.0
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+Report = Callable[[str], None]
+Kind = Literal["refused", "fault", "usage", "timeout"]
+
+
+class StartError(Exception):
+    """The platform could not be started: a sentence, and whether that is a refusal, a fault or a wrong usage."""
+
+    def __init__(self, message: str, kind: Kind = "fault") -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class Running:
+    """A platform that runs; made by `start`."""
+
+    def __init__(self, directory: Path, config: ArmConfig, processes: Processes) -> None:
+        self.directory = directory
+        self.processes = processes
+        self._config = config
+        self.facts: dict[str, Any] = {}
+        """What the loop told of its start: realtime, start_to_op_s."""
+        self._children: list[subprocess.Popen[bytes]] = []
+
+    # -- starting -----------------------------------------------------------------------------------------------
+
+    def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
+        reading, writing = os.pipe()
+        with open(self.directory / f"{name}.log", "wb") as log, undisturbed():
+            # A signal between start and registration would leave a process that nobody knows of.
+            child = subprocess.Popen(
+                [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=(writing,),
+                start_new_session=True,
+            )
+            os.close(writing)
+            self._children.append(child)
+            setattr(self.processes, name, identify(child.pid))
+            self.processes.write(self.directory)
+        return child, reading
+
+    def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
+        """Start the segment; return its ready line."""
+        more = ["--poll"] if poll else []
+        child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
+        self._keep_off(child.pid)
+        for line in _lines(reading, _SEGMENT_S, child):
+            if "pid" in line:
+                return line
+        raise StartError(self._last_words("segment", child))
+
+    def start_loop(self, report: Report) -> None:
+        """Start the loop; return when all slaves are in OP."""
+        child, reading = self._spawn("loop", "rtcp.runtime.loop_process", "--directory", str(self.directory))
+        for line in _lines(reading, _LOOP_S, child):
+            if line["event"] == "phase":
+                report(line["text"])
+            elif line["event"] == "error":
+                raise StartError("\n".join(line["sentences"]), "fault")
+            elif line["event"] == "ready":
+                self.facts = line
+                report("all slaves in OP")
+                return
+        raise StartError(self._last_words("loop", child))
+
+    def start_gateway(self) -> None:
+        """Start the gateway; return when the control socket listens."""
+        child, reading = self._spawn("gateway", "rtcp.runtime.gateway", "--directory", str(self.directory))
+        self._keep_off(child.pid)
+        for _ in _lines(reading, _GATEWAY_S, child):
+            return
+        raise StartError(self._last_words("gateway", child))
+
+    def _keep_off(self, pid: int) -> None:
+        """Keep a process off the cycle's CPU where there is another."""
+        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
+        if others:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(pid, others)
+
+    def _last_words(self, name: str, child: subprocess.Popen[bytes]) -> str:
+        log = (self.directory / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        ended = child.poll()
+        fate = "did not become ready in time" if ended is None else f"ended with code {ended}"
+        said = f": {log[-1]}" if log else ""
+        return f"the {name} (process {child.pid}) {fate}{said}"
+
+    # -- running and stopping -----------------------------------------------------------------------------------
+
+    def wait(self) -> int:
+        """Wait until the platform is stopped or its loop ends; return the exit code.
+
+        SIGINT, SIGTERM and SIGHUP stop it in an orderly way (0), and so does `rtcp stop` (0); a loop that ends by
+        itself is a fault (5), whereupon the rest is stopped too.
+        """
+        stopped: list[int] = []
+        before = {number: signal.signal(number, lambda got, frame: stopped.append(got)) for number in _SIGNALS}
+        try:
+            while not stopped and is_ours(self.processes.loop):
+                time.sleep(0.1)
+            if not stopped and self._ended_orderly():
+                self._reap(10.0)
+                return 0
+            self.stop()
+            return 0 if stopped else 5
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def _ended_orderly(self) -> bool:
+        """Whether another `rtcp stop` ended the loop: the directory, maybe a new platform's by now, is left alone."""
+        loop = next((child for child in self._children if child.pid == self.processes.loop), None)
+        if loop is not None and loop.wait() != 0:
+            return False
+        return stopping_mark(self.directory).exists() or not processes_file(self.directory).exists()
+
+    def _reap(self, patience_s: float) -> None:
+        for child in self._children:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                child.wait(timeout=patience_s)
+
+    def stop(self) -> None:
+        """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended. May be called twice."""
+        ask_gateway(self.directory)
+        clear(self.directory, self.processes)
+        self._reap(2.0)
+
+
+def clear(directory: Path, found: Processes) -> None:
+    """End what is left of a platform and remove its files."""
+    for pid in (found.loop, found.gateway, found.segment):
+        end(pid, 5.0)
+    forget_processes(directory)
+    for path in (control_socket(directory), blackboard_file(directory)):
+        path.unlink(missing_ok=True)
+
+
+def ask_gateway(directory: Path) -> None:
+    """Let the gateway end the platform; where it does not answer, the processes are ended one by one afterwards."""
+    with contextlib.suppress(ControlError, OSError):
+        path = control_socket(directory)
+        with ControlClient("rtcp stop", path) as client:
+            client.call("stop", timeout_s=_STOP_S)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Put off Ctrl-C and its kin until the block is done: what was started is known, or ended, by then."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {number: signal.signal(number, lambda got, frame: came.append(got)) for number in _SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])
+
+
+def _lines(reading: int, patience_s: float, child: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+    """Yield the JSON lines of a pipe until it ends or nothing comes for `patience_s`."""
+    kept = b""
+    with open(reading, "rb", buffering=0) as pipe:
+        while True:
+            if not select.select([pipe], [], [], patience_s)[0]:
+                return
+            read = pipe.read(65536)
+            if not read:
+                return
+            kept += read
+            *whole, kept = kept.split(b"\n")
+            for line in whole:
+                yield json.loads(line)

@@ -1,0 +1,46 @@
+"""The segment's file before a segment is made of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import ConfigError, default_config, load, segment_path
+from rtcp.virtual.check import check_segment
+
+MISTAKES = {
+    "its form": (
+        "slaves:\n- model: diewu-io\n- model: cubemars-orh70\n  drift: 3\n",
+        ["4: slaves[1].drift: this key is not known here; did you mean drift_ppm?"],
+    ),
+    "an unknown model": (
+        "slaves:\n- model: diewu-io\n- model: toaster\n",
+        ['3: slaves[1].model: found the text "toaster", allowed is one of diewu-io, cubemars-orh40'],
+    ),
+    "options that the model has not or not so": (
+        "slaves:\n- model: diewu-io\n  options:\n    serial: 5\n    colour: 3\n    counter_rate: yes\n",
+        [
+            "5: slaves[0].options.colour: model diewu-io has no option 'colour'; it has: serial",
+            "6: slaves[0].options.counter_rate: option counter_rate of model diewu-io",
+        ],
+    ),
+    "a delay that falls": (
+        "slaves:\n- model: diewu-io\n  delay_ns: 900\n- model: diewu-io\n",
+        ["4: slaves[1].delay_ns: found 820 ns, allowed is at least the 900 ns of the slave before it"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "sentences"), MISTAKES.values(), ids=MISTAKES.keys())
+def test_every_mistake_is_named_with_file_line_and_key(tmp_path: Path, text: str, sentences: list[str]) -> None:
+    file = tmp_path / "segment.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError) as caught:
+        check_segment(file)
+    for problem, sentence in zip(caught.value.problems, sentences, strict=True):
+        assert problem.startswith(f"{file}:{sentence}")
+
+
+def test_the_shipped_segment_has_no_mistakes() -> None:
+    check_segment(segment_path(load(default_config())))
