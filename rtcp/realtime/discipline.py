@@ -4,7 +4,9 @@ The reference slave's clock runs free. Each frame brings its system time at the 
 master's own time just before sending, the difference of the two clocks is known but for the way through the kernel.
 That difference is tracked by a second-order filter (phase and rate), and the next wake-up is computed straight from
 the reference's time, not steered by a controller: wake-up jitter then never enters the clocks, and there is no gain to
-tune against it. Residuals are bounded before they enter, so that one late frame moves the estimate by little.
+tune against it. Residuals are bounded before they enter, so that one late frame moves the estimate by little, and a
+frame that is late by more than any clock drifts (its sender or its receiver was kept off the CPU) is left out, unless
+so many follow each other that it must be the clock.
 
 Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
 grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
@@ -21,6 +23,8 @@ _PHASE_GAIN = 0.02
 # Critically damped for that phase gain.
 _RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
 _SHOWN_GAIN = 1 / 32
+_LATE_BEYOND_NS = 50_000.0
+_LATE_IN_A_ROW = 40
 _RATE_BOUND = 500e-6
 """No two oscillators differ by more: a bound that keeps a jump of the reference from winding the rate up."""
 
@@ -34,8 +38,8 @@ class Discipline:
     """
 
     __slots__ = (
-        "_base", "_difference", "_good_cycles", "_measured", "_period", "_phase", "_rate", "_reference", "_seen",
-        "aligned", "filtered_ns", "locked", "raw_ns",
+        "_base", "_difference", "_good_cycles", "_late", "_measured", "_period", "_phase", "_rate", "_reference",
+        "_seen", "aligned", "filtered_ns", "locked", "raw_ns",
     )  # fmt: skip
 
     def __init__(self, period_ns: int, phase_ns: int) -> None:
@@ -49,12 +53,14 @@ class Discipline:
         self._measured = [0] * MEASURE_CYCLES
         self._seen = 0
         self._good_cycles = 0
+        self._late = 0
         self.aligned = False
         self.locked = False
         self.raw_ns = 0
         """Reference time of the last frame less the nearest wanted instant: carries the wake-up's jitter."""
         self.filtered_ns = 0.0
-        """The same less the wake-up's own latency, low-pass filtered over 32 cycles: how well the clock is followed."""
+        """The same less the wake-up's own latency, low-pass filtered over 32 cycles, without single frames that were
+        late by more than 50 us: how well the clock is followed."""
 
     def observe(self, sent_ns: int, reference_ns: int) -> None:
         """Take in one frame: the master's time just before sending and the reference's when it passed."""
@@ -76,6 +82,11 @@ class Discipline:
             whole = round(residual / period) * period
             self._base += whole
             residual -= whole
+        if abs(residual) <= _LATE_BEYOND_NS:
+            self._late = 0
+        elif self._late < _LATE_IN_A_ROW:
+            self._late += 1
+            return
         bounded = min(max(residual, -_RESIDUAL_BOUND_NS), _RESIDUAL_BOUND_NS)
         self._difference += _PHASE_GAIN * bounded
         limit = _RATE_BOUND * period

@@ -21,7 +21,7 @@ _WATCH_TURNS = 10
 """Slave states are read every 100 ms: a slave that is lost shows in the working counter of its cycle, and each turn
 that holds the interpreter is one for which the cycle may have to wait."""
 _RECOVER_S = 2.0
-_LOCK_S = 5.0
+_LOCK_S = 15.0
 _ERROR_CODE = 0x603F
 _ERROR_BIT = 0x10
 
@@ -158,7 +158,8 @@ class Service(threading.Thread):
     def _watch(self) -> None:
         states = self._bus.read_states()
         self._tell_states(states)
-        if not self.all_op:
+        if not self.all_op or all(slave.state is AlState.NONE for slave in states):
+            # Where nobody answers it is the wire or the first slave: the cycle counts the lost frames and says so.
             return
         for slave in states:
             if slave.state is not AlState.OP:

@@ -105,3 +105,29 @@ def test_a_reference_that_jumps_unlocks_and_locks_again() -> None:
     assert states[2900]
     assert not all(states[3000:])
     assert states[-1]
+
+
+def test_frames_that_a_loaded_host_delays_do_not_keep_the_cycle_from_locking() -> None:
+    reference = Reference(-12.0, seed=9)
+    discipline = Discipline(PERIOD, PHASE)
+    planned = 10**12
+    for _ in range(2000):
+        # A quarter of the frames are kept up to 3 ms on their way, as where sender or receiver is off the CPU.
+        late = reference.random.randrange(3_000_000) if reference.random.random() < 0.25 else 0
+        discipline.observe(planned, reference.seen_by_frame(planned + late))
+        planned = discipline.next_wakeup(planned)
+    assert discipline.locked
+    assert abs(discipline.filtered_ns) < 5_000
+
+
+def test_a_reference_clock_that_jumps_for_good_is_not_taken_for_late_frames() -> None:
+    reference = Reference(0.0, seed=10)
+    discipline = Discipline(PERIOD, PHASE)
+    planned = 10**12
+    for cycle in range(6000):
+        jump = 150_000 if cycle >= 2000 else 0
+        discipline.observe(planned, reference.seen_by_frame(planned) + jump)
+        planned = discipline.next_wakeup(planned)
+        if cycle == 2200:
+            assert not discipline.locked
+    assert discipline.locked
