@@ -97,12 +97,11 @@ class Commander:
         """Wait for the state `wanted`, which is reached through the states `through` only; any other ends the wait."""
         until = time.monotonic() + patience_s
         told = 0.0
+        faults = self._picture.faults
         while (state := self._picture.state()) is not wanted or self._picture.switching():
             self._check_loop()
             if state is State.FAULT and wanted is not State.FAULT:
-                # The sentence may be a poll behind the state.
-                await asyncio.sleep(0.05)
-                raise CommandFailed("fault", self._picture.last_fault or "the machine went into fault")
+                raise CommandFailed("fault", await self._why(faults))
             name = "unknown" if state is None else state.name.lower()
             if state is not wanted and state not in through:
                 raise CommandFailed("refused", f"{what} was ended by another command: the machine is {name}")
@@ -112,6 +111,13 @@ class Commander:
                 told = time.monotonic()
                 await progress(self._progress())
             await asyncio.sleep(_POLL_S)
+
+    async def _why(self, faults: int) -> str:
+        """Return the sentence of a fault after the first `faults`: it may be some polls behind the state."""
+        until = time.monotonic() + _ANSWER_S
+        while self._picture.faults == faults and time.monotonic() < until:
+            await asyncio.sleep(_POLL_S)
+        return self._picture.last_fault or "the machine went into fault: see `rtcp status`"
 
     def _progress(self) -> dict[str, Any]:
         latest = self._observer.latest()

@@ -56,6 +56,8 @@ class Picture:
         self.fault = ""
         """The first sentence of the present fault: why the machine is in it."""
         self.last_fault = ""
+        self.faults = 0
+        """How many sentences of faults have been read: tells a new one from the last."""
         self.message = ""
         self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
         self.loop_lives = True
@@ -91,10 +93,9 @@ class Picture:
             if Code(event.code) in FAULTS:
                 self.fault = self.fault or sentence
                 self.last_fault = sentence
+                self.faults += 1
             elif event.code == Code.RESET:
                 self.fault = ""
-        """The first sentence of the present fault: why the machine is in it."""
-        self.last_fault = ""
         for text in self._observer.texts_since(self._text):
             self._text = text.number
             said.append((text.time_ns, text.sentence))
