@@ -32,29 +32,22 @@ class Platform:
         self.environment = {**os.environ, "RTCP_RUNTIME_DIR": str(self.directory), "COLUMNS": "100"}
 
     def be_patient(self, lost_ms: int) -> None:
-        """Use the shipped configuration, but take `lost_ms` without frames for a fault, and a lease of 3 s.
+        """Use the shipped configuration, but take `lost_ms` without frames (20 to 2000) for a fault; a lease is 3 s.
 
-        For tests of what the platform does: a shared host at times takes the CPU away for longer than those 20 ms.
+        For tests of what the platform does: a shared host at times takes the CPU away for longer than is shipped.
         """
         mine = self.directory / "config"
         shutil.copytree(default_config().parent, mine)
-        changes = {
-            mine / "assistive_arm.yaml": {
-                "lost_cycles: 40": f"lost_cycles: {2 * lost_ms}",
-                "lease_s: 0.5": "lease_s: 3.0",
-            },
-            mine / "devices" / "cubemars-orh.yaml": {
-                "watchdog_ms: 20": f"watchdog_ms: {min(lost_ms, 100)}",
-                "value: 120,": f"value: {6 * lost_ms},",
-            },
-        }
-        for file, words in changes.items():
-            text = file.read_text()
-            for old, new in words.items():
-                assert old in text
-                text = text.replace(old, new)
-            file.write_text(text)
-        self.environment["RTCP_CONFIG"] = str(mine / "assistive_arm.yaml")
+        file = mine / "assistive_arm.yaml"
+        text = file.read_text()
+        for old, new in {
+            "virtual_patience: 25 ": f"virtual_patience: {lost_ms / 20:g} ",
+            "lease_s: 0.5": "lease_s: 3.0",
+        }.items():
+            assert old in text
+            text = text.replace(old, new)
+        file.write_text(text)
+        self.environment["RTCP_CONFIG"] = str(file)
 
     def rtcp(self, *arguments: str, check: int | None = 0) -> subprocess.CompletedProcess[str]:
         """Run `rtcp` with `arguments`; assert its exit code unless `check` is None."""
@@ -97,12 +90,22 @@ class Platform:
             assert time.monotonic() < end, f"{what} did not come: {found}\n{self.logs()}"
             time.sleep(0.05)
 
+    def until_moving(self, far_rad: float = 0.05) -> dict[str, Any]:
+        """Wait until the first joint is on its way and that far from 0.
+
+        The distance and not the speed: where a host takes cycles away the motion takes longer, and its speed is less.
+        """
+        return self.until(
+            lambda found: found["state"] == "moving" and abs(found["joints"]["position"][0]) > far_rad, "motion"
+        )
+
     def wire(self, *arguments: str) -> str:
         """Run the independent look at the wire, in the segment's namespace."""
         segment = self.pids()["segment"]
         done = subprocess.run(
-            [sys.executable, str(WIRE), str(segment), *arguments], text=True, capture_output=True, check=True
+            [sys.executable, str(WIRE), str(segment), *arguments], text=True, capture_output=True, check=False
         )
+        assert done.returncode == 0, done.stderr
         return done.stdout
 
     @contextlib.contextmanager
@@ -172,7 +175,7 @@ def platform() -> Iterator[Platform]:
 @pytest.fixture
 def running(platform: Platform) -> Platform:
     """A platform of its own, started: for tests that break it."""
-    platform.be_patient(200)
+    platform.be_patient(2000)
     platform.rtcp("start", "--detach")
     return platform
 
@@ -181,7 +184,7 @@ def running(platform: Platform) -> Platform:
 def shared() -> Iterator[Platform]:
     """A started platform for the tests of a module that leave it as they found it."""
     made = Platform()
-    made.be_patient(200)
+    made.be_patient(2000)
     made.rtcp("start", "--detach")
     yield made
     made.end()

@@ -22,6 +22,14 @@ def observe(platform: Platform) -> Observer:
     return Observer(blackboard_file(platform.directory))
 
 
+def stand_still(pid: int, seconds: float) -> None:
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        time.sleep(seconds)
+    finally:
+        os.kill(pid, signal.SIGCONT)
+
+
 def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> None:
     running.rtcp("enable")
     pids = running.pids()
@@ -70,43 +78,18 @@ def test_the_foreground_start_stops_in_an_orderly_way_on_a_signal(platform: Plat
     assert not any(lives(pid) for pid in pids.values())
 
 
-def test_frames_lost_for_less_than_allowed_only_delay_the_motion(running: Platform) -> None:
+def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_grid(running: Platform) -> None:
     running.rtcp("enable")
-    moving = running.background("move", "0.4", "0", "0", "0", "0", "0", "--speed", "0.3")
-    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.2, "motion")
+    moving = running.background("move", "1.0", "0", "0", "0", "0", "0", "--speed", "0.3")
+    running.until_moving()
     observer = observe(running)
     first = observer.head
-    segment = running.pids()["segment"]
-    os.kill(segment, signal.SIGSTOP)
-    time.sleep(0.01)
-    os.kill(segment, signal.SIGCONT)
-    assert moving.wait() == 0
-    records, _ = observer.since(first)
-    observer.close()
-    assert (records["wkc"] < 0).sum() >= 10
-    assert np.abs(np.diff(records["target"], axis=0)).max() <= 0.5 * 500e-6 * 1.001
-    assert running.status()["state"] == "holding"
-
-
-def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_grid(platform: Platform) -> None:
-    running = platform
-    running.be_patient(40)
-    running.rtcp("start", "--detach")
-    running.rtcp("enable")
-    observer = observe(running)
-    moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
-    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.2, "motion")
-    segment = running.pids()["segment"]
-    first = observer.head
-    os.kill(segment, signal.SIGSTOP)
-    time.sleep(0.05)
-    os.kill(segment, signal.SIGCONT)
+    stand_still(running.pids()["segment"], 0.05)
     time.sleep(0.1)
     records, lost = observer.since(first)
     assert lost == 0
-    assert moving.wait() == 5
     without = records[records["wkc"] < 0]
-    assert len(without) >= 50
+    assert len(without) >= 20
     # The grid: every wake-up was planned a whole number of periods after the one before.
     planned = (records["time_ns"] - records["wakeup_ns"]).astype(np.int64)
     periods = np.diff(planned) / observer.period_ns
@@ -114,27 +97,48 @@ def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_g
     # A lost frame costs its cycle only: frameless cycles follow each other at the cycle's pace.
     waits = np.diff(without["time_ns"].astype(np.int64)) / observer.period_ns
     assert np.median(waits) < 1.5
+    # Less than is allowed: the motion goes on, and no target jumped.
+    assert moving.wait() == 0
+    steps = np.abs(np.diff(records["target"], axis=0))
+    assert steps.max() <= 0.5 * observer.period_ns * 1e-9 * 1.001
+    observer.close()
+    assert running.status()["state"] == "holding"
+
+
+def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_be_reset(platform: Platform) -> None:
+    platform.be_patient(200)
+    platform.rtcp("start", "--detach")
+    platform.rtcp("enable")
+    moving = platform.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+    platform.until_moving()
+    observer = observe(platform)
+    first = observer.head
+    stand_still(platform.pids()["segment"], 0.5)
+    said = moving.communicate()[1]
+    assert moving.returncode == 5
+    assert "process data lost" in said or "left OP" in said
+    records, _ = observer.since(first)
     # No target moved on while nobody listened, none jumped afterwards.
     steps = np.abs(np.diff(records["target"], axis=0))
     assert steps.max() <= 0.5 * observer.period_ns * 1e-9 * 1.001
     observer.close()
-    status = running.status()
+    status = platform.status()
     assert status["state"] == "fault"
     assert "process data lost" in status["message"] or "left OP" in status["message"]
-    running.rtcp("reset")
-    assert running.al_states() == [OP] * 7
-    assert running.status()["state"] == "ready"
-    running.rtcp("enable")
-    running.rtcp("move", *["0"] * 6)
+    platform.rtcp("reset")
+    assert platform.al_states() == [OP] * 7
+    assert platform.status()["state"] == "ready"
+    platform.rtcp("enable")
+    platform.rtcp("move", *["0"] * 6)
 
 
 @pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
 def test_one_slave_that_is_lost_stops_the_joints_of_the_others(platform: Platform, mode: str) -> None:
-    platform.be_patient(20)
+    platform.be_patient(200)
     platform.rtcp("start", "--detach", "--mode", mode)
     platform.rtcp("enable")
     moving = platform.background("move", "1.5", "0.5", "0", "0", "0", "0", "--speed", "0.4")
-    platform.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.3, "motion")
+    platform.until_moving()
     # The IO box falls to INIT: the drives' frames go on, and their watchdogs are content.
     platform.wire("init", "0")
     assert moving.wait() == 5
@@ -179,7 +183,7 @@ def test_an_object_is_not_written_while_drives_have_torque(running: Platform) ->
 def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platform) -> None:
     running.rtcp("enable")
     moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
-    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.15, "motion")
+    running.until_moving()
     observer = observe(running)
     gateway = running.pids()["gateway"]
     os.kill(gateway, signal.SIGSTOP)
@@ -197,7 +201,7 @@ def test_a_gateway_that_stands_still_ends_the_motion_by_its_lease(running: Platf
 
 
 def test_a_loop_that_is_terminated_alone_is_a_fault_of_the_foreground_start(platform: Platform) -> None:
-    platform.be_patient(200)
+    platform.be_patient(2000)
     foreground = platform.background("start")
     end = time.monotonic() + 30
     while platform.rtcp("status", check=None).returncode != 0:
@@ -212,7 +216,7 @@ def test_a_loop_that_is_terminated_alone_is_a_fault_of_the_foreground_start(plat
 def test_disabling_ends_another_clients_move_at_once(running: Platform) -> None:
     running.rtcp("enable")
     moving = running.background("move", "3.0", "0", "0", "0", "0", "0", "--speed", "0.2")
-    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.15, "motion")
+    running.until_moving()
     running.rtcp("disable")
     assert "ended by another command" in moving.communicate()[1]
     assert moving.returncode == 3
@@ -239,7 +243,7 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) ->
 def test_a_killed_gateway_stops_the_motion_and_can_be_replaced(running: Platform) -> None:
     running.rtcp("enable")
     moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
-    running.until(lambda found: abs(found["joints"]["velocity"][0]) > 0.2, "motion")
+    running.until_moving()
     observer = observe(running)
     before = running.pids()
     kill(before["gateway"])
@@ -288,7 +292,7 @@ def test_a_defect_in_the_cycle_leaves_slaves_in_init(platform: Platform) -> None
         "    Recorder.publish = defective\n"
     )
     platform.environment["PYTHONPATH"] = str(hook)
-    platform.be_patient(200)
+    platform.be_patient(2000)
     platform.rtcp("start", "--detach")
     platform.rtcp("enable")
     loop = platform.pids()["loop"]

@@ -180,7 +180,7 @@ def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) 
 
 def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform) -> None:
     moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
-    enabled.until(lambda found: found["state"] == "moving" and abs(found["joints"]["velocity"][0]) > 0.1, "motion")
+    enabled.until_moving()
     moving.kill()
     moving.wait()
     status = enabled.until(lambda found: found["state"] == "holding", "standstill")

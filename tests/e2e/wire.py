@@ -50,15 +50,21 @@ def frame(command: int, index: int, address: int, offset: int, data: bytes) -> b
 
 
 def ask(port: socket.socket, command: int, address: int, offset: int, length: int) -> tuple[bytes, int]:
-    """Send a read and return its data and working counter."""
+    """Send a read and return its data and working counter; a frame that is lost is sent again."""
     index = 0xDD
-    port.send(frame(command, index, address, offset, bytes(length)))
-    end = time.monotonic() + 5
+    port.settimeout(0.2)
+    end = time.monotonic() + 10
     while time.monotonic() < end:
-        answer, where = port.recvfrom(1600)
-        # Own frames on their way out are seen too; an answer comes in.
-        if where[2] != socket.PACKET_OUTGOING and answer[17] == index and answer[16] == command:
-            return answer[26 : 26 + length], struct.unpack_from("<H", answer, 26 + length)[0]
+        port.send(frame(command, index, address, offset, bytes(length)))
+        again = time.monotonic() + 0.2
+        while time.monotonic() < again:
+            try:
+                answer, where = port.recvfrom(1600)
+            except TimeoutError:
+                break
+            # Own frames on their way out are seen too; an answer comes in.
+            if where[2] != socket.PACKET_OUTGOING and answer[17] == index and answer[16] == command:
+                return answer[26 : 26 + length], struct.unpack_from("<H", answer, 26 + length)[0]
     raise TimeoutError("the segment does not answer")
 
 
@@ -66,7 +72,6 @@ def al_states(interface: str) -> list[int]:
     """Return the AL status words of all slaves, by position."""
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
         port.bind((interface, ETHERTYPE))
-        port.settimeout(5)
         _, count = ask(port, BRD, 0, 0x0130, 2)
         return [int.from_bytes(ask(port, APRD, -position, 0x0130, 2)[0], "little") for position in range(count)]
 
