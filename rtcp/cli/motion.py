@@ -82,8 +82,13 @@ def _disable() -> None:
 
 def _reset() -> None:
     """Reset a fault; enabling is a step of its own."""
-    ask("reset", "reset")
-    report("reset: no fault is left; `rtcp enable` goes on")
+    with connect("reset") as client:
+        client.call("reset")
+        holds = client.call("status").get("state") == "holding"
+    # A reset leaves the arm without torque: one that holds had nothing to reset.
+    report(
+        "nothing to reset: the arm is enabled and holds" if holds else "reset: no fault is left; `rtcp enable` goes on"
+    )
 
 
 def _mode(name: Annotated[str, typer.Argument(metavar="NAME", help="csp, csv or cst.")]) -> None:

@@ -99,7 +99,8 @@ class ControlClient:
         self._send(verb, json.dumps(request, allow_nan=False).encode() + b"\n")
         while True:
             reply = self._receive(verb, timeout_s)
-            if reply.get("id") != self._request:
+            # null: of a request of which no number could be read.
+            if reply.get("id") not in (self._request, None):
                 continue  # a late word on a request that was given up
             if "progress" in reply:
                 if progress is not None and isinstance(reply["progress"], dict):

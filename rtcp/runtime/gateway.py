@@ -18,14 +18,18 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from rtcp.runtime.commander import Commander, CommandFailed
+from rtcp.runtime.arguments import Arguments
+from rtcp.runtime.commander import Commander, CommandFailed, Progress
 from rtcp.runtime.observer import BlackboardError, Observer
-from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
+from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import end, read_processes, read_session, wait_gone
+from rtcp.runtime.session import end, forget_processes, read_processes, read_session, wait_gone
 
 _FOLLOW_S = 0.02
 _LINE_LIMIT = 1 << 16
+_TOO_LONG = b""
+"""Stands for a line beyond the limit; a true one has its newline at least."""
+_LET_GO_S = 1.0
 log = logging.getLogger("rtcp.gateway")
 
 
@@ -46,18 +50,18 @@ class Gateway:
         self._ended = asyncio.Event()
         self._stopping = False
         self._following: asyncio.Task[None] | None = None
-        self._verbs: dict[str, Callable[[str, dict[str, Any], Any], Awaitable[dict[str, Any]]]] = {
+        self._verbs: dict[str, Callable[[str, Arguments, Progress], Awaitable[dict[str, Any]]]] = {
             "status": self._status,
             "enable": lambda client, args, tell: self._commander.enable(client),
             "disable": lambda client, args, tell: self._commander.disable(client),
             "reset": lambda client, args, tell: self._commander.reset(client),
-            "mode": lambda client, args, tell: self._commander.mode(client, str(args["name"])),
+            "mode": lambda client, args, tell: self._commander.mode(client, args.text("name")),
             "move": self._move,
             "halt": lambda client, args, tell: self._commander.halt(client),
             "output": self._output,
             "scan": self._scan,
-            "sdo_read": self._sdo,
-            "sdo_write": lambda client, args, tell: self._commander.sdo_write(client, args),
+            "sdo_read": self._sdo_read,
+            "sdo_write": self._sdo_write,
             "stop": self._stop,
         }
 
@@ -117,6 +121,11 @@ class Gateway:
             given = await line
             if given is None:
                 return
+            if given is _TOO_LONG:
+                sentence = f"the request is a line longer than {_LINE_LIMIT} bytes: the connection is closed"
+                await _send(writer, _refusal(None, "invalid", sentence))
+                await _let_go(reader)
+                return
             line = asyncio.ensure_future(_read_line(reader))
             work = asyncio.ensure_future(self._answer(given, writer))
             # A client that goes away ends what it asked for: its lease goes with it.
@@ -143,49 +152,50 @@ class Gateway:
             args = request.get("args") or {}
             if not isinstance(args, dict):
                 raise CommandFailed("invalid", f"args must be an object, not {type(args).__name__}")
-            args = {**args, "do": request["do"]}
-            result = await verb(str(request.get("client") or "an unnamed client"), args, tell)
+            result = await verb(str(request.get("client") or "an unnamed client"), Arguments(args), tell)
             await _send(writer, {"id": number, "ok": True, "result": result})
         except CommandFailed as failed:
-            await _send(writer, {"id": number, "ok": False, "error": {"kind": failed.kind, "message": str(failed)}})
+            await _send(writer, _refusal(number, failed.kind, str(failed)))
         except (KeyError, TypeError, ValueError, OverflowError, struct.error, BlackboardError) as error:
             sentence = f"the request's arguments are not of the verb's form: {type(error).__name__} {error}"
-            await _send(writer, {"id": number, "ok": False, "error": {"kind": "invalid", "message": sentence}})
+            await _send(writer, _refusal(number, "invalid", sentence))
         except ConnectionError:
             raise
         except Exception as error:
             # One request's defect is answered and logged; the others are served on.
             log.exception("request %.200r", given)
             sentence = f"the gateway met a defect: {type(error).__name__} {error}"
-            await _send(writer, {"id": number, "ok": False, "error": {"kind": "internal", "message": sentence}})
+            await _send(writer, _refusal(number, "internal", sentence))
         if self._stopping:
             self._ended.set()
 
     # -- verbs --------------------------------------------------------------------------------------------------
 
-    async def _status(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
+    async def _status(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
         self._picture.follow()
         return self._picture.status(read_processes(self._directory))
 
-    async def _move(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
-        speed = args.get("speed")
-        q = [float(value) for value in args["q"]]
-        return await self._commander.move(client, q, None if speed is None else float(speed), tell)
+    async def _move(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+        return await self._commander.move(client, args.numbers("q"), args.number_or_none("speed"), tell)
 
-    async def _output(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
-        return await self._commander.output(client, int(args["number"]), bool(args["value"]))
+    async def _output(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+        return await self._commander.output(client, args.integer("number"), args.truth("value"))
 
-    async def _scan(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
+    async def _scan(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
         slaves = json.loads((self._directory / "scan.json").read_text())
         states = self._picture.status(read_processes(self._directory))["slaves"]
         for slave, now in zip(slaves, states, strict=False):
             slave["state"] = now["state"]
         return {"slaves": slaves}
 
-    async def _sdo(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
-        return await self._commander.service(args)
+    async def _sdo_read(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+        return await self._commander.service({"do": "sdo_read", **_object(args)})
 
-    async def _stop(self, client: str, args: dict[str, Any], tell: Any) -> dict[str, Any]:
+    async def _sdo_write(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+        request = {"do": "sdo_write", **_object(args), "hex": args.text("hex")}
+        return await self._commander.sdo_write(client, request)
+
+    async def _stop(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
         processes = read_processes(self._directory)
         stopping_mark(self._directory).touch(mode=0o600)
         if self._picture.loop_lives:
@@ -198,18 +208,35 @@ class Gateway:
         if self._following is not None:
             self._following.cancel()
         blackboard_file(self._directory).unlink(missing_ok=True)
-        processes_file(self._directory).unlink(missing_ok=True)
+        forget_processes(self._directory)
         self._stopping = True
         return {}
 
 
 async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
+    """Return the next line, `_TOO_LONG` in place of one beyond the limit, None where the client is gone."""
     try:
         line = await reader.readline()
-    except (ValueError, ConnectionError):
-        # A line beyond the limit: nothing that follows can be trusted.
+    except ConnectionError:
         return None
+    except ValueError:
+        return _TOO_LONG
     return line or None
+
+
+async def _let_go(reader: asyncio.StreamReader) -> None:
+    """Take what a client still sends, for a while: it reads its answer only when it has sent all."""
+
+    async def rest() -> None:
+        while await reader.read(_LINE_LIMIT):
+            pass
+
+    with contextlib.suppress(asyncio.TimeoutError):
+        await asyncio.wait_for(rest(), _LET_GO_S)
+
+
+def _object(args: Arguments) -> dict[str, int]:
+    return {key: args.integer(key) for key in ("slave", "index", "subindex")}
 
 
 def _parse(given: bytes) -> dict[str, Any]:
@@ -220,6 +247,10 @@ def _parse(given: bytes) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise CommandFailed("invalid", f"the request must be an object, not {type(request).__name__}")
     return request
+
+
+def _refusal(number: Any, kind: str, sentence: str) -> dict[str, Any]:
+    return {"id": number, "ok": False, "error": {"kind": kind, "message": sentence}}
 
 
 async def _send(writer: asyncio.StreamWriter, answer: dict[str, Any]) -> None:

@@ -24,6 +24,20 @@ def test_a_plain_verb_is_passed_on_and_answered_with_a_sentence(
 
 
 @pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        ("holding", "nothing to reset: the arm is enabled and holds\n"),
+        ("ready", "no fault is left; `rtcp enable` goes on\n"),
+    ],
+)
+def test_a_reset_says_whether_the_arm_is_to_be_enabled_next(
+    platform: Any, rtcp: Callable[..., Any], state: str, words: str
+) -> None:
+    platform.status["state"] = state
+    assert rtcp("reset").out.endswith(words)
+
+
+@pytest.mark.parametrize(
     ("kind", "code"), [("invalid", 2), ("refused", 3), ("fault", 5), ("timeout", 5), ("internal", 1)]
 )
 def test_each_kind_of_error_has_its_exit_code(platform: Any, rtcp: Callable[..., Any], kind: str, code: int) -> None:
