@@ -7,6 +7,7 @@ and 8, and whose `1e-3` stays a text. Repeated keys, which YAML forbids and most
 from __future__ import annotations
 
 import re
+import stat
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,16 @@ KeyPath = tuple[str | int, ...]
 
 Finding = tuple[KeyPath, str]
 """A mistake: where it is and the rest of its sentence."""
+
+_LARGEST, _MOST_VALUES, _DEEPEST = 1 << 20, 20_000, 50
+"""What a file may hold, in bytes or characters, values and levels: aliases count as all that they stand for."""
+_KINDS = {
+    stat.S_IFDIR: "a directory",
+    stat.S_IFIFO: "a named pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 
 
 @dataclass
@@ -57,11 +68,15 @@ def read(path: Path) -> Document:
     """Read a YAML file whose top level is a mapping.
 
     Raises:
-        ConfigError: the file is missing, unreadable, no text, no YAML, empty, no mapping, or repeats keys.
+        ConfigError: the file is missing, unreadable, no regular file, no text, no YAML, empty, no mapping, larger than
+            any configuration, or repeats keys.
     """
     text = _text_of(path)
+    document = Document(path)
+    builder = _Builder(document.lines)
     try:
         root = _Loader(text).get_single_node()
+        document.data = None if root is None else builder.value(root, ())
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{mark.line + 1}:{mark.column + 1}: " if mark else " "
@@ -74,14 +89,13 @@ def read(path: Path) -> Document:
         ) from error
     except RecursionError as error:
         raise ConfigError([f"{path}: the lists and mappings are nested too deeply"]) from error
+    except _TooMuch as error:
+        raise ConfigError([f"{path}: {error}"]) from error
     if root is None:
         raise ConfigError([f"{path}: the file is empty; a mapping of keys to values is expected"])
     if not isinstance(root, yaml.MappingNode):
         kind = "a list" if isinstance(root, yaml.SequenceNode) else "a single value"
         raise ConfigError([f"{path}:1: the file holds {kind}; a mapping of keys to values (`key: value`) is expected"])
-    document = Document(path)
-    builder = _Builder(document.lines)
-    document.data = builder.value(root, ())
     if builder.findings:
         raise ConfigError(document.sentences(builder.findings))
     return document
@@ -89,7 +103,15 @@ def read(path: Path) -> Document:
 
 def _text_of(path: Path) -> str:
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        kind = stat.S_IFMT(path.stat().st_mode)
+        # Looked at before it is opened, which would wait for the other end of a pipe.
+        if kind != stat.S_IFREG:
+            raise ConfigError([f"{path}: this is {_KINDS.get(kind, 'something else')}; a regular file is expected"])
+        with path.open("rb") as file:
+            content = file.read(_LARGEST + 1)
+        if len(content) > _LARGEST:
+            raise ConfigError([f"{path}: {_holds_more_than(_LARGEST, 'bytes')}"])
+        return content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError([f"{path}: there is no such file"]) from error
     except OSError as error:
@@ -99,6 +121,27 @@ def _text_of(path: Path) -> str:
         raise ConfigError(
             [f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"]
         ) from error
+
+
+def _holds_more_than(limit: int, what: str) -> str:
+    return f"the file holds more than {limit} {what}; a configuration has at most so many"
+
+
+class _TooMuch(Exception):
+    """The file is larger than any configuration, or unfolds to more: the rest of a sentence."""
+
+
+class _Count:
+    """Adds up, and ends the reading where it becomes more than a configuration has."""
+
+    def __init__(self, limit: int, what: str) -> None:
+        self._left, self._limit, self._what = limit, limit, what
+
+    def add(self, number: int) -> None:
+        self._left -= number
+        if self._left < 0:
+            what = f"{self._what}, an alias counted as all that it stands for"
+            raise _TooMuch(_holds_more_than(self._limit, what))
 
 
 def _reason(error: yaml.MarkedYAMLError) -> str:
@@ -112,6 +155,14 @@ class _Loader(yaml.SafeLoader):
     """PyYAML's reader with the scalars of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
+
+    def __init__(self, text: str) -> None:
+        super().__init__(text)
+        self._values = _Count(_MOST_VALUES, "values")
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        self._values.add(1)
+        return super().compose_node(parent, index)
 
 
 _LONGEST_NUMBER = 100
@@ -136,8 +187,13 @@ class _Builder:
         self.lines = lines
         self.findings: list[Finding] = []
         self._open: list[yaml.Node] = []
+        self._values = _Count(_MOST_VALUES, "values")
+        self._characters = _Count(_LARGEST, "characters")
 
     def value(self, node: yaml.Node, where: KeyPath) -> object:
+        self._values.add(1)
+        if len(self._open) >= _DEEPEST:
+            raise RecursionError
         self.lines.setdefault(where, node.start_mark.line + 1)
         if any(node is outer for outer in self._open):
             self.findings.append((where, "this alias contains itself"))
@@ -161,6 +217,7 @@ class _Builder:
                 self.findings.append((where, f"found the key {found} in line {line}; a key must be a text"))
                 continue
             key = key_node.value
+            self._characters.add(len(key))
             inner = (*where, key)
             if key in values:
                 first = self.lines[inner]
@@ -172,6 +229,7 @@ class _Builder:
 
     def _scalar(self, node: yaml.Node, where: KeyPath) -> object:
         text = str(node.value)
+        self._characters.add(len(text))
         match node.tag.removeprefix("tag:yaml.org,2002:"):
             case "str":
                 return text

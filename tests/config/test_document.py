@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import socket
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -56,6 +59,33 @@ UNREADABLE = {
     "an alias of itself": (b"a: &x [*x]\n", "a.yaml:1: a[0]: this alias contains itself"),
     "an unknown alias": (b"a: *x\n", "a.yaml:1:4: this is not valid YAML: found undefined alias 'x'"),
     "nesting without end": (b"a: " + b"[" * 5000, "a.yaml: the lists and mappings are nested too deeply"),
+    "more than a megabyte": (
+        b"a: 1\n" * 300_000,
+        "a.yaml: the file holds more than 1048576 bytes; a configuration has at most so many",
+    ),
+    "more values than any arm has": (
+        b"a: [" + b"1," * 30_000 + b"1]",
+        "a.yaml: the file holds more than 20000 values, an alias counted as all that it stands for; a configuration "
+        "has at most so many",
+    ),
+    "a billion laughs": (
+        b"a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]\n"
+        + b"".join(f"{new}: &{new} [{','.join(['*' + old] * 9)}]\n".encode() for old, new in pairwise("abcdefghi")),
+        "a.yaml: the file holds more than 20000 values, an alias counted as all that it stands for; a configuration "
+        "has at most so many",
+    ),
+    "one long text a thousand times": (
+        b"a: &a " + b"x" * 500_000 + b"\nb: [" + b"*a," * 1000 + b"]",
+        "a.yaml: the file holds more than 1048576 characters, an alias counted as all that it stands for; a "
+        "configuration has at most so many",
+    ),
+    "aliases that nest more deeply than the file": (
+        b"".join(
+            f"{new}: &{new} {'[' * 50}{'*' + old if old else 1}{']' * 50}\n".encode()
+            for old, new in pairwise(["", *"abcdefghijklmnopqrstuvwxyz"])
+        ),
+        "a.yaml: the lists and mappings are nested too deeply",
+    ),
 }
 
 
@@ -73,9 +103,19 @@ def test_a_missing_file_is_named() -> None:
         read(FILE)
 
 
-def test_a_directory_is_no_file() -> None:
-    FILE.mkdir()
-    with pytest.raises(ConfigError, match=r"^a\.yaml: the file cannot be read: Is a directory$"):
+NO_FILES = {
+    "a directory": (FILE.mkdir, "a directory"),
+    "a named pipe": (lambda: os.mkfifo(FILE), "a named pipe"),
+    "a link to a device without end": (lambda: FILE.symlink_to("/dev/zero"), "a device"),
+    "a socket": (lambda: socket.socket(socket.AF_UNIX).bind(str(FILE)), "a socket"),
+}
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(("make", "kind"), NO_FILES.values(), ids=NO_FILES.keys())
+def test_what_is_no_regular_file_is_refused_unread(make: Callable[[], object], kind: str) -> None:
+    make()
+    with pytest.raises(ConfigError, match=rf"^a\.yaml: this is {kind}; a regular file is expected$"):
         read(FILE)
 
 
