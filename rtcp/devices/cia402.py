@@ -6,7 +6,6 @@ from enum import Enum
 
 from rtcp.config.model import SlaveConfig
 from rtcp.devices.codec import DeviceError, factors, integer_range, make_codec, slots
-from rtcp.fieldbus.emergency import error_meaning
 from rtcp.fieldbus.pdo import layout
 
 
@@ -26,7 +25,7 @@ class DriveState(Enum):
 
 
 class DriveGoal(Enum):
-    """Where a drive is led; the value names it in sentences."""
+    """Where a drive is led."""
 
     DISABLED = "disabled"
     QUICK_STOPPED = "stopped by quick stop"
@@ -116,7 +115,7 @@ class Cia402Drive:
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
     Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm), `statusword`, `mode_display`,
-    `state`, and `error_code` where 0x603F is mapped as `error_code` (else whoever reads it by SDO may set it).
+    `state`, and `error_code` where 0x603F is mapped as `error_code`.
     Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
     `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
     """
@@ -239,12 +238,3 @@ class Cia402Drive:
             # Not a number, or infinite: the last counts that were sent.
             return last
         return low if value < low else high
-
-    def stuck_sentence(self, goal: DriveGoal, timeout_s: float) -> str:
-        """Return where the drive stands after `timeout_s` seconds on the way to `goal`, in words."""
-        error = f", error code 0x{self.error_code:04X}: {error_meaning(self.error_code)}" if self.error_code else ""
-        return (
-            f"drive {self.name} was not {goal.value} within {timeout_s:g} s: it is stuck in `{self.state.value}` "
-            f"(statusword 0x{self.statusword:04X}, controlword 0x{self.controlword:04X}, mode {self.mode_display} "
-            f"of {self.mode} commanded{error})"
-        )

@@ -34,7 +34,6 @@ class Arm:
     def __init__(self, config: ArmConfig, drives: Sequence[tuple[int, Cia402Drive]]) -> None:
         joints = config.joints
         period_s = config.cycle.period_us * 1e-6
-        self.slots = [slot for slot, _ in drives]
         self.drives = [drive for _, drive in drives]
         self._pairs = list(drives)
         self.low = [joint.position.min for joint in joints]

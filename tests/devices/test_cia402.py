@@ -217,12 +217,3 @@ def test_missing_channels_are_all_named_at_the_start():
         Cia402Drive(slave(rpdo=RPDO[:3]))
     with pytest.raises(DeviceError, match=r"`tpdo` maps no modes_of_operation_display"):
         Cia402Drive(slave(tpdo=TPDO[:4]))
-
-
-def test_a_stuck_drive_is_told_with_state_statusword_and_error(drive, wire):
-    wire.says(READY)
-    drive.advance(DriveGoal.ENABLED)
-    drive.error_code = 0x3220
-    sentence = drive.stuck_sentence(DriveGoal.ENABLED, 3.0)
-    for part in ("joint1", "3 s", "ready to switch on", "0x0231", "0x0007", "0x3220", "under-voltage"):
-        assert part in sentence

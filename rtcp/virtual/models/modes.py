@@ -138,17 +138,16 @@ class CyclicPosition:
         self._fastest = top * _CATCHING_UP + _CREEP
 
 
-class CyclicVelocity:
-    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
+class _WithoutPosition:
+    """What CSV and CST share: a target, an offset added to it, and the software position limits that stop the joint."""
 
     closed = False
 
-    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+    def __init__(self, axis: Axis, objects: ObjectDictionary, target: int, offset: int) -> None:
         self.bits = 0
         self._axis = axis
-        self._target = number(objects, 0x60FF)
-        self._offset = number(objects, 0x60B1)
-        self._top = number(objects, 0x607F)
+        self._target = number(objects, target)
+        self._offset = number(objects, offset)
         self._low = number(objects, 0x607D, 1)
         self._high = number(objects, 0x607D, 2)
         self._deceleration = number(objects, 0x6085)
@@ -159,13 +158,27 @@ class CyclicVelocity:
 
     resume = enter
 
+    def _wanted(self) -> float:
+        return (self._target.value + self._offset.value) * UNIT
+
+    def _limits(self) -> tuple[float, float, float]:
+        """Return the lowest and the highest position and the deceleration before them."""
+        return self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+
+
+class CyclicVelocity(_WithoutPosition):
+    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        super().__init__(axis, objects, 0x60FF, 0x60B1)
+        self._top = number(objects, 0x607F)
+
     def update(self, controlword: int, h: float, count: int) -> None:
         """Run at the velocity commanded."""
         axis = self._axis
-        wanted = (self._target.value + self._offset.value) * UNIT
+        allowed = wanted = self._wanted()
         top = self._top.value * UNIT
-        low, high, deceleration = self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
-        allowed = wanted
+        low, high, deceleration = self._limits()
         for _ in range(count):
             slowest, fastest = axis.velocity_range(low, high, deceleration)
             allowed = max(slowest, -top, min(fastest, top, wanted))
@@ -175,31 +188,17 @@ class CyclicVelocity:
         self.bits = _FOLLOWS if allowed == wanted else _FOLLOWS | _LIMIT
 
 
-class CyclicTorque:
+class CyclicTorque(_WithoutPosition):
     """CST (10): applies 0x6071 + 0x60B2 within 0x6072, and stops at the software position limits."""
 
-    closed = False
-
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
-        self.bits = 0
-        self._axis = axis
-        self._target = number(objects, 0x6071)
-        self._offset = number(objects, 0x60B2)
-        self._low = number(objects, 0x607D, 1)
-        self._high = number(objects, 0x607D, 2)
-        self._deceleration = number(objects, 0x6085)
-
-    def enter(self) -> None:
-        """Begin with the next target."""
-        self.bits = 0
-
-    resume = enter
+        super().__init__(axis, objects, 0x6071, 0x60B2)
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Apply the torque commanded."""
         axis = self._axis
-        wanted = (self._target.value + self._offset.value) * UNIT
-        low, high, deceleration = self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+        wanted = self._wanted()
+        low, high, deceleration = self._limits()
         for _ in range(count):
             slowest, fastest = axis.velocity_range(low, high, deceleration)
             axis.push(wanted, slowest, fastest, h)
