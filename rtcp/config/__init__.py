@@ -9,9 +9,10 @@ import importlib
 from typing import TYPE_CHECKING
 
 from rtcp.config.errors import ConfigError
-from rtcp.config.find import default_config, find_config
+from rtcp.config.find import default_config, find_arm, find_config
 
 if TYPE_CHECKING:
+    from rtcp.config.kinematics import load_kinematics
     from rtcp.config.schema import load, load_device, segment_path, with_period
     from rtcp.config.segment import SegmentConfig, SegmentSlave, load_segment
 
@@ -20,15 +21,18 @@ __all__ = [
     "SegmentConfig",
     "SegmentSlave",
     "default_config",
+    "find_arm",
     "find_config",
     "load",
     "load_device",
+    "load_kinematics",
     "load_segment",
     "segment_path",
     "with_period",
 ]
 
 _ON_FIRST_USE = {
+    "load_kinematics": "rtcp.config.kinematics",
     **dict.fromkeys(("load", "load_device", "segment_path", "with_period"), "rtcp.config.schema"),
     **dict.fromkeys(("SegmentConfig", "SegmentSlave", "load_segment"), "rtcp.config.segment"),
 }

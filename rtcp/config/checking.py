@@ -6,7 +6,7 @@ import difflib
 import json
 import types
 from collections.abc import Iterable
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Generic, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
@@ -15,6 +15,14 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from rtcp.config.document import Finding, KeyPath
 
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class AlsoText:
+    """Beside the type of a number that a text may stand for too: which texts, in words."""
+
+    words: str
+
 
 # Strict: "500" and true are no numbers, 2.5 is no integer. The loss of a silent conversion is the point.
 _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -78,7 +86,8 @@ def allowed(kind: object) -> str:
     if get_origin(bare) is Literal:
         return f"one of {', '.join(str(choice) for choice in get_args(bare))}"
     if bare in (int, float):
-        return ("an integer" if bare is int else "a number") + _span(bounds)
+        also = f", or {bounds[AlsoText].words}" if AlsoText in bounds else ""
+        return ("an integer" if bare is int else "a number") + _span(bounds) + also
     if bare is bool:
         return "true or false"
     if bare is str:

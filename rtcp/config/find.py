@@ -29,6 +29,27 @@ def find_config(given: Path | None = None) -> Path:
     return default_config()
 
 
+def find_arm(given: str | None = None) -> Path:
+    """Return the file of an arm to compute with: a path, or the bare name of a file beside the default configuration.
+
+    None: the arm's file as `find_config` finds it.
+
+    Raises:
+        ConfigError: there is no such file; for a bare name the arms that there are come with it.
+    """
+    if given is None:
+        return find_config()
+    path = Path(given)
+    if exists(path) or path.name != given or path.suffix:
+        return _there(path, "--arm")
+    folder = default_config().parent
+    named = folder / f"{given}.yaml"
+    if exists(named):
+        return named
+    known = sorted(file.stem for file in folder.glob("*.yaml") if "\nkinematics:" in file.read_text(encoding="utf-8"))
+    raise ConfigError([f"--arm {given}: there is no such file, and no arm of this name; known are {', '.join(known)}"])
+
+
 def default_config() -> Path:
     """Return the arm's file that came with the package: in a wheel inside it, in a checkout beside it.
 

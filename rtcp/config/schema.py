@@ -14,6 +14,7 @@ from rtcp.config.checking import Checker
 from rtcp.config.document import Finding, dotted, read
 from rtcp.config.errors import ConfigError
 from rtcp.config.find import exists
+from rtcp.config.geometry import Kinematics, kinematics_findings
 from rtcp.config.model import (
     ArmConfig,
     BusConfig,
@@ -47,6 +48,8 @@ class ArmFile:
     mode: DriveModeName = ArmConfig.mode
     enable_timeout_s: Positive = ArmConfig.enable_timeout_s
     lease_s: Positive = ArmConfig.lease_s
+    kinematics: Kinematics | None = None
+    """The arm's geometry; the platform's start checks it, `rtcp.config.kinematics` reads it."""
 
 
 _ARM, _DEVICE, _CYCLE = Checker(ArmFile), Checker(DeviceDescription), Checker(CycleConfig)
@@ -61,7 +64,7 @@ def load(path: Path) -> ArmConfig:
     """
     document = read(path)
     arm, findings = _ARM.check(document.data)
-    findings += rules.arm_findings(document.data)
+    findings += rules.arm_findings(document.data) + kinematics_findings(document.data)
     period_us = rules.period_us(document.data)
 
     devices: dict[str, DeviceDescription] = {}

@@ -1,0 +1,115 @@
+"""Positions and orientations as plain floats: the pose, its three angles, and the check for numbers that are none.
+
+Rotations are 3x3 matrices written row by row in a tuple of nine. The angles are those of R = Rx(rx) Ry(ry) Rz(rz):
+turn about the fixed x axis last. Imports nothing but `math`, so that the loop may use it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import NamedTuple, TypeAlias
+
+Vector: TypeAlias = tuple[float, float, float]
+Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+
+# Below this cos(ry) the two outer axes coincide and only rx + rz or rx - rz is defined.
+SINGULAR_COSINE = 1e-12
+
+
+def require_finite(values: Iterable[float], names: Iterable[str]) -> None:
+    """Raise ValueError that names the first value which is NaN or infinite."""
+    for value, name in zip(values, names):  # noqa: B905  names may go on for ever
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}: a finite number is needed")
+
+
+def rotation_from_rpy(rx: float, ry: float, rz: float) -> Rotation:
+    """R = Rx(rx) Ry(ry) Rz(rz), angles in rad."""
+    sx, cx, sy, cy, sz, cz = math.sin(rx), math.cos(rx), math.sin(ry), math.cos(ry), math.sin(rz), math.cos(rz)
+    return (
+        cy * cz, -cy * sz, sy,
+        cx * sz + sx * sy * cz, cx * cz - sx * sy * sz, -sx * cy,
+        sx * sz - cx * sy * cz, sx * cz + cx * sy * sz, cx * cy,
+    )  # fmt: skip
+
+
+def rpy_from_rotation(rotation: Rotation) -> Vector:
+    """The angles (rx, ry, rz), rad, with R = Rx(rx) Ry(ry) Rz(rz), ry in [-pi/2, pi/2], rx and rz in [-pi, pi].
+
+    At ry = +-pi/2 only rx + rz (or rx - rz) is defined: rz = 0 by choice, and rx carries the whole turn.
+    """
+    _, _, r02, r10, r11, r12, r20, r21, r22 = rotation
+    cosine = math.hypot(r12, r22)
+    ry = math.atan2(r02, cosine)
+    if cosine < SINGULAR_COSINE:
+        return math.atan2(r21, r11), ry, 0.0
+    rx = math.atan2(-r12, r22)
+    sx, cx = math.sin(rx), math.cos(rx)
+    # rz from Rx(-rx) R and not from r00, r01: close to the singular orientation the error of rx then cancels in R
+    return rx, ry, math.atan2(cx * r10 + sx * r20, cx * r11 + sx * r21)
+
+
+def orthonormality_error(rotation: Rotation) -> float:
+    """The largest entry of R R^T - 1, or 2 for a reflection: 0 for a rotation."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
+    determinant = (
+        r00 * (r11 * r22 - r12 * r21) - r01 * (r10 * r22 - r12 * r20) + r02 * (r10 * r21 - r11 * r20)
+    )  # fmt: skip
+    if determinant < 0.0:
+        return 2.0
+    return max(
+        abs(r00 * r00 + r01 * r01 + r02 * r02 - 1.0),
+        abs(r10 * r10 + r11 * r11 + r12 * r12 - 1.0),
+        abs(r20 * r20 + r21 * r21 + r22 * r22 - 1.0),
+        abs(r00 * r10 + r01 * r11 + r02 * r12),
+        abs(r00 * r20 + r01 * r21 + r02 * r22),
+        abs(r10 * r20 + r11 * r21 + r12 * r22),
+    )
+
+
+class Pose(NamedTuple):
+    """Where a frame is: `position` (3), m, and `rotation` (9), row by row; its columns are the frame's axes."""
+
+    position: Vector
+    rotation: Rotation
+
+    @classmethod
+    def from_xyzrpy(cls, x: float, y: float, z: float, rx: float, ry: float, rz: float) -> Pose:
+        """The pose at x, y, z (m) with R = Rx(rx) Ry(ry) Rz(rz) (rad); ValueError names a number that is not finite."""
+        require_finite((x, y, z, rx, ry, rz), ("x", "y", "z", "rx", "ry", "rz"))
+        return cls((float(x), float(y), float(z)), rotation_from_rpy(rx, ry, rz))
+
+    @property
+    def rpy(self) -> Vector:
+        """The angles (rx, ry, rz), rad, as `rpy_from_rotation` defines them."""
+        return rpy_from_rotation(self.rotation)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """This transform after `other`: frame A <- B times frame B <- C is frame A <- C."""
+        (x, y, z), (a, b, c, d, e, f, g, h, i) = self
+        (ox, oy, oz), (j, k, m, n, o, p, q, r, s) = other
+        return Pose(
+            (a * ox + b * oy + c * oz + x, d * ox + e * oy + f * oz + y, g * ox + h * oy + i * oz + z),
+            (
+                a * j + b * n + c * q, a * k + b * o + c * r, a * m + b * p + c * s,
+                d * j + e * n + f * q, d * k + e * o + f * r, d * m + e * p + f * s,
+                g * j + h * n + i * q, g * k + h * o + i * r, g * m + h * p + i * s,
+            ),
+        )  # fmt: skip
+
+    def inverse(self) -> Pose:
+        """The transform back."""
+        (x, y, z), (a, b, c, d, e, f, g, h, i) = self
+        return Pose(
+            (-(a * x + d * y + g * z), -(b * x + e * y + h * z), -(c * x + f * y + i * z)),
+            (a, d, g, b, e, h, c, f, i),
+        )
+
+    def require_finite(self) -> None:
+        """Raise ValueError that names the first entry which is NaN or infinite."""
+        require_finite(self.position, ("x", "y", "z"))
+        require_finite(self.rotation, (f"rotation[{row}][{column}]" for row in range(3) for column in range(3)))
+
+
+IDENTITY = Pose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
