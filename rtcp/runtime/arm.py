@@ -12,6 +12,7 @@ from rtcp.motion.guard import Guard
 from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
 
 MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
+WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
 """Drive states without torque and without a fault."""
 _ENABLED = DriveState.OPERATION_ENABLED
@@ -113,6 +114,13 @@ class Arm:
         """Return the first joint whose drive is enabled, or -1."""
         for axis, drive in enumerate(self.drives):
             if drive.state is _ENABLED:
+                return axis
+        return -1
+
+    def first_with_torque(self) -> int:
+        """Return the first joint whose drive gives torque: enabled, in a quick stop or reacting to a fault; or -1."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state in WITH_TORQUE:
                 return axis
         return -1
 

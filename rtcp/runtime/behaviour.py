@@ -21,6 +21,7 @@ _CLOSING_S = 2.0
 _RESET_S = 3.0
 _MODE_S = 1.0
 _CLOCK_S = 1.0
+_TOLD_CYCLES = 5
 _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
 
@@ -52,6 +53,7 @@ class Behaviour:
         self._clock_cycles = round(_CLOCK_S / period_s)
         self._unlocked = 0
         self._since = 0
+        self._told = 0
         self.state = State.STARTING
         self.cycle = 0
         self.lost = 0
@@ -92,6 +94,7 @@ class Behaviour:
     def enter(self, state: State) -> None:
         """Change to `state`."""
         self.state = state
+        self._told = 0
         self._since = self.cycle
         self.switching = False
 
@@ -268,6 +271,10 @@ class Behaviour:
                 self.enter(State.READY)
                 return
         if self._waited > self._reset_cycles:
+            axis = arm.first_moving()
+            if axis >= 0 and good and self._service.all_op:
+                self._fail(Code.RESET_MOVING, axis, arm.drives[axis].velocity)
+                return
             axis = arm.first_not_resting()
             if axis >= 0 and self._service.all_op:
                 self._fail_drive(Code.RESET_STUCK, axis)
@@ -292,6 +299,10 @@ class Behaviour:
             arm.generator.update()
             arm.command()
             return
-        arm.lead(DriveGoal.DISABLED)
+        # In a fault the drives ramp down by themselves: their torque goes when they stand.
+        ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
+        arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
         arm.follow()
-        self.done = arm.first_enabled() < 0
+        # What a drive shows is older than what it was told: it may still be about to enable.
+        self._told = 0 if ramping else self._told + 1
+        self.done = self._told > _TOLD_CYCLES and arm.first_with_torque() < 0

@@ -84,6 +84,7 @@ class Code(IntEnum):
     CLOCK_LOST = 19
     LEFT_RANGE = 20
     TORQUE_OFF = 21
+    RESET_MOVING = 22
 
 
 ALLOWED: dict[Command, frozenset[State]] = {

@@ -78,6 +78,10 @@ class Sentences:
                 "`rtcp reset` brings it back"
             ),
             Code.RESET_STUCK: self._reset_stuck,
+            Code.RESET_MOVING: lambda m: (
+                f"{self._joint(m.axis)} still turns, at {_number(m.value)} rad/s, 3 s after the reset was asked for: "
+                "its torque goes only at standstill; `rtcp disable` takes it off at once"
+            ),
             Code.GENERATOR: lambda _: "the trajectory generator refused its input: the arm holds",
             Code.DRIVE_FAULT: lambda m: (
                 f"{self._joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
@@ -167,6 +171,7 @@ FAULTS = frozenset(
         Code.DISABLE_STUCK,
         Code.SLAVE_NOT_OP,
         Code.RESET_STUCK,
+        Code.RESET_MOVING,
         Code.GENERATOR,
         Code.MODE_STUCK,
         Code.DRIVE_FAULT,

@@ -1,0 +1,1079 @@
+"""The machine's states, what makes a fault of them and what leads out again: the real classes and the real device
+models, cycle by cycle, without a bus and without a clock."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.devices import Cia402Drive, IoBox
+from rtcp.realtime.discipline import Discipline
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.behaviour import Behaviour
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.machine import Code, Command, State
+from rtcp.runtime.observer import Answer, Event, Observer
+from rtcp.runtime.orders import Orders
+from rtcp.runtime.sentences import FAULTS, Sentences
+from rtcp.runtime.service import Service
+from rtcp.virtual.models import CubemarsDrive, create
+from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
+
+PERIOD_S = 0.001
+COUNTS = 10000
+ENABLE_TIMEOUT_S = 0.2
+LOST_CYCLES = 40
+CSP, CSV, CST = 8, 9, 10
+CONTROLWORD, QUICK_STOP_OPTION, MODES_OF_OPERATION = 0x6040, 0x605A, 0x6060
+VOLTAGE_OFF, QUICK_STOP, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02, 0x07, 0x0F
+UNDER_VOLTAGE = 0x3220
+SPEED = 0.3
+WITH_TORQUE = (0x27, 0x07)
+"""Statuswords, masked, of Operation Enabled and Quick Stop Active (CiA 402-2, object 0x6041)."""
+
+
+def small_arm() -> ArmConfig:
+    """The first two joints of the default arm with its IO box, on a network interface: nothing is widened there."""
+    config = load(default_config())
+    return replace(
+        config,
+        slaves=config.slaves[:3],
+        joints=config.joints[:2],
+        cycle=replace(config.cycle, period_us=PERIOD_S * 1e6),
+        bus=replace(config.bus, interface="eth0", lost_cycles=LOST_CYCLES),
+        enable_timeout_s=ENABLE_TIMEOUT_S,
+    )
+
+
+CONFIG = small_arm()
+LONGEST_STEP = CONFIG.joints[0].velocity * PERIOD_S * COUNTS + 1
+"""Counts; one more than the speed limit allows, for the rounding of both ends."""
+
+
+class Segment:
+    """A process image whose other end are the device models, mapped by the virtual segment's own code."""
+
+    def __init__(self) -> None:
+        self.drives = [CubemarsDrive("orh70", load_inertia=2.0), CubemarsDrive("orh60", load_inertia=0.5)]
+        self.devices = [create("diewu-io"), *self.drives]
+        self.expected_wkc = 3 * len(self.devices)
+        self.dc_time = self.missed = self.stale = 0
+        self.carries = True
+        """Whether frames go out and come back."""
+        self.deaf: dict[tuple[int, int], dict[int, int]] = {}
+        """What a drive understands instead of what it is told: (drive from 0, object) -> {told: understood}."""
+        self._rx = [PdoImage.from_assignment(device.objects, RX_ASSIGN) for device in self.devices]
+        self._tx = [PdoImage.from_assignment(device.objects, TX_ASSIGN) for device in self.devices]
+        self._outputs = [bytes(image.byte_length) for image in self._rx]
+        self._inputs = [bytearray(image.byte_length) for image in self._tx]
+        for device in self.devices:
+            device.set_outputs_valid(True)
+            # The self-test.
+            device.step(0.2)
+        for drive in self.drives:
+            # As the start-up SDOs of the drive's description set it: ramp down, then hold.
+            drive.objects[QUICK_STOP_OPTION, 0].value = 6
+        self._answer()
+
+    def send(self) -> None:
+        if not self.carries:
+            return
+        for image, outputs in zip(self._rx, self._outputs, strict=True):
+            image.unpack(outputs)
+        for (axis, index), understood in self.deaf.items():
+            entry = self.drives[axis].objects[index, 0]
+            entry.value = understood.get(entry.value, entry.value)
+
+    def receive(self) -> int:
+        # A frame brings what was before it: devices take its outputs over with the SYNC0 after it.
+        if self.carries:
+            self._answer()
+        for device in self.devices:
+            device.step(PERIOD_S)
+        return self.expected_wkc if self.carries else -1
+
+    def input(self, index: int) -> bytes:
+        return bytes(self._inputs[index])
+
+    def set_output(self, index: int, data: bytes) -> None:
+        assert len(data) == len(self._outputs[index])
+        self._outputs[index] = data
+
+    def output(self, index: int) -> bytes:
+        return self._outputs[index]
+
+    def _answer(self) -> None:
+        for image, inputs in zip(self._tx, self._inputs, strict=True):
+            image.pack(inputs)
+
+
+class Said(NamedTuple):
+    """A drive's inputs and outputs of one cycle as they are on the wire, in counts."""
+
+    statusword: int
+    position: int
+    velocity: int
+    torque: int
+    mode_display: int
+    controlword: int
+    target: int
+    speed: int
+    effort: int
+    mode: int
+
+    @property
+    def has_torque(self) -> bool:
+        return self.statusword & 0x6F in WITH_TORQUE
+
+    @property
+    def obeys_target(self) -> bool:
+        """Whether the drive goes, or may go on, to the target of this frame."""
+        return self.has_torque and self.controlword in (ENABLE_OPERATION, QUICK_STOP)
+
+
+_WIRE = struct.Struct("<Hiiib")
+
+
+class Cycle(NamedTuple):
+    """What is seen of a cycle from outside."""
+
+    state: State
+    drives: tuple[Said, ...]
+
+
+class Bench:
+    """The loop's parts without the loop: each call of `cycle` does what `Loop.run` does once, in its order.
+
+    The service thread is not started; the bench does what it would do: slaves reach OP, and come back after a reset.
+    """
+
+    def __init__(self, board: Blackboard, observer: Observer, *, with_box: bool = True) -> None:
+        self.data = Segment()
+        self.models = self.data.drives
+        self.board, self.observer = board, observer
+        period_ns = round(PERIOD_S * 1e9)
+        self.discipline = Discipline(period_ns, 0)
+        self.discipline.locked = True
+        self.service = Service(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
+        self.slaves_come_back = True
+        self.arm = Arm(
+            CONFIG,
+            [
+                (slot, Cia402Drive(CONFIG.slaves[slot], speed_limit=joint.velocity))
+                for slot, joint in enumerate(CONFIG.joints, 1)
+            ],
+        )
+        self.box = IoBox(CONFIG.slaves[0]) if with_box else None
+        self.behaviour = Behaviour(CONFIG, self.arm, board, self.service, self.discipline)
+        self.orders = Orders(self.arm, self.box, self.behaviour, board, self.service)
+        self.sentences = Sentences(CONFIG)
+        self.log: list[Cycle] = []
+        self._events_before = max((event.number for event in observer.events_since(0)), default=0)
+        self.lease = observer.acquire("the bench", 3600.0)
+
+    @property
+    def state(self) -> State:
+        return self.behaviour.state
+
+    @property
+    def events(self) -> list[Event]:
+        return self.observer.events_since(self._events_before)
+
+    @property
+    def codes(self) -> list[Code]:
+        return [Code(event.code) for event in self.events]
+
+    def cycle(self) -> None:
+        data, behaviour = self.data, self.behaviour
+        if self.slaves_come_back and behaviour.state is State.RESETTING:
+            self.service.lost_slave = 0
+            self.service.all_op = True
+        data.send()
+        good = data.receive() == data.expected_wkc
+        if good:
+            self.arm.decode(data)
+            if self.box is not None:
+                self.box.decode(data.input(0))
+        if self.board.command_waits():
+            self.orders.take()
+        behaviour.step(good)
+        self.arm.encode(data)
+        if self.box is not None:
+            data.set_output(0, self.box.encode())
+        self.log.append(
+            Cycle(
+                behaviour.state,
+                tuple(
+                    Said(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
+                    for slot in range(1, len(data.devices))
+                ),
+            )
+        )
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / PERIOD_S)):
+            self.cycle()
+
+    def wait(self, condition: Callable[[], bool], seconds: float = 5.0) -> float:
+        """Run until `condition`; return the time it took."""
+        for n in range(round(seconds / PERIOD_S) + 1):
+            if condition():
+                return n * PERIOD_S
+            self.cycle()
+        raise AssertionError(f"not within {seconds} s, but {self.state.name}; {self.said}")
+
+    def until(self, state: State, seconds: float = 5.0) -> float:
+        """Run until the machine is in `state`; return the time it took."""
+        return self.wait(lambda: self.state is state, seconds)
+
+    def finish(self) -> float:
+        """Run until the loop may end; return the time it took."""
+        return self.wait(lambda: self.behaviour.done)
+
+    def order(self, command: int, numbers: Sequence[float] = (), lease: int | None = None) -> Answer:
+        """Give a command as a commander does, run one cycle and return the answer to it."""
+        number = self.observer.command(self.lease if lease is None else lease, command, numbers)
+        self.cycle()
+        answer = self.observer.answer(number)
+        assert answer is not None
+        return answer
+
+    def do(self, command: Command, numbers: Sequence[float] = ()) -> None:
+        """Give a command that is taken."""
+        answer = self.order(command, numbers)
+        assert answer.refusal == 0, self.sentences.refusal(*vars(answer).values())
+
+    def move(self, *target: float, speed: float = SPEED) -> None:
+        self.do(Command.MOVE, move_numbers(*target, speed=speed))
+
+    def refused(self, answer: Answer) -> str:
+        """Return the sentence of a refusal."""
+        return self.sentences.refusal(answer.refusal, answer.axis, answer.value, answer.limit)
+
+    @property
+    def said(self) -> list[str]:
+        """All events so far, in words."""
+        return [self.sentences.event(event.code, event.axis, event.value, event.limit) for event in self.events]
+
+    # -- ways to the states -------------------------------------------------------------------------------------
+
+    def start(self) -> Bench:
+        self.service.all_op = True
+        self.until(State.READY)
+        return self
+
+    def enable(self) -> Bench:
+        self.do(Command.ENABLE)
+        self.until(State.HOLDING)
+        return self
+
+    def hold(self, mode: int = CSP) -> Bench:
+        self.start()
+        self.do(Command.MODE, [mode])
+        self.enable()
+        self.wait(lambda: not self.behaviour.switching)
+        return self
+
+    def set_in_motion(self, mode: int = CSP) -> Bench:
+        """Both joints, at full speed on a long way."""
+        self.hold(mode)
+        self.move(1.8, 1.8)
+        self.run(0.6)
+        assert all(drive.velocity > 0.9 * SPEED for drive in self.arm.drives)
+        return self
+
+    def bring_to(self, state: State) -> Bench:
+        """Lead the machine into `state` from its beginning, by what leads there on a robot."""
+        if state is State.STARTING:
+            self.cycle()
+        elif state is State.READY:
+            self.start()
+        elif state is State.ENABLING:
+            self.start().do(Command.ENABLE)
+        elif state is State.HOLDING:
+            self.hold()
+        elif state is State.MOVING:
+            self.set_in_motion()
+        elif state is State.STOPPING:
+            self.set_in_motion().do(Command.STOP)
+        elif state is State.DISABLING:
+            self.set_in_motion().do(Command.DISABLE)
+        elif state is State.FAULT:
+            self.hold()
+            self.service.lost_slave = 3
+            self.cycle()
+        elif state is State.RESETTING:
+            self.bring_to(State.FAULT)
+            self.slaves_come_back = False
+            self.do(Command.RESET)
+        else:
+            self.set_in_motion().do(Command.SHUTDOWN)
+        assert self.state is state
+        return self
+
+    # -- what is seen on the wire -------------------------------------------------------------------------------
+
+    def words(self, axis: int) -> list[int]:
+        """The controlwords that a drive was sent, each once where it was repeated."""
+        sent = [cycle.drives[axis].controlword for cycle in self.log]
+        return [word for n, word in enumerate(sent) if n == 0 or sent[n - 1] != word]
+
+    def longest_step(self, axis: int) -> int:
+        """The longest step, in counts, between two targets in a row that the drive obeyed."""
+        said = [cycle.drives[axis] for cycle in self.log]
+        return max(
+            (
+                abs(after.target - before.target)
+                for before, after in pairwise(said)
+                if before.obeys_target and after.obeys_target
+            ),
+            default=0,
+        )
+
+
+def move_numbers(*target: float, speed: float = SPEED) -> list[float]:
+    """The numbers of a move as they lie in the command ring: targets first, speed last of twelve."""
+    return [*target, *([0.0] * (11 - len(target))), speed]
+
+
+@pytest.fixture(scope="module")
+def board() -> Iterator[tuple[Blackboard, Observer]]:
+    # One for all tests of the file: to make one, 16 MB of memory are touched.
+    path = Path(f"/dev/shm/rtcp-behaviour-{os.getpid()}")
+    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
+    observer = Observer(path)
+    path.unlink()
+    yield written, observer
+    observer.close()
+    written.close()
+
+
+@pytest.fixture
+def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+    made = Bench(*board)
+    yield made
+    board[1].release(made.lease)
+
+
+# -- every fault: what it is, what is said, what the drives are told, and the way back ------------------------------
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault from its cause to its end."""
+
+    name: str
+    code: Code
+    axis: int
+    says: tuple[str, ...]
+    """What its sentence has to name; {word} is the statusword of the joint when it happened."""
+    breaks: Callable[[Bench], object]
+    """From the start of the platform to the cause; the fault follows within 4 s."""
+    mend: Callable[[Bench], object]
+
+
+def nothing(bench: Bench) -> None:
+    """The cause does not last."""
+
+
+def hears_all(bench: Bench) -> None:
+    bench.data.deaf.clear()
+
+
+def drive_fault_while_ready(bench: Bench) -> None:
+    bench.start().models[1].inject_fault(UNDER_VOLTAGE)
+
+
+def drive_fault_in_motion(bench: Bench) -> None:
+    bench.set_in_motion().models[1].inject_fault(UNDER_VOLTAGE)
+
+
+def drive_that_does_not_enable(bench: Bench) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    bench.start().do(Command.ENABLE)
+
+
+def drive_that_does_not_disable(bench: Bench) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    bench.set_in_motion().do(Command.DISABLE)
+
+
+def drive_that_keeps_its_mode(bench: Bench) -> None:
+    bench.hold().data.deaf[1, MODES_OF_OPERATION] = {CSV: CSP}
+    bench.do(Command.MODE, [CSV])
+
+
+def drive_whose_fault_lasts(bench: Bench) -> None:
+    bench.start().models[1].condition.bus_voltage = 10.0
+    bench.until(State.FAULT)
+    bench.do(Command.RESET)
+
+
+def voltage_returns(bench: Bench) -> None:
+    bench.models[1].condition.bus_voltage = 48.0
+
+
+def slave_that_leaves_op(bench: Bench) -> None:
+    bench.set_in_motion().service.lost_slave = 3
+
+
+def slave_that_does_not_come_back(bench: Bench) -> None:
+    bench.bring_to(State.RESETTING)
+
+
+def slaves_come_back(bench: Bench) -> None:
+    bench.slaves_come_back = True
+
+
+def frames_stay_away(bench: Bench) -> None:
+    bench.set_in_motion().data.carries = False
+
+
+def frames_come_back(bench: Bench) -> None:
+    bench.data.carries = True
+
+
+def clock_runs_away(bench: Bench) -> None:
+    bench.set_in_motion().discipline.locked = False
+
+
+def clock_is_followed(bench: Bench) -> None:
+    bench.discipline.locked = True
+
+
+def joint_is_turned_out_of_its_range(bench: Bench) -> None:
+    bench.start().do(Command.ENABLE)
+    bench.models[1].mechanics.position = 2.1
+
+
+def joint_is_turned_back(bench: Bench) -> None:
+    bench.models[1].mechanics.position = 1.9
+
+
+def generator_refuses(bench: Bench) -> None:
+    bench.set_in_motion().arm.generator.update = lambda: False
+
+
+def generator_works(bench: Bench) -> None:
+    del bench.arm.generator.update
+
+
+FAULT_STORIES = (
+    Fault(
+        "a drive fault while ready", Code.DRIVE_FAULT, 1,
+        ("joint2", "in fault", "statusword {word}", "`rtcp reset`"),
+        drive_fault_while_ready, nothing,
+    ),
+    Fault(
+        "a drive fault in motion", Code.DRIVE_LEFT_ENABLED, 1,
+        ("joint2", "left Operation Enabled", "statusword {word}", "`rtcp reset`"),
+        drive_fault_in_motion, nothing,
+    ),
+    Fault(
+        "a drive that does not enable", Code.ENABLE_STUCK, 1,
+        ("joint2", "enabling stuck", "0.2 s", "{word}", "enable_timeout_s in assistive_arm.yaml"),
+        drive_that_does_not_enable, hears_all,
+    ),
+    Fault(
+        "a drive that does not disable", Code.DISABLE_STUCK, 1,
+        ("joint2", "does not give up Operation Enabled", "statusword {word}"),
+        drive_that_does_not_disable, hears_all,
+    ),
+    Fault(
+        "a drive that keeps its mode", Code.MODE_STUCK, 1,
+        ("joint2", "mode 8", "9 was asked", "1 s"),
+        drive_that_keeps_its_mode, hears_all,
+    ),
+    Fault(
+        "a drive whose fault lasts", Code.RESET_STUCK, 1,
+        ("joint2", "in fault after reset", "statusword {word}"),
+        drive_whose_fault_lasts, voltage_returns,
+    ),
+    Fault(
+        "a slave that does not come back", Code.RESET_STUCK, -1,
+        ("reset", "3 s", "OP", "the clock"),
+        slave_that_does_not_come_back, slaves_come_back,
+    ),
+    Fault(
+        "a slave that leaves OP", Code.SLAVE_NOT_OP, 3,
+        ("slave 3 (drive2)", "left OP", "`rtcp reset`"),
+        slave_that_leaves_op, nothing,
+    ),
+    Fault(
+        "frames that stay away", Code.BUS_LOST, -1,
+        ("process data lost", "41 cycles", "40", "bus.lost_cycles in assistive_arm.yaml", "`rtcp reset`"),
+        frames_stay_away, frames_come_back,
+    ),
+    Fault(
+        "a clock that runs away", Code.CLOCK_LOST, -1,
+        ("reference clock", "1 s", "`rtcp reset`"),
+        clock_runs_away, clock_is_followed,
+    ),
+    Fault(
+        "a joint that is turned out of its range", Code.LEFT_RANGE, 1,
+        ("joint2", "left its range", "2.1 rad", "joints[1].position in assistive_arm.yaml"),
+        joint_is_turned_out_of_its_range, joint_is_turned_back,
+    ),
+    Fault(
+        "a generator that refuses", Code.GENERATOR, -1,
+        ("trajectory generator", "holds"),
+        generator_refuses, generator_works,
+    ),
+)  # fmt: skip
+
+
+class Story:
+    """One fault, lived through once: what every test of it looks at."""
+
+    def __init__(self, fault: Fault, bench: Bench) -> None:
+        self.fault, self.bench = fault, bench
+        fault.breaks(bench)
+        if bench.state is State.FAULT:
+            bench.cycle()
+        bench.until(State.FAULT, 4.0)
+        self.event, self.said = bench.events[-1], bench.said[-1]
+        self.kept = bench.behaviour.fault
+        self.at = len(bench.log) - 1
+        bench.run(0.3)
+        fault.mend(bench)
+        bench.run(1.0)
+        self.mended = len(bench.log)
+        bench.do(Command.RESET)
+        self.after_reset = self._reach(State.READY)
+        bench.run(0.3)
+        self.before_enable = len(bench.log)
+        self.enable_answer = bench.order(Command.ENABLE)
+        self.after_enable = self._reach(State.HOLDING)
+        bench.run(0.1)
+
+    def _reach(self, state: State) -> State:
+        try:
+            self.bench.until(state, 4.0)
+        except AssertionError:
+            pass
+        return self.bench.state
+
+
+@pytest.fixture(scope="module", params=FAULT_STORIES, ids=lambda fault: fault.name)
+def story(request: pytest.FixtureRequest, board: tuple[Blackboard, Observer]) -> Story:
+    bench = Bench(*board)
+    try:
+        return Story(request.param, bench)
+    finally:
+        board[1].release(bench.lease)
+
+
+def test_every_code_of_a_fault_has_its_story() -> None:
+    # A joint that does not come to rest in a reset has a test of its own below.
+    assert {fault.code for fault in FAULT_STORIES} == FAULTS - {Code.RESET_MOVING}
+
+
+def test_a_fault_has_its_code_and_its_joint_or_slave(story: Story) -> None:
+    assert (Code(story.event.code), story.event.axis, story.kept) == (
+        story.fault.code,
+        story.fault.axis,
+        story.event.code,
+    )
+
+
+def test_a_fault_is_one_line_that_names_what_is_wrong_where_and_the_key(story: Story) -> None:
+    words = [f"0x{said.statusword:04X}" for said in story.bench.log[story.at].drives]
+    named = [part.format(word=words[story.fault.axis] if "{" in part else "") for part in story.fault.says]
+    assert [part for part in named if part not in story.said] == []
+    assert "\n" not in story.said
+
+
+def test_no_target_jumps_from_the_first_enabling_over_the_fault_to_the_next(story: Story) -> None:
+    assert [story.bench.longest_step(axis) <= LONGEST_STEP for axis in range(2)] == [True, True]
+
+
+def test_every_drive_with_torque_is_told_to_quick_stop_in_the_cycle_of_the_fault(story: Story) -> None:
+    told = [said.controlword for said in story.bench.log[story.at].drives if said.has_torque]
+    assert set(told) <= {QUICK_STOP}
+
+
+def test_in_a_fault_no_speed_and_no_torque_is_sent(story: Story) -> None:
+    sent = {(said.speed, said.effort) for cycle in story.bench.log[story.at : story.mended] for said in cycle.drives}
+    assert sent == {(0, 0)}
+
+
+def test_a_fault_stays_when_its_cause_is_gone(story: Story) -> None:
+    assert {cycle.state for cycle in story.bench.log[story.at : story.mended]} == {State.FAULT}
+
+
+def test_nothing_is_enabled_between_a_fault_and_the_next_enable(story: Story) -> None:
+    told = {said.controlword for cycle in story.bench.log[story.at : story.before_enable] for said in cycle.drives}
+    assert ENABLE_OPERATION not in told
+
+
+def test_a_reset_after_the_cause_leads_to_ready(story: Story) -> None:
+    assert story.after_reset is State.READY
+
+
+def test_an_enable_after_the_reset_leads_to_holding(story: Story) -> None:
+    assert (story.enable_answer.refusal, story.after_enable) == (0, State.HOLDING)
+
+
+# -- starting -------------------------------------------------------------------------------------------------------
+
+
+def test_the_slaves_are_asked_for_op_only_when_the_clock_is_followed(bench: Bench) -> None:
+    asked: list[int] = []
+    bench.service.want_op = lambda: asked.append(len(bench.log))
+    bench.discipline.locked = False
+    bench.run(0.1)
+    assert asked == []
+    bench.discipline.locked = True
+    bench.cycle()
+    assert asked == [100]
+
+
+def test_ready_is_told_when_all_slaves_are_in_op_and_not_before(bench: Bench) -> None:
+    bench.run(0.1)
+    assert (bench.state, bench.codes) == (State.STARTING, [])
+    bench.service.all_op = True
+    bench.cycle()
+    assert (bench.state, bench.codes) == (State.READY, [Code.READY])
+
+
+# -- enabling -------------------------------------------------------------------------------------------------------
+
+
+def test_enabling_starts_with_the_target_where_each_joint_stands(bench: Bench) -> None:
+    for model, position in zip(bench.models, (0.7, -0.4), strict=True):
+        model.mechanics.position = position
+    bench.hold()
+    for axis, position in enumerate((7000, -4000)):
+        told = [cycle.drives[axis] for cycle in bench.log if cycle.drives[axis].controlword == ENABLE_OPERATION]
+        assert {said.target for said in told} == {position}
+
+
+def test_a_joint_that_was_turned_by_hand_is_enabled_where_it_stands_then(bench: Bench) -> None:
+    bench.hold()
+    bench.do(Command.DISABLE)
+    bench.until(State.READY)
+    bench.run(0.1)
+    bench.models[0].mechanics.position = 0.5
+    bench.run(0.01)
+    before = len(bench.log)
+    bench.enable()
+    told = [said for cycle in bench.log[before:] if (said := cycle.drives[0]).controlword == ENABLE_OPERATION]
+    assert {said.target for said in told} == {5000}
+
+
+def test_a_joint_just_beyond_its_range_is_enabled_and_led_to_the_edge_within_its_speed(bench: Bench) -> None:
+    bench.models[1].mechanics.position = 2.015
+    bench.hold()
+    bench.run(0.5)
+    assert {cycle.drives[1].target for cycle in bench.log if cycle.drives[1].obeys_target} == {20000}
+    assert max(abs(cycle.drives[1].velocity) for cycle in bench.log) <= 1.2 * CONFIG.joints[1].velocity * COUNTS
+    assert bench.arm.drives[1].position == pytest.approx(2.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", [CSV, CST])
+def test_drives_are_enabled_in_csp_and_take_the_wanted_mode_only_then(bench: Bench, mode: int) -> None:
+    bench.hold(mode)
+    enabling = [cycle.drives[1].mode for cycle in bench.log if cycle.state is State.ENABLING]
+    assert set(enabling) == {CSP}
+    assert [said.mode_display for said in bench.log[-1].drives] == [mode, mode]
+
+
+@pytest.mark.parametrize("position", [0.0, 1.2])
+def test_the_arm_holds_its_place_through_every_change_of_mode(bench: Bench, position: float) -> None:
+    # A load that pulls: a mode that began without torque would sag.
+    bench.models[0].mechanics.gravity_torque = 15.0
+    bench.models[0].mechanics.position = position
+    bench.hold()
+    bench.run(0.3)
+    before = len(bench.log)
+    for mode in (CSV, CST, CSP, CST, CSV, CSP):
+        bench.do(Command.MODE, [mode])
+        bench.run(0.3)
+        assert bench.arm.first_in_another_mode() == -1
+    seen = [cycle.drives[0] for cycle in bench.log[before:]]
+    assert len({said.target for said in seen}) == 1
+    assert max(abs(said.position - round(position * COUNTS)) for said in seen) <= 50
+
+
+# -- how long things may take ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("breaks", "seconds"),
+    [
+        (drive_that_does_not_enable, ENABLE_TIMEOUT_S),
+        (drive_that_keeps_its_mode, 1.0),
+        (clock_runs_away, 1.0),
+        (slave_that_does_not_come_back, 3.0),
+    ],
+)
+def test_a_fault_of_patience_comes_when_it_is_over_and_not_before(
+    bench: Bench, breaks: Callable[[Bench], object], seconds: float
+) -> None:
+    breaks(bench)
+    assert bench.until(State.FAULT) == pytest.approx(seconds, abs=3 * PERIOD_S)
+
+
+def test_the_time_for_disabling_begins_when_the_arm_stands(bench: Bench) -> None:
+    drive_that_does_not_disable(bench)
+    bench.until(State.FAULT)
+    told = [said for cycle in bench.log if (said := cycle.drives[1]).controlword == SWITCH_ON and said.has_torque]
+    assert len(told) * PERIOD_S == pytest.approx(ENABLE_TIMEOUT_S, abs=3 * PERIOD_S)
+
+
+# -- lost frames ----------------------------------------------------------------------------------------------------
+
+
+def lose(bench: Bench, cycles: int) -> None:
+    bench.data.carries = False
+    bench.run(cycles * PERIOD_S)
+    bench.data.carries = True
+
+
+def test_as_many_lost_cycles_as_are_allowed_do_not_end_a_move(bench: Bench) -> None:
+    bench.hold()
+    bench.move(0.1, 0.1)
+    bench.run(0.2)
+    lose(bench, LOST_CYCLES)
+    bench.until(State.HOLDING)
+    assert bench.codes[-1] is Code.ARRIVED
+
+
+def test_lost_cycles_count_in_a_row_only(bench: Bench) -> None:
+    bench.set_in_motion()
+    for _ in range(5):
+        lose(bench, LOST_CYCLES)
+        bench.cycle()
+    assert bench.state is State.MOVING
+
+
+def test_set_points_stand_while_no_frame_comes_back_and_go_on_from_there(bench: Bench) -> None:
+    bench.set_in_motion()
+    before = bench.log[-1].drives[0].target
+    lose(bench, LOST_CYCLES)
+    assert {cycle.drives[0].target for cycle in bench.log[-LOST_CYCLES:]} == {before}
+    bench.cycle()
+    assert 0 < bench.log[-1].drives[0].target - before <= LONGEST_STEP
+
+
+def test_drives_that_still_hear_are_told_to_stop_for_as_long_as_no_frame_comes_back(bench: Bench) -> None:
+    frames_stay_away(bench)
+    bench.until(State.FAULT)
+    at = len(bench.log)
+    bench.run(0.5)
+    assert {said.controlword for cycle in bench.log[at:] for said in cycle.drives} == {QUICK_STOP}
+
+
+# -- whatever is lost, in whatever state ----------------------------------------------------------------------------
+
+CAUSES: dict[Code, Callable[[Bench], object]] = {
+    Code.BUS_LOST: lambda bench: setattr(bench.data, "carries", False),
+    Code.SLAVE_NOT_OP: lambda bench: setattr(bench.service, "lost_slave", 2),
+    Code.CLOCK_LOST: lambda bench: setattr(bench.discipline, "locked", False),
+    Code.DRIVE_LEFT_ENABLED: lambda bench: bench.models[1].inject_fault(UNDER_VOLTAGE),
+}
+LOST = [
+    *((code, state) for code in (Code.BUS_LOST, Code.SLAVE_NOT_OP)
+      for state in (State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING)),
+    *((Code.CLOCK_LOST, state) for state in (State.READY, State.HOLDING, State.MOVING)),
+    *((Code.DRIVE_LEFT_ENABLED, state) for state in (State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING)),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("code", "state"), LOST, ids=lambda value: value.name.lower())
+def test_what_is_lost_is_that_fault_in_every_state(bench: Bench, code: Code, state: State) -> None:
+    # A drive that is kept from enabling keeps the machine in that state.
+    bench.data.deaf[0, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
+    bench.bring_to(state)
+    CAUSES[code](bench)
+    bench.until(State.FAULT, 1.1)
+    assert (bench.codes[-1], bench.behaviour.fault) == (code, code)
+
+
+def test_a_drive_fault_while_enabling_ends_in_a_fault_that_names_the_joint(bench: Bench) -> None:
+    bench.bring_to(State.ENABLING).models[1].inject_fault(UNDER_VOLTAGE)
+    bench.until(State.FAULT, ENABLE_TIMEOUT_S + 0.01)
+    assert bench.said[-1].startswith("joint2: ")
+
+
+@pytest.mark.parametrize("code", [Code.DRIVE_LEFT_ENABLED, Code.SLAVE_NOT_OP])
+def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(bench: Bench, code: Code) -> None:
+    bench.set_in_motion()
+    bench.models[0].mechanics.external_torque = -130.0
+    bench.run(0.06)
+    lag = bench.log[-1].drives[0].target - bench.log[-1].drives[0].position
+    assert lag > 20 * LONGEST_STEP
+    CAUSES[code](bench)
+    bench.until(State.FAULT)
+    bench.models[0].mechanics.external_torque = 0.0
+    bench.run(0.5)
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    bench.enable()
+    bench.run(0.2)
+    assert bench.longest_step(0) <= LONGEST_STEP
+
+
+@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+def test_a_fault_of_one_drive_brings_the_others_to_rest_under_torque_in_every_mode(bench: Bench, mode: int) -> None:
+    bench.set_in_motion(mode)
+    bench.models[1].inject_fault(UNDER_VOLTAGE)
+    bench.until(State.FAULT)
+    bench.run(0.5)
+    assert bench.models[0].powered
+    assert abs(bench.models[0].mechanics.velocity) < 0.001
+
+
+# -- reset and torque off -------------------------------------------------------------------------------------------
+
+
+def test_disable_in_a_fault_takes_the_torque_off_and_leaves_the_fault(bench: Bench) -> None:
+    bench.bring_to(State.FAULT)
+    assert [model.powered for model in bench.models] == [True, True]
+    bench.do(Command.DISABLE)
+    bench.run(0.05)
+    assert [model.powered for model in bench.models] == [False, False]
+    assert (bench.state, bench.behaviour.fault) == (State.FAULT, Code.SLAVE_NOT_OP)
+    assert bench.codes[-1] is Code.TORQUE_OFF
+
+
+def test_disable_during_a_reset_ends_it_in_the_fault_that_was(bench: Bench) -> None:
+    bench.bring_to(State.RESETTING)
+    bench.do(Command.DISABLE)
+    bench.slaves_come_back = True
+    bench.run(0.5)
+    assert (bench.state, bench.behaviour.fault) == (State.FAULT, Code.SLAVE_NOT_OP)
+    assert [model.powered for model in bench.models] == [False, False]
+
+
+def test_the_fault_after_one_whose_torque_was_taken_off_is_a_quick_stop_again(bench: Bench) -> None:
+    bench.bring_to(State.FAULT)
+    bench.do(Command.DISABLE)
+    bench.run(0.05)
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    bench.enable()
+    bench.service.lost_slave = 3
+    bench.run(0.1)
+    assert bench.state is State.FAULT
+    assert [model.powered for model in bench.models] == [True, True]
+
+
+def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(bench: Bench) -> None:
+    for model in bench.models:
+        # A quick stop of 0.2 rad/s2, which takes 1.5 s.
+        model.objects[0x6085, 0].value = 2000
+    bench.set_in_motion()
+    bench.service.lost_slave = 3
+    bench.cycle()
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    moving = [said for cycle in bench.log for said in cycle.drives if said.has_torque and abs(said.velocity) > 100]
+    assert {said.controlword for said in moving} == {ENABLE_OPERATION, QUICK_STOP}
+
+
+def test_a_reset_waits_for_the_clock_to_be_followed(bench: Bench) -> None:
+    clock_runs_away(bench)
+    bench.until(State.FAULT)
+    bench.do(Command.RESET)
+    bench.run(1.0)
+    assert bench.state is State.RESETTING
+    bench.discipline.locked = True
+    bench.until(State.READY, 0.1)
+
+
+def test_a_joint_that_does_not_come_to_rest_is_named_when_the_reset_sticks(bench: Bench) -> None:
+    bench.bring_to(State.FAULT)
+    bench.slaves_come_back = True
+    turned = bench.models[1].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 2000.0, 0.05, 117.0
+    bench.do(Command.RESET)
+    bench.until(State.FAULT)
+    assert bench.codes[-1] is Code.RESET_MOVING
+    assert "joint2" in bench.said[-1]
+    assert "in fault" not in bench.said[-1]
+
+
+# -- moving, stopping, disabling ------------------------------------------------------------------------------------
+
+
+def test_a_move_arrives_where_it_was_told_to(bench: Bench) -> None:
+    bench.hold()
+    bench.move(0.05, -0.05)
+    bench.until(State.HOLDING)
+    bench.run(0.1)
+    assert bench.codes[-1] is Code.ARRIVED
+    assert [drive.position for drive in bench.arm.drives] == pytest.approx([0.05, -0.05], abs=1e-3)
+
+
+def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(bench: Bench) -> None:
+    generator = bench.hold().arm.generator
+
+    def jump() -> bool:
+        generator.position = [1.0, -2.5]
+        return True
+
+    generator.update = jump
+    bench.run(0.3)
+    assert [bench.longest_step(axis) for axis in range(2)] == [LONGEST_STEP - 1, LONGEST_STEP - 1]
+    generator.position = [1.0, -2.5]
+    bench.run(4.0)
+    assert min(cycle.drives[1].target for cycle in bench.log) == -2.0 * COUNTS
+
+
+def test_a_stop_comes_to_rest_far_before_the_target_and_holds(bench: Bench) -> None:
+    bench.bring_to(State.STOPPING)
+    bench.until(State.HOLDING)
+    bench.run(0.1)
+    assert bench.codes[-1] is Code.STOPPED
+    assert bench.arm.drives[0].position < 0.3
+    assert bench.arm.first_moving() == -1
+
+
+def test_a_lease_that_is_given_up_ends_the_move_in_a_controlled_stop(bench: Bench) -> None:
+    bench.set_in_motion()
+    bench.observer.release(bench.lease)
+    bench.cycle()
+    assert (bench.state, bench.codes[-1]) == (State.STOPPING, Code.LEASE_ENDED)
+    bench.until(State.HOLDING)
+    assert bench.longest_step(0) <= LONGEST_STEP
+
+
+def test_a_lease_of_another_commander_ends_the_move_too(bench: Bench) -> None:
+    bench.set_in_motion()
+    bench.observer.release(bench.lease)
+    bench.lease = bench.observer.acquire("another", 3600.0)
+    bench.cycle()
+    assert (bench.state, bench.codes[-1]) == (State.STOPPING, Code.LEASE_ENDED)
+
+
+def test_disabling_in_motion_takes_the_torque_only_at_standstill(bench: Bench) -> None:
+    bench.bring_to(State.DISABLING)
+    bench.until(State.READY)
+    assert bench.codes[-1] is Code.DISABLED
+    told = [said for cycle in bench.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
+    assert told
+    assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
+
+
+# -- the end --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        State.STARTING, State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING,
+        State.FAULT, State.RESETTING,
+    ],
+    ids=lambda state: state.name.lower(),
+)  # fmt: skip
+def test_the_loop_may_end_only_when_no_drive_has_torque(bench: Bench, state: State) -> None:
+    bench.bring_to(state)
+    if state is State.ENABLING:
+        # The moment at which the drives have been told to enable, and do not show it yet.
+        bench.wait(lambda: bench.log[-1].drives[0].controlword == ENABLE_OPERATION)
+    bench.do(Command.SHUTDOWN)
+    bench.finish()
+    assert [model.powered for model in bench.models] == [False, False]
+
+
+def test_closing_in_motion_stops_before_it_disables(bench: Bench) -> None:
+    bench.bring_to(State.CLOSING)
+    bench.finish()
+    told = [said for cycle in bench.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
+    assert told
+    assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
+
+
+def test_closing_without_frames_tells_all_drives_to_stop_for_20_cycles_and_ends(bench: Bench) -> None:
+    bench.bring_to(State.CLOSING)
+    bench.data.carries = False
+    bench.finish()
+    last = bench.log[-20:]
+    assert {said.controlword for cycle in last for said in cycle.drives} == {QUICK_STOP}
+
+
+def test_closing_ends_after_2_s_where_a_drive_does_not_disable(bench: Bench) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    bench.hold()
+    bench.do(Command.SHUTDOWN)
+    assert bench.finish() == pytest.approx(2.0, abs=3 * PERIOD_S)
+
+
+# -- whatever is asked and whatever happens -------------------------------------------------------------------------
+
+COMMANDS = ["enable", "disable", "reset", "stop"]
+MISHAPS = ["drive fault", "slave lost", "clock lost"]
+DEEDS = st.one_of(
+    st.tuples(st.just("run"), st.integers(1, 300)),
+    st.tuples(st.just("lose"), st.integers(1, 60)),
+    st.tuples(st.just("move"), st.tuples(st.floats(-2.2, 2.2), st.floats(-2.2, 2.2), st.floats(0.05, 0.55))),
+    st.tuples(st.just("mode"), st.sampled_from([CSP, CSV, CST])),
+    st.tuples(st.sampled_from(COMMANDS), st.none()),
+    st.tuples(st.sampled_from(MISHAPS), st.none()),
+    st.tuples(st.just("recover"), st.none()),
+)
+
+
+def happen(bench: Bench, deed: str, how: object) -> None:
+    if deed == "run":
+        bench.run(how * PERIOD_S)
+    elif deed == "lose":
+        lose(bench, how)
+    elif deed == "move":
+        bench.order(Command.MOVE, move_numbers(*how[:2], speed=how[2]))
+    elif deed == "mode":
+        bench.order(Command.MODE, [how])
+    elif deed == "drive fault":
+        bench.models[1].inject_fault(UNDER_VOLTAGE)
+    elif deed == "slave lost":
+        bench.service.lost_slave = 3
+    elif deed == "clock lost":
+        bench.discipline.locked = False
+    elif deed == "recover":
+        bench.discipline.locked = True
+        bench.order(Command.RESET)
+        bench.run(0.2)
+        bench.order(Command.ENABLE)
+        bench.run(0.05)
+    else:
+        bench.order(Command[deed.upper()])
+    bench.cycle()
+
+
+@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(deeds=st.lists(DEEDS, min_size=20, max_size=40))
+def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(
+    board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]
+) -> None:
+    bench = Bench(*board)
+    try:
+        bench.set_in_motion()
+        for deed, how in deeds:
+            happen(bench, deed, how)
+    finally:
+        board[1].release(bench.lease)
+    for axis, joint in enumerate(CONFIG.joints):
+        assert bench.longest_step(axis) <= LONGEST_STEP
+        obeyed = [said.target for cycle in bench.log if (said := cycle.drives[axis]).obeys_target]
+        assert all(joint.position.min * COUNTS <= target <= joint.position.max * COUNTS for target in obeyed)
+    quiet = (State.READY, State.FAULT, State.RESETTING)
+    assert all(
+        said.controlword != ENABLE_OPERATION for cycle in bench.log if cycle.state in quiet for said in cycle.drives
+    )
+    before = {after.state: set() for after in bench.log}
+    for earlier, after in pairwise(bench.log):
+        before[after.state].add(earlier.state)
+    assert before.get(State.ENABLING, set()) <= {State.READY, State.ENABLING}
+    assert before.get(State.MOVING, set()) <= {State.HOLDING, State.MOVING}
