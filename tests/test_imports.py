@@ -1,0 +1,241 @@
+"""Who may import whom (design: "The house"), read from the sources; and what the loop's process really loads."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ORDER = (
+    ("kinematics",), ("config",), ("fieldbus",), ("devices",), ("motion",), ("realtime",), ("runtime",), ("virtual",),
+    ("telemetry",), ("panel", "ros"), ("cli",),
+)  # fmt: skip
+"""The folders from the top of the list down; each imports itself and what stands above it, and not its neighbour."""
+EXCEPTIONS: dict[tuple[str, str], str] = {}
+"""(file, module) -> why it may import what stands below it or beside it. None is needed today."""
+NEVER_IN_THE_LOOP = {"pydantic", "pydantic_core", "typer", "rich", "pyroute2", "yaml", "mcap", "matplotlib"}
+IN_THE_LOOP = {"annotated_types", "pysoem", "ruckig"}
+"""Third-party modules of the loop's process. numpy may be among them by the design, but its threads would keep the
+process from joining the virtual segment's user namespace, so it is not."""
+LET_IN_BY_OTHERS = {"typing_extensions"}
+"""annotated_types imports it where it is installed."""
+
+PACKAGES = {"yaml": "pyyaml", "mpl_toolkits": "matplotlib"}
+"""Modules whose package has another name."""
+
+
+class Import(NamedTuple):
+    """One module that a file names in an import, wherever in the file it stands."""
+
+    file: str
+    line: int
+    module: str
+
+    @property
+    def importer(self) -> str:
+        return place_of(".".join(Path(self.file).with_suffix("").parts))
+
+    @property
+    def imported(self) -> str:
+        return place_of(self.module)
+
+
+def place_of(module: str) -> str:
+    """The folder of the house in which a module stands: `config` for rtcp.config.model, `rtcp` for the package."""
+    parts = module.split(".")
+    if parts[0] != "rtcp" or parts[1:] in ([], ["__init__"]):
+        return parts[0]
+    return parts[1]
+
+
+def modules_named(node: ast.AST, package: str) -> list[str]:
+    """The absolute names of the modules that an import statement of a file in `package` names; none for other nodes."""
+    if isinstance(node, ast.Import):
+        return [alias.name for alias in node.names]
+    if not isinstance(node, ast.ImportFrom):
+        return []
+    module = node.module or ""
+    if node.level:
+        parts = package.split(".")[: len(package.split(".")) - node.level + 1]
+        module = ".".join([*parts, module] if module else parts)
+    # `from rtcp import cli` names a module behind the word import, `from rtcp import __version__` does not.
+    behind = [alias.name for alias in node.names if module == "rtcp" and not alias.name.startswith("__")]
+    return [module, *(f"{module}.{name}" for name in behind)]
+
+
+def imports_of(root: Path) -> Iterator[Import]:
+    for path in sorted([*root.glob("rtcp/**/*.py"), *root.glob("kinematics/**/*.py")]):
+        file = path.relative_to(root)
+        for node in ast.walk(ast.parse(path.read_text(), str(file))):
+            for module in modules_named(node, ".".join(file.parent.parts)):
+                yield Import(str(file), node.lineno, module)
+
+
+def is_ours(found: Import) -> bool:
+    return found.module.partition(".")[0] in ("rtcp", "kinematics")
+
+
+def breaks_the_order(found: Import) -> bool:
+    """Whether it names a folder that stands below the importer's in the list, or beside it, or not in it at all."""
+    rank = {folder: at for at, folders in enumerate(ORDER) for folder in folders}
+    if found.imported in (found.importer, "rtcp"):
+        return False
+    if found.importer not in rank or found.imported not in rank:
+        return True
+    return rank[found.imported] >= rank[found.importer]
+
+
+IMPORTS = list(imports_of(ROOT))
+
+
+def told(breaches: list[Import]) -> list[str]:
+    return [f"{found.file}:{found.line} imports {found.module}" for found in breaches]
+
+
+# -- what the sources say -------------------------------------------------------------------------------------------
+
+
+def test_every_folder_of_the_house_stands_in_the_list() -> None:
+    listed = {folder for folders in ORDER for folder in folders}
+    found = {path.name for path in (ROOT / "rtcp").iterdir() if (path / "__init__.py").exists()}
+    assert found <= listed
+
+
+def test_every_module_but_the_packages_own_lies_in_a_folder() -> None:
+    assert [path.name for path in (ROOT / "rtcp").glob("*.py")] == ["__init__.py"]
+
+
+def test_a_folder_imports_only_folders_above_it() -> None:
+    breaches = [
+        found
+        for found in IMPORTS
+        if is_ours(found) and breaks_the_order(found) and (found.file, found.module) not in EXCEPTIONS
+    ]
+    assert told(breaches) == []
+
+
+def test_every_exception_is_still_needed() -> None:
+    breaches = {(found.file, found.module) for found in IMPORTS if is_ours(found) and breaks_the_order(found)}
+    assert set(EXCEPTIONS) <= breaches
+
+
+def test_the_package_itself_imports_nothing_of_ours() -> None:
+    assert told([found for found in IMPORTS if found.file == "rtcp/__init__.py" and is_ours(found)]) == []
+
+
+def test_nothing_imports_cli() -> None:
+    assert told([found for found in IMPORTS if found.imported == "cli" and found.importer != "cli"]) == []
+
+
+@pytest.mark.parametrize(
+    ("importer", "imported"),
+    [("virtual", "fieldbus"), ("virtual", "devices"), ("fieldbus", "virtual"), ("devices", "virtual")],
+)
+def test_the_two_sides_of_the_wire_share_no_code(importer: str, imported: str) -> None:
+    assert told([found for found in IMPORTS if (found.importer, found.imported) == (importer, imported)]) == []
+
+
+def test_devices_and_kinematics_know_nothing_of_motion() -> None:
+    assert told([f for f in IMPORTS if f.imported == "motion" and f.importer in ("devices", "kinematics")]) == []
+
+
+def test_motion_knows_nothing_of_bytes() -> None:
+    forbidden = ("fieldbus", "devices", "virtual", "struct")
+    assert told([found for found in IMPORTS if found.importer == "motion" and found.imported in forbidden]) == []
+
+
+def test_kinematics_imports_only_the_standard_library_numpy_and_itself() -> None:
+    allowed = {*sys.stdlib_module_names, "numpy", "kinematics"}
+    found = [found for found in IMPORTS if found.importer == "kinematics"]
+    assert told([each for each in found if each.module.partition(".")[0] not in allowed]) == []
+
+
+def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
+    # Python 3.10 has no reader of TOML; a list of strings is written there as in Python.
+    listed = re.search(r"^dependencies = (\[.*?^\])", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
+    assert listed is not None
+    declared = {
+        re.split(r"[^\w-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
+    }
+    names = {found.module.partition(".")[0] for found in IMPORTS if not is_ours(found)} - sys.stdlib_module_names
+    assert {PACKAGES.get(name, name) for name in names} - declared == set()
+
+
+def test_modules_are_imported_by_a_name_made_at_run_time_in_one_place_only() -> None:
+    # What this file cannot see: there it is rtcp.config's own modules, on first use, so that the loop has no validator.
+    by_name = {"import_module", "__import__"}
+    callers = set()
+    for path in sorted(ROOT.glob("rtcp/**/*.py")):
+        tree = ast.parse(path.read_text())
+        names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        attributes = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+        if by_name & (names | attributes):
+            callers.add(str(path.relative_to(ROOT)))
+    assert callers == {"rtcp/config/__init__.py"}
+
+
+# -- the reader of sources itself -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "breaches"),
+    [
+        ("rtcp/motion/bad.py", "import rtcp.devices.cia402", []),
+        ("rtcp/motion/bad.py", "import rtcp.runtime.arm", ["rtcp.runtime.arm"]),
+        ("rtcp/motion/bad.py", "def f():\n    from rtcp.cli.app import app", ["rtcp.cli.app"]),
+        ("rtcp/motion/bad.py", "from rtcp import runtime", ["rtcp.runtime"]),
+        ("rtcp/motion/bad.py", "from rtcp import __version__", []),
+        ("rtcp/motion/bad.py", "from ..runtime import arm", ["rtcp.runtime"]),
+        ("rtcp/motion/__init__.py", "from .guard import Guard", []),
+        ("rtcp/panel/bad.py", "import rtcp.ros.node", ["rtcp.ros.node"]),
+        ("rtcp/motion/bad.py", "import rtcp.unheard_of", ["rtcp.unheard_of"]),
+        ("kinematics/bad.py", "import rtcp.config.model", ["rtcp.config.model"]),
+    ],
+)
+def test_a_breach_is_seen_however_it_is_written(tmp_path: Path, file: str, line: str, breaches: list[str]) -> None:
+    (tmp_path / file).parent.mkdir(parents=True)
+    (tmp_path / file).write_text(line + "\n")
+    seen = [found.module for found in imports_of(tmp_path) if is_ours(found) and breaks_the_order(found)]
+    assert seen == breaches
+
+
+# -- what the loop's process really loads ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def loaded() -> set[str]:
+    """Names of the modules that a fresh interpreter has loaded for the loop's process, less those of its own start."""
+    program = (
+        "import json, sys; before = set(sys.modules)\n"
+        "import rtcp.runtime.loop_process\n"
+        "print(json.dumps(sorted(set(sys.modules) - before)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout))
+
+
+def test_the_loops_process_loads_its_three_packages_and_the_standard_library(loaded: set[str]) -> None:
+    names = {module.partition(".")[0] for module in loaded} - sys.stdlib_module_names - {"rtcp"}
+    # Cython's own, which pysoem's extension module brings along: `cython_runtime`, `_cython_3_2_4`.
+    names = {name for name in names if not name.lstrip("_").startswith("cython")}
+    assert names - LET_IN_BY_OTHERS == IN_THE_LOOP
+
+
+def test_the_loops_process_loads_no_validator_no_commands_and_no_network_tools(loaded: set[str]) -> None:
+    assert {module.partition(".")[0] for module in loaded} & NEVER_IN_THE_LOOP == set()
+
+
+def test_the_loops_process_loads_nothing_of_the_virtual_segment_and_the_commands(loaded: set[str]) -> None:
+    assert [name for name in loaded if place_of(name) in ("virtual", "telemetry", "panel", "ros", "cli")] == []
+
+
+def test_the_loops_process_loads_no_server_and_no_event_loop(loaded: set[str]) -> None:
+    assert loaded & {"asyncio", "http", "http.server", "socketserver"} == set()
