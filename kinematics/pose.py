@@ -34,6 +34,36 @@ def rotation_from_rpy(rx: float, ry: float, rz: float) -> Rotation:
     )  # fmt: skip
 
 
+def turned(sine: float, cosine: float, theta: float) -> Rotation:
+    """Rx(alpha) Rz(theta), the rotation of a row of the table, from the sine and cosine of alpha; theta in rad."""
+    s, c = math.sin(theta), math.cos(theta)
+    return c, -s, 0.0, cosine * s, cosine * c, -sine, sine * s, sine * c, cosine
+
+
+def times(one: Rotation, other: Rotation) -> Rotation:
+    """The product of two rotations."""
+    a, b, c, d, e, f, g, h, i = one
+    j, k, m, n, o, p, q, r, s = other
+    return (
+        a * j + b * n + c * q, a * k + b * o + c * r, a * m + b * p + c * s,
+        d * j + e * n + f * q, d * k + e * o + f * r, d * m + e * p + f * s,
+        g * j + h * n + i * q, g * k + h * o + i * r, g * m + h * p + i * s,
+    )  # fmt: skip
+
+
+def transposed(rotation: Rotation) -> Rotation:
+    """The rotation back."""
+    a, b, c, d, e, f, g, h, i = rotation
+    return a, d, g, b, e, h, c, f, i
+
+
+def applied(rotation: Rotation, vector: Vector) -> Vector:
+    """The rotated vector."""
+    a, b, c, d, e, f, g, h, i = rotation
+    x, y, z = vector
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z
+
+
 def rpy_from_rotation(rotation: Rotation) -> Vector:
     """The angles (rx, ry, rz), rad, with R = Rx(rx) Ry(ry) Rz(rz), ry in [-pi/2, pi/2], rx and rz in [-pi, pi].
 
@@ -86,25 +116,16 @@ class Pose(NamedTuple):
         return rpy_from_rotation(self.rotation)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """This transform after `other`: frame A <- B times frame B <- C is frame A <- C."""
-        (x, y, z), (a, b, c, d, e, f, g, h, i) = self
-        (ox, oy, oz), (j, k, m, n, o, p, q, r, s) = other
-        return Pose(
-            (a * ox + b * oy + c * oz + x, d * ox + e * oy + f * oz + y, g * ox + h * oy + i * oz + z),
-            (
-                a * j + b * n + c * q, a * k + b * o + c * r, a * m + b * p + c * s,
-                d * j + e * n + f * q, d * k + e * o + f * r, d * m + e * p + f * s,
-                g * j + h * n + i * q, g * k + h * o + i * r, g * m + h * p + i * s,
-            ),
-        )  # fmt: skip
+        """This transform after `other`: A <- C from A <- B and B <- C."""
+        x, y, z = applied(self.rotation, other.position)
+        px, py, pz = self.position
+        return Pose((px + x, py + y, pz + z), times(self.rotation, other.rotation))
 
     def inverse(self) -> Pose:
         """The transform back."""
-        (x, y, z), (a, b, c, d, e, f, g, h, i) = self
-        return Pose(
-            (-(a * x + d * y + g * z), -(b * x + e * y + h * z), -(c * x + f * y + i * z)),
-            (a, d, g, b, e, h, c, f, i),
-        )
+        back = transposed(self.rotation)
+        x, y, z = applied(back, self.position)
+        return Pose((-x, -y, -z), back)
 
     def require_finite(self) -> None:
         """Raise ValueError that names the first entry which is NaN or infinite."""

@@ -1,0 +1,63 @@
+"""Torques that the joints must give to hold the arm against gravity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kinematics.forward import frames
+from kinematics.model import ArmModel, LinkMass
+from kinematics.pose import Pose, require_finite
+
+Torques = tuple[float, float, float, float, float, float]
+
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2 along the base's axes, base upright; CGPM 1901
+
+
+def gravity_torques(
+    model: ArmModel,
+    q: Sequence[float],
+    gravity: Sequence[float] = STANDARD_GRAVITY,
+    payload: LinkMass | None = None,
+) -> Torques:
+    """Six torques in Nm with which the arm stands still at `q` (rad): g(q) of M(q) q'' + c(q, q') + g(q) = tau.
+
+    `gravity`: acceleration of free fall in m/s^2, in the base frame. `payload`: a mass whose centre is given in the
+    tool frame. ValueError when the model has no link masses, and for a value that is not finite, which it names.
+
+    Joint i holds the moment of all weights beyond it about its axis: -z_i . (sum over j >= i of (c_j - p_i) x m_j g).
+    """
+    if not model.links:
+        raise ValueError(f"the link masses of arm {model.name!r} are not known: its gravity torques cannot be computed")
+    gx, gy, gz = gravity
+    require_finite((gx, gy, gz), ("gravity x", "gravity y", "gravity z"))
+    poses = frames(model, q)
+    mass = mx = my = mz = 0.0  # of everything beyond the joint: mass in kg, and first moment about the base in kg m
+    if payload is not None:
+        mass, mx, my, mz = _moment(poses[6], payload)
+    torques = []
+    for pose, link in zip(reversed(poses[:6]), reversed(model.links), strict=True):
+        m, x, y, z = _moment(pose, link)
+        mass += m
+        mx += x
+        my += y
+        mz += z
+        (px, py, pz), (_, _, zx, _, _, zy, _, _, zz) = pose
+        rx = mx - mass * px
+        ry = my - mass * py
+        rz = mz - mass * pz
+        torques.append(zx * (rz * gy - ry * gz) + zy * (rx * gz - rz * gx) + zz * (ry * gx - rx * gy))
+    torques.reverse()
+    return tuple(torques)  # type: ignore[return-value]
+
+
+def _moment(pose: Pose, body: LinkMass) -> tuple[float, float, float, float]:
+    """Mass in kg, and mass times the centre's position in the base frame in kg m."""
+    (px, py, pz), (a, b, c, d, e, f, g, h, i) = pose
+    m = body.mass
+    x, y, z = body.centre
+    return (
+        m,
+        m * (px + a * x + b * y + c * z),
+        m * (py + d * x + e * y + f * z),
+        m * (pz + g * x + h * y + i * z),
+    )

@@ -1,0 +1,169 @@
+"""On and beside singularities: nothing is missing, a free joint is held, and which singularity it is is told."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import acos, atan2, hypot, pi, sin
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kinematics.forward import forward
+from kinematics.inverse import InverseKinematics
+from kinematics.model import ArmModel, DhRow
+from kinematics.solution import Singularity
+
+KINDS = ("wrist", "elbow", "shoulder")
+FLAGS = {"wrist": Singularity.WRIST, "elbow": Singularity.ELBOW, "shoulder": Singularity.SHOULDER}
+
+kinds = st.sets(st.sampled_from(KINDS), min_size=1)
+distances = st.sampled_from([0.0, *(10.0**-exponent for exponent in range(3, 10))])
+sides = st.sampled_from([-1.0, 1.0])
+configurations = st.tuples(*(st.floats(-1.0, 1.0) for _ in range(6)))
+
+
+def wrist_height_and_distance(model: ArmModel, q: list[float]) -> tuple[float, float]:
+    """Of the wrist centre seen from axis 2, in the plane of the arm (m): along x of frame 1, and upwards."""
+    pose = forward(model, [0.0, *q[1:]])
+    x, _, z = np.subtract(pose.position, np.multiply(model.rows[5].d, pose.rotation[2::3]))
+    return x, z - model.rows[0].d
+
+
+def beside(model: ArmModel, shape, kinds, distance: float, side: float) -> list[float]:
+    """A configuration inside the limits at a distance (rad, or m from axis 1) from all the singularities named."""
+    q = [share * min(-limit.lower, limit.upper) for share, limit in zip(shape, model.limits, strict=True)]
+    if kinds <= {"wrist", "elbow"} and "wrist" in kinds:
+        q[4] = side * distance
+    elif abs(sin(q[4])) < 0.05:
+        q[4] = 0.5
+    stretched = -model.rows[2].offset - atan2(-sin(model.rows[3].alpha) * model.rows[3].d, model.rows[3].a)
+    if "elbow" in kinds:
+        q[2] = stretched + side * distance
+    elif abs(sin(q[2] - stretched)) < 0.05:
+        q[2] = stretched + 0.5
+    if "shoulder" in kinds:
+        # the distance from axis 1 is that of a rigid triangle which joint 2 turns
+        x, z = wrist_height_and_distance(model, [q[0], 0.0, *q[2:]])
+        quarter, _ = wrist_height_and_distance(model, [q[0], pi / 2, *q[2:]])
+        q[1] = atan2(quarter, x) + acos(side * distance / hypot(x, z))
+        q[1] -= pi * round(q[1] / pi)
+    elif abs(wrist_height_and_distance(model, q)[0]) < 0.02:
+        q[1] += 0.5
+    return q
+
+
+def tolerance(kinds, distance: float) -> float:
+    """How far (rad) round-off of the pose, 1e-16, may move a solution at a distance from the singularities named.
+
+    A distance from axis 1 divides it. On the edge of the workspace it is the bend's square that is known: nearer than
+    5e-7 the arm is given as stretched. What direction of the forearm is lost is divided by the distance of the wrist.
+    """
+    if distance == 0.0:
+        return 1e-12
+    arm = 5e-15
+    if "shoulder" in kinds:
+        arm += 1e-15 / distance
+    if "elbow" in kinds:
+        arm += 5e-7 if distance < 5e-7 else 5e-15 / distance
+    return 1e-12 + (arm / distance if "wrist" in kinds else arm)
+
+
+def apart(one, other) -> float:
+    return float(np.abs(np.remainder(np.subtract(one, other) + pi, 2 * pi) - pi).max())
+
+
+@settings(deadline=None, max_examples=400)
+@given(shape=configurations, kinds=kinds, distance=distances, side=sides)
+def test_no_solution_is_missing_beside_singularities(shape, kinds, distance, side, either, chain, pose_errors, as_pose):
+    q = beside(either, shape, kinds, distance, side)
+    matrix = chain(either, np.array([q]))
+    answer = InverseKinematics(either).solve(as_pose(matrix[0]), q)
+    assert min(apart(solution.q, q) for solution in answer.solutions) < tolerance(kinds, distance)
+    found = np.array([solution.q for solution in answer.solutions])
+    position, rotation = pose_errors(np.repeat(matrix, len(found), axis=0), chain(either, found))
+    assert max(position.max(), rotation.max()) < 1e-9
+
+
+@settings(deadline=None, max_examples=100)
+@given(shape=configurations, kinds=kinds, side=sides, held=st.floats(-1.0, 1.0))
+def test_on_a_singularity_the_free_joints_stay_and_it_is_named(shape, kinds, side, held, either, chain, as_pose):
+    q = beside(either, shape, kinds, 0.0, side)
+    near = [held, q[1], q[2], -held, q[4], q[5]]
+    solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), near).solutions
+    named = [solution for solution in solutions if FLAGS["wrist"] in solution.singularity]
+    if kinds <= {"wrist", "elbow"} and "wrist" in kinds:
+        assert named
+        assert all(solution.q[3] == pytest.approx(-held, abs=1e-15) for solution in named)
+    if "shoulder" in kinds:
+        assert all(solution.q[0] == pytest.approx(held, abs=1e-15) for solution in solutions)
+    for kind in {"shoulder", "elbow"} & kinds:
+        assert all(FLAGS[kind] in solution.singularity for solution in solutions)
+
+
+@settings(deadline=None, max_examples=100)
+@given(shape=configurations, kinds=kinds, side=sides)
+def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_there(
+    shape, kinds, side, either, chain, as_pose
+):
+    q = beside(either, shape, kinds, 1e-3, side)
+    solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0])).solutions
+    assert len(solutions) == 8
+    own = min(solutions, key=lambda solution: apart(solution.q, q))
+    assert own.singularity == Singularity.NONE
+
+
+@pytest.mark.parametrize(("kinds", "count"), [({"elbow"}, 4), ({"shoulder"}, 4), ({"shoulder", "elbow"}, 2)], ids=str)
+def test_solutions_that_have_become_one_are_given_once(kinds, count, either, chain, as_pose):
+    q = beside(either, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), kinds, 0.0, 1.0)
+    solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), q).solutions
+    assert len(solutions) == count
+
+
+@pytest.mark.parametrize(("arm", "count"), [("assistive", 2), ("irb120", 1)])
+def test_both_wrists_become_one_in_every_arm_whose_forearm_points_along_axis_6(arm, count, chain, as_pose, request):
+    # Without an elbow offset the arm turned by half a turn about axis 1 and leant back has the same forearm
+    model = request.getfixturevalue(arm)
+    q = beside(model, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"wrist"}, 0.0, 1.0)
+    solutions = InverseKinematics(model).solve(as_pose(chain(model, np.array([q]))[0]), q).solutions
+    assert [solution.singularity for solution in solutions].count(Singularity.WRIST) == count
+    assert len(solutions) == 8 - count
+
+
+def test_straight_up_has_the_one_solution_that_holds_joints_1_and_4(assistive):
+    near = [0.3, 0.1, -0.1, -0.8, 0.2, 0.9]
+    (solution,) = InverseKinematics(assistive).solve(forward(assistive, [0.0] * 6), near).solutions
+    assert solution.q == pytest.approx((0.3, 0.0, 0.0, -0.8, 0.0, 0.5), abs=1e-15)
+    assert solution.singularity == Singularity.SHOULDER | Singularity.ELBOW | Singularity.WRIST
+    assert solution.within_limits
+
+
+def equal_lengths(model: ArmModel) -> ArmModel:
+    """With an upper arm as long as the forearm, which folds onto axis 2."""
+    rows = list(model.rows)
+    rows[2] = replace(rows[2], a=hypot(rows[3].a, rows[3].d))
+    return replace(model, rows=tuple(rows))
+
+
+def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(assistive):
+    model = equal_lengths(assistive)
+    folded = pi - model.rows[2].offset - atan2(-sin(model.rows[3].alpha) * model.rows[3].d, model.rows[3].a)
+    q = [0.4, 0.7, folded - 2 * pi * round(folded / (2 * pi)), 0.3, 0.6, 0.1]
+    solutions = InverseKinematics(model).solve(forward(model, q), q).solutions
+    assert min(apart(solution.q, q) for solution in solutions) < 1e-7
+    assert all(solution.q[1] == pytest.approx(0.7, abs=1e-15) for solution in solutions)
+    assert all(Singularity.ELBOW in solution.singularity for solution in solutions)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-7, 1e-5, 1e-3])
+def test_beside_the_tube_that_a_lateral_offset_keeps_free_nothing_is_missing(distance, assistive, chain, as_pose):
+    rows = list(assistive.rows)
+    rows[2] = DhRow(rows[2].alpha, rows[2].a, 0.12, rows[2].offset)
+    model = replace(assistive, rows=tuple(rows))
+    q = beside(assistive, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"shoulder"}, distance, 1.0)
+    solutions = InverseKinematics(model).solve(as_pose(chain(model, np.array([q]))[0])).solutions
+    assert min(apart(solution.q, q) for solution in solutions) < (1e-6 if distance < 1e-6 else 1e-14 / distance)
+    nearest = min(solutions, key=lambda solution: apart(solution.q, q))
+    assert (Singularity.SHOULDER in nearest.singularity) == (distance < 1e-8)
+    assert len(solutions) == (4 if distance < 1e-8 else 8)
