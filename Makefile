@@ -4,7 +4,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help setup run test lint format clean
+.PHONY: help setup oracles run test lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -12,6 +12,9 @@ help: ## show this list
 
 setup: ## make .venv with the package and what it needs
 	@sh .ci/setup "$(PYTHON)"
+
+oracles: setup ## add what the kinematics is compared with (Pinocchio, EAIK); without it those tests are skipped
+	@$(BIN)/python -m pip install --quiet --editable '.[dev,oracles]'
 
 run: setup ## run the demonstration: virtual segment, master, a move, the figures
 	@$(BIN)/rtcp demo

@@ -12,7 +12,7 @@ import pytest
 from rtcp import __version__
 
 COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "mode", "move", "output", "scan", "sdo",
-            "segment", "demo")  # fmt: skip
+            "segment", "demo", "arm")  # fmt: skip
 
 
 @pytest.mark.parametrize("option", ["-h", "--help"])
