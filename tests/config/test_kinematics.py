@@ -75,6 +75,11 @@ def test_the_joints_of_a_whole_arm_are_the_limits_of_its_kinematics() -> None:
     assert model.limits == tuple(JointLimit(j.position.min, j.position.max, j.velocity) for j in arm.joints)
 
 
+def test_the_joints_keep_their_names(directory: Path) -> None:
+    ARM.write_text(ARM.read_text().replace("name: joint2", "name: shoulder"))
+    assert load_kinematics(ARM).joint_names[:3] == ("joint1", "shoulder", "joint3")
+
+
 def test_the_links_of_the_assistive_arm_weigh_their_actuators_and_more() -> None:
     moved = sum((0.720, 0.720, 0.650, 0.500, 0.335))
     tubes = 0.170 + 0.440 + 0.550 + 0.140
