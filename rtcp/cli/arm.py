@@ -155,11 +155,7 @@ def _refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
     """Refuse what was meant as an option; the minus sign of a fraction of pi is none of an option."""
     from rtcp.config.geometry import angle
 
-    written = [value for value in values if angle(value) == value]
-    for value in written:
-        if value in known:
-            raise CommandError(f"{value} stands behind --, which ends the options: write it before")
-    refuse_options(written, known)
+    refuse_options([value for value in values if angle(value) == value], known)
 
 
 def _numbers(values: Sequence[str], names: Sequence[str]) -> list[float]:

@@ -42,6 +42,8 @@ def refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
     for value in values:
         if value.startswith("-") and not _LOOKS_LIKE_A_NUMBER.match(value):
             option = value.split("=", 1)[0]
+            if option in known:
+                raise CommandError(f"{option} stands behind --, which ends the options: write it before")
             near = difflib.get_close_matches(option, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
             raise CommandError(f"no such option: {option} ({hint})")

@@ -204,3 +204,9 @@ def test_on_a_terminal_a_move_draws_a_bar(platform: Any, rtcp_process: Callable[
     assert moving.wait() == 0
     assert "━".encode() in shown
     assert b"there, largest error" in shown
+
+
+def test_an_option_behind_the_end_of_the_options_is_told_so(rtcp: Callable[..., Any]) -> None:
+    moved = rtcp("move", "--", *["0"] * 6, "--speed", "0.2")
+    assert moved.code == 2
+    assert "--speed stands behind --" in moved.trouble
