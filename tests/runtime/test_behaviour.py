@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from rtcp.config import default_config, load
@@ -424,6 +424,19 @@ def voltage_returns(bench: Bench) -> None:
     bench.models[1].condition.bus_voltage = 48.0
 
 
+def joint_that_does_not_come_to_rest(bench: Bench) -> None:
+    bench.bring_to(State.FAULT)
+    # More than its drive can hold, and too heavy to become fast soon.
+    turned = bench.models[1].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 2000.0, 0.05, 117.0
+    bench.do(Command.RESET)
+
+
+def joint_is_let_go(bench: Bench) -> None:
+    turned = bench.models[1].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 1.0, 0.0, 0.0
+
+
 def slave_that_leaves_op(bench: Bench) -> None:
     bench.set_in_motion().service.lost_slave = 3
 
@@ -501,6 +514,11 @@ FAULT_STORIES = (
         drive_whose_fault_lasts, voltage_returns,
     ),
     Fault(
+        "a joint that does not come to rest", Code.RESET_MOVING, 1,
+        ("joint2", "still turns", "rad/s", "3 s", "`rtcp disable`"),
+        joint_that_does_not_come_to_rest, joint_is_let_go,
+    ),
+    Fault(
         "a slave that does not come back", Code.RESET_STUCK, -1,
         ("reset", "3 s", "OP", "the clock"),
         slave_that_does_not_come_back, slaves_come_back,
@@ -575,8 +593,7 @@ def story(request: pytest.FixtureRequest, board: tuple[Blackboard, Observer]) ->
 
 
 def test_every_code_of_a_fault_has_its_story() -> None:
-    # A joint that does not come to rest in a reset has a test of its own below.
-    assert {fault.code for fault in FAULT_STORIES} == FAULTS - {Code.RESET_MOVING}
+    assert {fault.code for fault in FAULT_STORIES} == FAULTS
 
 
 def test_a_fault_has_its_code_and_its_joint_or_slave(story: Story) -> None:
@@ -870,10 +887,14 @@ def test_the_fault_after_one_whose_torque_was_taken_off_is_a_quick_stop_again(be
     assert [model.powered for model in bench.models] == [True, True]
 
 
-def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(bench: Bench) -> None:
+def slow_quick_stop(bench: Bench) -> None:
+    """From full speed it takes 1.5 s, at 0.2 rad/s2."""
     for model in bench.models:
-        # A quick stop of 0.2 rad/s2, which takes 1.5 s.
         model.objects[0x6085, 0].value = 2000
+
+
+def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(bench: Bench) -> None:
+    slow_quick_stop(bench)
     bench.set_in_motion()
     bench.service.lost_slave = 3
     bench.cycle()
@@ -891,18 +912,6 @@ def test_a_reset_waits_for_the_clock_to_be_followed(bench: Bench) -> None:
     assert bench.state is State.RESETTING
     bench.discipline.locked = True
     bench.until(State.READY, 0.1)
-
-
-def test_a_joint_that_does_not_come_to_rest_is_named_when_the_reset_sticks(bench: Bench) -> None:
-    bench.bring_to(State.FAULT)
-    bench.slaves_come_back = True
-    turned = bench.models[1].mechanics
-    turned.inertia, turned.velocity, turned.external_torque = 2000.0, 0.05, 117.0
-    bench.do(Command.RESET)
-    bench.until(State.FAULT)
-    assert bench.codes[-1] is Code.RESET_MOVING
-    assert "joint2" in bench.said[-1]
-    assert "in fault" not in bench.said[-1]
 
 
 # -- moving, stopping, disabling ------------------------------------------------------------------------------------
@@ -967,6 +976,16 @@ def test_disabling_in_motion_takes_the_torque_only_at_standstill(bench: Bench) -
     assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
 
 
+@pytest.mark.xfail(strict=True, raises=AssertionError, reason="`disabled` is told while the drives are about to enable")
+def test_disabling_while_enabling_is_told_as_done_only_when_no_drive_has_torque(bench: Bench) -> None:
+    bench.bring_to(State.ENABLING)
+    # The moment at which the drives have been told to enable, and do not show it yet.
+    bench.wait(lambda: bench.log[-1].drives[0].controlword == ENABLE_OPERATION)
+    bench.do(Command.DISABLE)
+    bench.until(State.READY)
+    assert [model.powered for model in bench.models] == [False, False]
+
+
 # -- the end --------------------------------------------------------------------------------------------------------
 
 
@@ -994,6 +1013,17 @@ def test_closing_in_motion_stops_before_it_disables(bench: Bench) -> None:
     told = [said for cycle in bench.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
     assert told
     assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
+
+
+def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_the_torque(bench: Bench) -> None:
+    slow_quick_stop(bench)
+    bench.set_in_motion()
+    bench.service.lost_slave = 3
+    bench.run(0.01)
+    bench.do(Command.SHUTDOWN)
+    bench.finish()
+    moving = [said for cycle in bench.log for said in cycle.drives if said.has_torque and abs(said.velocity) > 100]
+    assert {said.controlword for said in moving} == {ENABLE_OPERATION, QUICK_STOP}
 
 
 def test_closing_without_frames_tells_all_drives_to_stop_for_20_cycles_and_ends(bench: Bench) -> None:
@@ -1052,7 +1082,8 @@ def happen(bench: Bench, deed: str, how: object) -> None:
     bench.cycle()
 
 
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+# A failing example is not shortened: that would take minutes.
+@settings(max_examples=25, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(deeds=st.lists(DEEDS, min_size=20, max_size=40))
 def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(
     board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]
