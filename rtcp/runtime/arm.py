@@ -110,13 +110,6 @@ class Arm:
                 return axis
         return -1
 
-    def first_enabled(self) -> int:
-        """Return the first joint whose drive is enabled, or -1."""
-        for axis, drive in enumerate(self.drives):
-            if drive.state is _ENABLED:
-                return axis
-        return -1
-
     def first_with_torque(self) -> int:
         """Return the first joint whose drive gives torque: enabled, in a quick stop or reacting to a fault; or -1."""
         for axis, drive in enumerate(self.drives):

@@ -22,6 +22,7 @@ _RESET_S = 3.0
 _MODE_S = 1.0
 _CLOCK_S = 1.0
 _TOLD_CYCLES = 5
+"""What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
 _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
 
@@ -120,8 +121,11 @@ class Behaviour:
         self._service.explain_drive(axis)
         self._fail(code, axis, float(self._arm.drives[axis].statusword))
 
+    def _fail_mode(self, axis: int) -> None:
+        self._fail(Code.MODE_STUCK, axis, float(self._arm.drives[axis].mode_display), float(self._arm.mode))
+
     def _bus_fails(self, good: bool) -> bool:
-        if not good and self.lost > self._lost_limit:
+        if not good and self.lost >= self._lost_limit:
             self._fail(Code.BUS_LOST, -1, float(self.lost), float(self._lost_limit))
             return True
         if self._service.lost_slave:
@@ -185,13 +189,16 @@ class Behaviour:
         if axis >= 0:
             self._fail(Code.LEFT_RANGE, axis, arm.drives[axis].position)
             return
+        axis = arm.first_in_fault()
+        if axis >= 0:
+            self._fail_drive(Code.DRIVE_FAULT, axis)
+            return
         arm.lead(DriveGoal.ENABLED)
         arm.follow()
         arm.command()
         axis = arm.first_not_enabled()
-        if axis < 0:
-            axis = arm.first_in_another_mode()
-        if axis < 0:
+        elsewhere = arm.first_in_another_mode() if axis < 0 else -1
+        if axis < 0 and elsewhere < 0:
             self.enables += 1
             self.all_enabled = True
             self._blackboard.event(Code.ENABLED)
@@ -199,7 +206,10 @@ class Behaviour:
             if self.wanted_mode is not DriveMode.CSP:
                 self.change_mode(self.wanted_mode)
         elif self._waited > self._enable_cycles:
-            self._fail_drive(Code.ENABLE_STUCK, axis)
+            if axis >= 0:
+                self._fail_drive(Code.ENABLE_STUCK, axis)
+            else:
+                self._fail_mode(elsewhere)
 
     def change_mode(self, mode: DriveMode) -> None:
         """Let the enabled drives, at standstill, change to `mode`."""
@@ -214,7 +224,7 @@ class Behaviour:
         if axis < 0:
             self.switching = False
         elif self._waited > self._mode_cycles:
-            self._fail(Code.MODE_STUCK, axis, float(self._arm.drives[axis].mode_display), float(self._arm.mode))
+            self._fail_mode(axis)
 
     def _moving(self, good: bool) -> None:
         lease, renewed, duration = self._blackboard.lease()
@@ -244,11 +254,12 @@ class Behaviour:
         self.all_enabled = False
         arm.lead(DriveGoal.DISABLED)
         arm.follow()
-        axis = arm.first_enabled()
-        if axis < 0:
+        self._told += 1
+        axis = arm.first_with_torque()
+        if axis < 0 and self._told > _TOLD_CYCLES:
             self._blackboard.event(Code.DISABLED)
             self.enter(State.READY)
-        elif self._waited > self._enable_cycles:
+        elif axis >= 0 and self._waited > self._enable_cycles:
             self._fail_drive(Code.DISABLE_STUCK, axis)
 
     def _faulted(self, good: bool) -> None:
@@ -283,9 +294,9 @@ class Behaviour:
 
     def _closing(self, good: bool) -> None:
         arm = self._arm
-        if self.lost > self._lost_limit:
+        if self.lost >= self._lost_limit:
             arm.lead(DriveGoal.QUICK_STOPPED)
-            self.done = self.lost > self._lost_limit + _FAREWELL_CYCLES
+            self.done = self.lost >= self._lost_limit + _FAREWELL_CYCLES
             return
         if self._waited > self._closing_cycles:
             self.done = True
@@ -303,6 +314,5 @@ class Behaviour:
         ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
         arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
         arm.follow()
-        # What a drive shows is older than what it was told: it may still be about to enable.
         self._told = 0 if ramping else self._told + 1
         self.done = self._told > _TOLD_CYCLES and arm.first_with_torque() < 0

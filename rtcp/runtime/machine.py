@@ -57,6 +57,7 @@ class Refusal(IntEnum):
     NOT_STILL = 13
     CLOCK = 14
     NO_PLAN = 15
+    OUTPUT_VALUE = 16
 
 
 class Code(IntEnum):

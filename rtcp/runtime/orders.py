@@ -153,7 +153,9 @@ class Orders:
         highest = self._box.output_count
         if number not in range(1, highest + 1):
             return Refusal.OUTPUT, -1, number, float(highest)
-        self._box.set_output(int(number), bool(value))
+        if value not in (0.0, 1.0):
+            return Refusal.OUTPUT_VALUE, int(number), value
+        self._box.set_output(int(number), value == 1.0)
         return _DONE
 
     def _shut_down(self, lease: int, numbers: Sequence[float]) -> Verdict:

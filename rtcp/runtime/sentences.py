@@ -43,6 +43,7 @@ class Sentences:
             Refusal.MODE: lambda m: f"mode {_number(m.value)} is not one of csp (8), csv (9), cst (10)",
             Refusal.OUTSIDE_LIMITS: self._outside_limits,
             Refusal.OUTPUT: lambda m: f"output {_number(m.value)} does not exist: 1 to {_number(m.limit)}",
+            Refusal.OUTPUT_VALUE: lambda m: f"output {m.axis}: found {_number(m.value)}, allowed is 0 or 1",
             Refusal.NO_OUTPUTS: lambda _: f"no IO box is configured (slaves in {self._file})",
             Refusal.UNKNOWN: lambda m: f"command {_number(m.value)} is unknown to this loop",
             Refusal.NOT_IN_OP: lambda _: "not all slaves are in OP: see `rtcp status`, then `rtcp reset`",
@@ -58,9 +59,9 @@ class Sentences:
         }
         self._events: dict[Code, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
-                f"process data lost: {_number(m.value)} cycles in a row without the expected working counter, more "
-                f"than {_number(m.limit)} are allowed ({self._lost_cycles()} in {self._file}); all drives are "
-                "told to stop, `rtcp reset` goes on when the slaves answer"
+                f"process data lost: {_number(m.value)} cycles in a row without the expected working counter "
+                f"({self._lost_cycles()} in {self._file}); all drives are told to stop, `rtcp reset` goes on when the "
+                "slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
                 f"{self._joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
@@ -71,7 +72,9 @@ class Sentences:
                 f"0x{int(m.value):04X} (enable_timeout_s in {self._file})"
             ),
             Code.DISABLE_STUCK: lambda m: (
-                f"{self._joint(m.axis)}: the drive does not give up Operation Enabled (statusword 0x{int(m.value):04X})"
+                f"{self._joint(m.axis)}: the drive did not give up its torque within "
+                f"{self._config.enable_timeout_s:g} s (statusword 0x{int(m.value):04X}; enable_timeout_s in "
+                f"{self._file})"
             ),
             Code.SLAVE_NOT_OP: lambda m: (
                 f"slave {m.axis} ({self._slave(m.axis)}) left OP; all drives are told to stop, "
@@ -82,7 +85,9 @@ class Sentences:
                 f"{self._joint(m.axis)} still turns, at {_number(m.value)} rad/s, 3 s after the reset was asked for: "
                 "its torque goes only at standstill; `rtcp disable` takes it off at once"
             ),
-            Code.GENERATOR: lambda _: "the trajectory generator refused its input: the arm holds",
+            Code.GENERATOR: lambda _: (
+                "the trajectory generator refused its input; all drives are told to stop, `rtcp reset` goes on"
+            ),
             Code.DRIVE_FAULT: lambda m: (
                 f"{self._joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
             ),
@@ -90,14 +95,11 @@ class Sentences:
                 "the cycle has not followed the reference clock for 1 s; all drives are told to stop, "
                 "`rtcp reset` goes on"
             ),
-            Code.LEFT_RANGE: lambda m: (
-                f"{self._joint(m.axis)} left its range while being enabled: it stands at {_number(m.value)} rad "
-                f"(joints[{m.axis}].position in {self._file})"
-            ),
+            Code.LEFT_RANGE: self._left_range,
             Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
             Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
             Code.MODE_STUCK: lambda m: (
-                f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for 1 s ago"
+                f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for"
             ),
             Code.READY: lambda _: "all slaves are in OP",
             Code.ENABLED: lambda _: "all drives are enabled, the arm holds",
@@ -145,6 +147,13 @@ class Sentences:
         return (
             f"{joint.name} stands at {_number(matter.value)} rad, outside its range {joint.position.min:g} to "
             f"{joint.position.max:g} rad (joints[{matter.axis}].position in {self._file}): it is not enabled there"
+        )
+
+    def _left_range(self, matter: Matter) -> str:
+        joint = self._config.joints[matter.axis]
+        return (
+            f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being enabled: "
+            f"it stands at {_number(matter.value)} rad (joints[{matter.axis}].position in {self._file})"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:

@@ -500,12 +500,12 @@ FAULT_STORIES = (
     ),
     Fault(
         "a drive that does not disable", Code.DISABLE_STUCK, 1,
-        ("joint2", "does not give up Operation Enabled", "statusword {word}"),
+        ("joint2", "did not give up its torque within", "statusword {word}", "enable_timeout_s"),
         drive_that_does_not_disable, hears_all,
     ),
     Fault(
         "a drive that keeps its mode", Code.MODE_STUCK, 1,
-        ("joint2", "mode 8", "9 was asked", "1 s"),
+        ("joint2", "mode 8", "9 was asked"),
         drive_that_keeps_its_mode, hears_all,
     ),
     Fault(
@@ -530,7 +530,7 @@ FAULT_STORIES = (
     ),
     Fault(
         "frames that stay away", Code.BUS_LOST, -1,
-        ("process data lost", "41 cycles", "40", "bus.lost_cycles in assistive_arm.yaml", "`rtcp reset`"),
+        ("process data lost", "40 cycles", "bus.lost_cycles in assistive_arm.yaml", "`rtcp reset`"),
         frames_stay_away, frames_come_back,
     ),
     Fault(
@@ -545,7 +545,7 @@ FAULT_STORIES = (
     ),
     Fault(
         "a generator that refuses", Code.GENERATOR, -1,
-        ("trajectory generator", "holds"),
+        ("trajectory generator", "`rtcp reset`"),
         generator_refuses, generator_works,
     ),
 )  # fmt: skip
@@ -762,7 +762,7 @@ def test_as_many_lost_cycles_as_are_allowed_do_not_end_a_move(bench: Bench) -> N
     bench.hold()
     bench.move(0.1, 0.1)
     bench.run(0.2)
-    lose(bench, LOST_CYCLES)
+    lose(bench, LOST_CYCLES - 1)
     bench.until(State.HOLDING)
     assert bench.codes[-1] is Code.ARRIVED
 
@@ -770,7 +770,7 @@ def test_as_many_lost_cycles_as_are_allowed_do_not_end_a_move(bench: Bench) -> N
 def test_lost_cycles_count_in_a_row_only(bench: Bench) -> None:
     bench.set_in_motion()
     for _ in range(5):
-        lose(bench, LOST_CYCLES)
+        lose(bench, LOST_CYCLES - 1)
         bench.cycle()
     assert bench.state is State.MOVING
 
@@ -778,8 +778,8 @@ def test_lost_cycles_count_in_a_row_only(bench: Bench) -> None:
 def test_set_points_stand_while_no_frame_comes_back_and_go_on_from_there(bench: Bench) -> None:
     bench.set_in_motion()
     before = bench.log[-1].drives[0].target
-    lose(bench, LOST_CYCLES)
-    assert {cycle.drives[0].target for cycle in bench.log[-LOST_CYCLES:]} == {before}
+    lose(bench, LOST_CYCLES - 1)
+    assert {cycle.drives[0].target for cycle in bench.log[-LOST_CYCLES + 1 :]} == {before}
     bench.cycle()
     assert 0 < bench.log[-1].drives[0].target - before <= LONGEST_STEP
 
@@ -904,6 +904,16 @@ def test_a_reset_lets_come_to_rest_what_still_moves_before_it_takes_its_torque(b
     assert {said.controlword for said in moving} == {ENABLE_OPERATION, QUICK_STOP}
 
 
+def test_a_reset_is_tried_again_until_the_cause_of_a_drive_fault_is_gone(bench: Bench) -> None:
+    bench.start().models[1].condition.bus_voltage = 10.0
+    bench.until(State.FAULT)
+    bench.do(Command.RESET)
+    bench.run(0.5)
+    assert bench.state is State.RESETTING
+    voltage_returns(bench)
+    bench.until(State.READY, 0.1)
+
+
 def test_a_reset_waits_for_the_clock_to_be_followed(bench: Bench) -> None:
     clock_runs_away(bench)
     bench.until(State.FAULT)
@@ -976,7 +986,6 @@ def test_disabling_in_motion_takes_the_torque_only_at_standstill(bench: Bench) -
     assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
 
 
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="`disabled` is told while the drives are about to enable")
 def test_disabling_while_enabling_is_told_as_done_only_when_no_drive_has_torque(bench: Bench) -> None:
     bench.bring_to(State.ENABLING)
     # The moment at which the drives have been told to enable, and do not show it yet.
@@ -1005,6 +1014,21 @@ def test_the_loop_may_end_only_when_no_drive_has_torque(bench: Bench, state: Sta
     bench.do(Command.SHUTDOWN)
     bench.finish()
     assert [model.powered for model in bench.models] == [False, False]
+
+
+def test_a_drive_that_falls_into_a_fault_while_enabling_ends_it_at_once(bench: Bench) -> None:
+    bench.bring_to(State.ENABLING).models[1].inject_fault(UNDER_VOLTAGE)
+    bench.until(State.FAULT, 0.1)
+    assert bench.codes[-1] is Code.DRIVE_FAULT
+
+
+def test_a_drive_that_does_not_take_the_mode_while_enabling_is_told_with_its_mode(bench: Bench) -> None:
+    bench.data.deaf[1, MODES_OF_OPERATION] = {8: 3}
+    bench.start()
+    bench.do(Command.ENABLE)
+    bench.until(State.FAULT)
+    assert bench.codes[-1] is Code.MODE_STUCK
+    assert "shows mode 3, 8 was asked for" in bench.said[-1]
 
 
 def test_closing_in_motion_stops_before_it_disables(bench: Bench) -> None:
@@ -1083,7 +1107,7 @@ def happen(bench: Bench, deed: str, how: object) -> None:
 
 
 # A failing example is not shortened: that would take minutes.
-@settings(max_examples=25, deadline=None, derandomize=True, phases=[Phase.generate])
+@settings(max_examples=15, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(deeds=st.lists(DEEDS, min_size=20, max_size=40))
 def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(
     board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]

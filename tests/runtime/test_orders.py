@@ -365,3 +365,10 @@ def test_at_most_one_command_is_taken_a_cycle(bench: Bench) -> None:
     bench.cycle()
     assert bench.observer.answer(second) is not None
     assert bench.state is State.STOPPING
+
+
+@pytest.mark.parametrize("value", [0.5, 2.0, float("nan")])
+def test_an_output_is_switched_by_0_or_1_alone(bench: Bench, value: float) -> None:
+    said = bench.start().refused(bench.order(Command.OUTPUT, [1, value]))
+    assert "output 1: found" in said
+    assert "allowed is 0 or 1" in said
