@@ -7,12 +7,13 @@ from the origin depends on theta1 (Pieper 1968), which gives for the wanted poin
     sin(alpha1) f2 = z - cos(alpha1) g3          2 a1 f1 = R^2 - a1^2 - g^2
 
 f1^2 + f2^2 = g1^2 + g2^2 is then an equation of theta3 alone, of second degree in its cosine and sine: a quartic in
-tan(theta3 / 2). Where a1 or sin(alpha1) is zero one of the two equations is already free of theta2.
+tan(theta3 / 2). Where a1 or sin(alpha1) is zero one of the two equations is already free of theta2. Newton's method
+makes all roots exact.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, hypot, inf, pi, remainder, sin, sqrt, tau
+from math import atan2, cos, hypot, remainder, sin, sqrt, tau
 
 from kinematics.model import ArmModel
 from kinematics.pose import Rotation, Vector, applied, times, transposed, turned
@@ -20,9 +21,13 @@ from kinematics.reach import smallest_of_turn
 from kinematics.solution import BACK, CONFIRMED, DOWN, ELBOW, SHOULDER, SLACK, Angles
 from kinematics.trigonometric import product, solve_linear, solve_quadratic
 
-_ZERO = 1e-12  # m, or a sine: meant to be none
+# m, or a sine. What is smaller than SMALL brings roots of the quartic so near to each other that round-off may hide
+# them: the roots without it are then tried too. What is smaller than ZERO is none.
+_SMALL = 1e-6
+_ZERO = 1e-12
 _SAME = 1e-7  # rad; two solutions that are nearer are one, on a singularity
-_STEPS = 3  # of Newton's method: roots of the quartic beside a double one are good to half the digits only
+_FLAT = 1e-12  # determinant, in units of the size, with which there is no step
+_STEPS = 8  # of Newton's method, at most: roots beside a double one are good to half the digits only
 
 
 class GeneralArm:
@@ -49,7 +54,7 @@ class GeneralArm:
     def is_regular(self) -> bool:
         """Whether the three joints can move the wrist centre in three directions; else nothing can be solved."""
         samples = ((0.3 + 0.9 * i, 0.1 + 0.7 * j) for i in range(7) for j in range(9))
-        return max(abs(self._determinant(*sample)) for sample in samples) > 1e-9 * self._size**3
+        return max(abs(self._determinant(*sample)) for sample in samples) > _SMALL * self._size**3
 
     def solve(self, wx: float, wy: float, wz: float, near1: float, near2: float) -> list[Angles]:
         """As `PlanarArm.solve`."""
@@ -84,18 +89,17 @@ class GeneralArm:
         return times(transposed(forearm), rotation)
 
     def shortfall(self, wx: float, wy: float, wz: float) -> float:
-        """As `PlanarArm.shortfall`; takes milliseconds."""
+        """As `PlanarArm.shortfall`, but by search over joints 2 and 3: 20 ms, too long for the loop."""
         radius = hypot(wx, wy)
 
-        def distance(theta3: float) -> float:
-            """From the singular positions of this theta3: the edge of the workspace consists of such."""
-            zero, quarter, half = (self._determinant(theta2, theta3) for theta2 in (0.0, 0.5 * pi, pi))
-            constant = 0.5 * (zero + half)
-            edges = solve_linear((constant, zero - constant, quarter - constant))
-            points = (self._point(0.0, theta2, theta3) for theta2 in edges)
-            return min((hypot(hypot(x, y) - radius, z - wz) for x, y, z in points), default=inf)
+        def of_plane(theta3: float) -> float:
+            def of_point(theta2: float) -> float:
+                x, y, z = self._point(0.0, theta2, theta3)
+                return hypot(hypot(x, y) - radius, z - wz)
 
-        return smallest_of_turn(distance)
+            return smallest_of_turn(of_point)
+
+        return smallest_of_turn(of_plane)
 
     def _planes(self, wx: float, wy: float, wz: float) -> list[tuple[float, float, float]]:
         """(theta3, f1, f2) that give the point its height and its distance from the origin."""
@@ -104,26 +108,31 @@ class GeneralArm:
         # R^2 - a1^2 - g^2 and z - cos(alpha1) g3
         far = (wx * wx + wy * wy + wz * wz - a1 * a1 - constant, -along, -across)
         high = (wz - c1 * self._g3[0], -c1 * self._g3[1], -c1 * self._g3[2])
-        if abs(a1) < _ZERO:
-            return [
+        found = []
+        if abs(a1) < _SMALL <= abs(s1):
+            found += [
                 (theta3, f1, f2)
                 for theta3 in solve_linear(far)
                 for f2 in (_at(high, theta3) / s1,)
                 for f1 in self._other(theta3, f2)
             ]
-        if abs(s1) < _ZERO:
-            return [
+        elif abs(s1) < _SMALL <= abs(a1):
+            found += [
                 (theta3, f1, f2)
                 for theta3 in solve_linear(high)
                 for f1 in (_at(far, theta3) / (2.0 * a1),)
                 for f2 in self._other(theta3, f1)
             ]
+        if min(abs(a1), abs(s1)) < _ZERO:
+            return found
         # sin(alpha1)^2 far^2 + 4 a1^2 high^2 = 4 a1^2 sin(alpha1)^2 (g^2 - g3^2)
         scale = 4.0 * a1 * a1 * s1 * s1
         linear = (scale * constant, scale * along, scale * across, 0.0, 0.0)
         terms = zip(product(far, far), product(high, high), product(self._g3, self._g3), linear, strict=True)
         equation = tuple(s1 * s1 * f + 4.0 * a1 * a1 * h + scale * g - k for f, h, g, k in terms)
-        return [(theta3, _at(far, theta3) / (2.0 * a1), _at(high, theta3) / s1) for theta3 in solve_quadratic(equation)]
+        return found or [
+            (theta3, _at(far, theta3) / (2.0 * a1), _at(high, theta3) / s1) for theta3 in solve_quadratic(equation)
+        ]
 
     def _other(self, theta3: float, one: float) -> list[float]:
         """The second of f1 and f2, both signs, where the first is known."""
@@ -178,7 +187,7 @@ class GeneralArm:
             x, y, z = error
             wanted = (c * x + s * y, c * y - s * x, z)
             determinant = _triple(one, two, three)
-            if abs(determinant) < _ZERO * self._size**3:
+            if abs(determinant) < _FLAT * self._size**3:
                 break
             better = (
                 theta1 + _triple(wanted, two, three) / determinant,

@@ -40,8 +40,12 @@ class Turns:
             q3, outside = self._turned(q3, joint + 2, outside)
         return (q1, q2, q3), outside
 
+    def allow(self, q: Six) -> bool:
+        """Whether every joint is inside its limits."""
+        return all(lower <= angle <= upper for angle, (lower, upper) in zip(q, self.limits, strict=True))
+
     def nearest_six(self, q: Six, near: Sequence[float]) -> Six:
-        """Of each angle and its turns the nearest to `near` inside the limits; one that no turn brings there is left."""
+        """Of each angle and its turns the nearest to `near` inside the limits; one that no turn brings there stays."""
         return six(
             angle if lower <= angle <= upper else self._brought(angle, lower, upper)
             for angle, (lower, upper) in zip(map(nearest_turn, q, near), self.limits, strict=True)

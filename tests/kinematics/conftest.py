@@ -11,6 +11,8 @@ import pytest
 from kinematics.model import ArmModel, DhRow, JointLimit
 from kinematics.pose import Pose
 
+# Properties are tested on machines that are busy with something else
+
 Chain = Callable[[ArmModel, np.ndarray], np.ndarray]
 
 
@@ -130,3 +132,82 @@ def as_pose() -> Callable[[np.ndarray], Pose]:
 def pose_of(matrix: np.ndarray) -> Pose:
     """The pose that a 4x4 matrix is."""
     return Pose(tuple(matrix[:3, 3].tolist()), tuple(matrix[:3, :3].ravel().tolist()))
+
+
+class Draw:
+    """Random numbers of a table."""
+
+    def __init__(self, seed: int) -> None:
+        self.random = np.random.default_rng(seed)
+
+    def sign(self) -> float:
+        return float(self.random.choice([-1.0, 1.0]))
+
+    def length(self, lowest: float, highest: float) -> float:
+        return float(self.random.uniform(lowest, highest)) * self.sign()
+
+    def oblique(self) -> float:
+        return float(self.random.uniform(0.4, pi - 0.4)) * self.sign()
+
+    def angle(self) -> float:
+        return float(self.random.uniform(-pi, pi))
+
+
+# alpha1, a1, alpha2 of the arm
+REGIONS = {
+    "parallel axes 2 and 3, offsets": lambda draw: (
+        pi / 2 * draw.sign(),
+        draw.length(0.0, 0.2),
+        draw.random.choice([0.0, pi]),
+    ),
+    "parallel axes 2 and 3, oblique axis 2": lambda draw: (draw.oblique(), draw.length(0.0, 0.2), 0.0),
+    "no parallel axes": lambda draw: (draw.oblique(), draw.length(0.05, 0.3), draw.oblique()),
+    "no parallel axes, axes 1 and 2 meet": lambda draw: (draw.oblique(), 0.0, draw.oblique()),
+    "parallel axes 1 and 2": lambda draw: (draw.random.choice([0.0, pi]), draw.length(0.1, 0.3), draw.oblique()),
+    "all right angles": lambda draw: (pi / 2 * draw.sign(), draw.length(0.05, 0.3), pi / 2 * draw.sign()),
+}
+
+
+def right_angled(draw: Draw) -> tuple[float, float]:
+    return pi / 2 * draw.sign(), pi / 2 * draw.sign()
+
+
+def oblique(draw: Draw) -> tuple[float, float]:
+    return draw.oblique(), draw.oblique()
+
+
+def foldable(draw: Draw) -> tuple[float, float]:
+    """Oblique, and axis 6 comes to lie in axis 4, as in a wrist with hollow shafts."""
+    alpha = draw.oblique()
+    return alpha, alpha * draw.sign()
+
+
+WRISTS = {"right-angled": right_angled, "oblique": oblique, "foldable": foldable}
+
+
+def draw_arm(seed: int, region: str, wrist: str) -> ArmModel:
+    """An arm of a region and a wrist, with random lengths, offsets, base and tool."""
+    draw = Draw(seed)
+    alpha1, a1, alpha2 = REGIONS[region](draw)
+    alpha4, alpha5 = WRISTS[wrist](draw)
+    rows = (
+        DhRow(draw.angle(), draw.length(0.0, 0.2), draw.length(0.0, 0.3), draw.angle()),
+        DhRow(alpha1, a1, draw.length(0.0, 0.2), draw.angle()),
+        DhRow(float(alpha2), draw.length(0.2, 0.5), draw.length(0.0, 0.2), draw.angle()),
+        DhRow(draw.oblique(), draw.length(0.0, 0.2), draw.length(0.2, 0.5), draw.angle()),
+        DhRow(alpha4, 0.0, 0.0, draw.angle()),
+        DhRow(alpha5, 0.0, draw.length(0.0, 0.2), draw.angle()),
+    )
+    tool = Pose.from_xyzrpy(*(draw.length(0.0, 0.2) for _ in range(3)), *(draw.angle() for _ in range(3)))
+    return ArmModel(f"arm {seed}", rows, (JointLimit(-pi, pi),) * 6, tool=tool)
+
+
+@pytest.fixture(scope="session", params=REGIONS)
+def region(request) -> str:
+    """The name of a geometry of the first three joints."""
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def build_arm() -> Callable[[int, str, str], ArmModel]:
+    return draw_arm

@@ -77,7 +77,7 @@ def test_of_100000_configurations_each_is_found_among_eight_confirmed_solutions(
         assert np.any(flags, axis=1).all()
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(pose=poses)
 def test_no_solution_is_given_that_forward_does_not_confirm(pose, either, chain, pose_errors):
     for solution in InverseKinematics(either).solve(pose).solutions:
@@ -85,7 +85,7 @@ def test_no_solution_is_given_that_forward_does_not_confirm(pose, either, chain,
         assert max(position[0], rotation[0]) < ACCURACY
 
 
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 @given(pose=poses)
 def test_a_pose_has_solutions_or_a_reason_and_the_reason_says_by_how_much(pose, either):
     answer = InverseKinematics(either).solve(pose)
@@ -100,7 +100,7 @@ def test_a_pose_has_solutions_or_a_reason_and_the_reason_says_by_how_much(pose, 
         assert amount == pytest.approx(beyond, rel=1e-5)
 
 
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 @given(pose=poses)
 def test_no_solution_is_given_twice(pose, either):
     found = np.array([solution.q for solution in InverseKinematics(either).solve(pose).solutions]).reshape(-1, 6)
@@ -180,13 +180,14 @@ def test_a_pose_whose_rotation_is_none_is_refused(distance, assistive):
         solver.solve_near(pose, [0.0] * 6)
 
 
-def test_a_joint_is_given_in_the_turn_that_its_limits_allow(irb120):
-    limits = (*irb120.limits[:5], JointLimit(6.5, 12.0))
+@pytest.mark.parametrize(("lower", "upper"), [(6.5, 12.0), (-12.0, -6.5)])
+def test_a_joint_is_given_in_the_turn_that_its_limits_allow(lower, upper, irb120):
+    limits = (*irb120.limits[:5], JointLimit(lower, upper))
     solutions = InverseKinematics(replace(irb120, limits=limits)).solve(IN_REACH).solutions
     inside = [solution for solution in solutions if 5 not in solution.outside]
     assert len(solutions) == 8
     assert inside
-    assert all(6.5 <= solution.q[5] <= 12.0 for solution in inside)
+    assert all(lower <= solution.q[5] <= upper for solution in inside)
     assert all(-pi < solution.q[5] <= pi for solution in solutions if solution not in inside)
 
 
