@@ -138,7 +138,7 @@ class BusConfig:
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """So many cycles in a row without a right working counter are a fault."""
     virtual_patience: Annotated[float, Ge(1), Le(100)] = 25.0
-    """On the virtual bus alone, the limits on lost process data are so many times wider: see `rtcp.config.virtual`."""
+    """So many times wider are limits on lost process data on the virtual bus alone; see `rtcp.config.virtual`."""
     send_phase: Fraction = 0.5
     """Where between two SYNC0 the frame passes the reference slave, as a fraction of the period."""
     op_timeout_s: Positive = 5.0

@@ -15,15 +15,15 @@ VIRTUAL = "virtual"
 """Name of the bus that is a segment in software."""
 
 _SYNC_ERROR_LIMIT = (0x10F1, 2)
-_LARGEST = 0xFFFF
 _LONGEST_WATCHDOG_MS = 6000.0
 
 
 def widen(config: ArmConfig) -> ArmConfig:
     """Return the configuration with `bus.virtual_patience` applied: only where its bus is `virtual`.
 
-    Multiplied are `bus.lost_cycles`, `watchdog_ms` of every device and, among its start-up SDOs, the sync error counter
-    limit (0x10F1:02, ETG.1020); a limit of 0, which switches that check off, stays 0.
+    Multiplied are `bus.lost_cycles` and `watchdog_ms` of every device. The sync error counter limit among its start-up
+    SDOs (0x10F1:02, ETG.1020) becomes 0, which switches that check off: a missed SYNC0 counts 3 and one that is met
+    takes 1 away, so that a host which loses a quarter of its ticks for long exceeds any limit in the end.
     """
     patience = config.bus.virtual_patience
     if config.bus.interface != VIRTUAL or patience == 1:
@@ -39,11 +39,9 @@ def _device(device: DeviceDescription, patience: float) -> DeviceDescription:
     return replace(
         device,
         watchdog_ms=min(device.watchdog_ms * patience, _LONGEST_WATCHDOG_MS),
-        sdo=tuple(_sdo(entry, patience) for entry in device.sdo),
+        sdo=tuple(map(_sdo, device.sdo)),
     )
 
 
-def _sdo(entry: StartupSdo, patience: float) -> StartupSdo:
-    if (entry.index, entry.sub_index) != _SYNC_ERROR_LIMIT:
-        return entry
-    return replace(entry, value=float(min(round(entry.value * patience), _LARGEST)))
+def _sdo(entry: StartupSdo) -> StartupSdo:
+    return replace(entry, value=0.0) if (entry.index, entry.sub_index) == _SYNC_ERROR_LIMIT else entry

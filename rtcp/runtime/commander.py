@@ -78,6 +78,8 @@ class Commander:
         await self._see_next_record()
         if answer.refusal:
             sentence = self._picture.refusal(answer.refusal, answer.axis, answer.value, answer.limit)
+            if self._picture.fault and self._picture.state() is State.FAULT:
+                sentence += f"; the fault: {self._picture.fault}"
             raise CommandFailed("refused", sentence)
 
     async def _see_next_record(self) -> None:

@@ -42,7 +42,11 @@ def test_on_the_virtual_bus_the_limits_on_lost_process_data_are_so_many_times_wi
     widened = widen(with_bus(shipped, "virtual", 10.0))
     assert widened.bus.lost_cycles == 400
     assert [slave.device.watchdog_ms for slave in widened.slaves] == [1000.0] + [200.0] * 6
-    assert sync_error_limits(widened) == [1200.0] * 6
+    assert sync_error_limits(widened) == [0.0] * 6
+
+
+def test_a_patience_of_1_leaves_every_limit_as_it_is_written(shipped: ArmConfig) -> None:
+    assert widen(with_bus(shipped, "virtual", 1.0)) == with_bus(shipped, "virtual", 1.0)
 
 
 def test_nothing_but_these_limits_changes(shipped: ArmConfig) -> None:
@@ -53,17 +57,6 @@ def test_nothing_but_these_limits_changes(shipped: ArmConfig) -> None:
         assert others == [entry for entry in before.device.sdo if entry.index != 0x10F1]
 
 
-def test_the_widened_limits_stay_within_what_the_registers_hold(shipped: ArmConfig) -> None:
+def test_the_widened_watchdog_stays_within_what_its_register_holds(shipped: ArmConfig) -> None:
     wide = widen(with_bus(shipped, "virtual", 100.0))
     assert max(slave.device.watchdog_ms for slave in wide.slaves) <= 6000.0
-    device = shipped.slaves[1].device
-    entries = tuple(
-        dataclasses.replace(entry, value=60_000.0) if entry.index == 0x10F1 else entry for entry in device.sdo
-    )
-    slaves = (
-        shipped.slaves[0],
-        dataclasses.replace(shipped.slaves[1], device=dataclasses.replace(device, sdo=entries)),
-    )
-    assert sync_error_limits(widen(dataclasses.replace(with_bus(shipped, "virtual", 100.0), slaves=slaves))) == [
-        65_535.0
-    ]

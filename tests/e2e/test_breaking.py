@@ -125,6 +125,7 @@ def test_a_segment_that_stands_still_for_longer_than_allowed_is_a_fault_and_can_
     status = platform.status()
     assert status["state"] == "fault"
     assert "process data lost" in status["message"] or "left OP" in status["message"]
+    assert f"; the fault: {status['message']}" in platform.rtcp("enable", check=3).stderr
     platform.rtcp("reset")
     assert platform.al_states() == [OP] * 7
     assert platform.status()["state"] == "ready"
