@@ -23,11 +23,13 @@ from kinematics.trigonometric import product, solve_linear, solve_quadratic
 
 # m, or a sine. What is smaller than SMALL brings roots of the quartic so near to each other that round-off may hide
 # them: the roots without it are then tried too. What is smaller than ZERO is none.
-_SMALL = 1e-6
+_SMALL = 1e-4
 _ZERO = 1e-12
+_LOOSE = 10.0  # so many times what is left out, relative, they may then be out of reach
 _SAME = 1e-7  # rad; two solutions that are nearer are one, on a singularity
+_REGULAR = 1e-6  # determinant, in units of the size, that an arm reaches somewhere if it is one
 _FLAT = 1e-12  # determinant, in units of the size, with which there is no step
-_STEPS = 8  # of Newton's method, at most: roots beside a double one are good to half the digits only
+_STEPS = 20  # of Newton's method, at most: towards a double root each only halves the way
 
 
 class GeneralArm:
@@ -54,7 +56,7 @@ class GeneralArm:
     def is_regular(self) -> bool:
         """Whether the three joints can move the wrist centre in three directions; else nothing can be solved."""
         samples = ((0.3 + 0.9 * i, 0.1 + 0.7 * j) for i in range(7) for j in range(9))
-        return max(abs(self._determinant(*sample)) for sample in samples) > _SMALL * self._size**3
+        return max(abs(self._determinant(*sample)) for sample in samples) > _REGULAR * self._size**3
 
     def solve(self, wx: float, wy: float, wz: float, near1: float, near2: float) -> list[Angles]:
         """As `PlanarArm.solve`."""
@@ -110,18 +112,18 @@ class GeneralArm:
         high = (wz - c1 * self._g3[0], -c1 * self._g3[1], -c1 * self._g3[2])
         found = []
         if abs(a1) < _SMALL <= abs(s1):
-            found += [
+            found = [
                 (theta3, f1, f2)
-                for theta3 in solve_linear(far)
+                for theta3 in _starts(far, a1)
                 for f2 in (_at(high, theta3) / s1,)
-                for f1 in self._other(theta3, f2)
+                for f1 in self._other(theta3, f2, a1)
             ]
         elif abs(s1) < _SMALL <= abs(a1):
-            found += [
+            found = [
                 (theta3, f1, f2)
-                for theta3 in solve_linear(high)
+                for theta3 in _starts(high, s1)
                 for f1 in (_at(far, theta3) / (2.0 * a1),)
-                for f2 in self._other(theta3, f1)
+                for f2 in self._other(theta3, f1, s1)
             ]
         if min(abs(a1), abs(s1)) < _ZERO:
             return found
@@ -130,14 +132,16 @@ class GeneralArm:
         linear = (scale * constant, scale * along, scale * across, 0.0, 0.0)
         terms = zip(product(far, far), product(high, high), product(self._g3, self._g3), linear, strict=True)
         equation = tuple(s1 * s1 * f + 4.0 * a1 * a1 * h + scale * g - k for f, h, g, k in terms)
-        return found or [
+        return found + [
             (theta3, _at(far, theta3) / (2.0 * a1), _at(high, theta3) / s1) for theta3 in solve_quadratic(equation)
         ]
 
-    def _other(self, theta3: float, one: float) -> list[float]:
-        """The second of f1 and f2, both signs, where the first is known."""
+    def _other(self, theta3: float, one: float, left_out: float) -> list[float]:
+        """The second of f1 and f2, both signs, where the first is known; with something left out, not quite."""
         g1, g2, _ = self._wrist(theta3)
         size = hypot(g1, g2)
+        if abs(left_out) > _ZERO:
+            one *= 1.0 - _LOOSE * abs(left_out)
         if abs(one) > size + SLACK:
             return []
         rest = sqrt(max(0.0, (size - one) * (size + one)))
@@ -199,6 +203,14 @@ class GeneralArm:
                 break
             angles, error = better, remaining
         return angles
+
+
+def _starts(form: Vector, left_out: float) -> list[float]:
+    """Where the form is zero; with something left out of it also those to start from where it just is not."""
+    angles = solve_linear(form)
+    if abs(left_out) > _ZERO:
+        angles += solve_linear((form[0] * (1.0 - _LOOSE * abs(left_out)), form[1], form[2]))
+    return angles
 
 
 def _at(form: Vector, angle: float) -> float:
