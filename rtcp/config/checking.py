@@ -44,8 +44,12 @@ class Checker(Generic[T]):
             made: list[T] = self._adapter.validate_json(json.dumps([data]))
         except ValidationError as error:
             found = error.errors(include_url=False)
-            # Pydantic counts the sound entries of a list: one whose entries are all wrong is not too short for that.
-            counted = [detail for detail in found if not (detail["type"] == "too_short" and detail["input"])]
+            # Pydantic counts the sound entries of a list: one with wrong entries is not too short for that.
+            counted = [
+                detail
+                for detail in found
+                if detail["type"] != "too_short" or len(detail["input"]) < detail["ctx"]["min_length"]
+            ]
             return None, [self._finding(detail["type"], detail["loc"][1:], detail["input"]) for detail in counted]
         return made[0], []
 
@@ -55,6 +59,8 @@ class Checker(Generic[T]):
         if reason == "unexpected_keyword_argument":
             return where, unknown_key(str(where[-1]), keys(annotation(self.kind, where[:-1])))
         wanted = annotation(self.kind, where)
+        if reason in ("too_short", "too_long") and isinstance(found, list) and found:
+            return where, f"found a list of {len(found)}, allowed is {allowed(wanted)}"
         return where, f"found {shown(found)}, allowed is {allowed(wanted)}{_hint(wanted, found)}"
 
 
@@ -93,6 +99,11 @@ def allowed(kind: object) -> str:
     if bare is str:
         return "a text" + (f" of 1 to {bounds[MaxLen].max_length} characters" if MaxLen in bounds else "")
     if get_origin(bare) is tuple:
+        if MinLen in bounds and MaxLen in bounds and bounds[MinLen].min_length == bounds[MaxLen].max_length:
+            of = {float: "numbers", int: "integers"}.get(_bare(get_args(bare)[0]), "entries")
+            return f"a list of {bounds[MinLen].min_length} {of}"
+        if MinLen in bounds and MaxLen in bounds:
+            return f"a list of {bounds[MinLen].min_length} to {bounds[MaxLen].max_length} entries"
         return "a list" + (" with at least one entry" if MinLen in bounds else "")
     if is_dataclass(bare):
         return f"a mapping with the keys {', '.join(keys(bare))}"

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from kinematics.model import ArmModel, DhRow, JointLimit, LinkMass
-from kinematics.pose import Pose, Vector
+from kinematics.model import ArmModel
+from rtcp.config.arm_model import arm_model
 from rtcp.config.checking import Checker, allowed
-from rtcp.config.document import Document, read
+from rtcp.config.document import read
 from rtcp.config.errors import ConfigError
 from rtcp.config.geometry import Kinematics, kinematics_findings
-from rtcp.config.model import Joint, Name
+from rtcp.config.model import Name
 from rtcp.config.schema import ArmFile, load
 
 
@@ -24,12 +23,7 @@ class KinematicsFile:
     kinematics: Kinematics
 
 
-@dataclass(frozen=True)
-class _Part:
-    kinematics: Kinematics
-
-
-_FILE, _PART = Checker(KinematicsFile), Checker(_Part)
+_FILE = Checker(KinematicsFile)
 
 _OF_A_WHOLE_ARM = {entry.name for entry in fields(ArmFile)} - {entry.name for entry in fields(KinematicsFile)}
 
@@ -50,15 +44,15 @@ def load_kinematics(path: Path) -> ArmModel:
         findings += kinematics_findings(data)
         if findings or file is None:
             raise ConfigError(document.sentences(findings))
-        return _model(document, file.name, file.kinematics, ())
+        try:
+            return arm_model(file.name, file.kinematics, ())
+        except ValueError as error:
+            raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
     config = load(path)
-    if data.get("kinematics") is None:
+    if config.arm is None:
         wanted = allowed(Kinematics)
         raise ConfigError(document.sentences([((), f"the key kinematics is missing; it must be {wanted}")]))
-    part, findings = _PART.check({"kinematics": data["kinematics"]})
-    if findings or part is None:
-        raise ConfigError(document.sentences(findings))
-    return _model(document, config.name, part.kinematics, config.joints)
+    return config.arm
 
 
 def torque_limits(path: Path) -> tuple[float, ...] | None:
@@ -71,29 +65,3 @@ def torque_limits(path: Path) -> tuple[float, ...] | None:
     if not isinstance(data, dict) or _OF_A_WHOLE_ARM.isdisjoint(data):
         return None
     return tuple(joint.torque for joint in load(path).joints)
-
-
-def _model(document: Document, name: str, part: Kinematics, joints: tuple[Joint, ...]) -> ArmModel:
-    if joints:
-        limits = tuple(JointLimit(joint.position.min, joint.position.max, joint.velocity) for joint in joints)
-        names = tuple(joint.name for joint in joints)
-    else:
-        limits = tuple(JointLimit(one.min, one.max, one.velocity or math.inf) for one in part.limits or ())
-        names = ArmModel.joint_names
-    x, y, z = part.tool.position
-    try:
-        return ArmModel(
-            name=name,
-            rows=tuple(DhRow(row.alpha, row.a, row.d, row.offset) for row in part.dh),
-            limits=limits,
-            links=tuple(LinkMass(link.mass, _vector(link.centre)) for link in part.links or ()),
-            tool=Pose.from_xyzrpy(x, y, z, *part.tool.rpy),
-            joint_names=names,
-        )
-    except ValueError as error:
-        raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
-
-
-def _vector(numbers: tuple[float, ...]) -> Vector:
-    x, y, z = numbers
-    return x, y, z

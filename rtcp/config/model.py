@@ -5,11 +5,21 @@ This module imports nothing heavy: the loop's process holds these objects and no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+
+from kinematics.model import ArmModel
+from rtcp.config.operation import (
+    CartesianConfig,
+    InputsConfig,
+    JogConfig,
+    MotionName,
+    OutputsConfig,
+    WatchConfig,
+)
 
 U8 = Annotated[int, Ge(0), Le(0xFF)]
 U16 = Annotated[int, Ge(0), Le(0xFFFF)]
@@ -115,6 +125,20 @@ class Joint:
 
 
 @dataclass(frozen=True)
+class GripperConfig:
+    """A gripper on a digital output, or one that a drive of its own moves: either `output` or `joint` is given."""
+
+    output: Annotated[int, Ge(1), Le(16)] | None = None
+    closed: Literal["on", "off"] = "on"
+    """The output's state that closes it."""
+    joint: Joint | None = None
+    """The axis after the arm's joints; its limits are the gripper's, at the drive's shaft."""
+    open_position: float | None = None
+    closed_position: float | None = None
+    """rad, of `joint`: where the gripper is open and where it is closed."""
+
+
+@dataclass(frozen=True)
 class CycleConfig:
     """The cycle: its period, its priority and its place."""
 
@@ -150,12 +174,30 @@ class ArmConfig:
 
     name: Name
     slaves: Annotated[tuple[SlaveConfig, ...], MinLen(1)]
-    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(11)]
+    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(10)]
     cycle: CycleConfig
     bus: BusConfig
     mode: DriveModeName = "csp"
     enable_timeout_s: Positive = 3.0
     lease_s: Positive = 0.5
     """A commander that is silent for so long has lost its lease: the arm stops in a controlled way."""
+    motion: MotionName = "joint"
+    """What the arm takes commands for at the start."""
+    cartesian: CartesianConfig = field(default_factory=CartesianConfig)
+    jog: JogConfig = field(default_factory=JogConfig)
+    watch: WatchConfig = field(default_factory=WatchConfig)
+    inputs: InputsConfig = field(default_factory=InputsConfig)
+    outputs: OutputsConfig = field(default_factory=OutputsConfig)
+    gripper: GripperConfig | None = None
+    arm: ArmModel | None = None
+    """The geometry; None: only joint motion is possible, and no Cartesian guard."""
+    zero_offsets: tuple[float, ...] = ()
+    """rad, what each axis' drive shows at the axis' zero, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
+
+    @property
+    def axes(self) -> tuple[Joint, ...]:
+        """All that drives move: the joints, from base to tool, and after them the gripper's where it has a drive."""
+        driven = self.gripper.joint if self.gripper else None
+        return self.joints if driven is None else (*self.joints, driven)

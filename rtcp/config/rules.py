@@ -5,10 +5,11 @@ They work on plain values, as many of them as have the right form, so that a mis
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rtcp.config.document import Finding, KeyPath
+from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.model import CycleConfig, DeviceDescription, PdoEntry
 
 BITS = {
@@ -44,6 +45,9 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
 # ETG.1000.6: the object ranges of receive and transmit PDO mappings.
 PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
 
+MOST_AXES = 10
+"""Joints, a gripper's among them, that a command has room for."""
+
 LONGEST_INTERFACE = 15
 """Characters of a network interface's name (IFNAMSIZ less the closing zero)."""
 
@@ -54,6 +58,14 @@ def entries(data: object, *keys: str) -> Iterator[tuple[int, dict[str, Any]]]:
         data = data.get(key) if isinstance(data, dict) else None
     if isinstance(data, list | tuple):
         yield from ((i, entry) for i, entry in enumerate(data) if isinstance(entry, dict))
+
+
+def axes(data: object) -> list[tuple[KeyPath, dict[str, Any]]]:
+    """Return all that drives move, each with its place: the joints, and the gripper's joint where it has one."""
+    found: list[tuple[KeyPath, dict[str, Any]]] = [(("joints", i), joint) for i, joint in entries(data, "joints")]
+    gripper = data.get("gripper") if isinstance(data, dict) else None
+    driven = gripper.get("joint") if isinstance(gripper, dict) else None
+    return [*found, (("gripper", "joint"), driven)] if isinstance(driven, dict) else found
 
 
 def number(data: object, key: str) -> float | None:
@@ -94,13 +106,16 @@ def name_padding(data: object) -> None:
 
 def arm_findings(data: object) -> list[Finding]:
     """Return the mistakes of an arm's file that concern more than one value."""
-    findings = _repeated(data, "slaves", "name", "the name") + _repeated(data, "joints", "name", "the name")
-    findings += _repeated(data, "joints", "slave", "the slave")
-    for i, joint in entries(data, "joints"):
+    slaves: list[tuple[KeyPath, dict[str, Any]]] = [(("slaves", i), slave) for i, slave in entries(data, "slaves")]
+    findings = _repeated(slaves, "name") + _repeated(axes(data), "name") + _repeated(axes(data), "slave")
+    if len(axes(data)) > MOST_AXES and axes(data)[-1][0] == ("gripper", "joint"):
+        told = f"found beside {len(axes(data)) - 1} joints, allowed are {MOST_AXES} in all"
+        findings.append((("gripper", "joint"), told))
+    for where, joint in axes(data):
         position = joint.get("position")
         low, high = number(position, "min"), number(position, "max")
         if low is not None and high is not None and not low < high:
-            findings.append((("joints", i, "position"), f"found min {low} and max {high}; min must be less than max"))
+            findings.append(((*where, "position"), f"found min {low} and max {high}; min must be less than max"))
     bus = data.get("bus") if isinstance(data, dict) else None
     interface = text(bus, "interface")
     if interface and (len(interface) > LONGEST_INTERFACE or "/" in interface or any(map(str.isspace, interface))):
@@ -113,11 +128,11 @@ def joint_findings(data: object, devices: Mapping[str, DeviceDescription]) -> li
     """Return the mistakes between the joints and the slaves that move them."""
     slaves = {name: slave for _, slave in entries(data, "slaves") if (name := text(slave, "name"))}
     findings: list[Finding] = []
-    for i, joint in entries(data, "joints"):
+    for axis, joint in axes(data):
         name = text(joint, "slave")
         if name is None:
             continue
-        where = ("joints", i, "slave")
+        where = (*axis, "slave")
         if name not in slaves:
             known = f"allowed are the names under slaves: {', '.join(slaves)}" if slaves else "no slave has a name"
             findings.append((where, f'found the text "{name}", which is no slave; {known}'))
@@ -129,7 +144,7 @@ def joint_findings(data: object, devices: Mapping[str, DeviceDescription]) -> li
             kind = f"its device {slaves[name]['device']} is of kind {device.kind}"
             findings.append((where, f'found the text "{name}", which moves no joint: {kind}; allowed is kind cia402'))
             continue
-        findings += _beyond_the_wire(i, joint, device)
+        findings += _beyond_the_wire(axis, joint, device)
     return findings
 
 
@@ -178,20 +193,18 @@ def period_findings(data: object, period: float) -> list[Finding]:
     return findings
 
 
-def _repeated(data: object, section: str, key: str, what: str) -> list[Finding]:
+def _repeated(found: list[tuple[KeyPath, dict[str, Any]]], key: str) -> list[Finding]:
     findings: list[Finding] = []
-    first: dict[str, int] = {}
-    for i, entry in entries(data, section):
+    first: dict[str, KeyPath] = {}
+    for where, entry in found:
         value = text(entry, key)
-        if value is not None and first.setdefault(value, i) != i:
-            place = f"{section}[{first[value]}]"
-            findings.append(
-                ((section, i, key), f'found the text "{value}", {what} that {place} has; each needs its own')
-            )
+        if value is not None and (place := first.setdefault(value, where)) != where:
+            told = f'found the text "{value}", the {key} that {dotted(place)} has; each needs its own'
+            findings.append(((*where, key), told))
     return findings
 
 
-def _beyond_the_wire(i: int, joint: dict[str, Any], device: DeviceDescription) -> list[Finding]:
+def _beyond_the_wire(axis: KeyPath, joint: dict[str, Any], device: DeviceDescription) -> list[Finding]:
     """Limits that the drive's process data cannot express: a target near them would wrap around."""
     channels = {channel.name: channel for pdo in device.rpdo for channel in pdo.channels}
     position = joint.get("position")
@@ -212,8 +225,16 @@ def _beyond_the_wire(i: int, joint: dict[str, Any], device: DeviceDescription) -
         if not all(low <= end <= high for end in ends):
             why = f"{name} of {device.name} is {channel.type} with factor {channel.factor:g}"
             found = f"{limit:g}" if len(ends) == 1 else f"+-{limit:g}"
-            findings.append((("joints", i, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"))
+            findings.append(((*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"))
     return findings
+
+
+def wire_range(device: DeviceDescription, name: str) -> tuple[float, float]:
+    """Return what a channel to a device can say, SI; without bounds where the channel is a float or not there."""
+    found = [channel for pdo in device.rpdo for channel in pdo.channels if channel.name == name]
+    if not found or found[0].type.startswith("float"):
+        return -math.inf, math.inf
+    return _reach(found[0])
 
 
 def _reach(channel: PdoEntry) -> tuple[float, float]:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from annotated_types import MinLen
+from annotated_types import MaxLen, MinLen
 
-from rtcp.config import rules
+from rtcp.config import operation_rules, rules
+from rtcp.config.arm_model import arm_model, kinematics_part
 from rtcp.config.checking import Checker
 from rtcp.config.document import Finding, dotted, read
 from rtcp.config.errors import ConfigError
@@ -21,10 +22,19 @@ from rtcp.config.model import (
     CycleConfig,
     DeviceDescription,
     DriveModeName,
+    GripperConfig,
     Joint,
     Name,
     Positive,
     SlaveConfig,
+)
+from rtcp.config.operation import (
+    CartesianConfig,
+    InputsConfig,
+    JogConfig,
+    MotionName,
+    OutputsConfig,
+    WatchConfig,
 )
 
 
@@ -42,14 +52,21 @@ class ArmFile:
 
     name: Name
     slaves: Annotated[tuple[SlaveEntry, ...], MinLen(1)]
-    joints: Annotated[tuple[Joint, ...], MinLen(1)]
+    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(rules.MOST_AXES)]
     cycle: CycleConfig = field(default_factory=CycleConfig)
     bus: BusConfig = field(default_factory=BusConfig)
     mode: DriveModeName = ArmConfig.mode
     enable_timeout_s: Positive = ArmConfig.enable_timeout_s
     lease_s: Positive = ArmConfig.lease_s
+    motion: MotionName = ArmConfig.motion
+    cartesian: CartesianConfig = field(default_factory=CartesianConfig)
+    jog: JogConfig = field(default_factory=JogConfig)
+    watch: WatchConfig = field(default_factory=WatchConfig)
+    inputs: InputsConfig = field(default_factory=InputsConfig)
+    outputs: OutputsConfig = field(default_factory=OutputsConfig)
+    gripper: GripperConfig | None = None
     kinematics: Kinematics | None = None
-    """The arm's geometry; the platform's start checks it, `rtcp.config.kinematics` reads it."""
+    """The arm's geometry, of which `ArmConfig.arm` is made."""
 
 
 _ARM, _DEVICE, _CYCLE = Checker(ArmFile), Checker(DeviceDescription), Checker(CycleConfig)
@@ -64,7 +81,10 @@ def load(path: Path) -> ArmConfig:
     """
     document = read(path)
     arm, findings = _ARM.check(document.data)
-    findings += rules.arm_findings(document.data) + kinematics_findings(document.data)
+    wrong_kinematics = kinematics_findings(document.data)
+    part = None if wrong_kinematics else kinematics_part(document.data)
+    findings += rules.arm_findings(document.data) + wrong_kinematics
+    findings += operation_rules.operation_findings(document.data) + operation_rules.box_findings(document.data, part)
     period_us = rules.period_us(document.data)
 
     devices: dict[str, DeviceDescription] = {}
@@ -79,8 +99,13 @@ def load(path: Path) -> ArmConfig:
         except ConfigError as error:
             in_devices += error.problems
     findings += rules.joint_findings(document.data, devices)
+    findings += operation_rules.terminal_findings(document.data, devices)
     if findings or in_devices or arm is None:
         raise ConfigError(document.sentences(findings) + in_devices)
+    try:
+        model = None if arm.kinematics is None else arm_model(arm.name, arm.kinematics, arm.joints)
+    except ValueError as error:
+        raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
     return ArmConfig(
         name=arm.name,
         slaves=tuple(SlaveConfig(slave.name, devices[slave.device]) for slave in arm.slaves),
@@ -90,6 +115,14 @@ def load(path: Path) -> ArmConfig:
         mode=arm.mode,
         enable_timeout_s=arm.enable_timeout_s,
         lease_s=arm.lease_s,
+        motion=arm.motion,
+        cartesian=arm.cartesian,
+        jog=arm.jog,
+        watch=arm.watch,
+        inputs=arm.inputs,
+        outputs=arm.outputs,
+        gripper=arm.gripper,
+        arm=model,
         source=path,
     )
 
@@ -137,6 +170,19 @@ def with_period(config: ArmConfig, period_us: float) -> ArmConfig:
     if cycle is None or problems:
         raise ConfigError(problems)
     return dataclasses.replace(config, cycle=cycle)
+
+
+def with_motion(config: ArmConfig, motion: MotionName) -> ArmConfig:
+    """Return the same arm that takes other commands at its start, as `rtcp start --mode` asks for.
+
+    Raises:
+        ConfigError: the arm lacks what this motion needs: its geometry, a stick.
+    """
+    if lacking := operation_rules.motion_lacks(
+        motion, geometry=config.arm is not None, stick=config.inputs.joystick is not None
+    ):
+        raise ConfigError([f"motion: {lacking}"])
+    return dataclasses.replace(config, motion=motion)
 
 
 def _no_device(key: str, file: Path) -> str:

@@ -118,21 +118,23 @@ class Cia402Drive:
     `state`, and `error_code` where 0x603F is mapped as `error_code`.
     Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
     `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
+    `zero` (rad) is what the drive itself shows where the joint is at 0; `position` and `target_position` count from it.
     """
 
     __slots__ = (
         "_error_slot", "_fields", "_in", "_in_factors", "_limits", "_out", "_pack", "_reset_calls", "_scales",
         "_unpack", "_was_enabled", "controlword", "error_code", "input_bytes", "mode", "mode_display", "name",
         "output_bytes", "position", "speed_limit", "state", "statusword", "target_position", "target_torque",
-        "target_velocity", "torque", "velocity",
+        "target_velocity", "torque", "velocity", "zero",
     )  # fmt: skip
 
-    def __init__(self, slave: SlaveConfig, speed_limit: float = 0.0) -> None:
+    def __init__(self, slave: SlaveConfig, speed_limit: float = 0.0, zero: float = 0.0) -> None:
         """Make the driver of `slave`.
 
         Args:
             slave: the slave's name and description.
             speed_limit: rad/s; what the drive is given as its speed limit in CSP.
+            zero: rad; what the drive shows where the joint is at 0.
 
         Raises:
             DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
@@ -160,6 +162,7 @@ class Cia402Drive:
         self.controlword = DISABLE_VOLTAGE
         self.mode = _CSP
         self.speed_limit = speed_limit
+        self.zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._was_enabled = False
         self._reset_calls = 0
@@ -170,7 +173,7 @@ class Cia402Drive:
         status, position, velocity, torque, mode = self._in
         by_position, by_velocity, by_torque = self._in_factors
         self.statusword = word = int(values[status])
-        self.position = values[position] * by_position
+        self.position = values[position] * by_position - self.zero
         self.velocity = values[velocity] * by_velocity
         self.torque = values[torque] * by_torque
         self.mode_display = int(values[mode])
@@ -205,6 +208,13 @@ class Cia402Drive:
         self.target_position = self.position
         self.target_velocity = self.target_torque = 0.0
 
+    def set_zero(self, zero: float) -> None:
+        """Count from another zero (rad): what is sent stays the same, what is shown moves. Not while it has torque."""
+        moved = self.zero - zero
+        self.zero = zero
+        self.position += moved
+        self.target_position += moved
+
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
@@ -218,7 +228,7 @@ class Cia402Drive:
         by_position, by_velocity, by_torque = self._scales
         fields[control] = self.controlword
         fields[mode] = commanded = self.mode
-        fields[position] = self._counts(self.target_position * by_position, 0, fields[position])
+        fields[position] = self._counts((self.target_position + self.zero) * by_position, 0, fields[position])
         speed = effort = 0
         if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == _CST:

@@ -6,7 +6,6 @@ The commanded position is continuous whatever is asked: a new target starts from
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
 
 from ruckig import (
     ControlInterface,
@@ -19,23 +18,19 @@ from ruckig import (
     Trajectory,
 )
 
+from rtcp.motion.state import MotionState, Phase, Reason, Target
+
 LONGEST_S = 600.0
 """A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: a little less jerk
 # is not on the border any more.
 _JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
-
-
-class Motion(IntEnum):
-    """What the generator is doing."""
-
-    HOLD = 0
-    MOVE = 1
-    STOP = 2
+# What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state.
+_INSIDE = 1.0 - 1e-9
 
 
 class JointGenerator:
-    """Set-points for `n` joints, one call of `update` a cycle.
+    """The modes `hold` and `joint`, and the stop that all modes share: set-points for `n` joints.
 
     Args:
         period_s: the cycle, s.
@@ -46,58 +41,62 @@ class JointGenerator:
         self, period_s: float, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]
     ) -> None:
         n = len(velocity)
-        self._velocity_limit = list(velocity)
-        self._jerk_limit = list(jerk)
         self._otg = Ruckig(n, period_s)
         self._output = OutputParameter(n)
         self._plan = Trajectory(n)
         # A move is planned beside the one that runs, and takes over only when the plan succeeds.
         self._inputs = [InputParameter(n), InputParameter(n), InputParameter(n)]
-        for given in self._inputs:
-            given.max_velocity = list(velocity)
-            given.max_acceleration = list(acceleration)
-            given.max_jerk = list(jerk)
         self._stop = self._inputs[2]
         self._stop.control_interface = ControlInterface.Velocity
         # Every joint stops as fast as it may: the path matters less than standing still.
         self._stop.synchronization = Synchronization.No
         self._zero = [0.0] * n
         self._active = self._inputs[0]
-        self.motion = Motion.HOLD
-        self.position = [0.0] * n
-        self.velocity = [0.0] * n
+        self._target = Target(n)
+        self.set_limits(velocity, acceleration, jerk)
+        self.clamps = False
+        self.phase = Phase.HOLD
+        self.reason = Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
         self.duration_s = 0.0
         self.elapsed_s = 0.0
 
-    def latch(self, position: Sequence[float]) -> None:
-        """Hold at `position` (rad, shape (n,)) from now on, at rest. Only for standstill: enable, lost bus."""
-        self.position = list(position)
-        self.velocity = self._zero
-        self.motion = Motion.HOLD
+    def set_limits(self, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]) -> None:
+        """Take other bounds, each of shape (n,); a motion that is under way goes on under those that it began with."""
+        self._velocity_limit = list(velocity)
+        self._acceleration_limit = list(acceleration)
+        self._jerk_limit = list(jerk)
 
-    def move_to(self, target: Sequence[float], speed: float) -> bool:
-        """Move to `target` (rad, shape (n,)), all joints arriving together; return False where no plan is found.
+    def hold(self) -> None:
+        """Hold where the state is from now on. Only for standstill: enable, lost bus, after another mode."""
+        self.phase = Phase.HOLD
+        self.reason = Reason.NONE
+
+    def move_to(self, state: MotionState, target: Sequence[float], speed: float, *, each: bool = False) -> bool:
+        """Move to `target` (rad, shape (n,)); return False where no plan is found.
 
         Without a plan, or with one longer than `LONGEST_S`, what was under way goes on.
 
         Args:
+            state: where the motion begins.
             target: inside the joint limits, which the caller has checked.
             speed: bound of every joint's speed, rad/s; each joint's own limit holds besides.
+            each: every joint arrives as early as it can; otherwise all arrive together.
         """
         move = self._inputs[1] if self._active is self._inputs[0] else self._inputs[0]
-        self._carry_over(move)
+        self._carry_over(move, state)
+        move.synchronization = Synchronization.No if each else Synchronization.Time
         move.target_position = list(target)
         move.target_velocity = self._zero
         # A joint that is faster than the new bound (a slower move begins in motion) needs room to slow down.
         move.max_velocity = [
             max(min(speed, limit), abs(now))
-            for limit, now in zip(self._velocity_limit, self.velocity, strict=True)
+            for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
         ]  # fmt: skip
         if not self._planned(move):
             return False
         self._active = move
-        self.elapsed_s = 0.0
-        self.motion = Motion.MOVE
+        self._begin(Phase.MOVE)
         return True
 
     def _planned(self, move: InputParameter) -> bool:
@@ -111,43 +110,58 @@ class JointGenerator:
                 continue
         return False
 
-    def stop(self) -> None:
-        """Come to rest under the acceleration and jerk limits; does nothing at rest."""
-        if self.motion is not Motion.MOVE:
+    def stop(self, state: MotionState) -> None:
+        """Come to rest under the acceleration and jerk limits, from whatever mode; does nothing at rest."""
+        if self.phase is Phase.STOP or not (any(state.velocity) or any(state.acceleration)):
             return
-        self._carry_over(self._stop)
+        self._carry_over(self._stop, state)
+        self._stop.max_velocity = self._velocity_limit
+        self._stop.max_jerk = self._jerk_limit
         self._stop.target_velocity = self._zero
         self._active = self._stop
-        self.elapsed_s = 0.0
-        self.motion = Motion.STOP
+        self._begin(Phase.STOP)
 
-    def _carry_over(self, given: InputParameter) -> None:
-        given.current_position = self.position
-        given.current_velocity = self.velocity
-        given.current_acceleration = self._output.new_acceleration if self.motion else self._zero
+    def _begin(self, phase: Phase) -> None:
+        self.phase = phase
+        self.reason = Reason.NONE
+        self.elapsed_s = 0.0
+
+    def _carry_over(self, given: InputParameter, state: MotionState) -> None:
+        given.current_position = state.position
+        given.current_velocity = state.velocity
+        bounds = self._acceleration_limit
+        given.max_acceleration = bounds
+        given.current_acceleration = [
+            _INSIDE * bound if now > bound else -_INSIDE * bound if now < -bound else now
+            for now, bound in zip(state.acceleration, bounds, strict=True)
+        ]
         given.target_acceleration = self._zero
 
-    def update(self) -> bool:
-        """Advance one cycle; return False when ruckig refuses (the set-points then stand where they were).
-
-        `position` (rad) and `velocity` (rad/s) are the new set-points.
-        """
-        if not self.motion:
-            return True
+    def update(self, state: MotionState, dt: float) -> Target:
+        """Return the set-points of the next cycle; where ruckig refuses they stand, and the reason says so."""
+        target = self._target
+        if not self.phase:
+            target.position = state.position
+            target.velocity = self._zero
+            return target
         output = self._output
         try:
             result = self._otg.update(self._active, output)
         except (RuckigError, ValueError):
-            return False
+            result = Result.Error
         if result < 0:
-            return False
-        self.position = output.new_position
-        self.velocity = output.new_velocity
+            target.position = state.position
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
+            self.reason = Reason.GENERATOR
+            return target
+        target.position = output.new_position
+        target.velocity = output.new_velocity
         self.duration_s = output.trajectory.duration
         self.elapsed_s = output.time
         if result == Result.Finished:
-            self.velocity = self._zero
-            self.motion = Motion.HOLD
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
         else:
             output.pass_to_input(self._active)
-        return True
+        return target

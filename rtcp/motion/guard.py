@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rtcp.config.model import Joint
+from rtcp.motion.limits import Limits
 from rtcp.motion.modes import Commanded
 
 
@@ -18,15 +18,18 @@ class Guard:
     `held` is a bit mask of the joints whose target was changed in the last call.
     """
 
-    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
-        self._low = [joint.position.min for joint in joints]
-        self._high = [joint.position.max for joint in joints]
-        self._speed = [joint.velocity for joint in joints]
-        self._torque = [joint.torque for joint in joints]
-        # Rounding of the set-points is no violation.
-        self._step = [joint.velocity * period_s * (1 + 1e-6) for joint in joints]
+    def __init__(self, limits: Limits, period_s: float) -> None:
+        self._period_s = period_s
+        self.take(limits)
         self._last = [0.0] * len(self._low)
         self.held = 0
+
+    def take(self, limits: Limits) -> None:
+        """Check against other limits from now on."""
+        self._low, self._high = limits.low, limits.high
+        self._speed, self._torque = limits.velocity, limits.torque
+        # Rounding of the set-points is no violation.
+        self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
 
     def latch(self, axis: int, position: float) -> None:
         """Take `position` (rad) as the target sent last: while a drive has no torque, its target is where it is."""

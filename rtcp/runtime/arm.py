@@ -1,4 +1,4 @@
-"""The joints as one: their drives, the generator of their set-points, the law of the mode, the guard."""
+"""The joints as one: their drives, the active mode and its guards, the law of the drive mode, the last clamp."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveGoal, DriveState
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.motion.generator import JointGenerator, Motion
+from rtcp.motion.envelope import SetPointGuard, Verdict
 from rtcp.motion.guard import Guard
+from rtcp.motion.limits import Limits
 from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
+from rtcp.motion.state import MotionState, Phase
+from rtcp.runtime.motions import Motions
 
 MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
@@ -34,23 +37,18 @@ class Arm:
 
     def __init__(self, config: ArmConfig, drives: Sequence[tuple[int, Cia402Drive]]) -> None:
         joints = config.joints
-        period_s = config.cycle.period_us * 1e-6
+        self.period_s = config.cycle.period_us * 1e-6
         self.drives = [drive for _, drive in drives]
-        self._pairs = list(drives)
-        self.low = [joint.position.min for joint in joints]
-        self.high = [joint.position.max for joint in joints]
-        self.fastest = max(joint.velocity for joint in joints)
-        self.generator = JointGenerator(
-            period_s,
-            [joint.velocity for joint in joints],
-            [joint.acceleration for joint in joints],
-            [joint.jerk for joint in joints],
-        )
-        self.guard = Guard(joints, period_s)
+        self.pairs = list(drives)
+        self.state = MotionState(len(joints))
+        self.limits = Limits(config)
+        self.guards = SetPointGuard(config, self.limits, self.period_s)
+        self.guard = Guard(self.limits, self.period_s)
+        self.motions = Motions(config, self.limits, self.guards, self.period_s)
         self._laws: dict[DriveMode, ModeLaw] = {
             DriveMode.CSP: PositionLaw(),
             DriveMode.CSV: VelocityLaw(joints),
-            DriveMode.CST: TorqueLaw(joints, period_s),
+            DriveMode.CST: TorqueLaw(joints, self.period_s),
         }
         self.set_mode(MODES[config.mode])
 
@@ -64,12 +62,17 @@ class Arm:
 
     def decode(self, data: ProcessData) -> None:
         """Take the drives' inputs."""
-        for slot, drive in self._pairs:
+        state = self.state
+        actual, speed, torque = state.actual, state.speed, state.torque
+        for axis, (slot, drive) in enumerate(self.pairs):
             drive.decode(data.input(slot))
+            actual[axis] = drive.position
+            speed[axis] = drive.velocity
+            torque[axis] = drive.torque
 
     def encode(self, data: ProcessData) -> None:
         """Hand over the drives' outputs."""
-        for slot, drive in self._pairs:
+        for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
 
     def lead(self, goal: DriveGoal) -> None:
@@ -77,31 +80,32 @@ class Arm:
         for drive in self.drives:
             drive.advance(goal)
 
-    def begin(self) -> None:
-        """Hold where the joints are, from standstill without torque; `follow` has seen to that each cycle."""
-        self.generator.latch(self.generator.position)
-
     def hold_target(self) -> None:
-        """Hold at the set-point that was made last."""
-        self.generator.latch(self.generator.position)
+        """Hold at the set-point that was made last, at rest from now on."""
+        self.motions.rest()
+        self.guards.latch(self.state)
 
     def follow(self) -> None:
         """Let set-point and guard follow the drives that have no torque: their target is where they are.
 
         A joint that stands outside its range is followed to the edge of it only; it is not enabled there.
         """
-        position, latch = self.generator.position, self.guard.latch
+        position, latch, limits = self.state.position, self.guard.latch, self.limits
         for i, drive in enumerate(self.drives):
             if drive.state not in _HOLDING:
-                low, high, here = self.low[i], self.high[i], drive.position
+                low, high, here = limits.low[i], limits.high[i], drive.position
                 position[i] = drive.target_position = high if here > high else low if here < low else here
                 latch(i, drive.target_position)
+        self.guards.latch(self.state)
 
-    def command(self) -> None:
-        """Write the targets of this cycle: set-point, law, guard."""
-        generator, drives = self.generator, self.drives
-        self._law.update(generator.position, generator.velocity, drives)
+    def command(self) -> Verdict:
+        """Write the targets of this cycle: the active mode, its guards, the law, the last clamp."""
+        state, drives, mode = self.state, self.drives, self.motions.active
+        target = mode.update(state, self.period_s)
+        verdict = self.guards.apply(state, target, mode.clamps)
+        self._law.update(state.position, state.velocity, drives)
         self.guard.check(drives)
+        return verdict
 
     def first_not_enabled(self) -> int:
         """Return the first joint whose drive is not enabled, or -1."""
@@ -141,9 +145,9 @@ class Arm:
 
     def first_outside(self) -> int:
         """Return the first joint that stands outside its range, or -1."""
+        low, high = self.limits.low, self.limits.high
         for axis, drive in enumerate(self.drives):
-            here = drive.position
-            if not self.low[axis] - RANGE_MARGIN_RAD <= here <= self.high[axis] + RANGE_MARGIN_RAD:
+            if not low[axis] - RANGE_MARGIN_RAD <= drive.position <= high[axis] + RANGE_MARGIN_RAD:
                 return axis
         return -1
 
@@ -157,4 +161,4 @@ class Arm:
     @property
     def still(self) -> bool:
         """Whether the set-points stand still."""
-        return self.generator.motion is Motion.HOLD
+        return self.motions.active.phase is Phase.HOLD

@@ -1,4 +1,4 @@
-"""What every state does in a cycle, and how it is left. One method a state; the tables are in `machine`.
+"""What every state does in a cycle. One method a state; which state an event leads to is the table of `machine`.
 
 In a fault every drive is told to quick-stop: it ramps down by itself and holds (0x605A = 6), whatever the mode, whether
 or not frames come back, and comes back to Operation Enabled only by reset and enable.
@@ -8,13 +8,16 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
-from rtcp.motion.generator import Motion
+from rtcp.motion.envelope import Verdict
 from rtcp.motion.modes import DriveMode
-from rtcp.realtime.clock import monotonic_ns
+from rtcp.motion.state import Phase, Reason
+from rtcp.motion.watch import Watch
 from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Code, State
+from rtcp.runtime.emergency_stop import EmergencyStop
+from rtcp.runtime.machine import TABLE, WITH_TORQUE, Code, Event, State
+from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
 
 _CLOSING_S = 2.0
@@ -25,6 +28,10 @@ _TOLD_CYCLES = 5
 """What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
 _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
+_ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
+"""Reasons that are no limit: the arm has stopped and takes commands."""
+_PRESSABLE = WITH_TORQUE | {State.READY, State.FAULT, State.RESETTING}
+"""States in which the emergency stop's input counts; on the way to OP the inputs are not yet valid."""
 
 
 class Behaviour:
@@ -33,19 +40,29 @@ class Behaviour:
     Args:
         config: timeouts and how many cycles may be lost.
         arm: the joints.
+        operator: the inputs and outputs that have a meaning.
         blackboard: where events go, and where the lease is.
         service: the thread beside the cycle.
         discipline: follows the reference clock, or None without distributed clocks.
     """
 
     def __init__(
-        self, config: ArmConfig, arm: Arm, blackboard: Blackboard, service: Service, discipline: Discipline | None
+        self,
+        config: ArmConfig,
+        arm: Arm,
+        operator: Operator,
+        blackboard: Blackboard,
+        service: Service,
+        discipline: Discipline | None,
     ) -> None:
         period_s = config.cycle.period_us * 1e-6
         self._arm = arm
+        self._operator = operator
         self._blackboard = blackboard
         self._service = service
         self._discipline = discipline
+        self._watch = Watch(config, arm.limits)
+        self._emergency = EmergencyStop(arm, service, blackboard, period_s)
         self._lost_limit = config.bus.lost_cycles
         self._enable_cycles = round(config.enable_timeout_s / period_s)
         self._reset_cycles = round(_RESET_S / period_s)
@@ -55,11 +72,17 @@ class Behaviour:
         self._unlocked = 0
         self._since = 0
         self._told = 0
+        self._limited = False
+        """Whether the stop that is under way ends in `stopped by limit`."""
         self.state = State.STARTING
         self.cycle = 0
+        self.now_ns = 0
+        """Instant of the cycle, ns of the loop's clock."""
         self.lost = 0
         """Cycles in a row without the expected working counter."""
         self.fault = Code.NONE
+        self.limit = Reason.NONE
+        """Which limit the machine was stopped by last; NONE once it is reset."""
         self.enables = 0
         self.moves = 0
         self.all_enabled = False
@@ -70,7 +93,7 @@ class Behaviour:
         self.wanted_mode = arm.mode
         """The mode to hold in: drives are enabled in CSP, where target = actual means standstill, and change then."""
         self.lease = 0
-        """Lease of the commander whose move is carried out."""
+        """Lease of the commander whose motion is carried out; 0: the stick's, which needs none."""
         self.done = False
         """Whether the loop may end."""
         self._steps = {
@@ -80,8 +103,11 @@ class Behaviour:
             State.HOLDING: self._holding,
             State.MOVING: self._moving,
             State.STOPPING: self._stopping,
+            State.STOPPED_BY_LIMIT: self._stopped_by_limit,
+            State.HOMING: self._homing,
             State.DISABLING: self._disabling,
             State.FAULT: self._faulted,
+            State.EMERGENCY_STOP: self._in_emergency,
             State.RESETTING: self._resetting,
             State.CLOSING: self._closing,
         }
@@ -90,10 +116,20 @@ class Behaviour:
         """Do one cycle of the present state; `good`: the exchange had the expected working counter."""
         self.cycle += 1
         self.lost = 0 if good else self.lost + 1
+        self._arm.state.now_ns = self.now_ns
+        operator = self._operator
+        if good:
+            operator.read()
+        if operator.emergency_stop and self.state in _PRESSABLE:
+            self._stop_in_emergency(Code.PRESSED)
         self._steps[self.state](good)
+        operator.show(self.all_enabled, self.state is State.MOVING)
 
-    def enter(self, state: State) -> None:
-        """Change to `state`."""
+    def on(self, event: Event) -> None:
+        """Change to the state that `event` leads to from the present one, as the table says."""
+        self._enter(TABLE[self.state].left_by[event])
+
+    def _enter(self, state: State) -> None:
         self.state = state
         self._told = 0
         self._since = self.cycle
@@ -108,6 +144,40 @@ class Behaviour:
     def _waited(self) -> int:
         return self.cycle - self._since
 
+    # -- what others ask ----------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Stop, disable and end; once it is said, nothing else is done."""
+        if self.state is not State.CLOSING:
+            self.on(Event.SHUTDOWN)
+
+    def begin_motion(self, lease: int) -> None:
+        """Let the active mode move the arm, for the commander of `lease`; 0: for the stick."""
+        self.lease = lease
+        self.moves += 1
+        self._limited = False
+        self.on(Event.MOTION)
+
+    def stop_motion(self) -> None:
+        """Let the active mode come to rest."""
+        self._arm.motions.stop(self._arm.state)
+        self._limited = False
+        self.on(Event.STOP)
+
+    def change_mode(self, mode: DriveMode) -> None:
+        """Let the enabled drives, at standstill, change to `mode`."""
+        self._arm.set_mode(mode)
+        self._enter(State.HOLDING)
+        self.switching = True
+
+    def release(self) -> None:
+        """Go on after a stop by a limit."""
+        self.limit = Reason.NONE
+        self.on(Event.RESET)
+        self._blackboard.event(Code.RELEASED)
+
+    # -- what goes wrong ----------------------------------------------------------------------------------------
+
     def _fail(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         self.fault = code
         self.torque_off = False
@@ -115,7 +185,7 @@ class Behaviour:
         self._arm.hold_target()
         self._arm.lead(DriveGoal.QUICK_STOPPED)
         self._blackboard.event(code, axis, value, limit)
-        self.enter(State.FAULT)
+        self.on(Event.BROKEN)
 
     def _fail_drive(self, code: Code, axis: int) -> None:
         self._service.explain_drive(axis)
@@ -123,6 +193,15 @@ class Behaviour:
 
     def _fail_mode(self, axis: int) -> None:
         self._fail(Code.MODE_STUCK, axis, float(self._arm.drives[axis].mode_display), float(self._arm.mode))
+
+    def _stop_in_emergency(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        if self.state is State.EMERGENCY_STOP:
+            return
+        self.fault = code
+        self.all_enabled = False
+        self._emergency.begin()
+        self._blackboard.event(code, axis, value, limit)
+        self.on(Event.EMERGENCY)
 
     def _bus_fails(self, good: bool) -> bool:
         if not good and self.lost >= self._lost_limit:
@@ -139,7 +218,7 @@ class Behaviour:
         return False
 
     def _track(self, good: bool) -> bool:
-        """Move on by one cycle while enabled; return False when the state has changed to a fault."""
+        """Move on by one cycle while enabled; return False when the state has changed by it."""
         arm = self._arm
         if self._bus_fails(good):
             return False
@@ -150,12 +229,44 @@ class Behaviour:
         if axis >= 0:
             self._fail_drive(Code.DRIVE_LEFT_ENABLED, axis)
             return False
-        if not arm.generator.update():
-            self._fail(Code.GENERATOR)
+        found = self._watch.look(arm.state)
+        if found is not None:
+            # Codes follow the kinds: speed, torque, following error.
+            self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
             return False
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
-        arm.command()
+        verdict = arm.command()
+        if verdict is Verdict.PASS and arm.motions.active.reason is Reason.NONE:
+            return True
+        return self._cut(verdict)
+
+    def _cut(self, verdict: Verdict) -> bool:
+        """Deal with a guard that cut the target, or a mode that ends by itself; return False when the state changed."""
+        arm, mode = self._arm, self._arm.motions.active
+        reason = mode.reason
+        if reason is Reason.GENERATOR:
+            self._fail(Code.GENERATOR)
+            return False
+        if verdict is Verdict.STOPPING or verdict is Verdict.STOPPED:
+            guards = arm.guards
+            limited = not mode.clamps
+            if self.state in (State.MOVING, State.HOLDING) or (limited and not self._limited):
+                self._end(guards.code, guards.axis, guards.value, guards.limit, limited)
+            if verdict is Verdict.STOPPED:
+                arm.motions.rest()
+            return False
+        if reason is not Reason.NONE and self.state is State.MOVING:
+            self._end(reason, mode.axis, mode.value, mode.limit, not mode.clamps and reason not in _ENDS_BY_ITSELF)
+            return False
         return True
+
+    def _end(self, reason: Reason, axis: int, value: float, limit: float, limited: bool) -> None:
+        self._blackboard.event(Code.ENDED + reason, axis, value, limit)
+        self._limited = limited
+        if limited:
+            self.limit = reason
+        if self.state in (State.MOVING, State.HOLDING, State.STOPPING):
+            self.on(Event.GUARD)
 
     # -- one method a state -------------------------------------------------------------------------------------
 
@@ -168,7 +279,7 @@ class Behaviour:
             self._arm.follow()
             if service.all_op:
                 self._blackboard.event(Code.READY)
-                self.enter(State.READY)
+                self.on(Event.ALL_IN_OP)
 
     def _ready(self, good: bool) -> None:
         arm = self._arm
@@ -201,8 +312,9 @@ class Behaviour:
         if axis < 0 and elsewhere < 0:
             self.enables += 1
             self.all_enabled = True
+            self._watch.reset()
             self._blackboard.event(Code.ENABLED)
-            self.enter(State.HOLDING)
+            self.on(Event.ENABLED)
             if self.wanted_mode is not DriveMode.CSP:
                 self.change_mode(self.wanted_mode)
         elif self._waited > self._enable_cycles:
@@ -211,40 +323,56 @@ class Behaviour:
             else:
                 self._fail_mode(elsewhere)
 
-    def change_mode(self, mode: DriveMode) -> None:
-        """Let the enabled drives, at standstill, change to `mode`."""
-        self._arm.set_mode(mode)
-        self.enter(State.HOLDING)
-        self.switching = True
-
     def _holding(self, good: bool) -> None:
-        if not self._track(good) or not self.switching:
+        if not self._track(good):
             return
-        axis = self._arm.first_in_another_mode()
-        if axis < 0:
-            self.switching = False
-        elif self._waited > self._mode_cycles:
-            self._fail_mode(axis)
+        if self.switching:
+            axis = self._arm.first_in_another_mode()
+            if axis < 0:
+                self.switching = False
+            elif self._waited > self._mode_cycles:
+                self._fail_mode(axis)
+        elif self._operator.lead_by_stick(self._arm, self._blackboard):
+            self.begin_motion(0)
 
     def _moving(self, good: bool) -> None:
-        lease, renewed, duration = self._blackboard.lease()
-        if lease != self.lease or monotonic_ns() - renewed > duration:
+        operator, arm = self._operator, self._arm
+        if not operator.permitted:
+            self._blackboard.event(Code.NOT_PERMITTED)
+        elif self.lease and self._lease_ended():
             self._blackboard.event(Code.LEASE_ENDED)
-            self._arm.generator.stop()
-            self.enter(State.STOPPING)
-            self._stopping(good)
-        elif self._track(good) and self._arm.still:
-            self._blackboard.event(Code.ARRIVED)
-            self.enter(State.HOLDING)
+        else:
+            if not self.lease:
+                operator.lead_by_stick(arm, self._blackboard)
+            if self._track(good) and arm.still:
+                if self.lease:
+                    self._blackboard.event(Code.ARRIVED)
+                self.on(Event.ARRIVED)
+            return
+        self.stop_motion()
+        self._stopping(good)
+
+    def _lease_ended(self) -> bool:
+        lease, renewed, duration = self._blackboard.lease()
+        return lease != self.lease or self.now_ns - renewed > duration
 
     def _stopping(self, good: bool) -> None:
-        if self._track(good) and self._arm.still:
+        if self._track(good) or self.state is State.STOPPING:
+            if not self._arm.still or self._arm.guards.stopping:
+                return
             self._blackboard.event(Code.STOPPED)
-            self.enter(State.HOLDING)
+            self._arm.motions.rest()
+            self.on(Event.LIMIT_STOPPED if self._limited else Event.STOPPED)
+
+    def _stopped_by_limit(self, good: bool) -> None:
+        self._track(good)
+
+    def _homing(self, good: bool) -> None:
+        raise NotImplementedError
 
     def _disabling(self, good: bool) -> None:
         arm = self._arm
-        if not arm.still:
+        if not arm.still or arm.guards.stopping:
             # The time for disabling begins when the arm stands.
             self._since = self.cycle
             self._track(good)
@@ -258,7 +386,7 @@ class Behaviour:
         axis = arm.first_with_torque()
         if axis < 0 and self._told > _TOLD_CYCLES:
             self._blackboard.event(Code.DISABLED)
-            self.enter(State.READY)
+            self.on(Event.DISABLED)
         elif axis >= 0 and self._waited > self._enable_cycles:
             self._fail_drive(Code.DISABLE_STUCK, axis)
 
@@ -267,6 +395,9 @@ class Behaviour:
         self._arm.lead(DriveGoal.DISABLED if self.torque_off else DriveGoal.QUICK_STOPPED)
         if good:
             self._arm.follow()
+
+    def _in_emergency(self, good: bool) -> None:
+        self._emergency.lead(good)
 
     def _resetting(self, good: bool) -> None:
         arm = self._arm
@@ -279,7 +410,7 @@ class Behaviour:
             if arm.first_not_resting() < 0:
                 self.fault = Code.NONE
                 self._blackboard.event(Code.RESET)
-                self.enter(State.READY)
+                self.on(Event.RESET_DONE)
                 return
         if self._waited > self._reset_cycles:
             axis = arm.first_moving()
@@ -303,12 +434,12 @@ class Behaviour:
             return
         if not good:
             return
-        if arm.generator.motion is Motion.MOVE:
-            arm.generator.stop()
-        if not arm.still and arm.first_not_enabled() < 0:
+        if arm.motions.active.phase is Phase.MOVE:
+            arm.motions.stop(arm.state)
+        if (not arm.still or arm.guards.stopping) and arm.first_not_enabled() < 0:
             self._since = self.cycle
-            arm.generator.update()
-            arm.command()
+            if arm.command() is Verdict.STOPPED:
+                arm.motions.rest()
             return
         # In a fault the drives ramp down by themselves: their torque goes when they stand.
         ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0

@@ -32,6 +32,7 @@ from rtcp.runtime.layout import (
     LEASE_ID_AT,
     LEASE_RENEWED_AT,
     MAGIC,
+    PLANS,
     RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
@@ -43,6 +44,7 @@ from rtcp.runtime.layout import (
     TEXTS_HEAD_AT,
     RecordLayout,
 )
+from rtcp.runtime.plans import mark_in_use, place
 from rtcp.runtime.words import Words
 
 
@@ -76,6 +78,7 @@ class Blackboard:
         # The record without its first number, which is published last.
         self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
         self._words = Words(self._map)
+        self._plans = [place(self._map, slot) for slot in range(PLANS)]
         self._records = 0
         self._events = 0
         self._texts = 0
@@ -157,7 +160,17 @@ class Blackboard:
         """The same by words."""
         return self._words
 
+    def plan(self, slot: int) -> memoryview:
+        """Return the doubles of a place for plans, row by row."""
+        return self._plans[slot]
+
+    def use_plan(self, slot: int) -> None:
+        """Say which place is being read from, so that the next plan goes into another; -1: none."""
+        mark_in_use(self._words, slot)
+
     def close(self) -> None:
         """Unmap; the file stays for those who read what happened last."""
+        for view in self._plans:
+            view.release()
         self._words.close()
         self._map.close()

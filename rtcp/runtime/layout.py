@@ -8,7 +8,7 @@
 | 384 | published records; published events; published texts | loop |
 | 512 | request and answer of the service thread | commander; service thread |
 | 1024 | slave states | service thread |
-| 8192 | service text, texts, events, commands, cycle records | loop and commanders |
+| 8192 | service text, texts, events, commands, plans, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
 """
@@ -18,7 +18,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-MAGIC = 0x5254_4350_0000_0001
+MAGIC = 0x5254_4350_0000_0002
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -43,6 +43,9 @@ RECORDS_HEAD_AT = 384
 EVENTS_HEAD_AT = 392
 TEXTS_HEAD_AT = 400
 
+PLAN_IN_USE_AT = 408
+"""Slot of the plan that the loop reads from, plus 1; 0: none."""
+
 SERVICE_STATE_AT = 512
 """0 idle, 1 asked, 2 answered"""
 SERVICE_LENGTH_AT = 520
@@ -66,10 +69,17 @@ EVENTS = 256
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT.size
 COMMAND_NUMBERS = 12
 COMMAND = struct.Struct(f"<QQI4x{COMMAND_NUMBERS}d")
-"""number, lease id, kind, numbers: of a move the joints' targets first and the speed last"""
+"""number, lease id, kind, numbers: the joints' first, what else there is from the end (`rtcp.runtime.orders`)"""
 COMMANDS = 64
 
-RECORDS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
+PLAN_ROWS, PLAN_COLUMNS = 4096, 20
+"""A plan: rows of 20 doubles, each a knot of a trajectory or a straight piece (`rtcp.motion.trajectory`, `line`)."""
+PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
+PLANS = 2
+"""Two places: one is written while the plan in the other runs."""
+PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
+
+RECORDS_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
 
 SCALARS = (
@@ -79,6 +89,8 @@ SCALARS = (
     ("dc_time_ns", "q"),
     ("state", "B"),
     ("mode", "B"),
+    ("motion", "B"),
+    ("stick_mode", "B"),
     ("flags", "H"),
     ("wkc", "h"),
     ("wkc_expected", "h"),
@@ -93,6 +105,7 @@ SCALARS = (
     ("outputs", "I"),
     ("counter", "i"),
     ("fault", "I"),
+    ("limit", "I"),
     ("held", "I"),
     ("enables", "I"),
     ("moves", "I"),
@@ -108,6 +121,11 @@ FLAG_DC_LOCKED = 1
 FLAG_ALL_OP = 2
 FLAG_ENABLED = 4
 FLAG_SWITCHING = 8
+FLAG_EMERGENCY_STOP = 16
+"""The emergency stop's input is pressed."""
+FLAG_MOTION_ALLOWED = 32
+"""The enabling switch is pressed, or there is none."""
+FLAG_ARM_HAS_STICK = 64
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ wake -> send the outputs of the last cycle -> receive -> decode -> machine state
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.realtime.clock import Sleeper, monotonic_ns
@@ -13,7 +15,6 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import State
 from rtcp.runtime.orders import Orders
 from rtcp.runtime.record import Recorder
 
@@ -32,6 +33,7 @@ class Loop:
         recorder: publishes what happened.
         blackboard: where commands come from.
         discipline: follows the reference clock, or None without distributed clocks.
+        now: the clock, ns; another one where time is simulated.
     """
 
     def __init__(
@@ -46,6 +48,7 @@ class Loop:
         recorder: Recorder,
         blackboard: Blackboard,
         discipline: Discipline | None,
+        now: Callable[[], int] = monotonic_ns,
     ) -> None:
         self._period_ns = period_ns
         self._spin_ns = spin_ns
@@ -56,8 +59,11 @@ class Loop:
         self._behaviour = behaviour
         self._orders = orders
         self._recorder = recorder
-        self._blackboard = blackboard
+        self._command_waits = blackboard.command_waits
         self._discipline = discipline
+        self._now = now
+        self._half_ns = period_ns // 2
+        self._expected = data.expected_wkc
         self._shutdown = False
 
     def shut_down(self) -> None:
@@ -66,47 +72,52 @@ class Loop:
 
     def run(self) -> None:
         """Run the cycle until it is asked to end and the drives are disabled (or 2 s have passed)."""
-        data, arm, box, box_slot = self._data, self._arm, self._box, self._box_slot
-        behaviour, orders, recorder = self._behaviour, self._orders, self._recorder
-        discipline, command_waits = self._discipline, self._blackboard.command_waits
-        period, spin, expected = self._period_ns, self._spin_ns, data.expected_wkc
+        behaviour, cycle, spin = self._behaviour, self.cycle, self._spin_ns
         sleep = Sleeper().until
-        half = period // 2
-        planned = monotonic_ns() + period
+        planned = monotonic_ns() + self._period_ns
         while not behaviour.done:
             sleep(planned - spin)
             while (woken := monotonic_ns()) < planned:
                 pass
-            data.send()
-            wkc = data.receive()
-            received = monotonic_ns()
-            good = wkc == expected
-            if good:
-                arm.decode(data)
-                if box is not None:
-                    box.decode(data.input(box_slot))
-            if command_waits():
-                orders.take()
-            if self._shutdown and behaviour.state is not State.CLOSING:
-                behaviour.enter(State.CLOSING)
-            behaviour.step(good)
-            arm.encode(data)
-            if box is not None:
-                data.set_output(box_slot, box.encode())
-            recorder.publish(woken, planned, received, wkc)
-            if discipline is None:
-                planned += period
+            planned = cycle(planned, woken)
+
+    def cycle(self, planned: int, woken: int) -> int:
+        """Do one cycle, planned at `planned` and begun at `woken` (ns of the clock); return when the next is due."""
+        data, arm, behaviour, recorder, now = self._data, self._arm, self._behaviour, self._recorder, self._now
+        data.send()
+        wkc = data.receive()
+        received = now()
+        good = wkc == self._expected
+        behaviour.now_ns = woken
+        if good:
+            arm.decode(data)
+            if self._box is not None:
+                self._box.decode(data.input(self._box_slot))
+        if self._command_waits():
+            self._orders.take()
+        if self._shutdown:
+            behaviour.close()
+        behaviour.step(good)
+        arm.encode(data)
+        if self._box is not None:
+            data.set_output(self._box_slot, self._box.encode())
+        recorder.publish(woken, planned, received, wkc)
+        discipline = self._discipline
+        if discipline is None:
+            planned += self._period_ns
+        else:
+            if wkc >= 0:
+                discipline.observe(woken, data.dc_time)
             else:
-                if wkc >= 0:
-                    discipline.observe(woken, data.dc_time)
-                else:
-                    discipline.coast()
-                planned = discipline.next_wakeup(planned)
-            finished = monotonic_ns()
-            recorder.compute_ns = finished - received
-            # Late: whole ticks are skipped, never replayed in a burst; two frames are never closer than half a period.
-            earliest = max(woken + half, finished)
-            if planned < earliest:
-                skipped = (earliest - planned + period - 1) // period
-                recorder.missed += skipped
-                planned += skipped * period
+                discipline.coast()
+            planned = discipline.next_wakeup(planned)
+        finished = now()
+        recorder.compute_ns = finished - received
+        # Late: whole ticks are skipped, never replayed in a burst; two frames are never closer than half a period.
+        earliest = max(woken + self._half_ns, finished)
+        if planned < earliest:
+            period = self._period_ns
+            skipped = (earliest - planned + period - 1) // period
+            recorder.missed += skipped
+            planned += skipped * period
+        return planned

@@ -13,25 +13,19 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveGoal
 from rtcp.devices.codec import DeviceError
-from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import BusError, ProcessData
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.realtime import scheduling
-from rtcp.realtime.discipline import Discipline
-from rtcp.runtime.arm import Arm
-from rtcp.runtime.behaviour import Behaviour
+from rtcp.runtime.assembly import assemble, discipline_of, drives_of
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.loop import Loop
-from rtcp.runtime.orders import Orders
 from rtcp.runtime.paths import blackboard_file
-from rtcp.runtime.record import Recorder
 from rtcp.runtime.service import Service
 from rtcp.runtime.session import Session, read_session
 
@@ -102,28 +96,21 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     for note in bus.notes:
         report.tell("phase", text=note)
     report.tell("phase", text="all slaves in SAFE-OP")
-    drives = _drives(config)
-    box = _box(config)
-    discipline = _discipline(config, period_ns)
+    discipline = discipline_of(config)
     blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)
     scheduling.share_interpreter_quickly()
     service = Service(
         bus,
         blackboard,
-        [slot + 1 for slot, _ in drives],
+        [slot + 1 for slot, _ in drives_of(config)],
         [joint.name for joint in config.joints],
         config.bus.op_timeout_s,
         cpu,
         config.cycle.priority,
     )
-    arm = Arm(config, drives)
-    behaviour = Behaviour(config, arm, blackboard, service, discipline)
-    only_box = None if box is None else box[1]
-    orders = Orders(arm, only_box, behaviour, blackboard, service)
-    recorder = Recorder(data, arm, only_box, behaviour, blackboard, service, discipline)
-    spin_ns = round(config.cycle.spin_us * 1000)
-    loop = Loop(period_ns, spin_ns, data, arm, box, behaviour, orders, recorder, blackboard, discipline)
+    parts = assemble(config, data, blackboard, service, discipline)
+    loop = parts.loop
     realtime = scheduling.Realtime()
 
     def started() -> None:
@@ -153,7 +140,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         raise
     except BaseException:
         # A defect in the cycle: the drives are told to stop before the bus goes away.
-        _disable_blindly(data, drives)
+        _disable_blindly(data, parts.arm.pairs)
         raise
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -161,29 +148,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         scheduling.release(realtime)
 
 
-def _drives(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
-    slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
-    return [
-        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity))
-        for joint in config.joints
-    ]
-
-
-def _box(config: ArmConfig) -> tuple[int, IoBox] | None:
-    for slot, slave in enumerate(config.slaves):
-        if slave.device.kind == "io":
-            return slot, IoBox(slave)
-    return None
-
-
-def _discipline(config: ArmConfig, period_ns: int) -> Discipline | None:
-    shifts = [slave.device.sync0_shift_us for slave in config.slaves if slave.device.assign_activate]
-    if not shifts:
-        return None
-    return Discipline(period_ns, round(shifts[0] * 1000 + config.bus.send_phase * period_ns))
-
-
-def _disable_blindly(data: ProcessData, drives: list[tuple[int, Cia402Drive]]) -> None:
+def _disable_blindly(data: ProcessData, drives: Sequence[tuple[int, Cia402Drive]]) -> None:
     for _ in range(_DISABLE_CYCLES):
         for slot, drive in drives:
             drive.decode(data.input(slot))

@@ -1,104 +1,222 @@
-"""The machine's state: what it may be, what it is asked, how it answers. Tables; the loop walks them."""
+"""The machine's states, what happens in them and what leads from one to another: one table; the loop walks it.
+
+`docs/machine.md` is drawn from it by `rtcp.runtime.machine_drawing`. Names of codes: `rtcp.runtime.codes`.
+"""
 
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import NamedTuple
+
+from rtcp.runtime.codes import Code, Command, Refusal
+
+__all__ = ["ALLOWED", "TABLE", "WITHOUT_LEASE", "WITH_TORQUE", "Code", "Command", "Event", "Refusal", "Row", "State"]
 
 
 class State(IntEnum):
     """What the arm is doing, as the loop knows it."""
 
+    OFF = 0
     STARTING = 1
-    """The cycle runs, slaves are on their way to OP, the reference clock is not yet followed."""
     READY = 2
-    """Slaves in OP, drives without torque."""
     ENABLING = 3
     HOLDING = 4
     MOVING = 5
     STOPPING = 6
-    """A controlled stop: down to standstill under the limits, then holding."""
     DISABLING = 7
     FAULT = 8
-    """Something was lost or broke. Every drive is told to quick-stop and hold; nothing moves until reset."""
     RESETTING = 9
     CLOSING = 10
-    """On the way out: stop, disable, INIT."""
+    STOPPED_BY_LIMIT = 11
+    EMERGENCY_STOP = 12
+    HOMING = 13
 
 
-class Command(IntEnum):
-    """What a commander may ask; numbers of the command ring."""
+class Event(IntEnum):
+    """What leads from one state to another."""
 
-    ENABLE = 1
-    DISABLE = 2
-    RESET = 3
-    MODE = 4
-    MOVE = 5
-    STOP = 6
-    OUTPUT = 7
-    SHUTDOWN = 8
-
-
-class Refusal(IntEnum):
-    """Why a command was refused; `rtcp.runtime.sentences` says it."""
-
-    NONE = 0
-    NOT_IN_THIS_STATE = 1
-    NO_LEASE = 2
-    POSITION_LIMIT = 3
-    NOT_A_NUMBER = 4
-    SPEED = 5
-    MODE = 6
-    OUTSIDE_LIMITS = 7
-    OUTPUT = 8
-    NO_OUTPUTS = 9
-    UNKNOWN = 10
-    NOT_IN_OP = 11
-    SWITCHING = 12
-    NOT_STILL = 13
-    CLOCK = 14
-    NO_PLAN = 15
-    OUTPUT_VALUE = 16
-
-
-class Code(IntEnum):
-    """What happened; the events of the blackboard."""
-
-    NONE = 0
-    BUS_LOST = 1
-    DRIVE_LEFT_ENABLED = 2
-    ENABLE_STUCK = 3
-    DISABLE_STUCK = 4
-    SLAVE_NOT_OP = 5
-    RESET_STUCK = 6
-    GENERATOR = 7
-    MODE_STUCK = 8
-    LEASE_ENDED = 9
-    READY = 10
-    ENABLED = 11
+    START = 1
+    """The loop's process begins its cycle."""
+    ALL_IN_OP = 2
+    """Every slave is in OP and the reference clock is followed."""
+    ENABLE = 3
+    ENABLED = 4
+    """Every drive shows Operation Enabled, in the mode that was asked for."""
+    MOTION = 5
+    """A move, a line, a trajectory, a stream, a speed, a torque, the stick."""
+    ARRIVED = 6
+    """The mode has come to its end and the set-points stand."""
+    STOP = 7
+    """Asked for, or the lease ended, the enabling switch was let go, the stick was given to the chair."""
+    STOPPED = 8
+    GUARD = 9
+    """A guard, or the mode itself, has ended the motion: it could not go on without passing a limit."""
+    LIMIT_STOPPED = 10
+    """The stop that a guard began has come to rest."""
+    DISABLE = 11
     DISABLED = 12
-    RESET = 13
-    ARRIVED = 14
-    STOPPED = 15
-    DC_LOCKED = 16
-    DC_UNLOCKED = 17
-    DRIVE_FAULT = 18
-    CLOCK_LOST = 19
-    LEFT_RANGE = 20
-    TORQUE_OFF = 21
-    RESET_MOVING = 22
+    BROKEN = 13
+    """Something was lost or broke: frames, a slave, a drive, the clock."""
+    EMERGENCY = 14
+    """The emergency stop is pressed, or something measured was beyond its limit for too long."""
+    RESET = 15
+    RESET_DONE = 16
+    RESET_FAILED = 17
+    SHUTDOWN = 18
+    ENDED = 19
+    HOME = 20
+    HOMED = 21
 
+
+class Row(NamedTuple):
+    """A state: its name in words, what the drives are commanded, which commands it takes, how it is left."""
+
+    words: str
+    commands: str
+    takes: frozenset[Command]
+    left_by: dict[Event, State]
+
+
+_ANYWHERE = frozenset({Command.SHUTDOWN})
+_READY = _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.GRIPPER, Command.LIMITS}
+_MOVES = frozenset(
+    {
+        Command.MOVE,
+        Command.TRAJECTORY,
+        Command.LINE,
+        Command.STREAM,
+        Command.JOG,
+        Command.VELOCITY,
+        Command.TORQUE,
+    }
+)
+_BROKEN = {Event.BROKEN: State.FAULT, Event.EMERGENCY: State.EMERGENCY_STOP, Event.SHUTDOWN: State.CLOSING}
+_TORQUE = _BROKEN | {Event.DISABLE: State.DISABLING}
+
+TABLE: dict[State, Row] = {
+    State.OFF: Row(
+        "off", "no frames; the drives' watchdog has stopped them", frozenset(), {Event.START: State.STARTING}
+    ),
+    State.STARTING: Row(
+        "starting",
+        "drives disabled; targets follow the actual positions",
+        _ANYWHERE,
+        {Event.ALL_IN_OP: State.READY, Event.SHUTDOWN: State.CLOSING},
+    ),
+    State.READY: Row(
+        "ready",
+        "drives disabled; targets follow the actual positions",
+        _READY | {Command.ENABLE, Command.MODE, Command.MOTION, Command.ZERO},
+        _BROKEN | {Event.ENABLE: State.ENABLING},
+    ),
+    State.ENABLING: Row(
+        "enabling",
+        "drives led to Operation Enabled, target = actual until each is there",
+        _ANYWHERE | {Command.DISABLE, Command.OUTPUT},
+        _TORQUE | {Event.ENABLED: State.HOLDING},
+    ),
+    State.HOLDING: Row(
+        "holding",
+        "the last set-points, unchanged",
+        _READY | _MOVES | {Command.MODE, Command.MOTION, Command.STOP, Command.HOME},
+        _TORQUE | {Event.MOTION: State.MOVING, Event.GUARD: State.STOPPING, Event.HOME: State.HOMING},
+    ),
+    State.MOVING: Row(
+        "moving",
+        "the set-points of the active mode, after the guards",
+        _READY | _MOVES | {Command.STOP},
+        _TORQUE
+        | {
+            Event.MOTION: State.MOVING,
+            Event.ARRIVED: State.HOLDING,
+            Event.STOP: State.STOPPING,
+            Event.GUARD: State.STOPPING,
+        },
+    ),
+    State.STOPPING: Row(
+        "stopping",
+        "down to standstill under the limits of acceleration",
+        _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.STOP, Command.GRIPPER},
+        _TORQUE
+        | {
+            Event.STOPPED: State.HOLDING,
+            Event.LIMIT_STOPPED: State.STOPPED_BY_LIMIT,
+            Event.GUARD: State.STOPPING,
+        },
+    ),
+    State.STOPPED_BY_LIMIT: Row(
+        "stopped by limit",
+        "the set-points at which it came to rest, unchanged",
+        _READY | {Command.STOP, Command.RESET},
+        _TORQUE | {Event.RESET: State.HOLDING},
+    ),
+    State.HOMING: Row(
+        "homing",
+        "one drive homes by itself (mode 6), the others hold",
+        _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.STOP},
+        _TORQUE | {Event.HOMED: State.HOLDING, Event.STOP: State.HOLDING},
+    ),
+    State.DISABLING: Row(
+        "disabling",
+        "a controlled stop first; then drives led to Switch On Disabled, brakes closed",
+        _ANYWHERE | {Command.DISABLE},
+        _BROKEN | {Event.DISABLED: State.READY},
+    ),
+    State.FAULT: Row(
+        "fault",
+        "quick stop: each drive ramps down by itself and holds (0x605A = 6), whether or not frames come back",
+        _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.RESET, Command.LIMITS},
+        {
+            Event.RESET: State.RESETTING,
+            Event.DISABLE: State.FAULT,
+            Event.EMERGENCY: State.EMERGENCY_STOP,
+            Event.SHUTDOWN: State.CLOSING,
+        },
+    ),
+    State.EMERGENCY_STOP: Row(
+        "emergency stop",
+        "quick stop; at standstill torque off and brakes closed; then the slaves to PRE-OP",
+        _ANYWHERE | {Command.DISABLE, Command.RESET, Command.LIMITS},
+        {Event.RESET: State.RESETTING, Event.DISABLE: State.EMERGENCY_STOP, Event.SHUTDOWN: State.CLOSING},
+    ),
+    State.RESETTING: Row(
+        "resetting",
+        "slaves brought back to OP, drive faults reset, drives disabled",
+        _ANYWHERE | {Command.DISABLE},
+        {
+            Event.RESET_DONE: State.READY,
+            Event.RESET_FAILED: State.FAULT,
+            Event.BROKEN: State.FAULT,
+            Event.DISABLE: State.FAULT,
+            Event.EMERGENCY: State.EMERGENCY_STOP,
+            Event.SHUTDOWN: State.CLOSING,
+        },
+    ),
+    State.CLOSING: Row(
+        "closing",
+        "a controlled stop, drives disabled; then INIT",
+        _ANYWHERE,
+        {Event.SHUTDOWN: State.CLOSING, Event.ENDED: State.OFF},
+    ),
+}
 
 ALLOWED: dict[Command, frozenset[State]] = {
-    Command.ENABLE: frozenset({State.READY}),
-    Command.DISABLE: frozenset(State) - {State.STARTING, State.CLOSING},
-    Command.RESET: frozenset({State.FAULT}),
-    Command.MODE: frozenset({State.READY, State.HOLDING}),
-    Command.MOVE: frozenset({State.HOLDING, State.MOVING}),
-    Command.STOP: frozenset({State.HOLDING, State.MOVING, State.STOPPING}),
-    Command.OUTPUT: frozenset({State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.FAULT}),
-    Command.SHUTDOWN: frozenset(State),
+    command: frozenset(state for state, row in TABLE.items() if command in row.takes) for command in Command
 }
 """In which states each command is taken."""
 
 WITHOUT_LEASE = frozenset({Command.DISABLE, Command.STOP, Command.SHUTDOWN})
 """Commands that only make the arm safer: anyone may give them at any time."""
+
+WITH_TORQUE = frozenset(
+    {
+        State.ENABLING,
+        State.HOLDING,
+        State.MOVING,
+        State.STOPPING,
+        State.STOPPED_BY_LIMIT,
+        State.HOMING,
+        State.DISABLING,
+    }
+)
+"""States in which drives may have torque and obey targets: an emergency is met by a quick stop."""

@@ -54,6 +54,7 @@ from rtcp.runtime.layout import (
     TEXTS_HEAD_AT,
     RecordLayout,
 )
+from rtcp.runtime.plans import write_plan
 from rtcp.runtime.words import Words
 
 _NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
@@ -295,6 +296,14 @@ class Observer:
         self._words.fence()
         self._words[COMMAND_HEAD_AT] = number
         return number
+
+    def write_plan(self, rows: Sequence[Sequence[float]]) -> int:
+        """Write a plan, rows of up to 20 numbers, for a command that names the slot which is returned.
+
+        Raises:
+            PlanTooLong: where it does not fit.
+        """
+        return write_plan(self._map, self._words, rows)
 
     def answer(self, number: int) -> Answer | None:
         """Return the loop's answer to the command `number`, or None while there is none."""

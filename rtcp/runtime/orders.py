@@ -1,23 +1,39 @@
-"""Commands as the loop takes them: checked against lease, state and limits, then carried out or refused."""
+"""Commands as the loop takes them: checked against lease, state and limits, then carried out or refused.
+
+What sets the arm in motion is in `motion_orders`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import isfinite
+from collections.abc import Callable, Sequence
 
 from rtcp.devices.io_box import IoBox
-from rtcp.motion.generator import LONGEST_S
 from rtcp.motion.modes import DriveMode
-from rtcp.realtime.clock import monotonic_ns
 from rtcp.runtime.arm import RANGE_MARGIN_RAD, Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Code, Command, Refusal, State
+from rtcp.runtime.codes import MotionMode
+from rtcp.runtime.limit_orders import LimitOrders
+from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Code, Command, Event, Refusal, State
+from rtcp.runtime.motion_orders import MotionOrders
+from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
+from rtcp.runtime.verdict import DONE, Verdict
 
-Verdict = tuple[Refusal] | tuple[Refusal, int, float] | tuple[Refusal, int, float, float]
-"""A refusal (or NONE), the axis that it is about, the value and the limit."""
-_DONE: Verdict = (Refusal.NONE,)
+_WAITS_FOR_MODE = frozenset(
+    {
+        Command.MODE,
+        Command.MOTION,
+        Command.MOVE,
+        Command.TRAJECTORY,
+        Command.LINE,
+        Command.STREAM,
+        Command.JOG,
+        Command.VELOCITY,
+        Command.TORQUE,
+        Command.HOME,
+    }
+)
 
 
 class Orders:
@@ -26,29 +42,41 @@ class Orders:
     Args:
         arm: the joints.
         box: the IO box, or None.
+        operator: the inputs and outputs that have a meaning.
         behaviour: the machine's state.
         blackboard: where commands come from and answers go.
         service: the thread beside the cycle.
     """
 
     def __init__(
-        self, arm: Arm, box: IoBox | None, behaviour: Behaviour, blackboard: Blackboard, service: Service
+        self,
+        arm: Arm,
+        box: IoBox | None,
+        operator: Operator,
+        behaviour: Behaviour,
+        blackboard: Blackboard,
+        service: Service,
     ) -> None:
         self._arm = arm
         self._box = box
+        self._operator = operator
         self._behaviour = behaviour
         self._blackboard = blackboard
         self._service = service
-        self._target = [0.0] * len(arm.drives)
-        self._answers = {
+        motion = MotionOrders(arm, operator, behaviour, blackboard)
+        self._answers: dict[Command, Callable[[int, Sequence[float]], Verdict]] = {
             Command.ENABLE: self._enable,
             Command.DISABLE: self._disable,
             Command.RESET: self._reset,
             Command.MODE: self._mode,
-            Command.MOVE: self._move,
             Command.STOP: self._stop,
             Command.OUTPUT: self._output,
             Command.SHUTDOWN: self._shut_down,
+            Command.MOTION: self._motion,
+            Command.GRIPPER: self._gripper,
+            Command.ZERO: self._zero,
+            Command.LIMITS: LimitOrders(arm, blackboard).take,
+            **motion.answers,
         }
 
     def take(self) -> None:
@@ -65,16 +93,18 @@ class Orders:
         state = self._behaviour.state
         if state not in ALLOWED[command]:
             return Refusal.NOT_IN_THIS_STATE, int(state), float(command)
-        if self._behaviour.switching and command in (Command.MODE, Command.MOVE):
+        if self._behaviour.switching and command in _WAITS_FOR_MODE:
             return (Refusal.SWITCHING,)
         return self._answers[command](lease, numbers)
 
     def _holds(self, lease: int) -> bool:
         held, renewed, duration = self._blackboard.lease()
-        return lease != 0 and held == lease and monotonic_ns() - renewed <= duration
+        return lease != 0 and held == lease and self._behaviour.now_ns - renewed <= duration
 
     def _enable(self, lease: int, numbers: Sequence[float]) -> Verdict:
         arm = self._arm
+        if self._operator.emergency_stop:
+            return (Refusal.PRESSED,)
         if not self._service.all_op:
             return (Refusal.NOT_IN_OP,)
         if not self._behaviour.clock_followed:
@@ -83,68 +113,77 @@ class Orders:
         if axis >= 0:
             return Refusal.NOT_STILL, axis, arm.drives[axis].velocity
         for axis, drive in enumerate(arm.drives):
-            low, high = arm.low[axis], arm.high[axis]
+            low, high = arm.limits.low[axis], arm.limits.high[axis]
             if not low - RANGE_MARGIN_RAD <= drive.position <= high + RANGE_MARGIN_RAD:
                 return Refusal.OUTSIDE_LIMITS, axis, drive.position, high if drive.position > high else low
         arm.set_mode(DriveMode.CSP)
-        arm.begin()
-        self._behaviour.enter(State.ENABLING)
-        return _DONE
+        arm.hold_target()
+        self._operator.wait_for_neutral()
+        self._behaviour.on(Event.ENABLE)
+        return DONE
 
     def _disable(self, lease: int, numbers: Sequence[float]) -> Verdict:
         behaviour = self._behaviour
         if behaviour.state in (State.FAULT, State.RESETTING):
             # The fault stays; only the torque goes.
             behaviour.torque_off = True
-            behaviour.enter(State.FAULT)
+            behaviour.on(Event.DISABLE)
             self._blackboard.event(Code.TORQUE_OFF)
-        elif behaviour.state not in (State.READY, State.DISABLING):
-            self._arm.generator.stop()
-            behaviour.enter(State.DISABLING)
-        return _DONE
+        elif behaviour.state not in (State.READY, State.DISABLING, State.EMERGENCY_STOP):
+            self._arm.motions.stop(self._arm.state)
+            behaviour.on(Event.DISABLE)
+        return DONE
 
     def _reset(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        behaviour = self._behaviour
+        if behaviour.state is State.STOPPED_BY_LIMIT:
+            behaviour.release()
+            return DONE
+        if self._operator.emergency_stop:
+            return (Refusal.PRESSED,)
         self._service.recover()
-        self._behaviour.enter(State.RESETTING)
-        return _DONE
+        behaviour.on(Event.RESET)
+        return DONE
 
     def _mode(self, lease: int, numbers: Sequence[float]) -> Verdict:
         wanted = numbers[0]
         if wanted not in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST):
             return Refusal.MODE, -1, wanted
-        behaviour, mode = self._behaviour, DriveMode(int(wanted))
+        motions = self._arm.motions
+        if motions.mode in (MotionMode.VELOCITY, MotionMode.TORQUE):
+            return Refusal.OTHER_MOTION, int(motions.mode), float(MotionMode.JOINT)
+        motions.drive_mode = DriveMode(int(wanted))
+        self._change_mode(motions.drive_mode)
+        return DONE
+
+    def _motion(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        if numbers[0] not in tuple(MotionMode):
+            return Refusal.MOTION, -1, numbers[0]
+        wanted = MotionMode(int(numbers[0]))
+        motions = self._arm.motions
+        if wanted in (MotionMode.CARTESIAN, MotionMode.JOYSTICK) and not motions.has_geometry:
+            return (Refusal.NO_GEOMETRY,)
+        motions.select(wanted)
+        self._operator.wait_for_neutral()
+        self._blackboard.event(Code.MOTION, int(wanted))
+        if motions.drive_mode_of(wanted) is not self._arm.mode or self._behaviour.state is not State.HOLDING:
+            self._change_mode(motions.drive_mode_of(wanted))
+        else:
+            self._arm.set_mode(self._arm.mode)
+        return DONE
+
+    def _change_mode(self, mode: DriveMode) -> None:
+        behaviour = self._behaviour
         behaviour.wanted_mode = mode
         if behaviour.state is State.HOLDING:
             behaviour.change_mode(mode)
         else:
             self._arm.set_mode(mode)
-        return _DONE
-
-    def _move(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        arm, target = self._arm, self._target
-        speed = numbers[-1]
-        if not isfinite(speed) or not 0.0 < speed <= arm.fastest:
-            return Refusal.SPEED, -1, speed, arm.fastest
-        for axis in range(len(target)):
-            wanted, low, high = numbers[axis], arm.low[axis], arm.high[axis]
-            if not isfinite(wanted):
-                return Refusal.NOT_A_NUMBER, axis, wanted
-            if not low <= wanted <= high:
-                return Refusal.POSITION_LIMIT, axis, wanted, high if wanted > high else low
-            target[axis] = wanted
-        if not arm.generator.move_to(target, speed):
-            return Refusal.NO_PLAN, -1, speed, LONGEST_S
-        behaviour = self._behaviour
-        behaviour.lease = lease
-        behaviour.moves += 1
-        behaviour.enter(State.MOVING)
-        return _DONE
 
     def _stop(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if self._behaviour.state is State.MOVING:
-            self._arm.generator.stop()
-            self._behaviour.enter(State.STOPPING)
-        return _DONE
+        if self._behaviour.state in (State.MOVING, State.HOMING):
+            self._behaviour.stop_motion()
+        return DONE
 
     def _output(self, lease: int, numbers: Sequence[float]) -> Verdict:
         if self._box is None:
@@ -155,9 +194,32 @@ class Orders:
             return Refusal.OUTPUT, -1, number, float(highest)
         if value not in (0.0, 1.0):
             return Refusal.OUTPUT_VALUE, int(number), value
+        if int(number) in self._operator.meant:
+            return Refusal.MEANT, -1, number
         self._box.set_output(int(number), value == 1.0)
-        return _DONE
+        return DONE
+
+    def _gripper(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        if numbers[0] not in (0.0, 1.0):
+            return Refusal.OUTPUT_VALUE, -1, numbers[0]
+        if not self._operator.has_gripper:
+            return (Refusal.NO_GRIPPER,)
+        self._operator.grip(numbers[0] == 0.0)
+        self._blackboard.event(Code.GRIPPER, -1, numbers[0])
+        return DONE
+
+    def _zero(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        axis, offset = numbers[0], numbers[1]
+        if axis not in range(len(self._arm.drives)):
+            return Refusal.AXIS, -1, axis, float(len(self._arm.drives))
+        if not abs(offset) <= 100.0:
+            return Refusal.OFFSET, int(axis), offset, 100.0
+        if self._arm.first_with_torque() >= 0:
+            return (Refusal.HAS_TORQUE,)
+        self._arm.drives[int(axis)].zero = offset
+        self._blackboard.event(Code.ZERO, int(axis), offset)
+        return DONE
 
     def _shut_down(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        self._behaviour.enter(State.CLOSING)
-        return _DONE
+        self._behaviour.close()
+        return DONE

@@ -10,9 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.realtime.statistics import SlidingPercentiles
-from rtcp.runtime.layout import FLAG_DC_LOCKED, FLAG_SWITCHING
+from rtcp.runtime.layout import FLAG_ARM_HAS_STICK, FLAG_DC_LOCKED, FLAG_SWITCHING
 from rtcp.runtime.machine import Code, State
+from rtcp.runtime.motion_sentences import STICK_MODES, motion_name
 from rtcp.runtime.observer import Observer
+from rtcp.runtime.robot_status import robot_status
 from rtcp.runtime.sentences import FAULTS, Sentences
 from rtcp.runtime.session import Processes, Session, is_ours
 
@@ -90,7 +92,7 @@ class Picture:
             self._event = event.number
             sentence = self._sentences.event(event.code, event.axis, event.value, event.limit)
             said.append((event.time_ns, sentence))
-            if Code(event.code) in FAULTS:
+            if event.code in FAULTS:
                 self.fault = self.fault or sentence
                 self.last_fault = sentence
                 self.faults += 1
@@ -118,6 +120,13 @@ class Picture:
         """Whether the drives are changing their mode."""
         latest = self._observer.latest()
         return latest is not None and bool(int(latest[0]["flags"]) & FLAG_SWITCHING)
+
+    def _robot(self, record: np.void, speaks: bool) -> dict[str, Any]:
+        if not (self.loop_lives and speaks):
+            # Nobody leads the drives any more: their watchdog has stopped them.
+            return robot_status(State.FAULT, int(record["motion"]), 0, int(Code.BUS_LOST), 0)
+        numbers = (int(record[name]) for name in ("motion", "flags", "fault", "limit"))
+        return robot_status(State(int(record["state"])), *numbers)
 
     def status(self, processes: Processes) -> dict[str, Any]:
         """Return the whole picture as `rtcp status --json` prints it."""
@@ -153,6 +162,12 @@ class Picture:
             "state": state,
             "message": message,
             "mode": MODE_NAMES.get(int(record["mode"]), str(int(record["mode"]))),
+            "motion": motion_name(int(record["motion"])),
+            "stick": {
+                "mode": STICK_MODES[int(record["stick_mode"]) % len(STICK_MODES)],
+                "arm_has_it": bool(int(record["flags"]) & FLAG_ARM_HAS_STICK),
+            },
+            "robot": self._robot(record, silent_s <= _STALE_S),
             "bus": self._session.bus,
             "cycle_ns": self._observer.period_ns,
             "cycles": int(record["cycle"]),

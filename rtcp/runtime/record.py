@@ -8,8 +8,19 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, FLAG_ENABLED, FLAG_SWITCHING, PER_JOINT, SCALARS
+from rtcp.runtime.layout import (
+    FLAG_ALL_OP,
+    FLAG_ARM_HAS_STICK,
+    FLAG_DC_LOCKED,
+    FLAG_EMERGENCY_STOP,
+    FLAG_ENABLED,
+    FLAG_MOTION_ALLOWED,
+    FLAG_SWITCHING,
+    PER_JOINT,
+    SCALARS,
+)
 from rtcp.runtime.machine import Code
+from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
 
 _LONGEST_NS = 2_000_000_000
@@ -23,6 +34,7 @@ class Recorder:
         data: the process image.
         arm: the joints.
         box: the IO box, or None.
+        operator: the inputs that have a meaning.
         behaviour: the machine's state.
         blackboard: where the records go.
         service: knows whether all slaves are in OP.
@@ -34,6 +46,7 @@ class Recorder:
         data: ProcessData,
         arm: Arm,
         box: IoBox | None,
+        operator: Operator,
         behaviour: Behaviour,
         blackboard: Blackboard,
         service: Service,
@@ -42,6 +55,7 @@ class Recorder:
         self._data = data
         self._arm = arm
         self._box = box
+        self._operator = operator
         self._behaviour = behaviour
         self._blackboard = blackboard
         self._service = service
@@ -57,6 +71,7 @@ class Recorder:
     def publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
         """Publish the cycle that was planned at `planned`, woke at `woken` and had its answer at `received` (ns)."""
         values, behaviour, discipline, box = self._values, self._behaviour, self._discipline, self._box
+        arm, operator = self._arm, self._operator
         flags = FLAG_ALL_OP if self._service.all_op else 0
         offset = filtered = 0
         if discipline is not None:
@@ -70,17 +85,25 @@ class Recorder:
             flags |= FLAG_ENABLED
         if behaviour.switching:
             flags |= FLAG_SWITCHING
+        if operator.emergency_stop:
+            flags |= FLAG_EMERGENCY_STOP
+        if operator.permitted:
+            flags |= FLAG_MOTION_ALLOWED
+        if operator.arm_has_stick:
+            flags |= FLAG_ARM_HAS_STICK
         inputs = outputs = counter = 0
         if box is not None:
             inputs, outputs, counter = box.inputs, box.outputs, box.counter
-        generator = self._arm.generator
+        mode = arm.motions.active
         # One slice, in the order of layout.SCALARS: cheaper than an index a field.
         values[: len(_AT)] = (
             behaviour.cycle,
             woken,
             self._data.dc_time,
             behaviour.state,
-            self._arm.mode,
+            arm.mode,
+            arm.motions.mode,
+            operator.stick_mode,
             flags,
             wkc,
             self._data.expected_wkc,
@@ -95,16 +118,17 @@ class Recorder:
             outputs,
             counter,
             behaviour.fault,
-            self._arm.guard.held,
+            behaviour.limit,
+            arm.guard.held | arm.guards.held,
             behaviour.enables,
             behaviour.moves,
-            generator.elapsed_s,
-            generator.duration_s,
+            mode.elapsed_s,
+            mode.duration_s,
         )
         at = len(_AT)
-        n = len(self._arm.drives)
-        target = generator.position
-        for i, drive in enumerate(self._arm.drives):
+        n = len(arm.drives)
+        target = arm.state.position
+        for i, drive in enumerate(arm.drives):
             values[at + i] = drive.position
             values[at + n + i] = drive.velocity
             values[at + 2 * n + i] = drive.torque

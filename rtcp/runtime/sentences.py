@@ -3,23 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.virtual import VIRTUAL
-from rtcp.runtime.machine import ALLOWED, Code, Command, Refusal, State
-
-
-class Matter(NamedTuple):
-    """What a refusal or an event is about."""
-
-    axis: int
-    value: float
-    limit: float
-
-
-def _number(value: float) -> str:
-    return f"{value:.6g}"
+from rtcp.runtime.machine import ALLOWED, TABLE, Code, Command, Refusal, State
+from rtcp.runtime.motion_sentences import motion_events, motion_refusals
+from rtcp.runtime.naming import Matter, Naming, number
 
 
 class Sentences:
@@ -31,65 +20,67 @@ class Sentences:
 
     def __init__(self, config: ArmConfig) -> None:
         self._config = config
+        self._names = Naming(config)
+        joint, slave, file = self._names.joint, self._names.slave, self._names.file
         self._refusals: dict[Refusal, Callable[[Matter], str]] = {
             Refusal.NOT_IN_THIS_STATE: self._not_in_this_state,
             Refusal.NO_LEASE: lambda _: "the lease has run out or is another commander's: nothing was moved",
             Refusal.POSITION_LIMIT: self._position_limit,
-            Refusal.NOT_A_NUMBER: lambda m: f"{self._joint(m.axis)}: target {m.value} is not a finite number",
+            Refusal.NOT_A_NUMBER: lambda m: f"{joint(m.axis)}: target {m.value} is not a finite number",
             Refusal.SPEED: lambda m: (
-                f"speed {_number(m.value)} rad/s is not allowed: more than 0 and at most {_number(m.limit)} rad/s "
-                f"(joints[].velocity in {self._file})"
+                f"speed {number(m.value)} rad/s is not allowed: more than 0 and at most {number(m.limit)} rad/s "
+                f"(joints[].velocity in {file})"
             ),
-            Refusal.MODE: lambda m: f"mode {_number(m.value)} is not one of csp (8), csv (9), cst (10)",
+            Refusal.MODE: lambda m: f"mode {number(m.value)} is not one of csp (8), csv (9), cst (10)",
             Refusal.OUTSIDE_LIMITS: self._outside_limits,
-            Refusal.OUTPUT: lambda m: f"output {_number(m.value)} does not exist: 1 to {_number(m.limit)}",
-            Refusal.OUTPUT_VALUE: lambda m: f"output {m.axis}: found {_number(m.value)}, allowed is 0 or 1",
-            Refusal.NO_OUTPUTS: lambda _: f"no IO box is configured (slaves in {self._file})",
-            Refusal.UNKNOWN: lambda m: f"command {_number(m.value)} is unknown to this loop",
+            Refusal.OUTPUT: lambda m: f"output {number(m.value)} does not exist: 1 to {number(m.limit)}",
+            Refusal.OUTPUT_VALUE: lambda m: f"output {m.axis}: found {number(m.value)}, allowed is 0 or 1",
+            Refusal.NO_OUTPUTS: lambda _: f"no IO box is configured (slaves in {file})",
+            Refusal.UNKNOWN: lambda m: f"command {number(m.value)} is unknown to this loop",
             Refusal.NOT_IN_OP: lambda _: "not all slaves are in OP: see `rtcp status`, then `rtcp reset`",
             Refusal.SWITCHING: lambda _: "the drives are changing their mode: try again when they show it",
             Refusal.NOT_STILL: lambda m: (
-                f"{self._joint(m.axis)} turns at {_number(m.value)} rad/s: it is enabled at standstill only"
+                f"{joint(m.axis)} turns at {number(m.value)} rad/s: it is enabled at standstill only"
             ),
             Refusal.NO_PLAN: lambda m: (
-                f"no trajectory of at most {_number(m.limit)} s was found to that target at {_number(m.value)} rad/s: "
+                f"no trajectory of at most {number(m.limit)} s was found to that target at {number(m.value)} rad/s: "
                 "choose a higher speed or a nearer target"
             ),
             Refusal.CLOCK: lambda _: "the cycle does not follow the reference clock yet (`rtcp status`, clocks)",
         }
-        self._events: dict[Code, Callable[[Matter], str]] = {
+        self._refusals |= motion_refusals(self._names)
+        self._events: dict[int, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
-                f"process data lost: {_number(m.value)} cycles in a row without the expected working counter "
-                f"({self._lost_cycles()} in {self._file}); all drives are told to stop, `rtcp reset` goes on when the "
+                f"process data lost: {number(m.value)} cycles in a row without the expected working counter "
+                f"({self._lost_cycles()} in {file}); all drives are told to stop, `rtcp reset` goes on when the "
                 "slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
-                f"{self._joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
+                f"{joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
                 "all joints are stopped, `rtcp reset` goes on"
             ),
             Code.ENABLE_STUCK: lambda m: (
-                f"{self._joint(m.axis)}: enabling stuck for {self._config.enable_timeout_s:g} s at statusword "
-                f"0x{int(m.value):04X} (enable_timeout_s in {self._file})"
+                f"{joint(m.axis)}: enabling stuck for {self._config.enable_timeout_s:g} s at statusword "
+                f"0x{int(m.value):04X} (enable_timeout_s in {file})"
             ),
             Code.DISABLE_STUCK: lambda m: (
-                f"{self._joint(m.axis)}: the drive did not give up its torque within "
+                f"{joint(m.axis)}: the drive did not give up its torque within "
                 f"{self._config.enable_timeout_s:g} s (statusword 0x{int(m.value):04X}; enable_timeout_s in "
-                f"{self._file})"
+                f"{file})"
             ),
             Code.SLAVE_NOT_OP: lambda m: (
-                f"slave {m.axis} ({self._slave(m.axis)}) left OP; all drives are told to stop, "
-                "`rtcp reset` brings it back"
+                f"slave {m.axis} ({slave(m.axis)}) left OP; all drives are told to stop, `rtcp reset` brings it back"
             ),
             Code.RESET_STUCK: self._reset_stuck,
             Code.RESET_MOVING: lambda m: (
-                f"{self._joint(m.axis)} still turns, at {_number(m.value)} rad/s, 3 s after the reset was asked for: "
+                f"{joint(m.axis)} still turns, at {number(m.value)} rad/s, 3 s after the reset was asked for: "
                 "its torque goes only at standstill; `rtcp disable` takes it off at once"
             ),
             Code.GENERATOR: lambda _: (
                 "the trajectory generator refused its input; all drives are told to stop, `rtcp reset` goes on"
             ),
             Code.DRIVE_FAULT: lambda m: (
-                f"{self._joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
+                f"{joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
             ),
             Code.CLOCK_LOST: lambda _: (
                 "the cycle has not followed the reference clock for 1 s; all drives are told to stop, "
@@ -99,7 +90,7 @@ class Sentences:
             Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
             Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
             Code.MODE_STUCK: lambda m: (
-                f"{self._joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for"
+                f"{joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for"
             ),
             Code.READY: lambda _: "all slaves are in OP",
             Code.ENABLED: lambda _: "all drives are enabled, the arm holds",
@@ -109,11 +100,14 @@ class Sentences:
             Code.STOPPED: lambda _: "the arm has stopped and holds",
             Code.DC_LOCKED: lambda _: "the cycle follows the reference clock",
             Code.DC_UNLOCKED: lambda _: "the cycle has lost the reference clock's phase",
-        }
+        } | motion_events(self._names)
 
     @property
     def _file(self) -> str:
-        return self._config.source.name or "the configuration"
+        return self._names.file
+
+    def _joint(self, matter: Matter) -> str:
+        return self._names.joint(matter.axis)
 
     def _lost_cycles(self) -> str:
         bus = self._config.bus
@@ -122,30 +116,23 @@ class Sentences:
             f"bus.lost_cycles times bus.virtual_patience, {bus.virtual_patience:g}," if widened else "bus.lost_cycles"
         )
 
-    def _joint(self, axis: int) -> str:
-        joints = self._config.joints
-        return joints[axis].name if 0 <= axis < len(joints) else f"joint {axis + 1}"
-
-    def _slave(self, position: int) -> str:
-        slaves = self._config.slaves
-        return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
-
     def _not_in_this_state(self, matter: Matter) -> str:
         command, state = Command(int(matter.value)), State(matter.axis)
-        allowed = ", ".join(sorted(other.name.lower() for other in ALLOWED[command]))
-        return f"{command.name.lower()} is not possible while {state.name.lower()}; it is while: {allowed}"
+        allowed = ", ".join(sorted(TABLE[other].words for other in ALLOWED[command]))
+        way_out = "; `rtcp reset` first" if Command.RESET in TABLE[state].takes else ""
+        return f"{command.name.lower()} is not possible while {TABLE[state].words}; it is while: {allowed}{way_out}"
 
     def _position_limit(self, matter: Matter) -> str:
         joint = self._config.joints[matter.axis]
         return (
-            f"{joint.name}: target {_number(matter.value)} rad is outside its range "
+            f"{joint.name}: target {number(matter.value)} rad is outside its range "
             f"{joint.position.min:g} to {joint.position.max:g} rad (joints[{matter.axis}].position in {self._file})"
         )
 
     def _outside_limits(self, matter: Matter) -> str:
         joint = self._config.joints[matter.axis]
         return (
-            f"{joint.name} stands at {_number(matter.value)} rad, outside its range {joint.position.min:g} to "
+            f"{joint.name} stands at {number(matter.value)} rad, outside its range {joint.position.min:g} to "
             f"{joint.position.max:g} rad (joints[{matter.axis}].position in {self._file}): it is not enabled there"
         )
 
@@ -153,15 +140,13 @@ class Sentences:
         joint = self._config.joints[matter.axis]
         return (
             f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being enabled: "
-            f"it stands at {_number(matter.value)} rad (joints[{matter.axis}].position in {self._file})"
+            f"it stands at {number(matter.value)} rad (joints[{matter.axis}].position in {self._file})"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:
         if matter.axis < 0:
             return "reset did not succeed within 3 s: not all slaves came back to OP, or the clock is not followed"
-        return (
-            f"{self._joint(matter.axis)}: the drive stays in fault after reset (statusword 0x{int(matter.value):04X})"
-        )
+        return f"{self._joint(matter)}: the drive stays in fault after reset (statusword 0x{int(matter.value):04X})"
 
     def refusal(self, code: int, axis: int, value: float, limit: float) -> str:
         """Return the sentence for a refusal."""
@@ -169,7 +154,7 @@ class Sentences:
 
     def event(self, code: int, axis: int, value: float, limit: float) -> str:
         """Return the sentence for an event."""
-        return self._events[Code(code)](Matter(axis, value, limit))
+        return self._events[code](Matter(axis, value, limit))
 
 
 FAULTS = frozenset(
@@ -186,6 +171,10 @@ FAULTS = frozenset(
         Code.DRIVE_FAULT,
         Code.CLOCK_LOST,
         Code.LEFT_RANGE,
+        Code.PRESSED,
+        Code.OVER_SPEED,
+        Code.OVER_TORQUE,
+        Code.FOLLOWING_ERROR,
     }
 )
-"""Events that are why the machine is in the state FAULT."""
+"""Events that are why the machine is in fault or in the emergency stop."""

@@ -64,6 +64,8 @@ class Service(threading.Thread):
         self._op_wanted = False
         self._op_reached = False
         self._recovery_wanted = False
+        self._park_wanted = False
+        self._parked = False
         self._explain = -1
         self._end = threading.Event()
         self.all_op = False
@@ -87,6 +89,11 @@ class Service(threading.Thread):
         """Ask for the slaves that left OP to be brought back."""
         self.all_op = False
         self._recovery_wanted = True
+
+    def park(self) -> None:
+        """Ask for all slaves to be taken to PRE-OP, as an emergency stop ends; `recover` brings them back."""
+        self.all_op = False
+        self._park_wanted = True
 
     def explain_drive(self, axis: int) -> None:
         """Ask for the drive's error code to be read and put into words."""
@@ -126,6 +133,9 @@ class Service(threading.Thread):
     def _turn(self, turn: int) -> None:
         if not self._op_reached and not self.refused:
             self._start(turn)
+        if self._park_wanted:
+            self._park_wanted = False
+            self._park()
         if self._recovery_wanted:
             self._recovery_wanted = False
             self._recover()
@@ -171,7 +181,20 @@ class Service(threading.Thread):
         for slave in states:
             self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
 
+    def _park(self) -> None:
+        self._parked = True
+        self._bus.request_state(AlState.PREOP)
+        for sentence in self._bus.wait_for_state(AlState.PREOP, _RECOVER_S):
+            self._blackboard.text(sentence)
+        self._tell_states(self._bus.read_states())
+
     def _recover(self) -> None:
+        if self._parked:
+            # They have kept their set-up: PRE-OP, in which they were put, loses none of it.
+            self._parked = False
+            waiting = [slave.position for slave in self._bus.read_states() if slave.state is AlState.PREOP]
+            self._bus.request_state(AlState.SAFEOP, waiting)
+            self._bus.wait_for_state(AlState.SAFEOP, _RECOVER_S, waiting)
         states = self._bus.read_states()
         fallen = [slave for slave in states if slave.state is not AlState.OP or slave.error]
         hopeless = [slave for slave in fallen if slave.state is not AlState.SAFEOP and slave.state is not AlState.OP]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 import re
 import subprocess
@@ -18,6 +19,7 @@ from kinematics.model import DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
 from rtcp.config import ConfigError, default_config, find, find_arm, load, load_kinematics
 from rtcp.config.geometry import angle
+from rtcp.config.operation import CartesianConfig
 
 ARM, IRB = Path("assistive_arm.yaml"), Path("abb_irb120.yaml")
 ROW1 = "{alpha: 0, a: 0, d: 0.290}"
@@ -51,6 +53,11 @@ def rewritten(file: Path, change: Callable[[dict[str, object]], object]) -> Path
     change(data)
     file.write_text(yaml.safe_dump(data))
     return file
+
+
+def without_kinematics(data: dict[str, object]) -> None:
+    """Take away the geometry, and with it the boxes, which need it."""
+    del data["kinematics"], data["cartesian"]
 
 
 # -- what the shipped files say ----------------------------------------------------------------------------------------
@@ -135,7 +142,9 @@ def test_a_file_of_kinematics_alone_is_no_arm_to_start(directory: Path) -> None:
 
 def test_an_arm_starts_without_kinematics_too(directory: Path) -> None:
     whole = load(ARM)
-    assert load(rewritten(ARM, lambda data: data.pop("kinematics"))) == whole
+    without = load(rewritten(ARM, without_kinematics))
+    assert whole.arm is not None
+    assert without == dataclasses.replace(whole, arm=None, cartesian=CartesianConfig())
 
 
 def test_kinematics_and_configuration_load_without_numpy() -> None:
@@ -356,7 +365,7 @@ def test_an_arm_of_another_number_of_joints_has_no_kinematics(directory: Path) -
         load_kinematics(file)
     (problem,) = caught.value.problems
     assert problem.endswith("kinematics: found beside 5 joints, allowed are 6; leave it out for such an arm")
-    assert len(load(rewritten(file, lambda data: data.pop("kinematics"))).joints) == 5
+    assert len(load(rewritten(file, without_kinematics)).joints) == 5
 
 
 def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
@@ -369,7 +378,7 @@ def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
 
 def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
-        load_kinematics(rewritten(ARM, lambda data: data.pop("kinematics")))
+        load_kinematics(rewritten(ARM, without_kinematics))
     wanted = "it must be a mapping with the keys dh, limits, links, tool"
     assert caught.value.problems == [f"{ARM}:1: the key kinematics is missing; {wanted}"]
 

@@ -197,6 +197,6 @@ def test_a_file_that_is_no_blackboard_is_refused(tmp_path: Path) -> None:
     (tmp_path / "short").write_bytes(b"x" * 100)
     with pytest.raises(BlackboardError, match="cut short"):
         Observer(tmp_path / "short")
-    (tmp_path / "zeros").write_bytes(bytes(1 << 20))
+    (tmp_path / "zeros").write_bytes(bytes(1 << 22))
     with pytest.raises(BlackboardError, match="not of this version"):
         Observer(tmp_path / "zeros")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import sin, sqrt
 
 from rtcp.virtual.models.mechanics import Mechanics
 
@@ -81,6 +81,60 @@ class Axis:
         reference = self.reference = self.reference + (velocity + 2.0 * _TRACKER * error) * h
         velocity += _POSITION_GAIN * (reference - velocity * h - self.mechanics.position - self.offset)
         self.run(fastest if velocity > fastest else -fastest if velocity < -fastest else velocity, h)
+
+    def glide(self, goal: float, slope: float, fastest: float, h: float, count: int) -> float:
+        """Move `demand` on by `slope` (rad/s) until it is at `goal`, and `track` it; `count` times. Return the slope left.
+
+        What a drive in CSP does all the time: `track`, `run` and `Mechanics.advance`, to the bit, without the calls.
+        """
+        mechanics = self.mechanics
+        demand, reference, along = self.demand, self.reference, self.reference_velocity
+        position, speed, offset = mechanics.position, mechanics.velocity, self.offset
+        gain, integral_gain, integral = self._velocity_gain, self._integral_gain, self._integral
+        limit, torque, saturated = self.torque_limit, self.torque, self.saturated
+        inertia, viscous, external = mechanics.inertia, mechanics.viscous, mechanics.external_torque
+        gravity, phase = mechanics.gravity_torque, mechanics.gravity_phase
+        friction = mechanics.coulomb
+        if mechanics.braked:
+            friction += mechanics.holding_torque
+        moving = slope != 0.0
+        move = slope * h
+        for _ in range(count):
+            if moving:
+                if (goal - demand - move) * move <= 1e-12:
+                    demand = goal
+                    slope = move = 0.0
+                else:
+                    demand += move
+            error = demand - reference
+            along += _TRACKER * _TRACKER * error * h
+            reference += (along + 2.0 * _TRACKER * error) * h
+            wanted = along + _POSITION_GAIN * (reference - along * h - position - offset)
+            error = (fastest if wanted > fastest else -fastest if wanted < -fastest else wanted) - speed
+            torque = gain * error + integral
+            saturated = not -limit <= torque <= limit
+            if saturated:
+                torque = limit if torque > limit else -limit
+            else:
+                integral += integral_gain * error * h
+            net = torque + external
+            if gravity:
+                net += gravity * sin(position + phase)
+            if speed == 0.0:
+                if -friction <= net <= friction:
+                    continue
+                after = h * (net - (friction if net > 0.0 else -friction)) / inertia
+            else:
+                opposed = net - friction if speed > 0.0 else net + friction
+                after = (speed + h * opposed / inertia) / (1.0 + h * viscous / inertia)
+                if after * speed < 0.0 and -friction <= net <= friction:
+                    after = 0.0
+            position += 0.5 * (speed + after) * h
+            speed = after
+        self.demand, self.reference, self.reference_velocity = demand, reference, along
+        self._integral, self.torque, self.saturated = integral, torque, saturated
+        mechanics.position, mechanics.velocity = position, speed
+        return slope
 
     def follow(self, h: float) -> None:
         """Close the position loop on `reference` and `reference_velocity`."""

@@ -15,8 +15,6 @@ PRODUCT_CODE = 0x00161602
 REVISION = 0x00010000
 """The maker's true numbers are not known to this project; these stand in for them."""
 
-NEUTRAL = 0x003F
-"""The inputs with nothing pressed: the pull-ups of the joystick's six lines, and nothing on the others."""
 CHANNELS = 16
 
 _U8, _U16, _U32, _I32 = DataType.UNSIGNED8, DataType.UNSIGNED16, DataType.UNSIGNED32, DataType.INTEGER32
@@ -43,8 +41,8 @@ class DiewuIoBox:
         )
         self.counter_rate = chosen["counter_rate"] or 0.0
         self.emergencies: deque[Emergency] = deque()
-        self.objects = objects = _build_objects(self.identity)
-        self._inputs = NEUTRAL
+        self._inputs = int(chosen["inputs"] or 0)
+        self.objects = objects = _build_objects(self.identity, self._inputs)
         self._outputs_valid = False
         self._turned = 0.0
         self._input_entry = number(objects, 0x6000, 1)
@@ -110,7 +108,7 @@ class DiewuIoBox:
         self._counter_entry.value = int(value)
 
 
-def _build_objects(identity: Identity) -> ObjectDictionary:
+def _build_objects(identity: Identity, inputs: int) -> ObjectDictionary:
     objects = ObjectDictionary()
     text = DataType.VISIBLE_STRING
     objects.variable(0x1000, "Device type", _U32, 0x00030191)  # digital inputs and outputs, CiA 401
@@ -125,7 +123,7 @@ def _build_objects(identity: Identity) -> ObjectDictionary:
         Entry(0x1018, 4, "Serial number", _U32, identity.serial),
     ])  # fmt: skip
     tx, rx = Access.RO | Access.TXPDO, Access.RW | Access.RXPDO
-    objects.record(0x6000, "Digital inputs", [Entry(0x6000, 1, "Inputs 0 to 15", _U16, NEUTRAL, tx)])
+    objects.record(0x6000, "Digital inputs", [Entry(0x6000, 1, "Inputs 0 to 15", _U16, inputs, tx)])
     objects.record(0x6010, "Encoder counter", [Entry(0x6010, 1, "Counter", _I32, 0, tx)])
     objects.record(0x7000, "Digital outputs", [Entry(0x7000, 1, "Outputs 0 to 15", _U16, 0, rx)])
     objects.record(0x2000, "Forced inputs", [

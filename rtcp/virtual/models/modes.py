@@ -104,22 +104,7 @@ class CyclicPosition:
         limit = self._speed.value
         if counts != self._set_point or limit != self._limit:
             self._take(counts, limit, h * count)
-        slope = self._slope
-        fastest = self._fastest
-        if slope:
-            goal = self._goal
-            move = slope * h
-            for _ in range(count):
-                left = goal - axis.demand
-                if (left - move) * move <= 1e-12:
-                    axis.demand = goal
-                    self._slope = move = 0.0
-                else:
-                    axis.demand += move
-                axis.track(fastest, h)
-        else:
-            for _ in range(count):
-                axis.track(fastest, h)
+        self._slope = axis.glide(self._goal, self._slope, self._fastest, h, count)
         bits = _FOLLOWS
         if self._clamped or (self._held_back and axis.demand != self._goal):
             bits |= _LIMIT

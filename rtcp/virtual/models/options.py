@@ -19,6 +19,9 @@ class Option:
     whole: bool = False
 
 
+NEUTRAL = 0x003F
+"""The IO box's inputs with nothing pressed: the pull-ups of the joystick's six lines, and nothing on the others."""
+
 _SERIAL = Option(1, 0, 0xFFFFFFFF, "serial number (0x1018:4)", whole=True)
 
 DRIVE_OPTIONS: Mapping[str, Option] = MappingProxyType({
@@ -36,6 +39,7 @@ DRIVE_OPTIONS: Mapping[str, Option] = MappingProxyType({
 IO_BOX_OPTIONS: Mapping[str, Option] = MappingProxyType({
     "serial": _SERIAL,
     "counter_rate": Option(0.0, -1e6, 1e6, "AB edges a second that the encoder turns by itself"),
+    "inputs": Option(NEUTRAL, 0, 0xFFFF, "levels at the inputs at power-on, bit 0 is input 1", whole=True),
 })  # fmt: skip
 
 

@@ -37,6 +37,18 @@ def test_a_line_pulled_low_reads_the_joystick_s_value(line: int, value: int) -> 
     assert _inputs(box) == 63
 
 
+@pytest.mark.parametrize("levels", [0, 0x033F, 0xFFFF])
+def test_the_levels_at_power_on_are_an_option(levels: int) -> None:
+    box = DiewuIoBox(inputs=levels)
+    assert box.objects[0x6000, 1].value == box.inputs == _inputs(box) == levels
+
+
+@pytest.mark.parametrize("wrong", [-1, 0x10000, 1.5, True])
+def test_levels_that_are_no_sixteen_bits_are_refused(wrong: object) -> None:
+    with pytest.raises(ValueError, match="must be a whole number from 0 to 65535"):
+        DiewuIoBox(inputs=wrong)
+
+
 def test_all_sixteen_inputs_can_be_set() -> None:
     box = DiewuIoBox()
     box.set_input(15, True)

@@ -1,0 +1,73 @@
+"""Plans as rows of 20 doubles, written outside the cycle (`rtcp.motion.planning`) and read in it, row by row.
+
+A knot of a trajectory (`KNOT`), for n <= 6 joints:
+
+    column 0          t, s from the start of the motion; rising from knot to knot
+    columns 1 .. 6    position of each joint, rad          (those beyond n are 0)
+    columns 7 .. 12   velocity of each joint, rad/s
+    columns 13 .. 18  acceleration of each joint, rad/s^2
+    column 19         the piece that leads here: `CUBIC` (its accelerations are not looked at) or `QUINTIC`
+
+A straight piece of a path (`LINE`), from rest to rest, travelled by a fraction that goes from 0 to 1:
+
+    columns 0 .. 2    position of the tool at its start, m
+    columns 3 .. 6    orientation there, unit quaternion w, x, y, z
+    columns 7 .. 9    position at its end, m
+    columns 10 .. 13  orientation there
+    columns 14 .. 16  largest speed, acceleration and jerk of the fraction, 1/s, 1/s^2, 1/s^3
+    column 17         its length, m
+    column 18         how long it takes, s
+    column 19         `LINE`
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from math import isfinite
+from typing import NamedTuple
+
+COLUMNS = 20
+MOST_JOINTS = 6
+KIND = COLUMNS - 1
+CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
+LONGEST_S = 86_400.0
+"""Nothing takes longer: a time beyond it is no time."""
+
+
+class Wrong(IntEnum):
+    """Why a plan is not started."""
+
+    DAMAGED = 1
+    """A row is none; `index`: the row, `value`: what was found, `limit`: its column."""
+    START = 2
+    """It does not begin where the arm is commanded; `index`: the joint, `value`: planned, `limit`: commanded."""
+    START_SPEED = 3
+    """It begins at time 0 with another speed than the arm has; `index`: the joint."""
+    UNREACHABLE = 4
+    """The way to its beginning cannot be made; `index`: the joint or -1."""
+
+
+class Refused(NamedTuple):
+    """The answer of `start` where nothing was started; what was under way goes on."""
+
+    wrong: Wrong
+    index: int
+    value: float
+    limit: float
+
+
+def read_row(rows: memoryview[float], index: int) -> list[float]:
+    """Return the 20 numbers of a row."""
+    at = index * COLUMNS
+    return rows[at : at + COLUMNS].tolist()
+
+
+def first_not_finite(row: list[float]) -> int:
+    """Return the first column that is no finite number, or -1."""
+    # A sum is finite where all numbers are that a plan can hold.
+    if isfinite(sum(row)):
+        return -1
+    for column, number in enumerate(row):
+        if not isfinite(number):
+            return column
+    return COLUMNS

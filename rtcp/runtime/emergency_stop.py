@@ -1,0 +1,79 @@
+"""The emergency path: quick stop without a jump before it, torque off at standstill, slaves to PRE-OP.
+
+Source: the thesis' emergency stop, which stops the network and takes the slaves to PRE-OP (facts, "The drive"). Here
+the drives come to rest first, because a drive that loses its process data in motion lets the arm fall.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from rtcp.devices.cia402 import DriveGoal
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.codes import Code
+from rtcp.runtime.service import Service
+
+_STAND_S = 2.0
+"""A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
+_OFF_S = 1.0
+_FIRST_CYCLES = 10
+"""What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
+
+
+class _Step(Enum):
+    QUICK_STOP = 1
+    TORQUE_OFF = 2
+    PARKED = 3
+
+
+class EmergencyStop:
+    """Led once a cycle while the machine is in the state emergency stop.
+
+    Args:
+        arm: the joints.
+        service: takes the slaves to PRE-OP.
+        blackboard: where it is told that they are there.
+        period_s: the cycle, s.
+    """
+
+    def __init__(self, arm: Arm, service: Service, blackboard: Blackboard, period_s: float) -> None:
+        self._arm = arm
+        self._service = service
+        self._blackboard = blackboard
+        self._stand_cycles = round(_STAND_S / period_s)
+        self._off_cycles = round(_OFF_S / period_s)
+        self._step = _Step.QUICK_STOP
+        self._cycles = 0
+
+    def begin(self) -> None:
+        """Begin with the quick stop, in the cycle that found the reason for it."""
+        self._step = _Step.QUICK_STOP
+        self._cycles = 0
+        self._arm.hold_target()
+        self._arm.lead(DriveGoal.QUICK_STOPPED)
+
+    def lead(self, good: bool) -> None:
+        """Do the cycle's part; `good`: the drives have answered."""
+        arm = self._arm
+        self._cycles += 1
+        if self._step is _Step.QUICK_STOP:
+            arm.lead(DriveGoal.QUICK_STOPPED)
+            stands = good and self._cycles > _FIRST_CYCLES and arm.first_moving() < 0
+            if stands or self._cycles > self._stand_cycles:
+                self._next(_Step.TORQUE_OFF)
+        elif self._step is _Step.TORQUE_OFF:
+            arm.lead(DriveGoal.DISABLED)
+            off = good and self._cycles > _FIRST_CYCLES and arm.first_with_torque() < 0
+            if off or self._cycles > self._off_cycles:
+                self._next(_Step.PARKED)
+                self._service.park()
+                self._blackboard.event(Code.PARKED)
+        else:
+            arm.lead(DriveGoal.DISABLED)
+        if good:
+            arm.follow()
+
+    def _next(self, step: _Step) -> None:
+        self._step = step
+        self._cycles = 0

@@ -1,0 +1,54 @@
+"""The modes of motion and which of them is active."""
+
+from __future__ import annotations
+
+from rtcp.config.model import ArmConfig
+from rtcp.motion.envelope import SetPointGuard
+from rtcp.motion.generator import JointGenerator
+from rtcp.motion.limits import Limits
+from rtcp.motion.modes import DriveMode
+from rtcp.motion.state import Mode, MotionState, Phase
+from rtcp.runtime.codes import MotionMode
+
+DRIVE_MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
+
+
+class Motions:
+    """All modes of an arm.
+
+    Args:
+        config: the arm.
+        limits: its limits as they are now.
+        guards: what the modes ask whether they would be cut.
+        period_s: the cycle, s.
+    """
+
+    def __init__(self, config: ArmConfig, limits: Limits, guards: SetPointGuard, period_s: float) -> None:
+        self.generator = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self.active: Mode = self.generator
+        self.mode = MotionMode[config.motion.upper()]
+        """What the arm takes commands for."""
+        self.drive_mode = DRIVE_MODES[config.mode]
+        """What moves, lines and jogs reach the drives in."""
+        self.has_geometry = config.arm is not None
+
+    def select(self, mode: MotionMode) -> None:
+        """Take commands for `mode` from now on; at standstill."""
+        self.mode = mode
+        self.rest()
+
+    def drive_mode_of(self, mode: MotionMode) -> DriveMode:
+        """Return the drives' mode that a motion mode needs."""
+        if mode is MotionMode.VELOCITY:
+            return DriveMode.CSV
+        return DriveMode.CST if mode is MotionMode.TORQUE else self.drive_mode
+
+    def rest(self) -> None:
+        """Hold where the set-points are; at standstill."""
+        self.generator.hold()
+        self.active = self.generator
+
+    def stop(self, state: MotionState) -> None:
+        """Let what moves come to rest."""
+        if self.active.phase is Phase.MOVE:
+            self.active.stop(state)

@@ -1,0 +1,53 @@
+"""Names of joints, slaves and boxes as sentences need them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rtcp.config.model import ArmConfig
+
+
+class Matter(NamedTuple):
+    """What a refusal or an event is about."""
+
+    axis: int
+    value: float
+    limit: float
+
+
+def number(value: float) -> str:
+    """Return a number as sentences show it."""
+    return f"{value:.6g}"
+
+
+class Naming:
+    """Puts numbers of joints and boxes into words.
+
+    Args:
+        config: names the joints and the file in which limits stand.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        self.config = config
+
+    @property
+    def file(self) -> str:
+        """The configuration's file, without its folder."""
+        return self.config.source.name or "the configuration"
+
+    def joint(self, axis: int) -> str:
+        """Return the name of a joint."""
+        joints = self.config.joints
+        return joints[axis].name if 0 <= axis < len(joints) else f"joint {axis + 1}"
+
+    def slave(self, position: int) -> str:
+        """Return the name of the slave at `position`, from 1."""
+        slaves = self.config.slaves
+        return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
+
+    def box(self, which: int) -> str:
+        """Return what the box number `which` is called, -1 for the one that the tool stays in, and its key."""
+        boxes = self.config.cartesian.keep_out
+        if 0 <= which < len(boxes):
+            return f"the keep-out box {boxes[which].name} (cartesian.keep_out[{which}] in {self.file})"
+        return f"the box that the tool stays in (cartesian.box in {self.file})"
