@@ -105,9 +105,9 @@ _RESET_HOLD = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
-_CSP, _CSV, _CST = 8, 9, 10
+CSP, _CSV, _CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
-_WITH_SPEED = (_CSP, _CSV)
+_WITH_SPEED = (CSP, _CSV)
 _ENABLED = DriveState.OPERATION_ENABLED
 
 
@@ -123,9 +123,9 @@ class Cia402Drive:
 
     __slots__ = (
         "_error_slot", "_fields", "_in", "_in_factors", "_limits", "_out", "_pack", "_reset_calls", "_scales",
-        "_unpack", "_was_enabled", "controlword", "error_code", "input_bytes", "mode", "mode_display", "name",
+        "_unpack", "_was_enabled", "_zero", "controlword", "error_code", "input_bytes", "mode", "mode_display", "name",
         "output_bytes", "position", "speed_limit", "state", "statusword", "target_position", "target_torque",
-        "target_velocity", "torque", "velocity", "zero",
+        "target_velocity", "torque", "velocity",
     )  # fmt: skip
 
     def __init__(self, slave: SlaveConfig, speed_limit: float = 0.0, zero: float = 0.0) -> None:
@@ -160,12 +160,24 @@ class Cia402Drive:
         self.statusword = self.mode_display = self.error_code = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.controlword = DISABLE_VOLTAGE
-        self.mode = _CSP
+        self.mode = CSP
         self.speed_limit = speed_limit
-        self.zero = zero
+        self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._was_enabled = False
         self._reset_calls = 0
+
+    @property
+    def zero(self) -> float:
+        """What the drive shows where the joint is at 0, rad. Set anew, what is shown moves, what is sent does not."""
+        return self._zero
+
+    @zero.setter
+    def zero(self, zero: float) -> None:
+        moved = self._zero - zero
+        self._zero = zero
+        self.position += moved
+        self.target_position += moved
 
     def decode(self, data: bytes) -> None:
         """Take the inputs of the cycle (`input_bytes` long). Until the drive is enabled the target follows them."""
@@ -173,7 +185,7 @@ class Cia402Drive:
         status, position, velocity, torque, mode = self._in
         by_position, by_velocity, by_torque = self._in_factors
         self.statusword = word = int(values[status])
-        self.position = values[position] * by_position - self.zero
+        self.position = values[position] * by_position - self._zero
         self.velocity = values[velocity] * by_velocity
         self.torque = values[torque] * by_torque
         self.mode_display = int(values[mode])
@@ -208,13 +220,6 @@ class Cia402Drive:
         self.target_position = self.position
         self.target_velocity = self.target_torque = 0.0
 
-    def set_zero(self, zero: float) -> None:
-        """Count from another zero (rad): what is sent stays the same, what is shown moves. Not while it has torque."""
-        moved = self.zero - zero
-        self.zero = zero
-        self.position += moved
-        self.target_position += moved
-
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
@@ -228,13 +233,13 @@ class Cia402Drive:
         by_position, by_velocity, by_torque = self._scales
         fields[control] = self.controlword
         fields[mode] = commanded = self.mode
-        fields[position] = self._counts((self.target_position + self.zero) * by_position, 0, fields[position])
+        fields[position] = self._counts((self.target_position + self._zero) * by_position, 0, fields[position])
         speed = effort = 0
         if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == _CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
             elif commanded == self.mode_display and commanded in _WITH_SPEED:
-                wanted = self.speed_limit if commanded == _CSP else self.target_velocity
+                wanted = self.speed_limit if commanded == CSP else self.target_velocity
                 speed = self._counts(wanted * by_velocity, 1, fields[velocity])
         fields[velocity] = speed
         fields[torque] = effort

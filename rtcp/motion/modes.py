@@ -98,6 +98,19 @@ class TorqueLaw:
             bound = self._bound[i]
             self._integral[i] = min(max(drive.torque, -bound), bound)
 
+    def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write `torque` (Nm) itself, with nothing about a set-point; `position` (rad) is where the arm is.
+
+        What `update` adds up begins there: it takes over without a step.
+        """
+        integral = self._integral
+        for i, drive in enumerate(drives):
+            bound, wanted = self._bound[i], torque[i]
+            integral[i] = bounded = bound if wanted > bound else -bound if wanted < -bound else wanted
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = bounded
+
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target torques (Nm)."""
         integral = self._integral

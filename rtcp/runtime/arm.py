@@ -45,10 +45,11 @@ class Arm:
         self.guards = SetPointGuard(config, self.limits, self.period_s)
         self.guard = Guard(self.limits, self.period_s)
         self.motions = Motions(config, self.limits, self.guards, self.period_s)
+        self._torque_law = TorqueLaw(joints, self.period_s)
         self._laws: dict[DriveMode, ModeLaw] = {
             DriveMode.CSP: PositionLaw(),
             DriveMode.CSV: VelocityLaw(joints),
-            DriveMode.CST: TorqueLaw(joints, self.period_s),
+            DriveMode.CST: self._torque_law,
         }
         self.set_mode(MODES[config.mode])
 
@@ -103,7 +104,10 @@ class Arm:
         state, drives, mode = self.state, self.drives, self.motions.active
         target = mode.update(state, self.period_s)
         verdict = self.guards.apply(state, target, mode.clamps)
-        self._law.update(state.position, state.velocity, drives)
+        if mode is self.motions.torque and self.motions.torque.direct:
+            self._torque_law.pass_on(state.position, target.torque, drives)
+        else:
+            self._law.update(state.position, state.velocity, drives)
         self.guard.check(drives)
         return verdict
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.homing import Homing, HomingPhase
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.modes import DriveMode
 from rtcp.motion.state import Phase, Reason
@@ -30,6 +31,11 @@ _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
 _ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
 """Reasons that are no limit: the arm has stopped and takes commands."""
+_HOMING_ENDS = {
+    HomingPhase.HOMED: Code.HOMED,
+    HomingPhase.FAILED: Code.HOMING_FAILED,
+    HomingPhase.STOPPED: Code.STOPPED,
+}
 _PRESSABLE = WITH_TORQUE | {State.READY, State.FAULT, State.RESETTING}
 """States in which the emergency stop's input counts; on the way to OP the inputs are not yet valid."""
 
@@ -62,6 +68,8 @@ class Behaviour:
         self._service = service
         self._discipline = discipline
         self._watch = Watch(config, arm.limits)
+        self.homing = Homing(period_s)
+        self._homed_axis = 0
         self._emergency = EmergencyStop(arm, service, blackboard, period_s)
         self._lost_limit = config.bus.lost_cycles
         self._enable_cycles = round(config.enable_timeout_s / period_s)
@@ -170,6 +178,13 @@ class Behaviour:
         self._enter(State.HOLDING)
         self.switching = True
 
+    def home(self, axis: int, lease: int) -> None:
+        """Let the drive of a joint home by itself; the arm holds, in CSP."""
+        self.lease = lease
+        self._homed_axis = axis
+        self.homing.start(self._arm.drives[axis])
+        self.on(Event.HOME)
+
     def release(self) -> None:
         """Go on after a stop by a limit."""
         self.limit = Reason.NONE
@@ -180,6 +195,7 @@ class Behaviour:
 
     def _fail(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         self.fault = code
+        self.homing.abandon()
         self.torque_off = False
         self.all_enabled = False
         self._arm.hold_target()
@@ -198,6 +214,7 @@ class Behaviour:
         if self.state is State.EMERGENCY_STOP:
             return
         self.fault = code
+        self.homing.abandon()
         self.all_enabled = False
         self._emergency.begin()
         self._blackboard.event(code, axis, value, limit)
@@ -368,10 +385,53 @@ class Behaviour:
         self._track(good)
 
     def _homing(self, good: bool) -> None:
-        raise NotImplementedError
+        arm, homing, axis = self._arm, self.homing, self._homed_axis
+        if self._bus_fails(good) or not good:
+            return
+        left = arm.first_not_enabled()
+        if left >= 0:
+            self._fail_drive(Code.DRIVE_LEFT_ENABLED, left)
+            return
+        if not self._operator.permitted or self._lease_ended():
+            homing.stop()
+        self._step_homing()
+        found = self._watch.look(arm.state)
+        if found is not None:
+            self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        elif homing.phase is HomingPhase.STUCK:
+            self._fail_mode(axis)
+        elif homing.phase is HomingPhase.HOMED and arm.first_outside() >= 0:
+            self._fail(Code.LEFT_RANGE, axis, arm.drives[axis].position)
+        elif homing.ended:
+            self._blackboard.event(_HOMING_ENDS[homing.phase], axis, self._homing_figure())
+            self.on(Event.HOMED if homing.phase is HomingPhase.HOMED else Event.STOPPED)
+
+    def _homing_figure(self) -> float:
+        homing = self.homing
+        return homing.position if homing.phase is HomingPhase.HOMED else float(homing.shown)
+
+    def _step_homing(self) -> None:
+        """Let the drive that homes go on; its set-point is where it says it is, the other joints' stand."""
+        arm, axis = self._arm, self._homed_axis
+        self.homing.step()
+        arm.state.position[axis] = self.homing.position
+        arm.guard.latch(axis, self.homing.position)
+        arm.guards.latch(arm.state)
+
+    def _homing_ends(self, good: bool) -> bool:
+        """Bring a homing to its end before the torque goes; return whether it is still under way."""
+        if self.homing.phase is HomingPhase.IDLE or self.homing.ended or self._arm.first_not_enabled() >= 0:
+            return False
+        self.homing.stop()
+        if good:
+            self._step_homing()
+        self._since = self.cycle
+        return not self.homing.ended
 
     def _disabling(self, good: bool) -> None:
         arm = self._arm
+        if self._homing_ends(good):
+            return
         if not arm.still or arm.guards.stopping:
             # The time for disabling begins when the arm stands.
             self._since = self.cycle
@@ -432,7 +492,7 @@ class Behaviour:
         if self._waited > self._closing_cycles:
             self.done = True
             return
-        if not good:
+        if not good or self._homing_ends(good):
             return
         if arm.motions.active.phase is Phase.MOVE:
             arm.motions.stop(arm.state)

@@ -32,7 +32,7 @@ class Command(IntEnum):
     VELOCITY = 14
     """[joint speeds .., at -1: for how long it counts, s]"""
     TORQUE = 15
-    """[joint torques .., at -1: for how long it counts, s]"""
+    """[joint torques .., at -3 and -2: the parts, 0 to 1, of the joints' stiffness and damping, at -1: for how long, s]"""
     LIMITS = 16
     """[slot, rows]"""
     GRIPPER = 17
@@ -112,6 +112,12 @@ class Refusal(IntEnum):
     LIMITS_NARROW = 35
     """Beyond what the configuration allows; axis, value found, limit allowed."""
     HAS_TORQUE = 36
+    PLAN_SPEED = 37
+    """The plan begins at time 0 with another speed than the arm has."""
+    IMPEDANCE = 39
+    HOME_MODE = 40
+    PLAN_LEAD = 38
+    """No way leads from where the arm is to the plan's first point."""
 
 
 class Code(IntEnum):

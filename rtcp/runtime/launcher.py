@@ -22,6 +22,7 @@ from rtcp.runtime.client import LONGEST_SOCKET_PATH, ControlError
 from rtcp.runtime.paths import RuntimeDirectoryError, control_socket, prepare, runtime_directory, stopping_mark
 from rtcp.runtime.running import Report, Running, StartError, ask_gateway, clear, undisturbed
 from rtcp.runtime.session import Processes, Session, is_ours, read_processes, read_session
+from rtcp.runtime.zero import read_zeros
 
 CheckSegment = Callable[[Path], object]
 """Raises ConfigError where no segment can be made of the file. Which models there are is known to `rtcp.virtual`."""
@@ -119,7 +120,7 @@ def _configured(options: StartOptions) -> ArmConfig:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, interface=options.bus))
     if options.cycle_us is not None:
         config = with_period(config, options.cycle_us)
-    return widen(config)
+    return widen(dataclasses.replace(config, zero_offsets=read_zeros(config)))
 
 
 def _check_bus(config: ArmConfig, check_segment: CheckSegment) -> None:

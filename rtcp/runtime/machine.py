@@ -154,7 +154,7 @@ TABLE: dict[State, Row] = {
         "homing",
         "one drive homes by itself (mode 6), the others hold",
         _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.STOP},
-        _TORQUE | {Event.HOMED: State.HOLDING, Event.STOP: State.HOLDING},
+        _TORQUE | {Event.HOMED: State.HOLDING, Event.STOPPED: State.HOLDING},
     ),
     State.DISABLING: Row(
         "disabling",

@@ -6,7 +6,11 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 from rtcp.motion.generator import LONGEST_S
-from rtcp.motion.state import Mode
+from rtcp.motion.line import LineMode
+from rtcp.motion.modes import DriveMode
+from rtcp.motion.rows import Wrong
+from rtcp.motion.state import Mode, Phase
+from rtcp.motion.trajectory import TrajectoryMode
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
@@ -16,10 +20,20 @@ from rtcp.runtime.machine import State
 from rtcp.runtime.operator import Operator
 from rtcp.runtime.verdict import DONE, Verdict
 
+MOST_PIECES = 256
+"""Straight pieces of a plan: all are looked at in the cycle in which it begins."""
 AUTOMATIC = (MotionMode.JOINT, MotionMode.CARTESIAN)
 """Modes that take moves, trajectories, lines, streams and jogs alike."""
 LONGEST_HOLD_S = 1.0
 """A speed, a torque or a jog counts for so long at most; then it has to be said again."""
+
+
+_PLAN_REFUSALS = {
+    Wrong.DAMAGED: Refusal.BAD_PLAN,
+    Wrong.START: Refusal.PLAN_START,
+    Wrong.START_SPEED: Refusal.PLAN_SPEED,
+    Wrong.UNREACHABLE: Refusal.PLAN_LEAD,
+}
 
 
 class MotionOrders:
@@ -46,6 +60,7 @@ class MotionOrders:
             Command.JOG: self._jog,
             Command.VELOCITY: self._velocity,
             Command.TORQUE: self._torque,
+            Command.HOME: self._home,
         }
 
     def _hindered(self, *allowed: MotionMode) -> Verdict | None:
@@ -95,28 +110,99 @@ class MotionOrders:
             return Refusal.NO_PLAN, -1, speed, LONGEST_S
         return self._begin(lease, generator)
 
-    def _plan(self, numbers: Sequence[float]) -> tuple[int, int] | Verdict:
+    def _rows(self, numbers: Sequence[float], most: int) -> tuple[int, int] | None:
         slot, count = numbers[0], numbers[1]
-        if slot not in range(PLANS):
-            return Refusal.BAD_PLAN, -1, slot, float(PLANS - 1)
-        if count not in range(1, PLAN_ROWS + 1):
-            return Refusal.BAD_PLAN, -1, count, float(PLAN_ROWS)
+        if slot not in range(PLANS) or count not in range(1, most + 1):
+            return None
         return int(slot), int(count)
 
+    def _carry_out(self, lease: int, numbers: Sequence[float], mode: TrajectoryMode | LineMode, most: int) -> Verdict:
+        if hindrance := self._hindered(*AUTOMATIC):
+            return hindrance
+        rows = self._rows(numbers, most)
+        if rows is None:
+            return Refusal.BAD_PLAN, -1, numbers[1], float(most)
+        slot, count = rows
+        refused = mode.start(self._arm.state, self._blackboard.plan(slot), count)
+        if refused is not None:
+            return _PLAN_REFUSALS[refused.wrong], refused.index, refused.value, refused.limit
+        self._blackboard.use_plan(slot)
+        return self._begin(lease, mode)
+
     def _trajectory(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        return self._carry_out(lease, numbers, self._arm.motions.trajectory, PLAN_ROWS)
 
     def _line(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        line = self._arm.motions.line
+        return (Refusal.NO_GEOMETRY,) if line is None else self._carry_out(lease, numbers, line, MOST_PIECES)
+
+    def _goes_on(self, mode: Mode) -> bool:
+        return self._arm.motions.active is mode and mode.phase is Phase.MOVE and self._behaviour.state is State.MOVING
 
     def _stream(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        if hindrance := self._hindered(*AUTOMATIC):
+            return hindrance
+        limits, arm, stream = self._arm.limits, self._arm, self._arm.motions.stream
+        if wrong := self._in_range(numbers, limits.low, limits.high):
+            return wrong
+        if not isfinite(numbers[-1]):
+            return Refusal.NOT_A_NUMBER, -1, numbers[-1]
+        if not self._goes_on(stream):
+            stream.start(arm.state)
+        if not stream.feed(self._numbers, numbers[-1], self._behaviour.now_ns):
+            return Refusal.STREAM_DROPPED, -1, stream.late_s
+        return self._begin(lease, stream)
 
     def _jog(self, lease: int, numbers: Sequence[float]) -> Verdict:
         raise NotImplementedError
 
     def _velocity(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        if hindrance := self._hindered(MotionMode.VELOCITY):
+            return hindrance
+        if wrong := self._within(numbers, self._arm.limits.velocity, Refusal.JOG_SPEED):
+            return wrong
+        velocity = self._arm.motions.velocity
+        if not self._goes_on(velocity):
+            velocity.start(self._arm.state)
+        velocity.command(self._numbers, numbers[-1], self._behaviour.now_ns)
+        return self._begin(lease, velocity)
+
+    def _within(self, numbers: Sequence[float], bounds: Sequence[float], refusal: Refusal) -> Verdict | None:
+        """Copy the joints' numbers and return what is wrong with them, or with how long they are to count, or None."""
+        hold_s = numbers[-1]
+        if not 0.0 < hold_s <= LONGEST_HOLD_S:
+            return Refusal.HOLD_TIME, -1, hold_s, LONGEST_HOLD_S
+        for axis in range(len(self._numbers)):
+            wanted, bound = numbers[axis], bounds[axis]
+            if not isfinite(wanted):
+                return Refusal.NOT_A_NUMBER, axis, wanted
+            if not -bound <= wanted <= bound:
+                return refusal, axis, wanted, bound
+            self._numbers[axis] = wanted
+        return None
 
     def _torque(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        if hindrance := self._hindered(MotionMode.TORQUE):
+            return hindrance
+        if wrong := self._within(numbers, self._arm.limits.torque, Refusal.TORQUE_LIMIT):
+            return wrong
+        stiffness, damping = numbers[-3], numbers[-2]
+        for share in (stiffness, damping):
+            if not 0.0 <= share <= 1.0:
+                return Refusal.IMPEDANCE, -1, share
+        torque = self._arm.motions.torque
+        if not self._goes_on(torque):
+            torque.start(self._arm.state)
+        torque.command(self._numbers, numbers[-1], self._behaviour.now_ns, stiffness, damping)
+        return self._begin(lease, torque)
+
+    def _home(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        arm, axis = self._arm, numbers[0]
+        if axis not in range(len(arm.drives)):
+            return Refusal.AXIS, -1, axis, float(len(arm.drives))
+        if not self._operator.permitted:
+            return (Refusal.NOT_PERMITTED,)
+        if arm.mode is not DriveMode.CSP:
+            return Refusal.HOME_MODE, -1, float(arm.mode)
+        self._behaviour.home(int(axis), lease)
+        return DONE

@@ -46,9 +46,24 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             + (f" in row {m.axis}" if m.axis >= 0 else f", at most {number(m.limit)} is allowed")
         ),
         Refusal.PLAN_START: lambda m: (
-            f"{names.joint(m.axis)}: the plan begins at {number(m.value)} rad, the arm is commanded to "
-            f"{number(m.limit)} rad: move there first (`rtcp run --approach`)"
+            (
+                f"{names.joint(m.axis)}: the plan begins at {number(m.value)} rad, the arm is commanded to "
+                f"{number(m.limit)} rad"
+                if m.axis >= 0
+                else f"the path begins {number(m.value)} (m or rad) away from where the tool is"
+            )
+            + ": move there first (`rtcp run --approach`)"
         ),
+        Refusal.PLAN_SPEED: lambda m: (
+            f"{names.joint(m.axis)}: the plan begins at time 0 with {number(m.value)} rad/s, the arm is commanded "
+            f"{number(m.limit)} rad/s: give its first point a later time"
+        ),
+        Refusal.IMPEDANCE: lambda m: (
+            f"{number(m.value)} of a joint's stiffness or damping is not allowed: a part from 0 to 1 of cst_stiffness "
+            f"and cst_damping (joints[] in {file})"
+        ),
+        Refusal.HOME_MODE: lambda _: "a drive is homed while the drives are in csp: `rtcp mode csp` first",
+        Refusal.PLAN_LEAD: lambda _: "no way was found from where the arm is to the plan's first point",
         Refusal.TORQUE_LIMIT: lambda m: (
             f"{names.joint(m.axis)}: torque {number(m.value)} Nm is beyond its limit of {number(m.limit)} Nm "
             f"(joints[{m.axis}].torque in {file})"

@@ -6,8 +6,13 @@ from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
 from rtcp.motion.generator import JointGenerator
 from rtcp.motion.limits import Limits
+from rtcp.motion.line import LineMode
 from rtcp.motion.modes import DriveMode
 from rtcp.motion.state import Mode, MotionState, Phase
+from rtcp.motion.stream import StreamMode
+from rtcp.motion.torque import TorqueMode
+from rtcp.motion.trajectory import TrajectoryMode
+from rtcp.motion.velocity import VelocityMode
 from rtcp.runtime.codes import MotionMode
 
 DRIVE_MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
@@ -25,6 +30,11 @@ class Motions:
 
     def __init__(self, config: ArmConfig, limits: Limits, guards: SetPointGuard, period_s: float) -> None:
         self.generator = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self.trajectory = TrajectoryMode(limits, period_s)
+        self.stream = StreamMode(limits, period_s)
+        self.velocity = VelocityMode(limits, period_s)
+        self.torque = TorqueMode(config.joints, limits, period_s, config.arm)
+        self.line = None if config.arm is None else LineMode(config.arm, limits, period_s)
         self.active: Mode = self.generator
         self.mode = MotionMode[config.motion.upper()]
         """What the arm takes commands for."""

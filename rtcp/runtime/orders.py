@@ -181,8 +181,10 @@ class Orders:
             self._arm.set_mode(mode)
 
     def _stop(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if self._behaviour.state in (State.MOVING, State.HOMING):
+        if self._behaviour.state is State.MOVING:
             self._behaviour.stop_motion()
+        elif self._behaviour.state is State.HOMING:
+            self._behaviour.homing.stop()
         return DONE
 
     def _output(self, lease: int, numbers: Sequence[float]) -> Verdict:

@@ -1,7 +1,7 @@
 """The zero offsets of the axes in a file: read and checked whole at the start, replaced as a whole or not at all.
 
-An offset is what an axis' drive shows, rad, where the axis is at 0. Absolute encoders keep it for ever: it is found once
-and stored, not driven to at each start.
+An offset is what an axis' drive shows, rad, where the axis is at 0. Absolute encoders keep it for ever: it is found
+once and stored, not driven to at each start.
 """
 
 from __future__ import annotations
@@ -104,6 +104,7 @@ def _replace(path: Path, directory: int, text: str) -> None:
     finally:
         os.close(descriptor)
     os.replace(new, path)
+    # Else a loss of power could bring the old name back.
     os.fsync(directory)
 
 
@@ -111,7 +112,7 @@ def _text(config: ArmConfig, offsets: list[float]) -> str:
     by_name = {axis.name: offset for axis, offset in zip(config.axes, offsets, strict=True)}
     lines = [f"  {_quoted(name)}: {offset!r}" for name, offset in by_name.items()]
     return "\n".join([
-        "# Zero offsets, rad: what each drive shows where its axis is at 0. Written by rtcp; do not edit while it runs.",
+        "# Zero offsets, rad: what each drive shows where its axis is at 0. Written by rtcp, checked at its start.",
         f"arm: {_quoted(config.name)}",
         f"check: {_check(config.name, by_name)}",
         "offsets:",
@@ -133,12 +134,11 @@ def _check(arm: str, offsets: Mapping[str, float]) -> int:
 
 def _findings(document: Document, config: ArmConfig) -> list[Finding]:
     data = document.data if isinstance(document.data, dict) else {}
+    keys = ", ".join(_KEYS)
     findings: list[Finding] = [
-        ((), f"the key {key} is missing: the file is damaged") for key in _KEYS if key not in data
+        ((), f"the key {key} is missing; there must be {keys}") for key in _KEYS if key not in data
     ]
-    findings += [
-        ((key,), f"this key is not known here; allowed are {', '.join(_KEYS)}") for key in data.keys() - {*_KEYS}
-    ]
+    findings += [((key,), f"this key is not known here; allowed are {keys}") for key in data if key not in _KEYS]
     if data.get("arm", config.name) != config.name:
         findings.append((("arm",), f'found {data["arm"]!r}, allowed is "{config.name}", the name of this arm'))
     offsets = data.get("offsets", {})

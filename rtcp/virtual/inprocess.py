@@ -19,6 +19,7 @@ from rtcp.virtual.device import Device
 from rtcp.virtual.inprocess_data import InProcessData
 from rtcp.virtual.inprocess_slave import InProcessError, InProcessSlave, identity_faults
 from rtcp.virtual.registers import State
+from rtcp.virtual.statemachine import AlStatusCode
 
 _EPOCH_NS = 1_000_000_000
 """The reference clock shows at least this at the start of time."""
@@ -170,10 +171,10 @@ class InProcessBus:
             self._data.pass_time(now_ns)
         self.now_ns = max(now_ns, self.now_ns)
 
-    def drop(self, position: int, state: State, code: int) -> None:
+    def drop(self, position: int, state: int, code: int) -> None:
         """Let a slave leave its state by itself, with an AL status code."""
         slave = self._slave(position)
-        slave.fall(state, type(slave.code)(code))
+        slave.fall(State(state), AlStatusCode(code))
         self._changed()
 
     def _changed(self) -> None:

@@ -1,4 +1,4 @@
-"""The loop on the in-process bus: the real parts of `rtcp.runtime`, commanded through a real blackboard, in simulated time.
+"""The loop on the in-process bus: the real parts of `rtcp.runtime` behind a real blackboard, in simulated time.
 
 Everything that happens follows from the configuration, the seed and the calls, to the bit.
 """
@@ -52,7 +52,7 @@ class Frame(NamedTuple):
 
 
 class InlineService(Service):
-    """Does in turns of the simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
+    """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
 
     def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:
         positions = [slot + 1 for slot, _ in drives_of(config)]

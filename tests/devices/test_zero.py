@@ -61,7 +61,7 @@ def test_another_zero_moves_what_is_shown_and_not_what_is_sent(before, after, co
     wire = Wire(Cia402Drive(slave(), zero=before))
     wire.says(SWITCHED_ON, counts)
     wire.drive.advance(DriveGoal.ENABLED)
-    wire.drive.set_zero(after)
+    wire.drive.zero = after
     assert wire.hears()[1] == counts
     assert wire.drive.position == pytest.approx(counts * 1e-4 - after, abs=1e-9)
     shown = wire.drive.position

@@ -667,7 +667,7 @@ def test_ready_is_told_when_all_slaves_are_in_op_and_not_before(bench: Bench) ->
     assert (bench.state, bench.codes) == (State.STARTING, [Code.DC_LOCKED])
     bench.service.all_op = True
     bench.cycle()
-    assert (bench.state, bench.codes) == (State.READY, [Code.READY])
+    assert (bench.state, bench.codes) == (State.READY, [Code.DC_LOCKED, Code.READY])
 
 
 # -- enabling -------------------------------------------------------------------------------------------------------

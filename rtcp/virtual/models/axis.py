@@ -83,7 +83,7 @@ class Axis:
         self.run(fastest if velocity > fastest else -fastest if velocity < -fastest else velocity, h)
 
     def glide(self, goal: float, slope: float, fastest: float, h: float, count: int) -> float:
-        """Move `demand` on by `slope` (rad/s) until it is at `goal`, and `track` it; `count` times. Return the slope left.
+        """Move `demand` on by `slope` (rad/s) until it is at `goal`, `track` it; `count` times. Return the slope left.
 
         What a drive in CSP does all the time: `track`, `run` and `Mechanics.advance`, to the bit, without the calls.
         """

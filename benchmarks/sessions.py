@@ -1,0 +1,66 @@
+"""Random sessions on the in-process bus, judged by the bytes that went over it.
+
+`python benchmarks/sessions.py --sessions 10000 --seed 1` plays the sessions of seeds 1 to 10000 on all CPUs, prints
+what came of them and exits with 1 on a failure. A failing seed is played again by `--seed N --sessions 1`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.sessions.play import Outcome, play
+
+
+def table(title: str, counts: Counter[str]) -> None:
+    print(f"{title}: " + ", ".join(f"{name} {count}" for name, count in counts.most_common()))
+
+
+def show(outcome: Outcome, wall_s: float) -> None:
+    print(f"sessions            {outcome.sessions}")
+    print(f"cycles              {outcome.cycles}, of which with a drive enabled {outcome.judged}")
+    print(f"simulated           {outcome.simulated_s:.0f} s in {wall_s:.0f} s")
+    table("commands taken     ", outcome.taken)
+    table("commands refused   ", outcome.refused)
+    table("happenings         ", outcome.happenings)
+    table("cycles in states   ", outcome.states)
+    print(f"largest step        {outcome.step:.4f} of what is allowed")
+    print(f"largest acceleration {outcome.acceleration:.4f} of what is allowed")
+    print(f"failures            {len(outcome.failures)}")
+    for seed, sentences in outcome.failures[:10]:
+        print(f"  seed {seed}:")
+        for sentence in sentences:
+            print(f"    {sentence}")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sessions", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=1, help="of the first session; the others follow")
+    parser.add_argument("--processes", type=int, default=os.cpu_count())
+    parser.add_argument("--stop", type=int, default=10, help="end after so many failures")
+    given = parser.parse_args()
+    total = Outcome()
+    began = shown = time.monotonic()
+    seeds = range(given.seed, given.seed + given.sessions)
+    with multiprocessing.Pool(given.processes) as pool:
+        for outcome in pool.imap_unordered(play, seeds, chunksize=4):
+            total.add(outcome)
+            if time.monotonic() - shown > 10:
+                shown = time.monotonic()
+                print(f"... {total.sessions} sessions, {len(total.failures)} failures", file=sys.stderr, flush=True)
+            if len(total.failures) >= given.stop:
+                break
+    show(total, time.monotonic() - began)
+    return 1 if total.failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,215 @@
+"""Joint targets from outside, at any rate: followed smoothly under the limits, and to rest when they cease."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import isfinite, sqrt
+from typing import TYPE_CHECKING
+
+from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
+
+from rtcp.motion.generator import JointGenerator
+from rtcp.motion.state import MotionState, Phase, Reason, Target
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Limits
+
+TIMEOUT_S = 0.2
+"""A stream that is silent for so long has ended."""
+_STRETCH = 1.25
+"""A target is reached so many of the sender's intervals after it came: what comes a little late finds the arm moving."""
+_INSIDE = 1.0 - 1e-9
+_SHARE = 0.2
+"""How much a new interval counts in the mean."""
+_DRIFT = 1e-4
+"""The sender's clock may run so much slower than ours, as a fraction."""
+
+
+class StreamMode:
+    """The mode `stream`.
+
+    Args:
+        limits: of the joints; read in every cycle.
+        period_s: the cycle, s.
+        timeout_s: so long after the last target the arm comes to rest.
+    """
+
+    def __init__(self, limits: Limits, period_s: float, timeout_s: float = TIMEOUT_S) -> None:
+        n = len(limits.velocity)
+        self._limits = limits
+        self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self._brakes = False
+        self._otg = Ruckig(n, period_s)
+        self._way, self._output = InputParameter(n), OutputParameter(n)
+        self._target = Target(n)
+        self._zero = [0.0] * n
+        self._joints = range(n)
+        self._timeout_ns = round(timeout_s * 1e9)
+        self._wanted = [0.0] * n
+        self._speed = [0.0] * n
+        self._stamp_s = 0.0
+        self._came_ns = 0
+        self._interval_s = 0.0
+        self._lag_s = 0.0
+        self._samples = 0
+        self._fresh = self._tracks = False
+        self.clamps = False
+        self.phase = Phase.HOLD
+        self.reason = Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+        self.elapsed_s = self.duration_s = 0.0
+        self.accepted = self.dropped = 0
+        """How many targets were taken and how many were not, since the stream began."""
+        self.late_s = 0.0
+        """How late the last one that was dropped came, s; 0 for one that was none."""
+
+    def start(self, state: MotionState) -> None:
+        """Begin at `state`; the next target that `feed` takes is the first."""
+        self.phase, self.reason = Phase.MOVE, Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+        self._samples = self.accepted = self.dropped = 0
+        self._interval_s = 0.0
+        self._came_ns = state.now_ns
+        self._fresh = self._tracks = self._brakes = False
+        self._wanted = list(state.position)
+        self._speed = list(self._zero)
+
+    def feed(self, q: Sequence[float], stamp_s: float, now_ns: int) -> bool:
+        """Take a target and return True, or drop it and return False.
+
+        Dropped is what is no number or outside the joints' range, what is stamped no later than the last one taken, and
+        what comes later than the others by more than the timeout.
+
+        Args:
+            q: rad, shape (n,) at least; what is beyond is not looked at.
+            stamp_s: the sender's clock, s; only differences count.
+            now_ns: as `MotionState.now_ns`.
+        """
+        self.late_s = 0.0
+        if self.phase is not Phase.MOVE or not isfinite(stamp_s) or not self._inside(q):
+            self.dropped += 1
+            return False
+        now_s = now_ns * 1e-9
+        lag = now_s - stamp_s
+        first = self._samples == 0
+        if not first:
+            step = stamp_s - self._stamp_s
+            if step <= 0.0:
+                self.late_s = -step
+                self.dropped += 1
+                return False
+            # The least lag of all is the clocks' difference: what exceeds it is how late a target came.
+            self._lag_s = min(lag, self._lag_s + _DRIFT * step)
+            late = lag - self._lag_s
+            if late * 1e9 > self._timeout_ns:
+                self.late_s = late
+                self.dropped += 1
+                return False
+            if step * 1e9 > self._timeout_ns:
+                first = True
+        if first:
+            if self._samples == 0:
+                self._lag_s = lag
+            self._speed = list(self._zero)
+            self._interval_s = 0.0
+        else:
+            self._learn(q, step)
+        wanted = self._wanted
+        for i in self._joints:
+            wanted[i] = q[i]
+        self._stamp_s, self._came_ns = stamp_s, now_ns
+        self._samples += 1
+        self.accepted += 1
+        self._fresh = True
+        return True
+
+    def _inside(self, q: Sequence[float]) -> bool:
+        low, high = self._limits.low, self._limits.high
+        # A comparison with what is no number is false.
+        return all(low[i] <= q[i] <= high[i] for i in self._joints)
+
+    def _learn(self, q: Sequence[float], step: float) -> None:
+        """Estimate the interval, and the speed that the target moves with."""
+        interval = self._interval_s
+        self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
+        limits, wanted, speed = self._limits, self._wanted, self._speed
+        over = 1.0 / step
+        for i in self._joints:
+            v, bound = (q[i] - wanted[i]) * over, limits.velocity[i] * _INSIDE
+            # Where the target is, the joint must still be able to stop inside its range.
+            room = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
+            stops = sqrt(limits.acceleration[i] * room)
+            bound = stops if stops < bound else bound
+            speed[i] = bound if v > bound else -bound if v < -bound else v
+
+    def stop(self, state: MotionState) -> None:
+        """Come to rest under the limits; further targets are dropped."""
+        if self.phase is Phase.MOVE:
+            self.phase = Phase.STOP
+            brake, limits = self._brake, self._limits
+            brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
+            brake.hold()
+            brake.stop(state)
+            self._brakes = True
+
+    def update(self, state: MotionState, dt: float) -> Target:
+        """Return the set-points of the next cycle."""
+        target = self._target
+        if self._brakes:
+            target = self._brake.update(state, dt)
+            if not self._brake.phase:
+                self._brakes, self.phase = False, Phase.HOLD
+            return target
+        if not self.phase:
+            target.position, target.velocity = state.position, self._zero
+            return target
+        silent_ns = state.now_ns - self._came_ns
+        if silent_ns > self._timeout_ns:
+            self.reason, self.value, self.limit = Reason.STREAM_ENDED, silent_ns * 1e-9, self._timeout_ns * 1e-9
+            self.stop(state)
+            return self.update(state, dt)
+        if self._fresh:
+            self._fresh = False
+            self._aim(state, self._speed, self._interval_s * _STRETCH)
+        elif not self._tracks:
+            target.position, target.velocity = state.position, self._zero
+            return target
+        output = self._output
+        try:
+            result = self._otg.update(self._way, output)
+        except (RuckigError, ValueError):
+            result = Result.Error
+        if result < 0:
+            self.reason = Reason.GENERATOR
+            self.stop(state)
+            return self.update(state, dt)
+        target.position, target.velocity = output.new_position, output.new_velocity
+        if result == Result.Finished:
+            self._tracks = any(self._way.target_velocity)
+            if self._tracks:
+                # No new target in time: rest at the last one.
+                output.pass_to_input(self._way)
+                self._aim_to_rest()
+        else:
+            output.pass_to_input(self._way)
+        return target
+
+    def _aim(self, state: MotionState, speed: Sequence[float], within_s: float) -> None:
+        way, limits = self._way, self._limits
+        way.current_position = state.position
+        way.current_velocity = state.velocity
+        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
+        way.max_acceleration = bounds = limits.acceleration
+        way.max_jerk = limits.jerk
+        way.current_acceleration = [
+            min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(state.acceleration, bounds, strict=True)
+        ]
+        way.target_position = self._wanted
+        way.target_velocity = speed
+        way.target_acceleration = self._zero
+        way.minimum_duration = within_s or None
+        self._tracks = True
+
+    def _aim_to_rest(self) -> None:
+        self._way.target_velocity = self._zero
+        self._way.minimum_duration = None

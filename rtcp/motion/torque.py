@@ -1,0 +1,152 @@
+"""Joint torques in CST: gravity is carried, what is asked for comes on top, and speed and range bound what it does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+from typing import TYPE_CHECKING
+
+from kinematics.gravity import gravity_torques
+from kinematics.model import ArmModel
+from rtcp.config.model import Joint
+from rtcp.motion.generator import JointGenerator
+from rtcp.motion.state import MotionState, Phase, Reason, Target
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Limits
+
+_RATE_S = 0.1
+"""A torque goes from 0 to the joint's largest in no less."""
+_FADE = 0.3
+"""Torque in the direction of motion fades out over the last part of the speed that a joint may have."""
+_MARGIN_RAD = 0.02
+"""So far inside its range a joint is brought to rest."""
+
+
+class TorqueMode:
+    """The mode `torque`.
+
+    While `direct` is true the set-point follows the arm, and `Target.torque` is the whole torque of each joint
+    (`TorqueLaw.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the law holds.
+
+    Args:
+        joints: for the stiffness and damping that the impedance is a part of.
+        limits: of the joints; read in every cycle.
+        period_s: the cycle, s.
+        model: for the gravity torques; None, or one without masses: what holds the arm at the start is kept.
+    """
+
+    def __init__(self, joints: Sequence[Joint], limits: Limits, period_s: float, model: ArmModel | None = None) -> None:
+        n = len(joints)
+        self._limits = limits
+        self._model = model if model is not None and model.links and n == 6 else None
+        self._stiffness = [joint.cst_stiffness for joint in joints]
+        self._damping = [joint.cst_damping for joint in joints]
+        self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self._target = Target(n)
+        self._zero = [0.0] * n
+        self._joints = range(n)
+        self._position = [0.0] * n
+        self._velocity = [0.0] * n
+        self._torque = [0.0] * n
+        self._wanted = [0.0] * n
+        self._given = [0.0] * n
+        self._bias = [0.0] * n
+        self._about = [0.0] * n
+        self._stiff = self._damped = 0.0
+        self._until_ns = 0
+        self.direct = False
+        self.clamps = True
+        self.phase = Phase.HOLD
+        self.reason = Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+        self.elapsed_s = self.duration_s = 0.0
+
+    def start(self, state: MotionState) -> None:
+        """Begin with the torques that hold the arm now, so that it does not sag."""
+        carried = self._carried(state.actual)
+        for i in self._joints:
+            self._bias[i] = state.torque[i] - carried[i]
+            self._given[i] = self._wanted[i] = 0.0
+        self._stiff = self._damped = 0.0
+        self._about[:] = state.position
+        self._until_ns = state.now_ns
+        self.direct = True
+        self.phase, self.reason = Phase.MOVE, Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+
+    def command(
+        self, torques: Sequence[float], hold_s: float, now_ns: int, stiffness: float = 0.0, damping: float = 0.0
+    ) -> None:
+        """Ask for joint torques beyond gravity, Nm, of shape (n,), finite; they count for `hold_s` from `now_ns` on.
+
+        Args:
+            torques: bounded by each joint's limit.
+            hold_s: s.
+            now_ns: as `MotionState.now_ns`.
+            stiffness: 0 to 1, of the joints' `cst_stiffness`, about where the arm is when it rises from 0.
+            damping: 0 to 1, of the joints' `cst_damping`.
+        """
+        if self.phase is not Phase.MOVE:
+            return
+        for i in self._joints:
+            bound, wanted = self._limits.torque[i], torques[i]
+            self._wanted[i] = bound if wanted > bound else -bound if wanted < -bound else wanted
+        if stiffness > 0.0 and self._stiff == 0.0:
+            self._about[:] = self._position
+        self._stiff, self._damped = min(max(stiffness, 0.0), 1.0), min(max(damping, 0.0), 1.0)
+        self._until_ns = now_ns + round(hold_s * 1e9)
+
+    def stop(self, state: MotionState) -> None:
+        """Bring the arm to rest under its limits, held by the law of CST from now on."""
+        if self.phase is Phase.MOVE:
+            brake, limits = self._brake, self._limits
+            brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
+            brake.hold()
+            brake.stop(state)
+            self.phase, self.direct = Phase.STOP, False
+
+    def update(self, state: MotionState, dt: float) -> Target:
+        """Return the set-points of the next cycle: where the arm is, and the torque."""
+        target = self._target
+        if self.phase is Phase.STOP:
+            target = self._brake.update(state, dt)
+            self.phase = self._brake.phase
+            return target
+        if not self.phase:
+            target.position, target.velocity = state.position, self._zero
+            return target
+        if state.now_ns > self._until_ns:
+            self.reason = Reason.COMMAND_ENDED
+            self.stop(state)
+            return self.update(state, dt)
+        limits = self._limits
+        low, high, fastest, slowing, most = limits.low, limits.high, limits.velocity, limits.acceleration, limits.torque
+        carried = self._carried(state.actual)
+        position, velocity, torque, given = self._position, self._velocity, self._torque, self._given
+        for i in self._joints:
+            q, v = state.actual[i], state.speed[i]
+            step = most[i] * dt / _RATE_S
+            change = self._wanted[i] - given[i]
+            given[i] += step if change > step else -step if change < -step else change
+            pushed = given[i] + self._stiff * self._stiffness[i] * (self._about[i] - q)
+            room = high[i] - q if v > 0.0 else q - low[i]
+            room -= _MARGIN_RAD
+            bound = sqrt(2.0 * slowing[i] * room) if room > 0.0 else 0.0
+            bound = bound if bound < fastest[i] else fastest[i]
+            speed = v if v >= 0.0 else -v
+            if pushed * v > 0.0:
+                left = (bound - speed) / (_FADE * fastest[i])
+                pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
+            beyond = speed - bound * (1.0 - _FADE)
+            drag = self._damped * v
+            if beyond > 0.0:
+                drag += beyond if v > 0.0 else -beyond
+            whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag
+            torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
+            position[i], velocity[i] = q, v
+        target.position, target.velocity, target.torque = position, velocity, torque
+        return target
+
+    def _carried(self, position: Sequence[float]) -> Sequence[float]:
+        return self._zero if self._model is None else gravity_torques(self._model, position)

@@ -1,0 +1,359 @@
+"""The file of zero offsets: whole or not at all, and every damage named."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import stat
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtcp.config import ConfigError, default_config, load
+from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
+from rtcp.runtime.launcher import StartOptions, _configured
+from rtcp.runtime.zero import read_zeros, state_directory, store_zero, zero_file
+
+ARM = load(default_config())
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+def problems(config: ArmConfig = ARM) -> list[str]:
+    """The sentences about the file, without its name."""
+    with pytest.raises(ConfigError) as caught:
+        read_zeros(config)
+    return [problem.removeprefix(f"{zero_file(config.name)}:") for problem in caught.value.problems]
+
+
+def spoil(old: str, new: str) -> None:
+    file = zero_file(ARM.name)
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
+
+
+# -- where it is -------------------------------------------------------------------------------------------------------
+
+
+def test_the_file_lies_where_the_environment_says(state: Path) -> None:
+    assert zero_file("assistive-arm") == state / "assistive-arm.zero.yaml"
+
+
+@pytest.mark.parametrize(
+    ("environment", "user", "directory"),
+    [
+        ({"RTCP_STATE_DIR": "/x"}, 0, "/x"),
+        ({"XDG_STATE_HOME": "/y"}, 0, "/var/lib/rtcp"),
+        ({"XDG_STATE_HOME": "/y"}, 1000, "/y/rtcp"),
+        ({"RTCP_STATE_DIR": ""}, 1000, "/home/me/.local/state/rtcp"),
+        ({"XDG_STATE_HOME": "relative"}, 1000, "/home/me/.local/state/rtcp"),
+    ],
+)
+def test_the_state_directory_is_the_first_of_these(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], user: int, directory: str
+) -> None:
+    for key in ("RTCP_STATE_DIR", "XDG_STATE_HOME"):
+        monkeypatch.delenv(key, raising=False)
+    for key, value in {"HOME": "/home/me", **environment}.items():
+        monkeypatch.setenv(key, value)
+    monkeypatch.setattr(os, "geteuid", lambda: user)
+    assert state_directory() == Path(directory)
+
+
+def test_no_name_of_an_arm_leaves_the_directory(state: Path) -> None:
+    names = ("../x", "a/b", "a%2Fb", "..", ".", "a b", "arm\n", "a\0b", "Arm-Süd_1.2")
+    files = {zero_file(name) for name in names}
+    assert {file.parent for file in files} == {state}
+    assert len(files) == len(names)
+    assert zero_file("Arm-Süd_1.2").name == "Arm-Süd_1.2.zero.yaml"
+
+
+# -- what it holds -----------------------------------------------------------------------------------------------------
+
+
+def test_without_a_file_there_are_no_offsets() -> None:
+    assert read_zeros(ARM) == ()
+
+
+def test_an_offset_is_stored_and_the_others_are_kept() -> None:
+    store_zero(ARM, 2, 0.125)
+    assert store_zero(ARM, 5, -1.5) == zero_file(ARM.name)
+    assert read_zeros(ARM) == (0.0, 0.0, 0.125, 0.0, 0.0, -1.5)
+    store_zero(ARM, 2, 0.0)
+    assert read_zeros(ARM) == (0.0, 0.0, 0.0, 0.0, 0.0, -1.5)
+
+
+@given(
+    st.lists(st.floats(-99, 99), min_size=6, max_size=6), st.text(st.characters(codec="utf-8"), min_size=1, max_size=9)
+)
+def test_what_is_stored_is_read_back_to_the_last_bit(offsets: list[float], name: str) -> None:
+    joints = (
+        replace(ARM.joints[0], name=name),
+        *(replace(one, name=f"{one.name} of {name}") for one in ARM.joints[1:]),
+    )
+    config = replace(ARM, name=f"an arm {name}", joints=joints)
+    for axis, offset in enumerate(offsets):
+        store_zero(config, axis, offset)
+    assert read_zeros(config) == tuple(offsets)
+
+
+def test_offsets_go_by_the_names_of_the_axes() -> None:
+    store_zero(ARM, 0, 0.5)
+    turned = replace(ARM, joints=ARM.joints[::-1])
+    assert read_zeros(turned) == (0.0, 0.0, 0.0, 0.0, 0.0, 0.5)
+
+
+def test_a_gripper_with_a_drive_has_an_offset_too() -> None:
+    finger = Joint("finger", "drive7", Range(0, 1), 1.0, 1.0, 1.0, 1.0)
+    arm = replace(
+        ARM,
+        slaves=(*ARM.slaves, SlaveConfig("drive7", ARM.slaves[1].device)),
+        gripper=GripperConfig(joint=finger, open_position=1.0, closed_position=0.0),
+    )
+    store_zero(arm, 6, 0.25)
+    assert read_zeros(arm)[6] == 0.25
+
+
+def test_the_start_puts_the_offsets_into_the_configuration() -> None:
+    options = StartOptions(config=default_config())
+    assert _configured(options).zero_offsets == ()
+    store_zero(ARM, 1, 0.75)
+    assert _configured(options).zero_offsets == (0.0, 0.75, 0.0, 0.0, 0.0, 0.0)
+    spoil("0.75", "0.76")
+    with pytest.raises(ConfigError, match="check: found"):
+        _configured(options)
+
+
+# -- what is wrong with it ---------------------------------------------------------------------------------------------
+
+DAMAGE = {
+    "a changed digit": (("0.125", "0.126"), [r"3: check: found \d+, allowed is \d+: the file is damaged, .*"]),
+    "another arm's": (('"assistive-arm"', '"other"'), [r"2: arm: found 'other', allowed is \"assistive-arm\", .*"]),
+    "a text": (("0.125", "zero"), [r"7: offsets.joint3: found 'zero', allowed is a number from -100 to 100 \(rad\)"]),
+    "nothing": (("0.125", ""), [r"7: offsets.joint3: found None, allowed is a number from -100 to 100 \(rad\)"]),
+    "a truth": (("0.125", "true"), [r"7: offsets.joint3: found True, allowed is a number from -100 to 100 \(rad\)"]),
+    "no number": (("0.125", ".nan"), [r"7: offsets.joint3: found nan, allowed is a number from -100 to 100 \(rad\)"]),
+    "degrees": (("0.125", "180"), [r"7: offsets.joint3: found 180, allowed is -100 to 100 \(rad\)"]),
+    "an unknown joint": (
+        ('"joint3"', '"joint9"'),
+        [
+            r"4: offsets: the key joint3 is missing: each axis of assistive-arm has its offset",
+            r"7: offsets.joint9: this is no axis of assistive-arm; its axes are joint1, joint2, joint3, joint4, .*",
+        ],
+    ),
+    "an unknown key": (("check:", "checks:"), [
+        r"2: the key check is missing; there must be arm, check, offsets",
+        r"3: checks: this key is not known here; allowed are arm, check, offsets",
+    ]),
+    "a joint twice": (('"joint3"', '"joint2"'), [r"6: offsets.joint2: this key stands twice, in lines 6 and 7; .*"]),
+    "no YAML": (("offsets:", "offsets: ["), [r"\d+:\d+: this is not valid YAML: .*"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "sentences"), DAMAGE.values(), ids=DAMAGE.keys())
+def test_damage_is_named_and_nothing_of_the_file_is_used(change: tuple[str, str], sentences: list[str]) -> None:
+    store_zero(ARM, 2, 0.125)
+    spoil(*change)
+    for problem, sentence in zip(problems(), sentences, strict=True):
+        assert re.fullmatch(sentence, problem)
+
+
+def named_or(offsets: tuple[float, ...]) -> bool:
+    """Whether the file in place is refused with a sentence or says these offsets."""
+    try:
+        return read_zeros(ARM) == offsets
+    except ConfigError as error:
+        return bool(error.problems)
+
+
+def test_a_file_that_was_cut_anywhere_is_refused() -> None:
+    store_zero(ARM, 5, 0.125)
+    file = zero_file(ARM.name)
+    whole = file.read_bytes()
+    # Without its last character, the end of a line, it still says all.
+    for length in range(len(whole) - 1):
+        file.write_bytes(whole[:length])
+        assert problems()
+
+
+def test_a_byte_that_was_changed_anywhere_is_found_or_changes_nothing() -> None:
+    store_zero(ARM, 2, 0.125)
+    file = zero_file(ARM.name)
+    whole, offsets = file.read_bytes(), read_zeros(ARM)
+    for place in range(len(whole)):
+        for bit in (1, 16):
+            file.write_bytes(bytes(byte ^ bit if i == place else byte for i, byte in enumerate(whole)))
+            assert named_or(offsets)
+
+
+def test_a_link_that_leads_nowhere_is_no_missing_file(state: Path) -> None:
+    state.mkdir()
+    zero_file(ARM.name).symlink_to(state / "nowhere")
+    assert problems() == [" there is no such file"]
+
+
+def test_an_offset_beyond_the_wire_is_refused() -> None:
+    drive = ARM.slaves[1].device
+    channels = tuple(
+        replace(one, type="int16", factor=0.001) if one.name == "target_position" else one
+        for one in drive.rpdo[0].channels
+    )
+    short = replace(drive, rpdo=(replace(drive.rpdo[0], channels=channels),))
+    arm = replace(ARM, slaves=tuple(replace(one, device=short) if one.device == drive else one for one in ARM.slaves))
+    store_zero(arm, 0, 29.6)
+    with pytest.raises(
+        ConfigError, match=r"offsets.joint1: found 29.7, with which .* -3.1 to 3.1 would be 26.6 to 32.8 "
+    ):
+        store_zero(arm, 0, 29.7)
+    with pytest.raises(
+        ConfigError, match=r"allowed is -32.768 to 32.767, what target_position of Cubemars ORH can say"
+    ):
+        store_zero(arm, 0, -29.7)
+    assert read_zeros(arm)[0] == 29.6
+
+
+@pytest.mark.parametrize("offset", [float("nan"), float("inf"), 101.0, -101.0])
+def test_an_offset_that_is_none_is_refused_and_the_file_stays(offset: float) -> None:
+    store_zero(ARM, 0, 0.5)
+    with pytest.raises(ConfigError, match=r"offsets\.joint1: found .* allowed is "):
+        store_zero(ARM, 0, offset)
+    assert read_zeros(ARM)[0] == 0.5
+
+
+def test_a_damaged_file_is_not_written_over() -> None:
+    store_zero(ARM, 0, 0.5)
+    spoil("0.5", "0.6")
+    before = zero_file(ARM.name).read_bytes()
+    with pytest.raises(ConfigError, match="check: found"):
+        store_zero(ARM, 1, 0.5)
+    assert zero_file(ARM.name).read_bytes() == before
+
+
+def test_a_directory_that_cannot_be_made_is_named(state: Path) -> None:
+    state.write_text("a file")
+    with pytest.raises(ConfigError, match=r"state: the directory cannot be used: "):
+        store_zero(ARM, 0, 0.5)
+
+
+def test_a_disk_that_is_full_is_named_and_the_old_file_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    store_zero(ARM, 0, 0.5)
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        with pytest.raises(ConfigError, match="cannot be written: No space left on device"):
+            store_zero(ARM, 0, 0.6)
+    assert read_zeros(ARM)[0] == 0.5
+    store_zero(ARM, 0, 0.7)
+    assert read_zeros(ARM)[0] == 0.7
+
+
+def test_the_file_is_readable_for_all_and_writable_for_its_owner() -> None:
+    before = os.umask(0o022)
+    try:
+        assert stat.S_IMODE(store_zero(ARM, 0, 0.5).stat().st_mode) == 0o644
+    finally:
+        os.umask(before)
+
+
+# -- interrupted between any two steps ---------------------------------------------------------------------------------
+
+# Kills itself before or after the n-th call of one of the functions that touch the disk; a write is done by halves.
+CHILD = """
+import os, signal, sys
+from rtcp.config import default_config, load
+from rtcp.runtime.zero import store_zero
+when, at, count = sys.argv[1], int(sys.argv[2]), 0
+def watched(name):
+    real = getattr(os, name)
+    def call(*args, **more):
+        global count
+        count += 1
+        here = count
+        if here == at and when == "before":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if name == "write":
+            args = (args[0], args[1][: (len(args[1]) + 1) // 2])
+        result = real(*args, **more)
+        if here == at and when == "after":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return result
+    return call
+config = load(default_config())
+for name in ("open", "write", "fsync", "replace", "close"):
+    setattr(os, name, watched(name))
+store_zero(config, 0, 0.9)
+print(count)
+"""
+
+
+def child(when: str, at: int) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-c", CHILD, when, str(at)], capture_output=True, text=True, check=False)
+
+
+def test_killed_between_any_two_steps_it_leaves_the_old_file_or_the_new_one() -> None:
+    store_zero(ARM, 0, 0.1)
+    store_zero(ARM, 1, 0.2)
+    old = zero_file(ARM.name).read_bytes()
+    steps = int(child("never", 0).stdout)
+    new = zero_file(ARM.name).read_bytes()
+    assert steps > 8
+    seen = []
+    for at in range(1, steps + 1):
+        zero_file(ARM.name).write_bytes(old)
+        ended = child("after", at)
+        assert ended.returncode == -signal.SIGKILL
+        seen.append(read_zeros(ARM)[0])
+        assert zero_file(ARM.name).read_bytes() in (old, new)
+        # What is left behind hinders nobody.
+        store_zero(ARM, 1, 0.2)
+        assert read_zeros(ARM)[1] == 0.2
+    assert seen == sorted(seen)
+    assert {*seen} == {0.1, 0.9}
+
+
+def test_the_new_file_is_on_the_disk_before_it_takes_the_olds_name_and_the_name_after(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    store_zero(ARM, 0, 0.1)
+    calls: list[str] = []
+    fsync, rename = os.fsync, os.replace
+
+    def synced(descriptor: int) -> None:
+        kind = "directory" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file"
+        calls.append(f"fsync {kind} of {os.fstat(descriptor).st_size if kind == 'file' else ''}")
+        fsync(descriptor)
+
+    def renamed(old: Path, new: Path) -> None:
+        calls.append("rename")
+        rename(old, new)
+
+    monkeypatch.setattr(os, "fsync", synced)
+    monkeypatch.setattr(os, "replace", renamed)
+    size = store_zero(ARM, 0, 0.2).stat().st_size
+    assert calls == [f"fsync file of {size}", "rename", "fsync directory of "]
+
+
+def test_two_writers_wait_for_each_other(state: Path) -> None:
+    store_zero(ARM, 0, 0.0)
+    code = (
+        "import sys; from rtcp.config import default_config, load; from rtcp.runtime.zero import store_zero\n"
+        "config, axis = load(default_config()), int(sys.argv[1])\n"
+        "for i in range(40): store_zero(config, axis, i / 64)\n"
+    )
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(axis)]) for axis in range(3)]
+    assert [writer.wait() for writer in writers] == [0, 0, 0]
+    assert read_zeros(ARM) == (39 / 64, 39 / 64, 39 / 64, 0.0, 0.0, 0.0)
