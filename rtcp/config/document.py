@@ -71,7 +71,7 @@ def read(path: Path) -> Document:
         ConfigError: the file is missing, unreadable, no regular file, no text, no YAML, empty, no mapping, larger than
             any configuration, or repeats keys.
     """
-    text = _text_of(path)
+    text = text_of(path)
     document = Document(path)
     builder = _Builder(document.lines)
     try:
@@ -101,7 +101,12 @@ def read(path: Path) -> Document:
     return document
 
 
-def _text_of(path: Path) -> str:
+def text_of(path: Path) -> str:
+    """Return what a file says.
+
+    Raises:
+        ConfigError: the file is missing, unreadable, no regular file, no text, or larger than any configuration.
+    """
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
         # Looked at before it is opened, which would wait for the other end of a pipe.

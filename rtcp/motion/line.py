@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot, inf
+from math import hypot
 from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError
@@ -12,7 +12,7 @@ from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Vector
 from rtcp.motion.generator import JointGenerator
-from rtcp.motion.rows import KIND, LINE, Refused, Wrong, first_not_finite, read_row
+from rtcp.motion.rows import Refused, Wrong, damaged_line, read_row
 from rtcp.motion.slerp import quaternion, rotation, turn_between, turned_by
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 AT_START_M, AT_START_RAD = 1e-3, 2e-3
 """So near to where the tool is commanded the first piece begins; what is left fades out."""
 _STILL_RAD_S = 1e-6
-_UNIT = 1e-6
 _EXACT = 1e-9
-_FASTEST = 1e4
 _FADED = 0.25
 """What was left at the start fades out over so much of the first piece."""
 
@@ -80,14 +78,10 @@ class LineMode:
         At rest the tool has to be where the first piece begins. In motion the arm first comes to rest under its limits,
         and the first piece then leads from there to its end. Where it is refused, what was under way goes on.
         """
-        duration = 0.0
-        for index in range(count):
-            row = read_row(rows, index)
-            if (wrong := _damage(row, index)) is not None:
-                return wrong
-            duration += row[18]
-        moves = any(abs(v) > _STILL_RAD_S for v in state.velocity)
         first = read_row(rows, 0)
+        if (wrong := damaged_line(first, 0)) is not None:
+            return wrong
+        moves = any(abs(v) > _STILL_RAD_S for v in state.velocity)
         tool = forward(self._model, state.position)
         if not moves:
             far = hypot(*(a - b for a, b in zip(tool.position, first[0:3], strict=True)))
@@ -99,7 +93,7 @@ class LineMode:
         self._rows, self._row, self._count = rows, 0, count
         self._settles, self._brakes = moves, False
         self.elapsed_s = self._done_s = 0.0
-        self.duration_s = duration
+        self.duration_s = first[18]
         self.phase, self.reason = Phase.MOVE, Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
         self._piece = first
@@ -192,13 +186,13 @@ class LineMode:
         assert self._rows is not None
         self._row += 1
         row, last = read_row(self._rows, self._row), self._piece
-        wrong = _damage(row, self._row)
+        wrong = damaged_line(row, self._row)
         if wrong is None and not hypot(row[0] - last[7], row[1] - last[8], row[2] - last[9]) <= AT_START_M:
             wrong = Refused(Wrong.DAMAGED, self._row, row[0], 0.0)
         if wrong is None and not turn_between(last[10:14], row[3:7])[1] <= AT_START_RAD:
             wrong = Refused(Wrong.DAMAGED, self._row, row[3], 3.0)
         if wrong is not None:
-            self.axis, self.value, self.limit = wrong.index, wrong.value, wrong.limit
+            self.axis, self.value, self.limit = wrong.at, wrong.value, wrong.limit
             return False
         self._done_s = self.elapsed_s
         self._begin(state, row)
@@ -246,9 +240,7 @@ class LineMode:
             output.pass_to_input(self._active)
         return target
 
-    def _give_up(
-        self, state: MotionState, dt: float, reason: Reason, axis: int, value: float, limit: float
-    ) -> Target:
+    def _give_up(self, state: MotionState, dt: float, reason: Reason, axis: int, value: float, limit: float) -> Target:
         self.phase, self.reason, self.axis, self.value, self.limit = Phase.STOP, reason, axis, value, limit
         self._stop_joints(state)
         self._brakes, self._settles = True, False
@@ -258,19 +250,3 @@ class LineMode:
 def _left(x: float) -> float:
     """1 to 0 with speed and acceleration 0 at both ends."""
     return 1.0 - x * x * x * (10.0 + x * (6.0 * x - 15.0)) if x < 1.0 else 0.0
-
-
-def _damage(row: list[float], index: int) -> Refused | None:
-    column = first_not_finite(row)
-    if column >= 0:
-        return Refused(Wrong.DAMAGED, index, row[min(column, KIND)], float(column))
-    if row[KIND] != LINE:
-        return Refused(Wrong.DAMAGED, index, row[KIND], float(KIND))
-    for at in (3, 10):
-        size = sum(c * c for c in row[at : at + 4])
-        if not abs(size - 1.0) <= _UNIT:
-            return Refused(Wrong.DAMAGED, index, size, float(at))
-    for at, most in ((14, _FASTEST), (15, inf), (16, inf)):
-        if not 0.0 < row[at] <= most:
-            return Refused(Wrong.DAMAGED, index, row[at], float(at))
-    return None

@@ -7,6 +7,7 @@ T^2.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import comb
 from typing import TypeAlias
 
 Coefficients: TypeAlias = tuple[float, float, float, float, float, float]
@@ -51,8 +52,8 @@ def derivative(coefficients: Sequence[float]) -> list[float]:
 def sign_changes(coefficients: Sequence[float]) -> list[float]:
     """Return where in (0, 1) the polynomial changes its sign, rising.
 
-    Between two neighbouring sign changes of its derivative a polynomial is monotone, and has one root at most: the roots
-    of each derivative are found from those of the next, down to a straight line.
+    Between two neighbouring sign changes of its derivative a polynomial is monotone, and has one root at most: the
+    roots of each derivative are found from those of the next, down to a straight line.
     """
     if not any(coefficients[1:]):
         return []
@@ -82,10 +83,8 @@ def _root(coefficients: Sequence[float], low: float, high: float, rising: bool) 
             high = x
         steep = value(slope, x)
         step = y / steep if steep else last
-        if not (low < x - step < high) or abs(step) > 0.5 * last:
-            following = 0.5 * (low + high)
-        else:
-            following = x - step
+        slow = not low < x - step < high or abs(step) > 0.5 * last
+        following = 0.5 * (low + high) if slow else x - step
         last = abs(following - x)
         if last <= _NEARLY:
             return following
@@ -128,8 +127,6 @@ def _hull_is_inside(coefficients: Sequence[float], low: float, high: float) -> b
 
 def _over_binomials(degree: int) -> list[list[float]]:
     """b[k] = sum over j <= k of C(k, j) / C(degree, j) c[j] (Farouki 2012, section 2)."""
-    from math import comb
-
     return [[comb(k, j) / comb(degree, j) for j in range(k + 1)] for k in range(degree + 1)]
 
 

@@ -16,7 +16,7 @@ A straight piece of a path (`LINE`), from rest to rest, travelled by a fraction 
     columns 10 .. 13  orientation there
     columns 14 .. 16  largest speed, acceleration and jerk of the fraction, 1/s, 1/s^2, 1/s^3
     column 17         its length, m
-    column 18         how long it takes, s
+    column 18         how long it and all pieces after it take, s
     column 19         `LINE`
 """
 
@@ -32,26 +32,29 @@ KIND = COLUMNS - 1
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
 LONGEST_S = 86_400.0
 """Nothing takes longer: a time beyond it is no time."""
+_UNIT = 1e-6
+_FASTEST = 1e9
+_LONGEST_M = 1e3
 
 
 class Wrong(IntEnum):
     """Why a plan is not started."""
 
     DAMAGED = 1
-    """A row is none; `index`: the row, `value`: what was found, `limit`: its column."""
+    """A row is none; `at`: the row, `value`: what was found, `limit`: its column."""
     START = 2
-    """It does not begin where the arm is commanded; `index`: the joint, `value`: planned, `limit`: commanded."""
+    """It does not begin where the arm is commanded; `at`: the joint, `value`: planned, `limit`: commanded."""
     START_SPEED = 3
-    """It begins at time 0 with another speed than the arm has; `index`: the joint."""
+    """It begins at time 0 with another speed than the arm has; `at`: the joint."""
     UNREACHABLE = 4
-    """The way to its beginning cannot be made; `index`: the joint or -1."""
+    """The way to its beginning cannot be made; `at`: the joint or -1."""
 
 
 class Refused(NamedTuple):
     """The answer of `start` where nothing was started; what was under way goes on."""
 
     wrong: Wrong
-    index: int
+    at: int
     value: float
     limit: float
 
@@ -59,7 +62,7 @@ class Refused(NamedTuple):
 def read_row(rows: memoryview[float], index: int) -> list[float]:
     """Return the 20 numbers of a row."""
     at = index * COLUMNS
-    return rows[at : at + COLUMNS].tolist()
+    return list(rows[at : at + COLUMNS])
 
 
 def first_not_finite(row: list[float]) -> int:
@@ -71,3 +74,22 @@ def first_not_finite(row: list[float]) -> int:
         if not isfinite(number):
             return column
     return COLUMNS
+
+
+def damaged_line(row: list[float], index: int) -> Refused | None:
+    """Return what is wrong with a straight piece, or None."""
+    column = first_not_finite(row)
+    if column >= 0:
+        return Refused(Wrong.DAMAGED, index, row[min(column, KIND)], float(column))
+    if row[KIND] != LINE:
+        return Refused(Wrong.DAMAGED, index, row[KIND], float(KIND))
+    for at in (3, 10):
+        size = sum(c * c for c in row[at : at + 4])
+        if not abs(size - 1.0) <= _UNIT:
+            return Refused(Wrong.DAMAGED, index, size, float(at))
+    if not 0.0 <= row[17] <= _LONGEST_M:
+        return Refused(Wrong.DAMAGED, index, row[17], 17.0)
+    for at, most in ((14, _FASTEST), (15, _FASTEST), (16, _FASTEST), (18, LONGEST_S)):
+        if not 0.0 < row[at] <= most:
+            return Refused(Wrong.DAMAGED, index, row[at], float(at))
+    return None

@@ -44,7 +44,7 @@ def rotation(q: Sequence[float]) -> Rotation:
 
 
 def turn_between(start: Sequence[float], end: Sequence[float]) -> tuple[Vector, float]:
-    """Return axis, in the frame of `start`, and angle, 0 to pi, of the shorter turn from one orientation to the other."""
+    """Return axis, in the frame of `start`, and angle, 0 to pi, of the shorter turn between two orientations."""
     (a, b, c, d), (w, x, y, z) = start, end
     # conj(start) * end
     turn_w = a * w + b * x + c * y + d * z

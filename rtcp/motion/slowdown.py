@@ -65,8 +65,7 @@ class Slowdown:
         speed = now + rate * dt
         speed = speed if speed < high else high
         speed = speed if speed > low else low
-        if speed > now:
-            speed = now
+        speed = speed if speed < now else now
         if speed < _STILL or (low == 0.0 and speed < most * dt * dt):
             speed = 0.0
         self.rate = (speed - now) / dt

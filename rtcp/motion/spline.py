@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 
 def spline_velocities(times: Sequence[float], values: Sequence[float]) -> list[float]:
@@ -18,8 +19,8 @@ def spline_velocities(times: Sequence[float], values: Sequence[float]) -> list[f
     velocity = [0.0] * n
     if n < 3:
         return velocity
-    steps = [after - before for before, after in zip(times, times[1:], strict=False)]
-    slopes = [(after - before) / h for before, after, h in zip(values, values[1:], steps, strict=False)]
+    steps = [after - before for before, after in pairwise(times)]
+    slopes = [(after - before) / h for (before, after), h in zip(pairwise(values), steps, strict=True)]
     upper, right = [0.0] * n, [0.0] * n
     for i in range(1, n - 1):
         before, after = steps[i - 1], steps[i]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 TIMEOUT_S = 0.2
 """A stream that is silent for so long has ended."""
 _STRETCH = 1.25
-"""A target is reached so many of the sender's intervals after it came: what comes a little late finds the arm moving."""
+"""A target is reached so many of the sender's intervals after it came: the next may be a little late."""
 _INSIDE = 1.0 - 1e-9
 _SHARE = 0.2
 """How much a new interval counts in the mean."""
@@ -71,6 +71,8 @@ class StreamMode:
         self._interval_s = 0.0
         self._came_ns = state.now_ns
         self._fresh = self._tracks = self._brakes = False
+        # Until the first target comes, what moves comes to rest.
+        self._rest_from(state)
         self._wanted = list(state.position)
         self._speed = list(self._zero)
 
@@ -146,11 +148,14 @@ class StreamMode:
         """Come to rest under the limits; further targets are dropped."""
         if self.phase is Phase.MOVE:
             self.phase = Phase.STOP
-            brake, limits = self._brake, self._limits
-            brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
-            brake.hold()
-            brake.stop(state)
+            self._rest_from(state)
             self._brakes = True
+
+    def _rest_from(self, state: MotionState) -> None:
+        brake, limits = self._brake, self._limits
+        brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
+        brake.hold()
+        brake.stop(state)
 
     def update(self, state: MotionState, dt: float) -> Target:
         """Return the set-points of the next cycle."""
@@ -172,8 +177,7 @@ class StreamMode:
             self._fresh = False
             self._aim(state, self._speed, self._interval_s * _STRETCH)
         elif not self._tracks:
-            target.position, target.velocity = state.position, self._zero
-            return target
+            return self._brake.update(state, dt)
         output = self._output
         try:
             result = self._otg.update(self._way, output)
@@ -196,6 +200,7 @@ class StreamMode:
 
     def _aim(self, state: MotionState, speed: Sequence[float], within_s: float) -> None:
         way, limits = self._way, self._limits
+        self._brake.hold()
         way.current_position = state.position
         way.current_velocity = state.velocity
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]

@@ -19,6 +19,7 @@ _RATE_S = 0.1
 """A torque goes from 0 to the joint's largest in no less."""
 _FADE = 0.3
 """Torque in the direction of motion fades out over the last part of the speed that a joint may have."""
+_STILL_RAD_S = 0.01
 _MARGIN_RAD = 0.02
 """So far inside its range a joint is brought to rest."""
 
@@ -65,8 +66,11 @@ class TorqueMode:
     def start(self, state: MotionState) -> None:
         """Begin with the torques that hold the arm now, so that it does not sag."""
         carried = self._carried(state.actual)
+        # In motion a torque holds nothing: what held the arm before is kept.
+        rests = not any(abs(v) > _STILL_RAD_S for v in state.speed)
         for i in self._joints:
-            self._bias[i] = state.torque[i] - carried[i]
+            if rests:
+                self._bias[i] = state.torque[i] - carried[i]
             self._given[i] = self._wanted[i] = 0.0
         self._stiff = self._damped = 0.0
         self._about[:] = state.position

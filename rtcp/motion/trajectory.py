@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ruckig import InputParameter, Ruckig, RuckigError
-from ruckig import Trajectory as Lead
-
 from rtcp.motion.generator import JointGenerator
+from rtcp.motion.lead import Lead
 from rtcp.motion.polynomials import Coefficients, cubic, quintic
 from rtcp.motion.rows import CUBIC, KIND, LONGEST_S, QUINTIC, Refused, Wrong, first_not_finite, read_row
 from rtcp.motion.slowdown import Slowdown
@@ -22,6 +20,7 @@ AT_START_RAD_S = 1e-2
 """And with so nearly the velocity that the arm has."""
 _FADE_S = 0.5
 _EXACT = 1e-12
+_AT_ONCE_S = 1e-9
 _SLACK = 1e-6
 
 
@@ -39,9 +38,7 @@ class TrajectoryMode:
         self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
         self._brakes = False
         self._slowdown = Slowdown()
-        self._otg = Ruckig(n, period_s)
-        self._way = InputParameter(n)
-        self._lead, self._spare = Lead(n), Lead(n)
+        self._lead = Lead(limits)
         self._lead_s = 0.0
         self._target = Target(n)
         self._zero = [0.0] * n
@@ -76,15 +73,17 @@ class TrajectoryMode:
         if last[0] <= _EXACT:
             return Refused(Wrong.DAMAGED, count - 1, last[0], 0.0)
         there = first[0] <= _EXACT
-        refused = self._is_elsewhere(state, first) if there else self._lead_to(state, first)
+        if there:
+            refused = self._is_elsewhere(state, first)
+        else:
+            refused = self._lead.plan(state.position, state.velocity, state.acceleration, first)
         if refused is not None:
             return refused
         self._fade_s = self._lead_s = 0.0
         if there:
             self._fade_out(state, first, last[0])
         else:
-            self._lead, self._spare = self._spare, self._lead
-            self._lead_s = self._lead.duration
+            self._lead_s = self._lead.duration_s
         self._rows, self._row, self._count = rows, 0, count
         self._knot = first
         self._delay_s = max(self._lead_s - first[0], 0.0)
@@ -128,48 +127,6 @@ class TrajectoryMode:
                 self._fade_s = min(_FADE_S, last_s)
             self._fade[i] = quintic(ahead, faster, 0.0, 0.0, 0.0, 0.0, min(_FADE_S, last_s))
 
-    def _lead_to(self, state: MotionState, first: list[float]) -> Refused | None:
-        way, limits, n = self._way, self._limits, len(self._zero)
-        way.current_position = state.position
-        way.current_velocity = state.velocity
-        way.target_position = first[1 : 1 + n]
-        way.target_velocity = first[7 : 7 + n]
-        way.minimum_duration = first[0]
-        self._bound(way, state, first)
-        for scale in (1.0, 1.0 - 1e-4, 1.0 - 1e-2):
-            way.max_jerk = [scale * jerk for jerk in limits.jerk]
-            try:
-                done = self._otg.calculate(way, self._spare) >= 0
-            except (RuckigError, ValueError):
-                done = False
-            if done and self._spare.duration <= LONGEST_S:
-                return self._lead_inside()
-        return Refused(Wrong.UNREACHABLE, -1, first[0], 0.0)
-
-    def _bound(self, way: InputParameter, state: MotionState, first: list[float]) -> None:
-        """Set the limits; what the state already exceeds by a rounding, and no state of ruckig's may, is brought in."""
-        limits = self._limits
-        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
-        way.max_acceleration = limits.acceleration
-        way.current_acceleration = [
-            min(max(a, -b * (1 - 1e-9)), b * (1 - 1e-9))
-            for a, b in zip(state.acceleration, limits.acceleration, strict=True)
-        ]
-        wanted = first[13 : 13 + len(self._zero)] if first[KIND] == QUINTIC else self._zero
-        way.target_acceleration = [
-            min(max(a, -b * (1 - 1e-9)), b * (1 - 1e-9)) for a, b in zip(wanted, limits.acceleration, strict=True)
-        ]
-
-    def _lead_inside(self) -> Refused | None:
-        limits, extrema = self._limits, self._spare.position_extrema
-        for i in self._joints:
-            bound = extrema[i]
-            if bound.min < limits.low[i] - _SLACK:
-                return Refused(Wrong.UNREACHABLE, i, bound.min, limits.low[i])
-            if bound.max > limits.high[i] + _SLACK:
-                return Refused(Wrong.UNREACHABLE, i, bound.max, limits.high[i])
-        return None
-
     def stop(self, state: MotionState) -> None:
         """Brake along the path, as fast as the joints' limits allow."""
         if self.phase is Phase.MOVE:
@@ -188,8 +145,8 @@ class TrajectoryMode:
             if not self._go_to(self.elapsed_s + dt):
                 return self._give_up(state, dt)
             self.elapsed_s = min(self.elapsed_s + dt, self.duration_s)
-            if self.elapsed_s >= self.duration_s:
-                self._arrive(state)
+            if self.elapsed_s >= self.duration_s - _AT_ONCE_S and not self._arrives():
+                return self._give_up(state, dt)
         elif self.phase is Phase.STOP:
             slowdown, limits = self._slowdown, self._limits
             before = slowdown.speed
@@ -205,42 +162,41 @@ class TrajectoryMode:
                 velocity[i] *= speed
             if speed == 0.0:
                 self.phase = Phase.HOLD
-            elif self.elapsed_s >= self.duration_s:
-                self._arrive(state)
+            elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and not self._arrives():
+                return self._give_up(state, dt)
         else:
             target.position, target.velocity = state.position, self._zero
             return target
         target.position, target.velocity = self._position, self._velocity
         return target
 
-    def _arrive(self, state: MotionState) -> None:
+    def _arrives(self) -> bool:
+        """Come to rest at the end; False where a damaged plan does not end at rest."""
         self.phase = Phase.HOLD
         for i in self._joints:
-            if not -_SLACK < self._velocity[i] < _SLACK:
-                # A plan ends at rest; this one was damaged.
-                self._report(state, self._count - 1, self._velocity[i], 7.0 + i)
-                return
+            speed = self._velocity[i]
+            if not -_SLACK < speed < _SLACK:
+                self.axis, self.value, self.limit = self._count - 1, speed, 7.0 + i
+                return False
             self._velocity[i] = 0.0
-
-    def _report(self, state: MotionState, row: int, value: float, column: float) -> None:
-        self.reason, self.axis, self.value, self.limit = Reason.PLAN, row, value, column
-        self.phase = Phase.STOP
-        self._brakes = True
-        limits = self._limits
-        self._brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
-        self._brake.hold()
-        self._brake.stop(state)
+        return True
 
     def _give_up(self, state: MotionState, dt: float) -> Target:
-        self._brake.phase = Phase.HOLD
-        self._report(state, self.axis, self.value, self.limit)
+        """The plan is damaged: come to rest from the state, whatever the path."""
+        self.reason = Reason.PLAN
+        self.phase = Phase.STOP
+        self._brakes = True
+        brake, limits = self._brake, self._limits
+        brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
+        brake.hold()
+        brake.stop(state)
         return self.update(state, dt)
 
     def _go_to(self, at_s: float) -> bool:
         """Write position and velocity of the path at its time `at_s`; False where the plan is damaged."""
         position, velocity = self._position, self._velocity
         if at_s < self._lead_s:
-            position[:], velocity[:], _ = self._lead.at_time(at_s)
+            position[:], velocity[:], _ = self._lead.at(at_s)
             return True
         while at_s > self._to_s and self._row < self._count - 1:
             if not self._next():
@@ -275,7 +231,7 @@ class TrajectoryMode:
         if wrong is None and not 0.0 < length <= LONGEST_S:
             wrong = Refused(Wrong.DAMAGED, index, knot[0], 0.0)
         if wrong is not None:
-            self.axis, self.value, self.limit = wrong.index, wrong.value, wrong.limit
+            self.axis, self.value, self.limit = wrong.at, wrong.value, wrong.limit
             return False
         pieces = self._pieces
         if knot[KIND] == CUBIC:
@@ -289,4 +245,3 @@ class TrajectoryMode:
         self._row, self._knot = index, knot
         self._from_s, self._to_s = before[0] + self._delay_s, knot[0] + self._delay_s
         return True
-

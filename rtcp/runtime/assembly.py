@@ -41,9 +41,10 @@ def drives_of(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
         DeviceError: a device's description cannot serve.
     """
     slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
+    zeros = config.zero_offsets or (0.0,) * len(config.axes)
     return [
-        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity))
-        for joint in config.joints
+        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity, zero=zero))
+        for joint, zero in zip(config.joints, zeros, strict=False)
     ]
 
 

@@ -125,7 +125,7 @@ class MotionOrders:
         slot, count = rows
         refused = mode.start(self._arm.state, self._blackboard.plan(slot), count)
         if refused is not None:
-            return _PLAN_REFUSALS[refused.wrong], refused.index, refused.value, refused.limit
+            return _PLAN_REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
         self._blackboard.use_plan(slot)
         return self._begin(lease, mode)
 

@@ -61,7 +61,6 @@ class InProcessSlave:
     def _map(self) -> None:
         self._rx = PdoImage.from_assignment(self.device.objects, RX_ASSIGN)
         self._tx = PdoImage.from_assignment(self.device.objects, TX_ASSIGN)
-        self._image = bytearray(self._tx.byte_length)
         self.outputs = bytes(self._rx.byte_length)
         self._refresh()
 
@@ -181,8 +180,7 @@ class InProcessSlave:
             self._taken = self.outputs
         self.device.step(dt)
         if state >= State.SAFE_OP:
-            self._tx.pack(self._image)
-            self.inputs = bytes(self._image)
+            self.inputs = self._tx.packed()
 
     def watch(self, since_fed_ns: int, came: bool) -> bool:
         """Look after watchdog and, at a SYNC0, sync error; return whether it has left OP."""
@@ -206,8 +204,7 @@ class InProcessSlave:
 
     def _refresh(self) -> None:
         self._taken = b""
-        self._tx.pack(self._image)
-        self.inputs = bytes(self._image)
+        self.inputs = self._tx.packed()
 
     # -- setting up -------------------------------------------------------------------------------------------------
 

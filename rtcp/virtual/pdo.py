@@ -6,6 +6,7 @@ import struct
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from operator import attrgetter
 
 from rtcp.virtual.abort import AbortCode
 from rtcp.virtual.encoding import from_bits, struct_code, to_bits
@@ -27,6 +28,7 @@ MAX_ASSIGNED = 4
 Mapped = tuple[int, int, int]
 """A mapped entry: index (0: a gap), subindex, bits."""
 Buffer = bytes | bytearray | memoryview
+_VALUE = attrgetter("value")
 
 
 class SyncManagerType(IntEnum):
@@ -117,7 +119,7 @@ class PdoImage:
             struct.error: `data` is shorter than that (of an image whose entries all fill whole bytes).
         """
         if self._struct is not None:
-            for entry, value in zip(self.entries, self._struct.unpack_from(data, offset), strict=True):
+            for entry, value in zip(self.entries, self._struct.unpack_from(data, offset)):  # noqa: B905
                 entry.value = value
             return
         image = int.from_bytes(data[offset : offset + self.byte_length], "little")
@@ -131,12 +133,20 @@ class PdoImage:
             struct.error: a value out of its type's range, or `target` too short.
         """
         if self._struct is not None:
-            self._struct.pack_into(target, offset, *[entry.value for entry in self.entries])
+            self._struct.pack_into(target, offset, *map(_VALUE, self.entries))
             return
         image = 0
         for entry, shift, _ in self._bits:
             image |= to_bits(entry) << shift
         target[offset : offset + self.byte_length] = image.to_bytes(self.byte_length, "little")
+
+    def packed(self) -> bytes:
+        """Return the entries' values as bytes; raises as `pack`."""
+        if self._struct is not None:
+            return self._struct.pack(*map(_VALUE, self.entries))
+        image = bytearray(self.byte_length)
+        self.pack(image)
+        return bytes(image)
 
 
 def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None:

@@ -53,6 +53,10 @@ MISTAKES = {
         driven("1.4", "1.6"),
         "gripper.open_position: found 1.6, allowed is -0.1 to 1.5, gripper.joint.position",
     ),
+    "closed beyond its range": (
+        driven("closed_position: 0.0", "closed_position: -0.2"),
+        "gripper.closed_position: found -0.2, allowed is -0.1 to 1.5, gripper.joint.position",
+    ),
     "closed where it is open": (
         driven("closed_position: 0.0", "closed_position: 1.4"),
         "gripper.closed_position: found 1.4, the open_position too; the gripper must have somewhere to go",

@@ -50,6 +50,11 @@ MISTAKES = {
         WITHOUT_GEOMETRY,
         'motion: found the text "cartesian", which needs the arm\'s geometry: the key kinematics is missing',
     ),
+    "a joystick motion without geometry": (
+        ("motion: joint", "motion: joystick"),
+        WITHOUT_GEOMETRY,
+        'motion: found the text "joystick", which needs the arm\'s geometry: the key kinematics is missing',
+    ),
     "a box without geometry": (
         WITHOUT_GEOMETRY,
         "cartesian.keep_out[0]: found a box, which needs the arm's geometry: the key kinematics is missing",
@@ -202,6 +207,22 @@ def test_a_mistake_elsewhere_hides_none_of_these(problems_after: Callable[..., l
         ARM, ("mode: csp", "mode: cps"), around("min: [2, 0, 0], max: [3, 1, 1]"), ("{output: 4", "{output: 1")
     )
     assert [problem.split(": ")[1] for problem in problems] == ["mode", "cartesian.keep_out[0]", "gripper.output"]
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        "min: [-1, -1, -0.5], max: [1, 1, -0.01]",
+        "min: [-1, -1, 0.2], max: [1, 1, 0.3]",
+        "min: [0.01, -1, -1], max: [1, 1, 1]",
+        "min: [-1, -1, -1], max: [1, -0.01, 1]",
+    ],
+    ids=["a floor", "a shelf above the shoulder", "a wall", "a wall behind"],
+)
+def test_a_box_may_stand_close_to_the_base(directory: Path, corners: str) -> None:
+    old, new = around(corners)
+    Path(ARM).write_text(Path(ARM).read_text().replace(old, new))
+    assert len(load(Path(ARM)).cartesian.keep_out) == 2
 
 
 @pytest.mark.parametrize("key", ["motion", "cartesian", "jog", "watch", "inputs", "outputs", "gripper"])

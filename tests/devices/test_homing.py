@@ -122,6 +122,18 @@ def test_a_stop_takes_the_start_bit_away_and_waits_for_rest(homing, wire):
     assert told(homing, wire, ENABLED, 2, mode=8) is P.STOPPED
 
 
+def test_after_a_stop_the_target_is_where_the_drive_came_to_rest(homing, wire):
+    told(homing, wire, UNDER_WAY, 20, position=900, velocity=500)
+    homing.stop()
+    for position in range(900, 950):
+        told(homing, wire, UNDER_WAY, position=position, velocity=500)
+        assert homing.position == pytest.approx(position * 1e-4)
+    told(homing, wire, REST, position=955)
+    told(homing, wire, ENABLED, 2, position=955, mode=8)
+    assert wire.hears()[1] == 955
+    assert homing.position == pytest.approx(0.0955)
+
+
 def test_a_stop_at_the_home_changes_nothing(homing, wire):
     told(homing, wire, ATTAINED, LATE + 1)
     homing.stop()
@@ -177,7 +189,8 @@ def test_a_homing_can_follow_another(homing, drive, wire):
     told(homing, wire, ENABLED, 2, mode=8)
     homing.start(drive)
     assert not homing.ended
-    assert told(homing, wire, ENABLED, mode=8) is P.ENTERING
+    assert told(homing, wire, ENABLED, position=750, mode=8) is P.ENTERING
+    assert homing.position == pytest.approx(0.075)
     assert told(homing, wire, REST) is P.SEARCHING
     told(homing, wire, FAILED, LATE + 1)
     told(homing, wire, FAILED, 20)

@@ -40,6 +40,10 @@ CONTROLWORD, QUICK_STOP_OPTION, MODES_OF_OPERATION = 0x6040, 0x605A, 0x6060
 VOLTAGE_OFF, QUICK_STOP, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02, 0x07, 0x0F
 UNDER_VOLTAGE = 0x3220
 SPEED = 0.3
+NOTHING_PRESSED = 0x033F
+"""Levels at the box's inputs: stick neutral, toggle at arm (9), emergency stop closed (10)."""
+EMERGENCY_STOP_INPUT = 9
+"""Channel of the box, from 0."""
 WITH_TORQUE = (0x27, 0x07)
 """Statuswords, masked, of Operation Enabled and Quick Stop Active (CiA 402-2, object 0x6041)."""
 
@@ -54,6 +58,7 @@ def small_arm() -> ArmConfig:
         cycle=replace(config.cycle, period_us=PERIOD_S * 1e6),
         bus=replace(config.bus, interface="eth0", lost_cycles=LOST_CYCLES),
         enable_timeout_s=ENABLE_TIMEOUT_S,
+        arm=None,
     )
 
 
@@ -69,7 +74,7 @@ class Segment:
 
     def __init__(self) -> None:
         self.drives = [CubemarsDrive("orh70", load_inertia=2.0), CubemarsDrive("orh60", load_inertia=0.5)]
-        self.devices = [create("diewu-io"), *self.drives]
+        self.devices = [create("diewu-io", inputs=NOTHING_PRESSED), *self.drives]
         self.expected_wkc = 3 * len(self.devices)
         self.dc_time = self.missed = self.stale = 0
         self.carries = True
@@ -264,6 +269,11 @@ class Bench:
         """All events so far, in words."""
         return [self.sentences.event(event.code, event.axis, event.value, event.limit) for event in self.events]
 
+    def press(self, pressed: bool = True) -> None:
+        """Press the emergency stop, or release it, and let it be seen."""
+        self.data.devices[0].set_input(EMERGENCY_STOP_INPUT, not pressed)
+        self.run(0.02)
+
     # -- ways to the states -------------------------------------------------------------------------------------
 
     def start(self) -> Bench:
@@ -311,6 +321,19 @@ class Bench:
             self.hold()
             self.service.lost_slave = 3
             self.cycle()
+        elif state is State.EMERGENCY_STOP:
+            self.hold().press()
+        elif state is State.STOPPED_BY_LIMIT:
+            # The limits close in on a move that was planned under wider ones.
+            self.set_in_motion()
+            self.arm.limits.high[0] = self.arm.state.position[0] + 0.3
+            self.until(State.STOPPED_BY_LIMIT)
+        elif state is State.HOMING:
+            self.hold()
+            # A search that finds nothing: the speed is too small.
+            self.models[0].objects[0x6098, 0].value = 34
+            self.models[0].objects[0x6099, 2].value = 1
+            self.do(Command.HOME, [0])
         elif state is State.RESETTING:
             self.bring_to(State.FAULT)
             self.slaves_come_back = False

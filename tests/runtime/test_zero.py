@@ -325,6 +325,13 @@ def test_killed_between_any_two_steps_it_leaves_the_old_file_or_the_new_one() ->
     assert {*seen} == {0.1, 0.9}
 
 
+def test_a_remnant_of_an_interrupted_write_does_not_show_in_the_next(state: Path) -> None:
+    state.mkdir()
+    (state / f".{zero_file(ARM.name).name}.new").write_text("x: 1\n" * 1000)
+    store_zero(ARM, 0, 0.1)
+    assert read_zeros(ARM)[0] == 0.1
+
+
 def test_the_new_file_is_on_the_disk_before_it_takes_the_olds_name_and_the_name_after(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -13,7 +13,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.runtime.machine import Command, State
 from rtcp.virtual.simulation import Frame, Simulation
 from tests.sessions.geometry import Box, depth, points
-from tests.sessions.judge import Bounds, Judge
+from tests.sessions.judge import COUNTS, Bounds, Judge
 
 PERIODS_US = (1000, 1250, 1500, 2000)
 DRIVE_MODES = (8, 9, 10)
@@ -110,7 +110,9 @@ class Driver:
     @property
     def commanded(self) -> list[float]:
         """The last targets on the bus, rad."""
-        return [model.objects[0x607A, 0].value / 1e4 for model in self.simulation.models]  # type: ignore[operator]
+        models, zeros = self.simulation.models, self.judge.zero
+        told = [int(model.objects[0x607A, 0].value) for model in models]
+        return [(counts - zero) / COUNTS for counts, zero in zip(told, zeros, strict=True)]
 
     # -- what may be done -------------------------------------------------------------------------------------------
 
@@ -132,6 +134,8 @@ class Driver:
         taken = answer.refusal == 0
         (self.taken if taken else self.refused)[name] += 1
         self.log[-1] += f" -> {answer.refusal}"
+        if taken and name == "zero":
+            self.judge.zero[int(numbers[0])] = round(numbers[1] * COUNTS)
         return taken
 
     def happen(self, name: str, what: str = "") -> None:

@@ -78,6 +78,8 @@ class Judge:
         self.frames = 0
         self.obeyed = 0
         """Frames in which at least one drive was enabled and told to be."""
+        self.zero = [0] * len(drives)
+        """What each drive shows at the arm's zero, counts."""
         self._dt = period_s
         self._drives = list(drives)
         self._expected = expected_wkc
@@ -106,15 +108,18 @@ class Judge:
             control, position, velocity, torque, mode = WIRE.unpack(frame.sent[slot])
             status, actual, _, _, shown = WIRE.unpack(frame.received[slot])
             joint = self._joints[axis]
+            position, actual = position - self.zero[axis], actual - self.zero[axis]
             used, self._used[axis] = self._used[axis], actual
-            if control != ENABLE_OPERATION or status & STATE_MASK != OPERATION_ENABLED:
+            if control != ENABLE_OPERATION or status & STATE_MASK != OPERATION_ENABLED or mode not in (CSP, CSV, CST):
                 if joint.mode:
                     self._joints[axis] = _Joint()
                 continue
             obeying += 1
             if mode != shown:
                 # Told to change its mode and has not yet.
-                joint.mode = joint.mode and CHANGING
+                if joint.mode:
+                    self._judge_going_on(axis, joint, position, mode, frame.now_ns)
+                    joint.mode = CHANGING
             elif mode != joint.mode:
                 self._judge_entry(axis, joint, position, actual, mode, frame.now_ns)
                 joint = self._joints[axis] = _Joint()
@@ -147,13 +152,16 @@ class Judge:
         """The first target after enabling is where the joint is; the first in another mode goes on from the last."""
         bounds = self.bounds
         low, high = bounds.low[axis] * COUNTS - 1, bounds.high[axis] * COUNTS + 1
-        step = bounds.velocity[axis] * self._dt * COUNTS + 1
-        if joint.mode and mode == CSP and abs(position - joint.last) > step:
-            self._violation(now, axis, f"target {position} after the change of mode, {joint.last} before it")
+        self._judge_going_on(axis, joint, position, mode, now)
         if not joint.mode and mode == CSP and abs(position - min(max(actual, low), high)) > LATCHED:
             self._violation(now, axis, f"first target {position}, the joint stands at {actual}")
         if mode == CSP and not low - MARGIN <= position <= high + MARGIN:
             self._violation(now, axis, f"first target {position} outside {low:.0f}..{high:.0f}")
+
+    def _judge_going_on(self, axis: int, joint: _Joint, position: int, mode: int, now: int) -> None:
+        step = self.bounds.velocity[axis] * self._dt * COUNTS + 1
+        if joint.mode and mode == CSP and abs(position - joint.last) > step:
+            self._violation(now, axis, f"target {position} after the change of mode, {joint.last} before it")
 
     def _judge_position(self, axis: int, joint: _Joint, position: int, answered: bool, now: int) -> None:
         bounds, past = self.bounds, joint.positions

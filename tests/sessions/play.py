@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from random import Random
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.machine import Command
+from rtcp.runtime.machine import Command, State
+from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
     DRIVE_MODES,
     FAULTS,
-    NONSENSE,
     PERIODS_US,
     Driver,
     bounds_of,
@@ -24,7 +24,6 @@ from tests.sessions.driver import (
 MOTIONS = ("joint", "cartesian", "joystick", "velocity", "torque")
 ACTIONS = 24
 LONGEST_WAIT_S = 0.4
-COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
 
 
 @dataclass
@@ -67,26 +66,32 @@ class Player:
         self.random = random = Random(seed)
         config = configuration() if config is None else config
         self.bounds = bounds_of(config)
-        chosen = with_start(
-            config, random.choice(PERIODS_US), random.choice(("csp", "csp", "csv", "cst")), random.choice(MOTIONS)
-        )
-        self.driver = Driver(chosen, seed, self._place(random.random() < 0.9))
+        motion = random.choice(MOTIONS)
+        chosen = with_start(config, random.choice(PERIODS_US), random.choice(("csp", "csp", "csv", "cst")), motion)
+        self.driver = driver = Driver(chosen, seed, self._place(random.random() < 0.9))
         self.period_s = chosen.cycle.period_us * 1e-6
+        self.deeds = deeds = Deeds(driver, random, self.period_s)
+        self.motion = MOTIONS.index(motion) + 1
         self.actions: list[tuple[int, Callable[[], object]]] = [
-            (10, self._enable),
-            (14, self._move),
-            (5, lambda: self._order("STOP")),
-            (2, lambda: self._order("DISABLE")),
-            (3, lambda: self._order("MODE", [self._or_nonsense(random.choice(DRIVE_MODES))])),
-            (3, lambda: self._order("OUTPUT", [self._or_nonsense(random.randrange(0, 18)), random.randrange(3)])),
-            (2, lambda: self._order("RESET")),
-            (1, lambda: self.driver.order(random.randrange(64), [self._number() for _ in range(12)])),
-            (1, lambda: self.driver.order(COMMANDS["MOVE"], self._move_numbers(), lease=random.randrange(3))),
-            (2, lambda: self.driver.fault(random.randrange(6), random.choice(FAULTS))),
-            (3, lambda: self.driver.lose(random.choice((1, 1, 2, 5, 20, 60)), random.random() < 0.5)),
-            (1, lambda: self.driver.drop(random.randrange(1, 8))),
+            (4, self._enable),
+            (24, self._begin_motion),
+            (5, lambda: deeds.order("STOP")),
+            (2, lambda: deeds.order("DISABLE")),
+            (2, lambda: deeds.order("MODE", [deeds.or_nonsense(random.choice(DRIVE_MODES))])),
+            (4, self._change_motion),
+            (2, lambda: deeds.order("OUTPUT", [deeds.or_nonsense(random.randrange(0, 18)), random.randrange(3)])),
+            (1, lambda: deeds.order("GRIPPER", [deeds.or_nonsense(random.randrange(2))])),
+            (2, lambda: deeds.order("RESET")),
+            (1, lambda: driver.order(random.randrange(64), [self._number() for _ in range(12)])),
+            (1, lambda: driver.order(Command.MOVE, self._move_numbers(), lease=random.randrange(3))),
+            (1, lambda: driver.fault(random.randrange(6), random.choice(FAULTS))),
+            (2, lambda: driver.lose(random.choice((1, 1, 2, 5, 20, 60)), random.random() < 0.5)),
+            (1, lambda: driver.drop(random.randrange(1, 8))),
             (2, self._silence),
             (2, self._push),
+            (2, deeds.stick),
+            (1, deeds.toggle),
+            (1, deeds.emergency),
         ]
 
     def _place(self, free: bool) -> list[float]:
@@ -100,20 +105,33 @@ class Player:
             if not free or is_free(bounds, found, 0.01):
                 return found
 
-    def _or_nonsense(self, number: float) -> float:
-        return self.random.choice(NONSENSE) if self.random.random() < 0.05 else number
-
     def _number(self) -> float:
-        return self._or_nonsense(self.random.uniform(-3.0, 3.0))
+        return self.deeds.or_nonsense(self.random.uniform(-3.0, 3.0))
 
-    def _order(self, name: str, numbers: list[float] | None = None) -> bool:
-        return name in COMMANDS and self.driver.order(COMMANDS[name], numbers or [])
+    def _begin_motion(self) -> None:
+        """Mostly one that the motion mode takes, now and then another."""
+        deeds, motion = self.deeds, self.motion
+        if self.random.random() < 0.1:
+            motion = self.random.randrange(1, 6)
+        if motion == MOTIONS.index("velocity") + 1:
+            deeds.velocity()
+        elif motion == MOTIONS.index("torque") + 1:
+            deeds.torque()
+        elif motion == MOTIONS.index("joystick") + 1:
+            deeds.stick()
+        else:
+            self.random.choice((self._move, self._move, deeds.trajectory, deeds.line, deeds.stream, deeds.jog))()
+
+    def _change_motion(self) -> None:
+        wanted = self.random.randrange(1, 6)
+        if self.deeds.order("MOTION", [self.deeds.or_nonsense(wanted)]):
+            self.motion = wanted
 
     def _enable(self) -> None:
         if self.random.random() < 0.9:
             self.driver.enable()
         else:
-            self._order("ENABLE")
+            self.deeds.order("ENABLE")
 
     def _move_numbers(self) -> list[float]:
         random, bounds = self.random, self.bounds
@@ -125,15 +143,15 @@ class Player:
             wanted = q + span * (far - q)
             if random.random() < 0.05:
                 wanted = random.choice((low, high, low - 1e-3, high + 1e-3))
-            target.append(self._or_nonsense(wanted) if random.random() < 0.1 else wanted)
+            target.append(self.deeds.or_nonsense(wanted) if random.random() < 0.1 else wanted)
         if random.random() < 0.2:
             kept = random.randrange(6)
             target = [q if axis != kept else wanted for axis, (q, wanted) in enumerate(zip(here, target, strict=True))]
         speed = random.choice((0.5, 0.5, 0.2, random.uniform(0.0, 0.6)))
-        return [*target, *[0.0] * 4, float(random.randrange(2)), self._or_nonsense(speed)]
+        return [*target, *[0.0] * 4, float(random.randrange(2)), self.deeds.or_nonsense(speed)]
 
     def _move(self) -> None:
-        self._order("MOVE", self._move_numbers())
+        self.deeds.order("MOVE", self._move_numbers())
 
     def _silence(self) -> None:
         self.driver.fall_silent()
@@ -154,10 +172,17 @@ class Player:
             for _ in range(ACTIONS):
                 if driver.simulation.done or driver.violations:
                     break
-                random.choices(self.actions, weights)[0][1]()
+                asleep = driver.state in (State.READY, State.FAULT, State.RESETTING)
+                if asleep and random.random() < 0.5:
+                    self._enable()
+                else:
+                    random.choices(self.actions, weights)[0][1]()
                 driver.wait(int(random.expovariate(8.0 / LONGEST_WAIT_S) / self.period_s) + 1)
                 if random.random() < 0.3:
                     driver.wait(int(random.uniform(0.0, LONGEST_WAIT_S) / self.period_s))
+            if random.random() < 0.15:
+                driver.order(Command.SHUTDOWN)
+                driver.wait(int(2.5 / self.period_s))
         finally:
             driver.close()
         judge = driver.judge

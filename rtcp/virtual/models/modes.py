@@ -83,6 +83,8 @@ class CyclicPosition:
         self._high = number(objects, 0x607D, 2)
         self._period = number(objects, 0x60C2, 1)
         self._exponent = number(objects, 0x60C2, 2)
+        self._period_told = self._exponent_told = 0
+        self._period_s = 0.0
         self._set_point: int | None = None
         self._limit = 0
         self._goal = 0.0
@@ -111,14 +113,23 @@ class CyclicPosition:
         self.bits = bits
 
     def _take(self, counts: int, limit: int, step: float) -> None:
+        # Every cycle in a motion: comparisons are quicker than min and max.
         self._set_point, self._limit = counts, limit
-        allowed = max(self._low.value, min(self._high.value, counts))
+        high, low = self._high.value, self._low.value
+        allowed = high if counts > high else counts
+        if allowed < low:  # noqa: PLR1730
+            allowed = low
         self._clamped = allowed != counts
         self._goal = allowed * UNIT
-        period = self._period.value * 10.0**self._exponent.value or step
-        top = min(abs(limit), self._top.value) * UNIT
-        slope = (self._goal - self._axis.demand) / period
-        self._slope = max(-top, min(top, slope))
+        value, exponent = self._period.value, self._exponent.value
+        if value != self._period_told or exponent != self._exponent_told:
+            self._period_told, self._exponent_told = value, exponent
+            self._period_s = value * 10.0**exponent
+        highest = self._top.value
+        size = -limit if limit < 0 else limit
+        top = (highest if highest < size else size) * UNIT
+        slope = (self._goal - self._axis.demand) / (self._period_s or step)
+        self._slope = top if slope > top else -top if slope < -top else slope
         self._held_back = self._slope != slope
         self._fastest = top * _CATCHING_UP + _CREEP
 

@@ -1,0 +1,148 @@
+"""The limits of an arm as they are now: read by modes and guards every cycle, changed as one transaction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from math import isfinite
+from typing import NamedTuple, TypeAlias
+
+from rtcp.config.model import ArmConfig
+
+Corners: TypeAlias = tuple[float, float, float, float, float, float]
+"""A box along the base's axes, m: x, y, z of its lower corner, then of its upper one."""
+
+
+class Wrong(IntEnum):
+    """Why limits are not taken."""
+
+    NO_LIMIT = 1
+    """A number that is none, or a range that is empty; `index`: joint, or -1 for a box."""
+    WIDER = 2
+    """Beyond what the configuration allows; `index` as above."""
+    OUTSIDE = 3
+    """The arm stands, or would come to rest, outside; `index`: joint, or -1 for a box."""
+
+
+class Refused(NamedTuple):
+    """The answer of a transaction that was not carried out: nothing has changed."""
+
+    wrong: Wrong
+    index: int
+    value: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class Values:
+    """One set of limits: rad, rad/s, rad/s^2, rad/s^3, Nm, one number a joint; m for the boxes."""
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    velocity: tuple[float, ...]
+    acceleration: tuple[float, ...]
+    jerk: tuple[float, ...]
+    torque: tuple[float, ...]
+    box: Corners | None = None
+    keep_out: tuple[Corners, ...] = ()
+
+    @classmethod
+    def configured(cls, config: ArmConfig) -> Values:
+        """Return the limits of a configuration."""
+        joints, cartesian = config.joints, config.cartesian
+        return cls(
+            low=tuple(joint.position.min for joint in joints),
+            high=tuple(joint.position.max for joint in joints),
+            velocity=tuple(joint.velocity for joint in joints),
+            acceleration=tuple(joint.acceleration for joint in joints),
+            jerk=tuple(joint.jerk for joint in joints),
+            torque=tuple(joint.torque for joint in joints),
+            box=None if cartesian.box is None else corners(cartesian.box.min, cartesian.box.max),
+            keep_out=tuple(corners(box.min, box.max) for box in cartesian.keep_out),
+        )
+
+
+def corners(low: tuple[float, ...], high: tuple[float, ...]) -> Corners:
+    """Return a box as six numbers."""
+    (a, b, c), (d, e, f) = low, high
+    return a, b, c, d, e, f
+
+
+class Limits:
+    """What is in force. Lists keep their identity: whoever holds one sees every change.
+
+    Args:
+        config: the arm; its limits are the widest that there may be.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        self.widest = Values.configured(config)
+        self.low = list(self.widest.low)
+        self.high = list(self.widest.high)
+        self.velocity = list(self.widest.velocity)
+        self.acceleration = list(self.widest.acceleration)
+        self.jerk = list(self.widest.jerk)
+        self.torque = list(self.widest.torque)
+        self.box = self.widest.box
+        self.keep_out = self.widest.keep_out
+
+    def apply(self, new: Values) -> None:
+        """Put `new` into force; `check` comes before it."""
+        self.low[:], self.high[:] = new.low, new.high
+        self.velocity[:], self.acceleration[:] = new.velocity, new.acceleration
+        self.jerk[:], self.torque[:] = new.jerk, new.torque
+        self.box, self.keep_out = new.box, new.keep_out
+
+    def check(self, new: Values, position: list[float], velocity: list[float]) -> Refused | None:
+        """Return why `new` cannot come into force for an arm at `position` (rad) with `velocity` (rad/s), or None.
+
+        The boxes are compared with the configuration's only; where the arm is in them is for the zones to say.
+        """
+        for axis, (q, v) in enumerate(zip(position, velocity, strict=True)):
+            refused = self._joint(new, axis, q, v)
+            if refused is not None:
+                return refused
+        return self._boxes(new)
+
+    def _joint(self, new: Values, axis: int, q: float, v: float) -> Refused | None:
+        low, high = new.low[axis], new.high[axis]
+        if not (isfinite(low) and isfinite(high) and low < high):
+            return Refused(Wrong.NO_LIMIT, axis, low if not isfinite(low) else high, low)
+        widest = self.widest
+        if low < widest.low[axis]:
+            return Refused(Wrong.WIDER, axis, low, widest.low[axis])
+        if high > widest.high[axis]:
+            return Refused(Wrong.WIDER, axis, high, widest.high[axis])
+        for name in ("velocity", "acceleration", "jerk", "torque"):
+            found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
+            if not (isfinite(found) and found > 0.0):
+                return Refused(Wrong.NO_LIMIT, axis, found, 0.0)
+            if found > most:
+                return Refused(Wrong.WIDER, axis, found, most)
+        rest = q + 0.5 * v * abs(v) / new.acceleration[axis]
+        if abs(v) > new.velocity[axis]:
+            return Refused(Wrong.OUTSIDE, axis, v, new.velocity[axis])
+        if not low <= min(q, rest) <= max(q, rest) <= high:
+            return Refused(Wrong.OUTSIDE, axis, rest, high if rest > high or q > high else low)
+        return None
+
+    def _boxes(self, new: Values) -> Refused | None:
+        for box in (*new.keep_out, *([] if new.box is None else [new.box])):
+            for lower, upper in zip(box[:3], box[3:], strict=True):
+                if not (isfinite(lower) and isfinite(upper) and lower < upper):
+                    return Refused(Wrong.NO_LIMIT, -1, lower if not isfinite(lower) else upper, lower)
+        widest = self.widest
+        if widest.box is not None:
+            if new.box is None:
+                return Refused(Wrong.WIDER, -1, 0.0, 0.0)
+            for at in range(6):
+                beyond = new.box[at] < widest.box[at] if at < 3 else new.box[at] > widest.box[at]
+                if beyond:
+                    return Refused(Wrong.WIDER, -1, new.box[at], widest.box[at])
+        if len(new.keep_out) < len(widest.keep_out):
+            return Refused(Wrong.WIDER, -1, float(len(new.keep_out)), float(len(widest.keep_out)))
+        for box, least in zip(new.keep_out, widest.keep_out, strict=False):
+            for at in range(6):
+                if box[at] > least[at] if at < 3 else box[at] < least[at]:
+                    return Refused(Wrong.WIDER, -1, box[at], least[at])
+        return None

@@ -1,0 +1,122 @@
+"""A mode without a loop: its targets become the state, as guards that cut nothing would let them."""
+
+from __future__ import annotations
+
+import array
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config import load
+from rtcp.config.model import ArmConfig
+from rtcp.motion.state import Mode, MotionState, Phase
+
+PERIOD = 0.0005
+
+
+@dataclass
+class Bounds:
+    """Limits of six joints, as `rtcp.motion.limits` holds them."""
+
+    low: list[float]
+    high: list[float]
+    velocity: list[float]
+    acceleration: list[float]
+    jerk: list[float]
+    torque: list[float]
+
+
+@dataclass
+class Drive:
+    """Runs modes one after another on one state and checks every cycle against the limits."""
+
+    limits: Bounds
+    state: MotionState = field(default_factory=lambda: MotionState(6))
+    period_s: float = PERIOD
+    with_jerk: bool = False
+    path: list[list[float]] = field(default_factory=list)
+
+    def at(self, q: Sequence[float]) -> Drive:
+        """Stand at `q`."""
+        self.state.position = [float(angle) for angle in q]
+        self.state.actual = list(self.state.position)
+        return self
+
+    def cycle(self, mode: Mode) -> None:
+        """One cycle: continuous, inside range, speed and acceleration."""
+        state, dt, limits = self.state, self.period_s, self.limits
+        target = mode.update(state, dt)
+        position, velocity = list(target.position), list(target.velocity)
+        acceleration = [(after - before) / dt for before, after in zip(state.velocity, velocity, strict=True)]
+        for i in range(6):
+            where = (i, state.now_ns, mode.phase, mode.reason)
+            assert math.isfinite(position[i]), where
+            assert limits.low[i] - 1e-6 <= position[i] <= limits.high[i] + 1e-6, where
+            assert abs(velocity[i]) <= limits.velocity[i] * (1 + 1e-6), where
+            assert abs(acceleration[i]) <= limits.acceleration[i] * (1 + 1e-3) + 1e-6, where
+            moved, expected = position[i] - state.position[i], 0.5 * (velocity[i] + state.velocity[i]) * dt
+            assert abs(moved - expected) <= limits.acceleration[i] * dt * dt + 1e-9, where
+            if self.with_jerk:
+                change = abs(acceleration[i] - state.acceleration[i])
+                assert change <= limits.jerk[i] * dt * 1.01 + 1e-4, where
+        state.position, state.velocity, state.acceleration = position, velocity, acceleration
+        state.actual, state.speed = list(position), list(velocity)
+        state.now_ns += round(dt * 1e9)
+        self.path.append(position)
+
+    def run(self, mode: Mode, cycles: int) -> None:
+        """So many cycles."""
+        for _ in range(cycles):
+            self.cycle(mode)
+
+    def until_rest(self, mode: Mode, most_s: float = 60.0) -> float:
+        """Run until the mode holds and return how long it took, s; at rest then."""
+        began = self.state.now_ns
+        while mode.phase is not Phase.HOLD:
+            self.cycle(mode)
+            assert (self.state.now_ns - began) * 1e-9 < most_s
+        self.cycle(mode)
+        assert max(map(abs, self.state.velocity)) < 1e-6
+        return (self.state.now_ns - began) * 1e-9
+
+
+@pytest.fixture(scope="session")
+def arm() -> ArmConfig:
+    return load(Path(__file__).parents[3] / "config" / "assistive_arm.yaml")
+
+
+def bounds_of(arm: ArmConfig) -> Bounds:
+    joints = arm.joints
+    return Bounds(
+        [joint.position.min for joint in joints],
+        [joint.position.max for joint in joints],
+        [joint.velocity for joint in joints],
+        [joint.acceleration for joint in joints],
+        [joint.jerk for joint in joints],
+        [joint.torque for joint in joints],
+    )
+
+
+@pytest.fixture
+def bounds(arm: ArmConfig) -> Bounds:
+    return bounds_of(arm)
+
+
+@pytest.fixture
+def drive(bounds: Bounds) -> Drive:
+    return Drive(bounds)
+
+
+@pytest.fixture(scope="session")
+def new_drive(arm: ArmConfig) -> Callable[..., Drive]:
+    return lambda **given: Drive(bounds_of(arm), **given)
+
+
+@pytest.fixture(scope="session")
+def memory() -> Callable[[Iterable[Sequence[float]]], Any]:
+    """Lay rows out as the plan area does."""
+    return lambda rows: memoryview(array.array("d", [number for row in rows for number in row]))

@@ -1,0 +1,241 @@
+"""The mode `cartesian`: straight, with slerp, at rest at each pose, braking along the line."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import pytest
+
+from kinematics import Pose, forward
+from rtcp.motion.line import LineMode
+from rtcp.motion.planning import Stop, plan_lines
+from rtcp.motion.rows import COLUMNS, KIND, Wrong
+from rtcp.motion.slerp import quaternion, turn_between
+from rtcp.motion.state import Phase, Reason
+
+PERIOD = 0.0005
+Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
+
+
+@pytest.fixture
+def mode(arm: Any, bounds: Any) -> LineMode:
+    return LineMode(arm.arm, bounds, PERIOD)
+
+
+@pytest.fixture
+def moved(arm: Any) -> Callable[..., Stop]:
+    """The pose at Q, moved and turned."""
+    at = forward(arm.arm, Q)
+    x, y, z = at.position
+    rx, ry, rz = at.rpy
+    return lambda dx=0.0, dy=0.0, dz=0.0, drx=0.0, dry=0.0, drz=0.0, speed=None: Stop(
+        (x + dx, y + dy, z + dz, rx + drx, ry + dry, rz + drz), None, speed
+    )
+
+
+@pytest.fixture
+def rows(arm: Any, bounds: Any, memory: Callable[..., Any]) -> Callable[..., tuple[Any, int]]:
+    def planned(stops: list[Stop], q: Sequence[float] = Q, speed: float | None = None) -> tuple[Any, int]:
+        plan = plan_lines(arm.arm, bounds, arm.cartesian, q, stops, speed=speed)
+        return memory(plan.rows), len(plan.rows)
+
+    return planned
+
+
+def off_line(start: Sequence[float], end: Sequence[float], point: Sequence[float]) -> float:
+    way = [b - a for a, b in zip(start, end, strict=True)]
+    length = math.hypot(*way)
+    along = sum((p - a) * w for p, a, w in zip(point, start, way, strict=True)) / length
+    return math.dist(point, [a + along * w / length for a, w in zip(start, way, strict=True)])
+
+
+def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
+    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    stops = [moved(dy=0.2), moved(dy=0.2, dz=0.1), moved()]
+    drive.at(Q)
+    assert mode.start(drive.state, *rows(stops)) is None
+    rests, corner = [], 0
+    while mode.phase is not Phase.HOLD:
+        drive.cycle(mode)
+        if corner < 3 and math.dist(forward(arm.arm, drive.state.position).position, stops[corner].pose[:3]) < 1e-9:
+            rests.append(max(map(abs, drive.state.velocity)))
+            corner += 1
+    assert corner == 3
+    assert max(rests) < 1e-3
+    corners = [forward(arm.arm, Q).position, *(stop.pose[:3] for stop in stops)]
+    worst = 0.0
+    for q in drive.path[::20]:
+        point = forward(arm.arm, q).position
+        worst = max(worst, min(off_line(a, b, point) for a, b in zip(corners, corners[1:], strict=False)))
+    assert worst < 1e-9
+    assert mode.reason is Reason.NONE
+    assert mode.elapsed_s == pytest.approx(mode.duration_s, abs=0.01)
+
+
+def test_the_tool_keeps_to_speed_and_acceleration(arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+    drive.at(Q)
+    mode.start(drive.state, *rows([moved(dz=-0.2)], speed=0.05))
+    drive.until_rest(mode)
+    points = [forward(arm.arm, q).position for q in drive.path[::2]]
+    speeds = [math.dist(a, b) / (2 * PERIOD) for a, b in zip(points, points[1:], strict=False)]
+    assert max(speeds) == pytest.approx(0.05, rel=1e-6)
+    steps = [abs(b - a) / (2 * PERIOD) for a, b in zip(speeds, speeds[1:], strict=False)]
+    assert max(steps) < arm.cartesian.acceleration * 1.001
+
+
+def test_a_turn_is_about_one_axis_and_ends_where_it_should(
+    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    goal = moved(drx=0.4, dry=-0.3, drz=0.2)
+    drive.at(Q)
+    start, end = forward(arm.arm, Q), Pose.from_xyzrpy(*goal.pose)
+    axis, angle = turn_between(quaternion(start.rotation), quaternion(end.rotation))
+    mode.start(drive.state, *rows([goal]))
+    drive.until_rest(mode)
+    done = 0.0
+    for q in drive.path[::50]:
+        here = forward(arm.arm, q)
+        assert math.dist(here.position, start.position) < 1e-9
+        about, turned = turn_between(quaternion(start.rotation), quaternion(here.rotation))
+        assert turned >= done - 1e-9
+        done = turned
+        if turned > 0.01:
+            assert about == pytest.approx(axis, abs=1e-6)
+    assert done == pytest.approx(angle, abs=1e-6)
+
+
+@pytest.mark.parametrize("after_s", [0.0005, 0.1, 0.5, 1.0, 1.4])
+def test_a_stop_brakes_along_the_line(
+    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any, after_s: float
+) -> None:
+    goal = moved(dy=0.2, drz=0.2)
+    drive.at(Q)
+    mode.start(drive.state, *rows([goal]))
+    drive.run(mode, round(after_s / PERIOD))
+    mode.stop(drive.state)
+    drive.until_rest(mode, 1.0)
+    start = forward(arm.arm, Q).position
+    assert max(off_line(start, goal.pose[:3], forward(arm.arm, q).position) for q in drive.path[1:]) < 1e-9
+    assert mode.reason is Reason.NONE
+    assert math.dist(forward(arm.arm, drive.state.position).position, goal.pose[:3]) > 1e-3
+
+
+def test_a_small_rest_at_the_start_fades_out_without_a_jump(
+    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    plan = rows([moved(dy=0.2)])
+    drive.at([q + 3e-4 for q in Q])
+    assert mode.start(drive.state, *plan) is None
+    drive.until_rest(mode)
+    assert math.dist(forward(arm.arm, drive.state.position).position, moved(dy=0.2).pose[:3]) < 1e-9
+
+
+def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+    plan = rows([moved(dy=0.2)])
+    drive.at([q + 3e-3 for q in Q])
+    refused = mode.start(drive.state, *plan)
+    assert refused is not None
+    assert refused.wrong is Wrong.START
+    assert refused.value > refused.limit
+    assert mode.phase is Phase.HOLD
+
+
+def test_a_line_that_begins_in_motion_comes_to_rest_and_then_leads_to_its_end(
+    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    first, second = rows([moved(dy=0.2)]), rows([moved(dz=-0.1), moved()])
+    drive.at(Q)
+    mode.start(drive.state, *first)
+    drive.run(mode, 1500)
+    assert max(map(abs, drive.state.velocity)) > 0.05
+    assert mode.start(drive.state, *second) is None
+    drive.until_rest(mode)
+    assert math.dist(forward(arm.arm, drive.state.position).position, moved().pose[:3]) < 1e-9
+    assert mode.reason is Reason.NONE
+
+
+def test_a_stop_while_it_still_comes_to_rest_ends_there(drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+    first, second = rows([moved(dy=0.2)]), rows([moved(dz=-0.1)])
+    drive.at(Q)
+    mode.start(drive.state, *first)
+    drive.run(mode, 1500)
+    mode.start(drive.state, *second)
+    drive.run(mode, 5)
+    mode.stop(drive.state)
+    assert drive.until_rest(mode) < 1.0
+
+
+def test_lines_that_interrupt_each_other_never_jump(
+    arm: Any, new_drive: Any, bounds: Any, rows: Any, moved: Any
+) -> None:
+    plans = [rows([moved(dy=0.1)]), rows([moved(dz=-0.1), moved(dz=0.05)]), rows([moved(drz=0.3)])]
+    for seed in range(6):
+        chance, drive, mode = random.Random(seed), new_drive().at(Q), LineMode(arm.arm, bounds, PERIOD)
+        for _ in range(5):
+            mode.start(drive.state, *chance.choice(plans))
+            drive.run(mode, chance.randint(1, 1500))
+            if chance.random() < 0.3:
+                mode.stop(drive.state)
+                drive.run(mode, chance.randint(1, 300))
+        mode.stop(drive.state)
+        drive.until_rest(mode)
+
+
+def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(
+    drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    plan, count = rows([moved(dy=0.2)])
+    plan[8] = 1.5
+    drive.at(Q)
+    assert mode.start(drive.state, plan, count) is None
+    drive.until_rest(mode)
+    assert mode.reason is Reason.NO_SOLUTION
+    assert mode.value > 0.0
+
+
+def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
+    drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    plan, count = rows([moved(dy=0.4)])
+    # As if nothing had been slowed down: the tool stays bounded, a joint does not.
+    plan[14], plan[15], plan[16] = 5.0, 0.9, 5.0
+    drive.at(Q)
+    mode.start(drive.state, plan, count)
+    drive.until_rest(mode)
+    assert mode.reason is Reason.JUMP
+    assert mode.value > mode.limit
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [(0, math.nan), (3, 2.0), (9, math.inf), (14, 0.0), (14, -1.0), (15, math.nan), (18, -1.0), (KIND, 3.0)],
+)
+def test_a_damaged_piece_is_not_started_and_ends_what_runs(
+    drive: Any, mode: LineMode, rows: Any, moved: Any, column: int, value: float
+) -> None:
+    plan, count = rows([moved(dy=0.1), moved()])
+    drive.at(Q)
+    mode.start(drive.state, plan, count)
+    drive.run(mode, 100)
+    plan[COLUMNS + column] = value
+    drive.until_rest(mode)
+    assert (mode.reason, mode.axis) == (Reason.PLAN, 1)
+    plan[column] = value
+    refused = mode.start(drive.state, plan, count)
+    assert refused is not None
+    assert (refused.wrong, refused.at) == (Wrong.DAMAGED, 0)
+
+
+def test_a_piece_that_begins_elsewhere_than_the_last_ended_is_damaged(
+    drive: Any, mode: LineMode, rows: Any, moved: Any
+) -> None:
+    plan, count = rows([moved(dy=0.1), moved()])
+    plan[COLUMNS + 2] += 0.01
+    drive.at(Q)
+    mode.start(drive.state, plan, count)
+    drive.until_rest(mode)
+    assert (mode.reason, mode.axis) == (Reason.PLAN, 1)

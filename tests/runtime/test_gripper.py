@@ -1,0 +1,161 @@
+"""A gripper with a drive in the cycle: the driver, its motion and the model of its drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
+from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.runtime.gripper import DrivenGripper, gripper_of
+from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
+
+ARM = load(default_config())
+FINGER = Joint("finger", "drive7", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
+DRIVEN = replace(
+    ARM,
+    slaves=(*ARM.slaves, SlaveConfig("drive7", ARM.slaves[1].device)),
+    gripper=GripperConfig(joint=FINGER, open_position=1.4, closed_position=0.0),
+)
+DT = ARM.cycle.period_us * 1e-6
+
+
+class Bench:
+    """The gripper and its drive; between its fingers may lie something hard."""
+
+    def __init__(self, config: ArmConfig = DRIVEN, position: float = 1.0) -> None:
+        gripper = gripper_of(config)
+        assert gripper is not None
+        self.gripper: DrivenGripper = gripper
+        self.model = CubemarsDrive("orh40", load_inertia=0.02, initial_position=position)
+        self.model.set_outputs_valid(True)
+        self.model.step(0.2)
+        # As the drive's description has it: 0.2 rad for 50 ms are a fault.
+        self.model.objects[0x6065, 0].value = 2000
+        self._rx = PdoImage.from_assignment(self.model.objects, RX_ASSIGN)
+        self._tx = PdoImage.from_assignment(self.model.objects, TX_ASSIGN)
+        self._outputs = b"" or bytes(self._rx.byte_length)
+        self.goal = DriveGoal.DISABLED
+        self.object_at: float | None = None
+        self.run(0.02)
+
+    def input(self, index: int) -> bytes:
+        assert index == 7
+        data = bytearray(self._tx.byte_length)
+        self._tx.pack(data)
+        return bytes(data)
+
+    def set_output(self, index: int, data: bytes) -> None:
+        assert index == 7
+        self._outputs = data
+
+    def run(self, seconds: float) -> list[float]:
+        """Let time pass as the loop does; return the joint's positions."""
+        gripper, mechanics, path = self.gripper, self.model.mechanics, []
+        for _ in range(round(seconds / DT)):
+            self._rx.unpack(self._outputs)
+            inside = 0.0 if self.object_at is None else max(0.0, self.object_at - mechanics.position)
+            mechanics.external_torque = 2000.0 * inside - (5.0 * mechanics.velocity if inside else 0.0)
+            self.model.step(DT)
+            gripper.decode(self)
+            gripper.lead(self.goal)
+            if gripper.enabled:
+                gripper.command()
+            else:
+                gripper.follow()
+            gripper.encode(self)
+            path.append(mechanics.position)
+        return path
+
+    def enabled(self) -> Bench:
+        self.goal = DriveGoal.ENABLED
+        self.run(0.1)
+        assert self.gripper.enabled
+        return self
+
+
+def test_a_gripper_on_an_output_has_no_drive() -> None:
+    assert gripper_of(ARM) is None
+    assert gripper_of(replace(ARM, gripper=None)) is None
+
+
+def test_enabling_moves_nothing() -> None:
+    bench = Bench(position=0.7).enabled()
+    assert max(abs(position - 0.7) for position in bench.run(0.5)) < 1e-3
+
+
+@pytest.mark.parametrize(("close", "goal"), [(True, 0.0), (False, 1.4)])
+def test_it_closes_and_opens(close: bool, goal: float) -> None:
+    bench = Bench().enabled()
+    assert bench.gripper.grip(close)
+    bench.run(3.0)
+    assert bench.model.mechanics.position == pytest.approx(goal, abs=2e-3)
+
+
+def test_it_counts_from_its_own_zero_offset() -> None:
+    bench = Bench(replace(DRIVEN, zero_offsets=(*[9.0] * 6, 0.25))).enabled()
+    bench.gripper.grip(True)
+    bench.run(3.0)
+    assert bench.model.mechanics.position == pytest.approx(0.25, abs=2e-3)
+
+
+def test_it_holds_what_is_hard_without_a_fault_and_lets_go() -> None:
+    bench = Bench().enabled()
+    bench.object_at = 0.5
+    bench.gripper.grip(True)
+    bench.run(5.0)
+    assert bench.gripper.motion.gripped
+    assert bench.gripper.enabled
+    assert bench.model.mechanics.position == pytest.approx(0.5, abs=0.01)
+    held = abs(bench.gripper.drive.torque)
+    assert FINGER.torque * 0.5 < held < FINGER.torque * 3
+    bench.gripper.grip(False)
+    bench.run(3.0)
+    assert bench.model.mechanics.position == pytest.approx(1.4, abs=2e-3)
+
+
+def test_it_takes_no_order_without_torque() -> None:
+    bench = Bench(position=0.7)
+    assert not bench.gripper.grip(True)
+    bench.enabled()
+    assert bench.run(0.5)[-1] == pytest.approx(0.7, abs=1e-3)
+
+
+def test_a_stop_on_its_way_holds_it_there() -> None:
+    bench = Bench().enabled()
+    bench.gripper.grip(True)
+    bench.run(0.5)
+    bench.gripper.stop()
+    bench.run(0.5)
+    here = bench.model.mechanics.position
+    assert 0.1 < here < 0.9
+    assert bench.run(0.5)[-1] == pytest.approx(here, abs=1e-3)
+
+
+def test_after_a_fault_on_its_way_it_goes_nowhere_by_itself() -> None:
+    bench = Bench().enabled()
+    bench.gripper.grip(True)
+    bench.run(0.5)
+    bench.model.inject_fault(0x7305)
+    bench.goal = DriveGoal.QUICK_STOPPED
+    bench.run(0.5)
+    assert bench.gripper.drive.state is DriveState.FAULT
+    here = bench.model.mechanics.position
+    bench.goal = DriveGoal.RESET
+    bench.run(0.2)
+    bench.enabled()
+    assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
+
+
+def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:
+    bench = Bench().enabled()
+    bench.gripper.grip(True)
+    bench.run(0.5)
+    bench.goal = DriveGoal.DISABLED
+    bench.run(1.0)
+    here = bench.model.mechanics.position
+    bench.enabled()
+    assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)

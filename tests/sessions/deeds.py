@@ -1,0 +1,192 @@
+"""Longer deeds of a random session: what takes several commands, or a plan, or a hand on the stick."""
+
+from __future__ import annotations
+
+from math import sqrt
+from random import Random
+
+from kinematics import forward
+from rtcp.runtime.machine import Command, State
+from tests.sessions.driver import NONSENSE, STICK, Driver, configuration
+
+COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
+CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
+"""Column 19 of a plan's row (`rtcp.motion.rows`)."""
+HOLD_S = 0.2
+
+
+class Deeds:
+    """Made of a driver and the session's random numbers."""
+
+    def __init__(self, driver: Driver, random: Random, period_s: float) -> None:
+        self.driver = driver
+        self.random = random
+        self._period_s = period_s
+
+    def or_nonsense(self, number: float, share: float = 0.03) -> float:
+        """Return the number, or now and then one that nobody should send."""
+        return self.random.choice(NONSENSE) if self.random.random() < share else number
+
+    def order(self, name: str, numbers: list[float] | None = None) -> bool:
+        """Give a command, if there is one of that name."""
+        return name in COMMANDS and self.driver.order(COMMANDS[name], numbers or [])
+
+    def seconds(self, least: float, most: float) -> None:
+        """Let time pass."""
+        self.driver.wait(int(self.random.uniform(least, most) / self._period_s))
+
+    def _near(self, by: float) -> list[float]:
+        return [q + self.random.uniform(-by, by) for q in self.driver.commanded]
+
+    def _padded(self, numbers: list[float], *last: float) -> list[float]:
+        return [*numbers, *[0.0] * (12 - len(numbers) - len(last)), *last]
+
+    # -- plans ------------------------------------------------------------------------------------------------------
+
+    def trajectory(self) -> None:
+        """A trajectory that nobody has planned: its pieces may be far too quick, or none at all."""
+        random = self.random
+        here = self.driver.commanded
+        kind = random.choice((CUBIC, QUINTIC))
+        pace = random.choice((0.1, 0.3, 0.3, 1.0))
+        rows, t = [], 0.0
+        if random.random() < 0.5:
+            rows.append([0.0, *here, *[0.0] * 12, kind])
+        for _ in range(random.randrange(1, 8)):
+            step = random.uniform(0.1, 0.6)
+            t += step
+            here = [q + random.uniform(-pace, pace) * step for q in here]
+            speed = [random.uniform(-pace, pace) if random.random() < 0.5 else 0.0 for _ in here]
+            rows.append([t, *here, *speed, *[0.0] * 6, kind])
+        rows[-1][7:13] = [0.0] * 6
+        if random.random() < 0.1:
+            rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
+        slot = self.driver.simulation.observer.write_plan(rows)
+        self.order("TRAJECTORY", [self.or_nonsense(slot), self.or_nonsense(len(rows))])
+
+    def line(self) -> None:
+        """Straight pieces from where the tool is, planned by nobody: out of reach, too quick, through a singularity."""
+        random = self.random
+        arm = configuration().arm
+        if arm is None:
+            return
+        pose = forward(arm, self.driver.commanded)
+        turn = _quaternion(pose.rotation)
+        rows, at = [], list(pose.position)
+        for _ in range(random.randrange(1, 4)):
+            far = random.choice((0.02, 0.1, 0.3))
+            to = [x + random.uniform(-far, far) for x in at]
+            length = sqrt(sum((b - a) ** 2 for a, b in zip(at, to, strict=True)))
+            speed = random.choice((0.05, 0.1, 0.25, 0.5)) / max(length, 1e-3)
+            took = 2.0 / speed
+            rows.append([*at, *turn, *to, *turn, speed, 4 * speed, 40 * speed, length, took, LINE])
+            at = to
+        if random.random() < 0.1:
+            rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
+        slot = self.driver.simulation.observer.write_plan(rows)
+        self.order("LINE", [self.or_nonsense(slot), self.or_nonsense(len(rows))])
+
+    # -- what has to be said again and again --------------------------------------------------------------------------
+
+    def stream(self) -> None:
+        """Targets at some rate; late ones, doubled ones, jumps, and an end without a word."""
+        random, driver = self.random, self.driver
+        interval = random.choice((0.004, 0.01, 0.033, 0.1))
+        pace = random.choice((0.1, 0.3, 0.6))
+        target = driver.commanded
+        velocity = [random.uniform(-pace, pace) for _ in target]
+        for _ in range(random.randrange(3, 30)):
+            driver.stamp += interval
+            if random.random() < 0.1:
+                velocity = [random.uniform(-pace, pace) for _ in target]
+            target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
+            sent = self._near(0.5) if random.random() < 0.03 else target
+            stamp = driver.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
+            self.order("STREAM", self._padded([self.or_nonsense(q, 0.01) for q in sent], self.or_nonsense(stamp, 0.01)))
+            driver.wait(max(1, int(interval * random.uniform(0.5, 1.5) / self._period_s)))
+
+    def jog(self) -> None:
+        """Speeds of the tool or of joints, held for a while."""
+        random = self.random
+        frame = float(random.randrange(3))
+        speeds = [
+            random.choice((0.0, 0.0, 1.0, -1.0))
+            * (random.choice((0.05, 0.1, 0.2, 0.3)) if frame == 2 or axis > 2 else 0.1)
+            for axis in range(6)
+        ]
+        for _ in range(random.randrange(1, 12)):
+            numbers = [self.or_nonsense(v, 0.01) for v in speeds]
+            self.order("JOG", self._padded(numbers, self.or_nonsense(frame, 0.01), self.or_nonsense(HOLD_S, 0.01)))
+            self.seconds(0.02, 0.15)
+            if random.random() < 0.1:
+                speeds[random.randrange(6)] *= -1.0
+
+    def velocity(self) -> None:
+        """Joint speeds."""
+        random = self.random
+        for _ in range(random.randrange(1, 8)):
+            speeds = [random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)) for _ in range(6)]
+            numbers = [self.or_nonsense(v, 0.01) for v in speeds]
+            self.order("VELOCITY", self._padded(numbers, self.or_nonsense(random.choice((0.1, 0.5, 1.0)), 0.02)))
+            self.seconds(0.02, 0.5)
+
+    def torque(self) -> None:
+        """Joint torques, with or without an impedance about where the arm was."""
+        random = self.random
+        for _ in range(random.randrange(1, 8)):
+            size = random.choice((1.0, 5.0, 20.0))
+            torques = [random.uniform(-size, size) for _ in range(6)]
+            numbers = [self.or_nonsense(v, 0.01) for v in torques]
+            shares = [random.choice((0.0, 0.5, 1.0)), random.choice((0.0, 1.0))]
+            self.order("TORQUE", self._padded(numbers, *shares, self.or_nonsense(random.choice((0.1, 0.5)), 0.02)))
+            self.seconds(0.02, 0.4)
+
+    # -- a hand at the arm ------------------------------------------------------------------------------------------
+
+    def stick(self) -> None:
+        """Push the stick, change modes, and now and then show what is no code."""
+        random, driver = self.random, self.driver
+        for _ in range(random.randrange(1, 6)):
+            driver.stick(random.choice(STICK) if random.random() < 0.9 else random.randrange(256))
+            self.seconds(0.0, 0.4)
+            if random.random() < 0.6:
+                driver.stick(63)
+                self.seconds(0.0, 0.1)
+        if random.random() < 0.7:
+            driver.stick(63)
+
+    def toggle(self) -> None:
+        """Give the stick to the chair for a while."""
+        self.driver.toggle(False)
+        self.seconds(0.0, 0.3)
+        self.driver.toggle(True)
+
+    def emergency(self) -> None:
+        """Press the emergency stop, and mostly reset it later."""
+        self.driver.press(True)
+        self.seconds(0.0, 0.6)
+        self.driver.press(False)
+        self.seconds(0.0, 0.1)
+        if self.random.random() < 0.8:
+            self.order("RESET")
+            self.driver.simulation.until(lambda: self.driver.state is not State.RESETTING, 0.5)
+
+
+def _quaternion(rotation: object) -> list[float]:
+    """w, x, y, z of a rotation, by its largest component (nine numbers, row by row)."""
+    (a, b, c), (d, e, f), (g, h, i) = _rows(rotation)
+    squares = [1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i]
+    at = squares.index(max(squares))
+    size = sqrt(squares[at])
+    mixed = (
+        (size, (h - f) / size, (c - g) / size, (d - b) / size),
+        ((h - f) / size, size, (b + d) / size, (c + g) / size),
+        ((c - g) / size, (b + d) / size, size, (f + h) / size),
+        ((d - b) / size, (c + g) / size, (f + h) / size, size),
+    )
+    return [0.5 * part for part in mixed[at]]
+
+
+def _rows(rotation: object) -> list[list[float]]:
+    flat = [float(x) for row in rotation for x in (row if hasattr(row, "__iter__") else (row,))]  # type: ignore[attr-defined]
+    return [flat[0:3], flat[3:6], flat[6:9]]
