@@ -31,7 +31,7 @@ def operation_findings(data: object) -> list[Finding]:
 
 
 def terminal_findings(data: object, devices: Mapping[str, DeviceDescription]) -> list[Finding]:
-    """Return the terminals with a meaning for which there is no IO box; the devices in `rules` have 16 of each."""
+    """Return the terminals with a meaning for which there is no IO box; `device_rules` sees to 16 of each."""
     named = [devices.get(text(slave, "device") or "") for _, slave in entries(data, "slaves")]
     if any(device is None or device.kind == "io" for device in named):
         return []

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from annotated_types import MaxLen, MinLen
 
-from rtcp.config import operation_rules, rules
+from rtcp.config import device_rules, operation_rules, rules
 from rtcp.config.arm_model import arm_model, kinematics_part
 from rtcp.config.checking import Checker
 from rtcp.config.document import Finding, dotted, read
@@ -134,11 +134,11 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
         ConfigError: with one sentence for every mistake.
     """
     document = read(path)
-    rules.name_padding(document.data)
+    device_rules.name_padding(document.data)
     device, findings = _DEVICE.check(document.data)
-    findings += rules.device_findings(document.data)
+    findings += device_rules.device_findings(document.data)
     if period_us is not None:
-        findings += rules.period_findings(document.data, period_us)
+        findings += device_rules.period_findings(document.data, period_us)
     if findings or device is None:
         raise ConfigError(document.sentences(findings))
     return device
@@ -165,7 +165,7 @@ def with_period(config: ArmConfig, period_us: float) -> ArmConfig:
     cycle, findings = _CYCLE.check({**dataclasses.asdict(config.cycle), "period_us": period_us})
     problems = [f"cycle.{finding[0][-1]}: {finding[1]}" for finding in findings]
     for device in {slave.device.name: slave.device for slave in config.slaves}.values():
-        found: list[Finding] = rules.period_findings(dataclasses.asdict(device), period_us) if cycle else []
+        found: list[Finding] = device_rules.period_findings(dataclasses.asdict(device), period_us) if cycle else []
         problems += [f"{device.name}: {dotted(where)}: {text}" for where, text in found]
     if cycle is None or problems:
         raise ConfigError(problems)

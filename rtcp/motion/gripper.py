@@ -25,12 +25,14 @@ class GripperMotion:
         self._generator = JointGenerator(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
         self._state = MotionState(1)
         self._period_s = period_s
-        # A way that begins in motion takes the last cycle's mean acceleration for the present one: so much it may miss by.
+        # A way that begins in motion takes the last cycle's mean acceleration for the present one, and errs by so much.
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
+        self._step = joint.velocity * period_s
         self._firm_torque = joint.torque
         self._low, self._high = joint.position.min, joint.position.max
         self._goals = {False: open_position, True: closed_position}
         self._firm = 0
+        self._closing: bool | None = None
         self.gripped = False
 
     @property
@@ -46,7 +48,7 @@ class GripperMotion:
     def latch(self, position: float) -> None:
         """Rest at `position`, rad, or at the end of the range that it is beyond: without torque it is where it is."""
         state = self._state
-        state.position[0] = min(max(position, self._low), self._high)
+        state.position[0] = self.clamped(position)
         state.velocity[0] = state.acceleration[0] = 0.0
         self._generator.hold()
         self._firm = 0
@@ -54,6 +56,9 @@ class GripperMotion:
 
     def grip(self, close: bool) -> bool:
         """Go to where it is closed, or open, from whatever it does; return False where no way is found."""
+        if close is self._closing and self._generator.phase is Phase.MOVE:
+            return True
+        self._closing = close
         self._firm = 0
         self.gripped = False
         return self._generator.move_to(self._state, [self._goals[close]], self._speed)
@@ -75,8 +80,19 @@ class GripperMotion:
             self.gripped = True
             return here
         target = self._generator.update(state, self._period_s)
-        position, velocity = target.position[0], target.velocity[0]
+        position = self._next(state.position[0], target.position[0])
+        velocity = target.velocity[0]
         state.position[0] = position
         state.velocity[0] = velocity
         state.acceleration[0] = (velocity - before) / self._period_s
         return position
+
+    def clamped(self, position: float) -> float:
+        """Return what of the range, rad, is nearest to `position`."""
+        return min(max(position, self._low), self._high)
+
+    def _next(self, here: float, wanted: float) -> float:
+        """The last place before the drive: inside the range, no step beyond speed x cycle, never what is no number."""
+        low, high = max(self._low, here - self._step), min(self._high, here + self._step)
+        # A comparison with NaN is false.
+        return wanted if low <= wanted <= high else high if wanted > high else low if wanted < low else here

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
 
+from rtcp.motion.room import allowed_acceleration
 from rtcp.motion.rows import KIND, LONGEST_S, QUINTIC, Refused, Wrong
 
 if TYPE_CHECKING:
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
 # ruckig finds no way where a distance is exactly a border between two profiles.
 _JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-2)
-# What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state.
 _INSIDE = 1.0 - 1e-9
 _SLACK = 1e-6
 
@@ -47,10 +47,16 @@ class Lead:
         way, limits, n = self._way, self._limits, len(position)
         bounds = limits.acceleration
         way.current_position, way.current_velocity = list(position), list(velocity)
-        way.current_acceleration = _inside(acceleration, bounds)
+        way.current_acceleration = [
+            allowed_acceleration(acceleration[i], velocity[i], limits.velocity[i], bounds[i], limits.jerk[i])
+            for i in range(n)
+        ]
         way.target_position, way.target_velocity = list(knot[1 : 1 + n]), list(knot[7 : 7 + n])
         # A cubic begins with any acceleration.
-        way.target_acceleration = _inside(knot[13 : 13 + n] if knot[KIND] == QUINTIC else [0.0] * n, bounds)
+        wanted = knot[13 : 13 + n] if knot[KIND] == QUINTIC else [0.0] * n
+        way.target_acceleration = [
+            min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)
+        ]
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
         way.max_acceleration = list(bounds)
         way.minimum_duration = knot[0]
@@ -78,6 +84,3 @@ class Lead:
                 continue
         return False
 
-
-def _inside(values: Sequence[float], bounds: Sequence[float]) -> list[float]:
-    return [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(values, bounds, strict=True)]

@@ -13,6 +13,8 @@ _MOST_RATE = 50.0
 _MOST_JERK = 2000.0
 """1/s and 1/s^2: where no joint moves nothing else bounds how fast the path's time stands still."""
 _STILL = 1e-9
+_OF_LIMIT = 0.99
+"""Of a joint's acceleration so much is used, so that what is between two cycles keeps to it too."""
 
 
 class Slowdown:
@@ -51,7 +53,7 @@ class Slowdown:
             if steep > 1e-6:
                 # |p' u - v| <= a dt, and what the jerk leaves of du/dt's change.
                 signed = before if at_full > 0.0 else -before
-                room = bound * dt
+                room = _OF_LIMIT * bound * dt
                 least, largest = (signed - room) / steep, (signed + room) / steep
                 low = least if least > low else low
                 high = largest if largest < high else high

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import isfinite, sqrt
+from math import isfinite
 from typing import TYPE_CHECKING
 
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
 
 from rtcp.motion.generator import JointGenerator
+from rtcp.motion.room import allowed_acceleration, stoppable_speed
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
@@ -18,7 +19,8 @@ TIMEOUT_S = 0.2
 """A stream that is silent for so long has ended."""
 _STRETCH = 1.25
 """A target is reached so many of the sender's intervals after it came: the next may be a little late."""
-_INSIDE = 1.0 - 1e-9
+_BENDS = 1.0
+_INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """How much a new interval counts in the mean."""
 _DRIFT = 1e-4
@@ -47,6 +49,9 @@ class StreamMode:
         self._timeout_ns = round(timeout_s * 1e9)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
+        self._slope = [0.0] * n
+        self._change = [0.0] * n
+        self._last: list[float] = []
         self._stamp_s = 0.0
         self._came_ns = 0
         self._interval_s = 0.0
@@ -112,7 +117,7 @@ class StreamMode:
         if first:
             if self._samples == 0:
                 self._lag_s = lag
-            self._speed = list(self._zero)
+            self._speed, self._change = list(self._zero), list(self._zero)
             self._interval_s = 0.0
         else:
             self._learn(q, step)
@@ -131,18 +136,24 @@ class StreamMode:
         return all(low[i] <= q[i] <= high[i] for i in self._joints)
 
     def _learn(self, q: Sequence[float], step: float) -> None:
-        """Estimate the interval, and the speed that the target moves with."""
+        """Estimate the interval, and with which speed and acceleration the target moves."""
         interval = self._interval_s
+        known = interval > 0.0
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
-        limits, wanted, speed = self._limits, self._wanted, self._speed
+        limits, wanted, speed, slope = self._limits, self._wanted, self._speed, self._slope
         over = 1.0 / step
         for i in self._joints:
-            v, bound = (q[i] - wanted[i]) * over, limits.velocity[i] * _INSIDE
+            mean, most = (q[i] - wanted[i]) * over, limits.acceleration[i]
+            bend = (mean - slope[i]) * over if known else 0.0
+            bend = most if bend > most else -most if bend < -most else bend
+            slope[i] = mean
+            v = mean + 0.5 * bend * step
             # Where the target is, the joint must still be able to stop inside its range.
             room = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
-            stops = sqrt(limits.acceleration[i] * room)
+            bound, stops = limits.velocity[i] * _INSIDE, stoppable_speed(0.9 * room, most, limits.jerk[i])
             bound = stops if stops < bound else bound
-            speed[i] = bound if v > bound else -bound if v < -bound else v
+            speed[i] = v = bound if v > bound else -bound if v < -bound else v
+            self._change[i] = allowed_acceleration(_BENDS * bend, v, bound, most, limits.jerk[i])
 
     def stop(self, state: MotionState) -> None:
         """Come to rest under the limits; further targets are dropped."""
@@ -187,7 +198,8 @@ class StreamMode:
             self.reason = Reason.GENERATOR
             self.stop(state)
             return self.update(state, dt)
-        target.position, target.velocity = output.new_position, output.new_velocity
+        target.position = self._last = output.new_position
+        target.velocity = output.new_velocity
         if result == Result.Finished:
             self._tracks = any(self._way.target_velocity)
             if self._tracks:
@@ -201,20 +213,27 @@ class StreamMode:
     def _aim(self, state: MotionState, speed: Sequence[float], within_s: float) -> None:
         way, limits = self._way, self._limits
         self._brake.hold()
-        way.current_position = state.position
-        way.current_velocity = state.velocity
+        # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
+        if not self._tracks or state.position != self._last:
+            way.current_position, way.current_velocity = state.position, state.velocity
+            way.current_acceleration = [
+                allowed_acceleration(
+                    state.acceleration[i],
+                    state.velocity[i],
+                    limits.velocity[i],
+                    limits.acceleration[i],
+                    limits.jerk[i],
+                )
+                for i in self._joints
+            ]
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
-        way.max_acceleration = bounds = limits.acceleration
-        way.max_jerk = limits.jerk
-        way.current_acceleration = [
-            min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(state.acceleration, bounds, strict=True)
-        ]
+        way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
         way.target_position = self._wanted
         way.target_velocity = speed
-        way.target_acceleration = self._zero
+        way.target_acceleration = self._change
         way.minimum_duration = within_s or None
         self._tracks = True
 
     def _aim_to_rest(self) -> None:
-        self._way.target_velocity = self._zero
+        self._way.target_velocity = self._way.target_acceleration = self._zero
         self._way.minimum_duration = None

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
 
+from rtcp.motion.room import allowed_acceleration, stoppable_speed
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
-_INSIDE = 1.0 - 1e-9
 
 
 class VelocityMode:
@@ -92,12 +91,19 @@ class VelocityMode:
             way.target_velocity = bounded
             way.current_position = state.position
             way.current_velocity = state.velocity
-            bounds = self._limits.acceleration
-            way.max_acceleration = bounds
-            way.max_jerk = self._limits.jerk
-            way.current_acceleration = [
-                min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(state.acceleration, bounds, strict=True)
-            ]
+            limits = self._limits
+            way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
+            if state.position != self._last:
+                way.current_acceleration = [
+                    allowed_acceleration(
+                        state.acceleration[i],
+                        state.velocity[i],
+                        limits.velocity[i],
+                        limits.acceleration[i],
+                        limits.jerk[i],
+                    )
+                    for i in self._joints
+                ]
         try:
             result = self._otg.update(way, output)
         except (RuckigError, ValueError):
@@ -122,16 +128,9 @@ class VelocityMode:
         for i, v in enumerate(self._wanted):
             if v:
                 room = high[i] - position[i] if v > 0.0 else position[i] - low[i]
-                stops = _stoppable(room, acceleration[i], jerk[i])
+                stops = stoppable_speed(room, acceleration[i], jerk[i])
                 bounded[i] = stops if v > stops else -stops if v < -stops else v
             else:
                 bounded[i] = 0.0
         return bounded
 
-
-def _stoppable(room: float, acceleration: float, jerk: float) -> float:
-    """The speed that comes to rest within `room`: v^2 / 2a + v a / 2j = room, solved for v."""
-    if room <= 0.0:
-        return 0.0
-    ramp = 0.5 * acceleration * acceleration / jerk
-    return sqrt(ramp * ramp + 2.0 * acceleration * room) - ramp

@@ -95,7 +95,7 @@ def assemble(
     box = None if slotted is None else slotted[1]
     operator = Operator(config, box)
     behaviour = Behaviour(config, arm, operator, blackboard, service, discipline)
-    orders = Orders(arm, box, operator, behaviour, blackboard, service)
+    orders = Orders(config, arm, box, operator, behaviour, blackboard, service)
     recorder = Recorder(data, arm, box, operator, behaviour, blackboard, service, discipline)
     loop = Loop(
         round(config.cycle.period_us * 1000),

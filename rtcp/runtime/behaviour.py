@@ -36,8 +36,9 @@ _HOMING_ENDS = {
     HomingPhase.FAILED: Code.HOMING_FAILED,
     HomingPhase.STOPPED: Code.STOPPED,
 }
-_PRESSABLE = WITH_TORQUE | {State.READY, State.FAULT, State.RESETTING}
-"""States in which the emergency stop's input counts; on the way to OP the inputs are not yet valid."""
+_PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
+"""States that the emergency stop's input ends. On the way to OP the inputs are not yet valid; while ready no drive has
+torque, and enabling is refused for as long as it is pressed."""
 
 
 class Behaviour:

@@ -116,6 +116,7 @@ class Refusal(IntEnum):
     """The plan begins at time 0 with another speed than the arm has."""
     IMPEDANCE = 39
     HOME_MODE = 40
+    JOG_FRAME = 41
     PLAN_LEAD = 38
     """No way leads from where the arm is to the plan's first point."""
 

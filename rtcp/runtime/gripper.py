@@ -7,7 +7,8 @@ from rtcp.devices.cia402 import Cia402Drive, DriveGoal, DriveState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.motion.gripper import GripperMotion
 
-_WITH_TORQUE = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+_RANGE_MARGIN_RAD = 0.02
+"""So far beyond its range it may stand and still be enabled, to be brought back to the edge."""
 
 
 class DrivenGripper:
@@ -36,14 +37,19 @@ class DrivenGripper:
         drive = self.drive
         return drive.state is DriveState.OPERATION_ENABLED and drive.mode_display == drive.mode
 
+    @property
+    def outside(self) -> bool:
+        """Whether it stands so far outside its range that it must not be enabled."""
+        return abs(self.motion.clamped(self.drive.position) - self.drive.position) > _RANGE_MARGIN_RAD
+
     def lead(self, goal: DriveGoal) -> None:
         """Lead the drive one step towards `goal`."""
         self.drive.advance(goal)
 
     def follow(self) -> None:
-        """Let the set-point follow a drive without torque; one with torque keeps the set-point it has, at rest."""
+        """Let the set-point follow a drive that does not follow it; an enabled one keeps what it has, at rest."""
         drive, motion = self.drive, self.motion
-        if drive.state not in _WITH_TORQUE:
+        if drive.state is not DriveState.OPERATION_ENABLED:
             motion.latch(drive.position)
         elif motion.moving:
             motion.latch(motion.position)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from math import isfinite
 
+from rtcp.config.model import ArmConfig
 from rtcp.motion.generator import LONGEST_S
 from rtcp.motion.line import LineMode
 from rtcp.motion.modes import DriveMode
@@ -14,7 +15,7 @@ from rtcp.motion.trajectory import TrajectoryMode
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.codes import Command, MotionMode, Refusal
+from rtcp.runtime.codes import Command, JogFrame, MotionMode, Refusal
 from rtcp.runtime.layout import PLAN_ROWS, PLANS
 from rtcp.runtime.machine import State
 from rtcp.runtime.operator import Operator
@@ -40,18 +41,23 @@ class MotionOrders:
     """What `Orders` hands on.
 
     Args:
+        config: Cartesian speeds.
         arm: the joints.
         operator: knows whether motion is permitted.
         behaviour: the machine's state.
         blackboard: where plans are.
     """
 
-    def __init__(self, arm: Arm, operator: Operator, behaviour: Behaviour, blackboard: Blackboard) -> None:
+    def __init__(
+        self, config: ArmConfig, arm: Arm, operator: Operator, behaviour: Behaviour, blackboard: Blackboard
+    ) -> None:
         self._arm = arm
         self._operator = operator
         self._behaviour = behaviour
         self._blackboard = blackboard
         self._numbers = [0.0] * len(arm.drives)
+        cartesian = config.cartesian
+        self._jog_bounds = (cartesian.speed,) * 3 + (cartesian.angular_speed,) * 3
         self.answers: dict[Command, Callable[[int, Sequence[float]], Verdict]] = {
             Command.MOVE: self._move,
             Command.TRAJECTORY: self._trajectory,
@@ -154,11 +160,28 @@ class MotionOrders:
         return self._begin(lease, stream)
 
     def _jog(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        raise NotImplementedError
+        if hindrance := self._hindered(*AUTOMATIC, MotionMode.JOYSTICK):
+            return hindrance
+        frame = numbers[-2]
+        if frame not in tuple(JogFrame):
+            return Refusal.JOG_FRAME, -1, frame
+        if frame == JogFrame.JOINTS:
+            return self._speeds(lease, numbers)
+        jog, arm = self._arm.motions.jog, self._arm
+        if jog is None:
+            return (Refusal.NO_GEOMETRY,)
+        if wrong := self._within(numbers, self._jog_bounds, Refusal.JOG_SPEED):
+            return wrong
+        if not self._goes_on(jog):
+            jog.start(arm.state)
+        until_ns = self._behaviour.now_ns + round(numbers[-1] * 1e9)
+        jog.command(self._numbers, "tool" if frame == JogFrame.TOOL else "base", until_ns)
+        return self._begin(lease, jog)
 
     def _velocity(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(MotionMode.VELOCITY):
-            return hindrance
+        return self._hindered(MotionMode.VELOCITY) or self._speeds(lease, numbers)
+
+    def _speeds(self, lease: int, numbers: Sequence[float]) -> Verdict:
         if wrong := self._within(numbers, self._arm.limits.velocity, Refusal.JOG_SPEED):
             return wrong
         velocity = self._arm.motions.velocity

@@ -62,6 +62,7 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             f"{number(m.value)} of a joint's stiffness or damping is not allowed: a part from 0 to 1 of cst_stiffness "
             f"and cst_damping (joints[] in {file})"
         ),
+        Refusal.JOG_FRAME: lambda m: f"frame {number(m.value)} is unknown: 0 base, 1 tool, 2 joints",
         Refusal.HOME_MODE: lambda _: "a drive is homed while the drives are in csp: `rtcp mode csp` first",
         Refusal.PLAN_LEAD: lambda _: "no way was found from where the arm is to the plan's first point",
         Refusal.TORQUE_LIMIT: lambda m: (

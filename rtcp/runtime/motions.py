@@ -5,6 +5,7 @@ from __future__ import annotations
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
 from rtcp.motion.generator import JointGenerator
+from rtcp.motion.jog import JogMode
 from rtcp.motion.limits import Limits
 from rtcp.motion.line import LineMode
 from rtcp.motion.modes import DriveMode
@@ -35,6 +36,7 @@ class Motions:
         self.velocity = VelocityMode(limits, period_s)
         self.torque = TorqueMode(config.joints, limits, period_s, config.arm)
         self.line = None if config.arm is None else LineMode(config.arm, limits, period_s)
+        self.jog = None if config.arm is None else JogMode(config, config.arm, limits, guards, period_s)
         self.active: Mode = self.generator
         self.mode = MotionMode[config.motion.upper()]
         """What the arm takes commands for."""

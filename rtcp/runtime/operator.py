@@ -4,39 +4,102 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.io_box import IoBox
+from rtcp.devices.stick import Stick
+from rtcp.devices.terminals import Inputs, Outputs
+from rtcp.motion.joystick import Joystick
+from rtcp.motion.state import Phase
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.codes import Code, MotionMode
 
 
 class Operator:
-    """Reads the inputs that have a meaning and writes the outputs that have one.
+    """Reads the inputs that have a meaning, leads the arm by the stick, and writes the outputs that have a meaning.
 
     Args:
         config: which they are.
-        box: the IO box, or None.
+        box: the IO box, or None: then nothing is pressed, nothing is forbidden and no stick is there.
     """
 
     def __init__(self, config: ArmConfig, box: IoBox | None) -> None:
+        cycle_s = config.cycle.period_us * 1e-6
         self._box = box
-        self.emergency_stop = False
-        self.permitted = True
+        self._inputs = Inputs(config.inputs, cycle_s)
+        self._outputs = Outputs(config.outputs, config.gripper)
+        self._stick = Stick(config.inputs, cycle_s)
+        self._joystick = Joystick(config.jog)
+        self._arm_had_it = True
+        self._code_told = False
+        self.emergency_stop = box is not None and self._inputs.emergency_stop.active
+        """Whether it is pressed; before the box has been heard it is."""
+        self.permitted = box is None or self._inputs.enabling_switch.active
+        """Whether the enabling switch allows motion."""
         self.arm_has_stick = False
-        self.stick_mode = 0
-        self.meant: frozenset[int] = frozenset()
-        self.has_gripper = False
+        self.meant = self._outputs.meant
+        """Numbers of the outputs that nobody switches by hand."""
+        self.has_gripper = box is not None and config.gripper is not None and config.gripper.output is not None
+
+    @property
+    def stick_mode(self) -> int:
+        """0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper."""
+        return self._joystick.mode
 
     def read(self) -> None:
         """Take the inputs of the cycle."""
+        box, inputs = self._box, self._inputs
+        if box is None:
+            return
+        levels = box.inputs
+        inputs.read(levels)
+        self._stick.read(levels)
+        self.emergency_stop = inputs.emergency_stop.active
+        self.permitted = inputs.enabling_switch.active
+        self.arm_has_stick = inputs.arm_toggle.active
 
     def show(self, powered: bool, moving: bool) -> None:
         """Switch the lamps and toggle the heartbeat."""
+        if self._box is not None:
+            self._box.outputs = self._outputs.write(self._box.outputs, powered, moving)
 
     def wait_for_neutral(self) -> None:
         """Let the stick count only after it has been neutral."""
+        self._joystick.wait_for_neutral()
 
     def grip(self, close: bool) -> None:
-        """Close or open the gripper."""
+        """Close or open the gripper on its output."""
+        if self._box is not None:
+            self._box.outputs = self._outputs.grip(self._box.outputs, close)
 
     def lead_by_stick(self, arm: Arm, blackboard: Blackboard) -> bool:
-        """Let the stick lead the arm; return whether it wants to move."""
+        """Let the stick lead the arm, in the motion mode joystick; return whether the arm has to move for it.
+
+        Called every cycle in which the arm holds, or moves by the stick.
+        """
+        motions = arm.motions
+        jog = motions.jog
+        if motions.mode is not MotionMode.JOYSTICK or jog is None:
+            return False
+        if self.arm_has_stick is not self._arm_had_it:
+            self._arm_had_it = self.arm_has_stick
+            blackboard.event(Code.STICK_TAKEN, -1, float(self.arm_has_stick))
+        stick, joystick = self._stick, self._joystick
+        before = joystick.mode
+        joystick.update(stick, self.arm_has_stick and self.permitted)
+        if joystick.mode != before:
+            blackboard.event(Code.STICK_MODE, joystick.mode)
+        if not stick.valid and self.arm_has_stick:
+            if not self._code_told:
+                blackboard.event(Code.CAME_OUT, -1, float(stick.code))
+            self._code_told = True
+        elif stick.valid:
+            self._code_told = False
+        if joystick.grip is not None and self.has_gripper:
+            self.grip(not joystick.grip)
+            blackboard.event(Code.GRIPPER, -1, float(joystick.grip))
+        jog.command(joystick.twist, joystick.frame)
+        if jog.phase is Phase.HOLD and joystick.moves:
+            jog.start(arm.state)
+            jog.command(joystick.twist, joystick.frame)
+            motions.active = jog
+            return True
         return False

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from rtcp.config.model import ArmConfig
 from rtcp.devices.io_box import IoBox
 from rtcp.motion.modes import DriveMode
 from rtcp.runtime.arm import RANGE_MARGIN_RAD, Arm
@@ -40,6 +41,7 @@ class Orders:
     """Takes at most one command a cycle.
 
     Args:
+        config: the arm.
         arm: the joints.
         box: the IO box, or None.
         operator: the inputs and outputs that have a meaning.
@@ -50,6 +52,7 @@ class Orders:
 
     def __init__(
         self,
+        config: ArmConfig,
         arm: Arm,
         box: IoBox | None,
         operator: Operator,
@@ -63,7 +66,7 @@ class Orders:
         self._behaviour = behaviour
         self._blackboard = blackboard
         self._service = service
-        motion = MotionOrders(arm, operator, behaviour, blackboard)
+        motion = MotionOrders(config, arm, operator, behaviour, blackboard)
         self._answers: dict[Command, Callable[[int, Sequence[float]], Verdict]] = {
             Command.ENABLE: self._enable,
             Command.DISABLE: self._disable,

@@ -59,7 +59,6 @@ class InProcessData:
     def count(self) -> None:
         """Work out the working counter anew: a slave has changed its state."""
         self._wkc = sum(slave.counts for slave in self._slaves)
-        self._all_hear = all(slave.hears for slave in self._slaves)
 
     def fed(self, slave: InProcessSlave) -> bool:
         """Whether a frame has come within the slave's watchdog time."""
@@ -81,13 +80,9 @@ class InProcessData:
         self.heard = True
         self._answer = [slave.inputs for slave in self._slaves]
         self._shown = self.now_ns + self._offset_ns
-        if self._all_hear:
-            for slave, outputs in zip(self._slaves, self.outputs, strict=True):
-                slave.outputs = outputs
-        else:
-            for slave, outputs in zip(self._slaves, self.outputs, strict=True):
-                if slave.hears:
-                    slave.outputs = outputs
+        # Every slave keeps them; only one in OP takes them over.
+        for slave, outputs in zip(self._slaves, self.outputs, strict=True):
+            slave.outputs = outputs
         self._fed_ns = self.now_ns
         self._came = True
         self._answered = not self._lost_back

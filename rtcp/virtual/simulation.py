@@ -12,29 +12,26 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
-from rtcp.runtime.assembly import assemble, discipline_of, drives_of
+from rtcp.runtime.assembly import assemble, discipline_of
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
 from rtcp.runtime.machine import State as MachineState
 from rtcp.runtime.observer import Answer, Event, Observer
-from rtcp.runtime.service import Service
+from rtcp.virtual.inline_service import InlineService
 from rtcp.virtual.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
-from rtcp.virtual.registers import State
 
 NAME = "inprocess"
 """Name of the bus."""
 _SHARED_MEMORY = Path("/dev/shm")
 _BEGIN_NS = 1_000_000_000
 _TURN_NS = 10_000_000
-_WATCH_TURNS = 10
 _RENEWALS = 5
 """A commander renews its lease so many times as often as it runs out."""
-_ERROR_CODE = 0x603F
 
 
 class Frame(NamedTuple):
@@ -49,90 +46,6 @@ class Frame(NamedTuple):
     """Working counter of the answer, -1 without one."""
     received: tuple[bytes, ...]
     """Inputs of each slave, of the last answer that came."""
-
-
-class InlineService(Service):
-    """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
-
-    def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:
-        positions = [slot + 1 for slot, _ in drives_of(config)]
-        names = [joint.name for joint in config.joints]
-        super().__init__(cast(Any, bus), blackboard, positions, names, config.bus.op_timeout_s, 0, 1)
-        self._segment = bus
-        self._board = blackboard
-        self._positions = positions
-        self._names = names
-        self._wanted: list[Callable[[], None]] = []
-        self._op_asked = False
-        self._axis = -1
-        self.comes_back = True
-        """Whether slaves that were lost come back when asked."""
-
-    def want_op(self) -> None:
-        """Ask for OP; may be said every cycle."""
-        if not self._op_asked:
-            self._op_asked = True
-            self._wanted.append(self._start_all)
-
-    def recover(self) -> None:
-        """Ask for the slaves that left OP to be brought back."""
-        self.all_op = False
-        self._wanted.append(self._bring_back)
-
-    def park(self) -> None:
-        """Ask for all slaves to be taken to PRE-OP."""
-        self.all_op = False
-        self._wanted.append(self._park_all)
-
-    def explain_drive(self, axis: int) -> None:
-        """Ask for the drive's error code to be put into words."""
-        self._axis = axis
-
-    def take_turn(self, turn: int) -> None:
-        """Do what was asked; now and then look at the slaves."""
-        wanted, self._wanted = self._wanted, []
-        for do in wanted:
-            do()
-        if self._axis >= 0:
-            axis, self._axis = self._axis, -1
-            code = int.from_bytes(self._segment.sdo_read(self._positions[axis], _ERROR_CODE, 0), "little")
-            if code:
-                self._board.text(f"{self._names[axis]}: the drive's error code is 0x{code:04X}")
-        if turn % _WATCH_TURNS == 0:
-            self._look()
-
-    def _start_all(self) -> None:
-        self._segment.request_state(State.OP)
-        self.refused = self._segment.wait_for_state(State.OP, 0.0)
-        self.all_op = not self.refused
-
-    def _park_all(self) -> None:
-        self._segment.request_state(State.PRE_OP)
-
-    def _bring_back(self) -> None:
-        if not self.comes_back:
-            return
-        bus = self._segment
-        for slave in bus.slaves:
-            if slave.error:
-                bus.acknowledge(slave.position)
-            if slave.state is State.PRE_OP:
-                bus.request_state(State.SAFE_OP, [slave.position])
-            if slave.state is State.SAFE_OP:
-                bus.request_state(State.OP, [slave.position])
-        if not bus.wait_for_state(State.OP, 0.0):
-            self.lost_slave = 0
-            self.all_op = True
-
-    def _look(self) -> None:
-        for state in self._segment.read_states():
-            self._board.slave(state.position, state.state | (0x10 if state.error else 0), state.code)
-            if self.all_op and state.state is not State.OP:
-                self._board.text(f"slave {state.position} ({state.name}) left OP: it is in {state.words()}")
-                self.all_op = False
-                self.lost_slave = state.position
-        for emergency in self._segment.emergencies():
-            self._board.text(emergency.sentence())
 
 
 class Simulation:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
 from rtcp.motion.gripper import GripperMotion
+from rtcp.motion.state import Target
 
 DT = 0.0005
 JOINT = Joint("finger", "drive7", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=2.0)
@@ -48,9 +51,12 @@ def test_whatever_it_is_told_it_keeps_to_its_limits(orders):
     for order, cycles in orders:
         motion.stop() if order == "stop" else motion.grip(order == "close")
         path += [motion.update(0.0) for _ in range(cycles)]
-    speeds = [(b - a) / DT for a, b in zip(path, path[1:], strict=False)]
+    speeds = [(b - a) / DT for a, b in itertools.pairwise(path)]
     assert max(map(abs, speeds)) <= JOINT.velocity * (1 + 1e-6)
-    assert max(abs(b - a) / DT for a, b in zip(speeds, speeds[1:], strict=False)) <= JOINT.acceleration * (1 + 1e-3)
+    assert max(abs(b - a) / DT for a, b in itertools.pairwise(speeds)) <= JOINT.acceleration * (1 + 1e-3)
+    changes = [(b - a) / DT for a, b in itertools.pairwise(speeds)]
+    # The acceleration at the beginning of a way is known but for the jerk of a cycle.
+    assert max(abs(b - a) / DT for a, b in itertools.pairwise(changes)) <= 3 * JOINT.jerk
     assert JOINT.position.min <= min(path) <= max(path) <= JOINT.position.max
 
 
@@ -66,6 +72,32 @@ def test_what_it_holds_ends_the_motion_at_once(motion, close, push):
     assert not motion.moving
     assert abs(here - before) < 5 * DT * JOINT.velocity
     assert set(run(motion, 1.0, push)) == {here}
+
+
+def test_to_be_told_again_changes_nothing(motion):
+    other = GripperMotion(JOINT, OPEN, CLOSED, DT)
+    other.latch(0.5)
+    path = []
+    other.grip(True)
+    for _ in range(2000):
+        assert motion.grip(True) or not motion.moving
+        path.append((motion.update(0.0), other.update(0.0)))
+    assert all(one == two for one, two in path[:1500])
+
+
+@pytest.mark.parametrize("wanted", [float("nan"), float("inf"), -float("inf"), 1e300, 5.0, -5.0, 0.51])
+def test_no_set_point_passes_that_is_not_one_step_away(motion, monkeypatch, wanted):
+    motion.grip(False)
+
+    def astray(state, dt):
+        target = Target(1)
+        target.position[0] = wanted
+        return target
+
+    monkeypatch.setattr(motion._generator, "update", astray)
+    path = [0.5, *run(motion, 2.0)]
+    assert all(abs(b - a) <= JOINT.velocity * DT * (1 + 1e-9) for a, b in itertools.pairwise(path))
+    assert JOINT.position.min <= min(path) <= max(path) <= JOINT.position.max
 
 
 def test_a_torque_with_the_motion_is_no_grip(motion):

@@ -856,8 +856,8 @@ def test_a_drive_fault_while_enabling_ends_in_a_fault_that_names_the_joint(bench
 @pytest.mark.parametrize("code", [Code.DRIVE_LEFT_ENABLED, Code.SLAVE_NOT_OP])
 def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(bench: Bench, code: Code) -> None:
     bench.set_in_motion()
-    bench.models[0].mechanics.external_torque = -130.0
-    bench.run(0.06)
+    bench.models[0].mechanics.external_torque = -100.0
+    bench.run(0.04)
     lag = bench.log[-1].drives[0].target - bench.log[-1].drives[0].position
     assert lag > 20 * LONGEST_STEP
     CAUSES[code](bench)

@@ -37,7 +37,7 @@ class Bench:
         self.model.objects[0x6065, 0].value = 2000
         self._rx = PdoImage.from_assignment(self.model.objects, RX_ASSIGN)
         self._tx = PdoImage.from_assignment(self.model.objects, TX_ASSIGN)
-        self._outputs = b"" or bytes(self._rx.byte_length)
+        self._outputs = bytes(self._rx.byte_length)
         self.goal = DriveGoal.DISABLED
         self.object_at: float | None = None
         self.run(0.02)
@@ -148,6 +148,37 @@ def test_after_a_fault_on_its_way_it_goes_nowhere_by_itself() -> None:
     bench.run(0.2)
     bench.enabled()
     assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
+
+
+def test_enabled_out_of_a_quick_stop_it_stands_where_it_came_to_rest() -> None:
+    bench = Bench().enabled()
+    bench.model.objects[0x605A, 0].value = 6
+    bench.gripper.grip(True)
+    bench.run(0.5)
+    bench.goal = DriveGoal.QUICK_STOPPED
+    bench.run(0.5)
+    assert bench.gripper.drive.state is DriveState.QUICK_STOP_ACTIVE
+    here = bench.model.mechanics.position
+    bench.enabled()
+    path = bench.run(0.5)
+    assert max(abs(position - here) for position in path) < 2e-3
+
+
+def test_a_joint_that_is_enabled_while_others_are_not_rests() -> None:
+    bench = Bench().enabled()
+    bench.gripper.grip(True)
+    bench.run(0.5)
+    bench.gripper.follow()
+    assert not bench.gripper.motion.moving
+
+
+@pytest.mark.parametrize(
+    ("position", "outside"), [(-0.11, False), (-0.13, True), (1.51, False), (1.53, True), (0.5, False)]
+)
+def test_outside_its_range_it_is_not_to_be_enabled(position: float, outside: bool) -> None:
+    bench = Bench(position=position)
+    assert bench.gripper.outside is outside
+    assert bench.gripper.drive.target_position == min(max(bench.gripper.drive.position, -0.1), 1.5)
 
 
 def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:

@@ -31,6 +31,10 @@ class Deeds:
         """Give a command, if there is one of that name."""
         return name in COMMANDS and self.driver.order(COMMANDS[name], numbers or [])
 
+    def goes_on(self, taken: bool) -> bool:
+        """Whether a commander says it again: not for long where it was refused."""
+        return taken or self.random.random() < 0.6
+
     def seconds(self, least: float, most: float) -> None:
         """Let time pass."""
         self.driver.wait(int(self.random.uniform(least, most) / self._period_s))
@@ -95,14 +99,17 @@ class Deeds:
         pace = random.choice((0.1, 0.3, 0.6))
         target = driver.commanded
         velocity = [random.uniform(-pace, pace) for _ in target]
-        for _ in range(random.randrange(3, 30)):
+        for _ in range(random.randrange(3, 20)):
             driver.stamp += interval
             if random.random() < 0.1:
                 velocity = [random.uniform(-pace, pace) for _ in target]
             target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
             sent = self._near(0.5) if random.random() < 0.03 else target
             stamp = driver.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
-            self.order("STREAM", self._padded([self.or_nonsense(q, 0.01) for q in sent], self.or_nonsense(stamp, 0.01)))
+            numbers = [self.or_nonsense(q, 0.01) for q in sent]
+            taken = self.order("STREAM", self._padded(numbers, self.or_nonsense(stamp, 0.01)))
+            if not self.goes_on(taken):
+                return
             driver.wait(max(1, int(interval * random.uniform(0.5, 1.5) / self._period_s)))
 
     def jog(self) -> None:
@@ -114,9 +121,11 @@ class Deeds:
             * (random.choice((0.05, 0.1, 0.2, 0.3)) if frame == 2 or axis > 2 else 0.1)
             for axis in range(6)
         ]
-        for _ in range(random.randrange(1, 12)):
+        for _ in range(random.randrange(1, 9)):
             numbers = [self.or_nonsense(v, 0.01) for v in speeds]
-            self.order("JOG", self._padded(numbers, self.or_nonsense(frame, 0.01), self.or_nonsense(HOLD_S, 0.01)))
+            last = (self.or_nonsense(frame, 0.01), self.or_nonsense(HOLD_S, 0.01))
+            if not self.goes_on(self.order("JOG", self._padded(numbers, *last))):
+                return
             self.seconds(0.02, 0.15)
             if random.random() < 0.1:
                 speeds[random.randrange(6)] *= -1.0
@@ -124,21 +133,25 @@ class Deeds:
     def velocity(self) -> None:
         """Joint speeds."""
         random = self.random
-        for _ in range(random.randrange(1, 8)):
+        for _ in range(random.randrange(1, 5)):
             speeds = [random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)) for _ in range(6)]
             numbers = [self.or_nonsense(v, 0.01) for v in speeds]
-            self.order("VELOCITY", self._padded(numbers, self.or_nonsense(random.choice((0.1, 0.5, 1.0)), 0.02)))
-            self.seconds(0.02, 0.5)
+            hold_s = self.or_nonsense(random.choice((0.1, 0.5, 1.0)), 0.02)
+            if not self.goes_on(self.order("VELOCITY", self._padded(numbers, hold_s))):
+                return
+            self.seconds(0.02, 0.4)
 
     def torque(self) -> None:
         """Joint torques, with or without an impedance about where the arm was."""
         random = self.random
-        for _ in range(random.randrange(1, 8)):
+        for _ in range(random.randrange(1, 5)):
             size = random.choice((1.0, 5.0, 20.0))
             torques = [random.uniform(-size, size) for _ in range(6)]
             numbers = [self.or_nonsense(v, 0.01) for v in torques]
             shares = [random.choice((0.0, 0.5, 1.0)), random.choice((0.0, 1.0))]
-            self.order("TORQUE", self._padded(numbers, *shares, self.or_nonsense(random.choice((0.1, 0.5)), 0.02)))
+            hold_s = self.or_nonsense(random.choice((0.1, 0.5)), 0.02)
+            if not self.goes_on(self.order("TORQUE", self._padded(numbers, *shares, hold_s))):
+                return
             self.seconds(0.02, 0.4)
 
     # -- a hand at the arm ------------------------------------------------------------------------------------------

@@ -228,7 +228,8 @@ class Judge:
             if newest < n:
                 break
             change = abs(past[newest] - past[newest - n])
-            allowed = bounds.acceleration[axis] * n * self._dt * COUNTS + ROUNDING + gain
+            # A mode tells the speed at the end of its cycle, a guard's stop the mean of it: half a cycle apart.
+            allowed = bounds.acceleration[axis] * (n + 0.5) * self._dt * COUNTS + ROUNDING + gain
             self.largest_acceleration = max(self.largest_acceleration, change / allowed)
             if change > allowed:
                 self._violation(

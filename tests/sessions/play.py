@@ -22,8 +22,12 @@ from tests.sessions.driver import (
 )
 
 MOTIONS = ("joint", "cartesian", "joystick", "velocity", "torque")
-ACTIONS = 24
-LONGEST_WAIT_S = 0.4
+SHARES = (3, 3, 2, 1, 1)
+ACTIONS = 14
+LONGEST_WAIT_S = 0.3
+
+
+MOVABLE = (State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING, State.CLOSING)
 
 
 @dataclass
@@ -66,7 +70,7 @@ class Player:
         self.random = random = Random(seed)
         config = configuration() if config is None else config
         self.bounds = bounds_of(config)
-        motion = random.choice(MOTIONS)
+        (motion,) = random.choices(MOTIONS, SHARES)
         chosen = with_start(config, random.choice(PERIODS_US), random.choice(("csp", "csp", "csv", "cst")), motion)
         self.driver = driver = Driver(chosen, seed, self._place(random.random() < 0.9))
         self.period_s = chosen.cycle.period_us * 1e-6
@@ -123,7 +127,7 @@ class Player:
             self.random.choice((self._move, self._move, deeds.trajectory, deeds.line, deeds.stream, deeds.jog))()
 
     def _change_motion(self) -> None:
-        wanted = self.random.randrange(1, 6)
+        wanted = self.random.choices(range(1, 6), SHARES)[0]
         if self.deeds.order("MOTION", [self.deeds.or_nonsense(wanted)]):
             self.motion = wanted
 
@@ -172,9 +176,8 @@ class Player:
             for _ in range(ACTIONS):
                 if driver.simulation.done or driver.violations:
                     break
-                asleep = driver.state in (State.READY, State.FAULT, State.RESETTING)
-                if asleep and random.random() < 0.5:
-                    self._enable()
+                if driver.state not in MOVABLE and random.random() < 0.7:
+                    driver.enable()
                 else:
                     random.choices(self.actions, weights)[0][1]()
                 driver.wait(int(random.expovariate(8.0 / LONGEST_WAIT_S) / self.period_s) + 1)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from random import Random
+
 import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from rtcp.runtime.machine import Command, State
+from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
     DRIVE_MODES,
     FAULTS,
@@ -54,6 +57,7 @@ FREE = [
     (1.5, 0.6, 0.5, 2.0, 1.0, -2.0),
 ]
 """Places to begin at that are outside every keep-out box."""
+DEEDS = ("trajectory", "line", "stream", "jog", "velocity", "torque", "stick", "toggle", "emergency")
 AXES = st.integers(0, 5)
 ANGLES = st.floats(-3.2, 3.2) | st.sampled_from(NONSENSE)
 TARGETS = st.lists(ANGLES, min_size=6, max_size=6)
@@ -72,6 +76,7 @@ class AnySession(RuleBasedStateMachine):
         motion=st.sampled_from(MOTIONS),
     )  # fmt: skip
     def begin(self, place: tuple[float, ...], period: int, mode: str, motion: str) -> None:
+        self.period_s = period * 1e-6
         self.driver = Driver(with_start(configuration(), period, mode, motion), 1, place)
 
     @property
@@ -91,6 +96,15 @@ class AnySession(RuleBasedStateMachine):
     def move_a_little(self, by: list[float]) -> None:
         target = [q + d for q, d in zip(self.it.commanded, by, strict=True)]
         self.it.order(Command.MOVE, [*target, *[0.0] * 5, 0.5])
+
+    @rule(name=st.sampled_from(DEEDS), seed=st.integers(0, 10_000))
+    def do(self, name: str, seed: int) -> None:
+        """Something longer: a plan, a stream, a hand on the stick."""
+        getattr(Deeds(self.it, Random(seed), self.period_s), name)()
+
+    @rule(motion=st.integers(1, 5))
+    def change_the_motion(self, motion: int) -> None:
+        self.it.order(Command.MOTION, [motion])
 
     @rule(command=st.sampled_from([Command.STOP, Command.DISABLE, Command.RESET]))
     def stop(self, command: Command) -> None:

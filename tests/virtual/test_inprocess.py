@@ -15,7 +15,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.emergency import Emergency as FieldbusEmergency
-from rtcp.runtime.machine import Command
+from rtcp.runtime.machine import Code, Command
 from rtcp.runtime.machine import State as MachineState
 from rtcp.virtual.inprocess import Emergency, InProcessBus, SlaveFacts, SlaveState
 from rtcp.virtual.inprocess_data import InProcessData
@@ -35,10 +35,14 @@ SYNC_LIMIT = 120
 
 @pytest.fixture(scope="module")
 def config() -> ArmConfig:
-    """The IO box and the first two joints of the default arm."""
+    """The IO box and the first two joints of the default arm; no geometry, which is one of six."""
     whole = load(default_config())
     return replace(
-        whole, slaves=whole.slaves[:3], joints=whole.joints[:2], cycle=replace(whole.cycle, period_us=PERIOD_NS / 1000)
+        whole,
+        arm=None,
+        slaves=whole.slaves[:3],
+        joints=whole.joints[:2],
+        cycle=replace(whole.cycle, period_us=PERIOD_NS / 1000),
     )
 
 
@@ -236,6 +240,43 @@ def test_a_drive_lives_through_every_cycle_also_without_frames(master: Master) -
     assert drive.mechanics.position == pytest.approx(before + 0.010, abs=0.0011)
 
 
+def test_sync0_comes_at_whole_cycles_of_the_reference_clock(master: Master) -> None:
+    drive = master.drives[0]
+    drive.mechanics.braked = False
+    drive.mechanics.velocity = 1.0
+    drive.mechanics.coulomb = drive.mechanics.viscous = drive.mechanics.holding_torque = 0.0
+    master.exchange()
+    frame = master.now - PERIOD_NS
+    before = drive.mechanics.position
+    master.bus.advance_to(frame + PERIOD_NS // 2 - 1)
+    assert drive.mechanics.position == before
+    master.bus.advance_to(frame + PERIOD_NS // 2)
+    assert drive.mechanics.position == pytest.approx(before + 0.001)
+
+
+def test_outputs_do_not_count_below_op(config: ArmConfig) -> None:
+    master = Master(config)
+    master.bus.request_state(State.SAFE_OP, [2])
+    master.tell(1, 0x06, position=77)
+    assert master.exchange(3) == 9
+    assert master.drives[0].objects[0x607A, 0].value == 0
+    master.bus.request_state(State.OP, [2])
+    master.exchange(3)
+    assert master.drives[0].objects[0x607A, 0].value == 77
+
+
+def test_a_drive_without_sync0_steps_with_the_frames_and_knows_no_sync_error(config: ArmConfig) -> None:
+    free = [replace(slave, device=replace(slave.device, assign_activate=0)) for slave in config.slaves]
+    master = Master(replace(config, slaves=tuple(free)))
+    master.tell(1, 0, position=55)
+    master.exchange()
+    assert master.drives[0].objects[0x607A, 0].value == 55
+    for _ in range(SYNC_LIMIT):
+        master.data.lose(1, heard=False)
+        master.exchange(2)
+    assert master.states()[1] == (State.OP, False, 0)
+
+
 # -- what goes wrong ------------------------------------------------------------------------------------------------
 
 
@@ -357,14 +398,23 @@ def test_a_lease_that_is_not_renewed_runs_out_in_simulated_time(simulation: Simu
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 1.0)
 
 
-def test_slaves_that_left_op_come_back_after_a_reset_and_not_before(simulation: Simulation) -> None:
-    to_holding(simulation)
-    simulation.bus.drop(2, State.SAFE_OP, 0x001A)
-    assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
-    simulation.run(0.5)
-    assert simulation.state is MachineState.FAULT
-    assert simulation.order(Command.RESET).refusal == 0
-    assert simulation.until(lambda: simulation.state is MachineState.READY, 1.0)
+def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_before(
+    config: ArmConfig, segment: SegmentConfig
+) -> None:
+    # The cycle counts what is missing for so long that the service finds the slave first.
+    patient = replace(config, bus=replace(config.bus, lost_cycles=1000))
+    with Simulation(patient, 1, segment=segment) as simulation:
+        simulation.acquire()
+        to_holding(simulation)
+        simulation.bus.drop(2, State.SAFE_OP, 0x001A)
+        assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
+        assert [event.axis for event in simulation.events if event.code == Code.SLAVE_NOT_OP] == [2]
+        simulation.run(0.5)
+        assert simulation.state is MachineState.FAULT
+        assert simulation.order(Command.RESET).refusal == 0
+        assert simulation.until(lambda: simulation.state is MachineState.READY, 1.0)
+        simulation.run(0.3)
+        assert simulation.state is MachineState.READY
 
 
 def story(config: ArmConfig, segment: SegmentConfig, seed: int) -> list[Frame]:

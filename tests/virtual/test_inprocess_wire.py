@@ -1,4 +1,4 @@
-"""A drive on the in-process bus does what it does behind an EtherCAT slave controller: the same bytes, frame by frame."""
+"""A drive on the in-process bus does what it does behind an EtherCAT slave controller: the same bytes, each frame."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def over_the_wire(told: Sequence[bytes], lost: Sequence[int]) -> list[bytes]:
     start_sync0(line, 0, CYCLE, first_in=50 * MS)
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
     sync0 = line.slaves[0].esc.dc.sync0  # type: ignore[union-attr]
-    line.pass_time((sync0.due - line.now) % CYCLE + CYCLE // 2)
+    line.pass_time(((sync0.due or 0) - line.now) % CYCLE + CYCLE // 2)
     line.write(0, 0x0120, bytes((OP, 0)))
     line.pass_time(CYCLE - 100_000)
 
@@ -90,18 +90,22 @@ def in_process(told: Sequence[bytes], lost: Sequence[int]) -> list[bytes]:
             data.lose(1, heard=False)
         data.set_output(0, outputs)
         data.send()
-        if data.receive() == data.expected_wkc and n >= 100:
+        if data.receive() >= 0 and n >= 100:
             heard.append(data.input(0))
     return heard
 
 
-@pytest.mark.parametrize("lost", [(), (450, 451, 460), range(500, 515)], ids=["all frames", "some lost", "many lost"])
+@pytest.mark.parametrize(
+    ("lost", "state"),
+    [((), 0x07), ((450, 460), 0x07), (range(500, 515), 0x08)],
+    ids=["all frames", "single ones lost", "so many lost that it leaves OP"],
+)
 @pytest.mark.parametrize("mode", MODES)
-def test_the_same_outputs_bring_the_same_inputs(mode: str, lost: Sequence[int]) -> None:
+def test_the_same_outputs_bring_the_same_inputs(mode: str, lost: Sequence[int], state: int) -> None:
     told = schedule(MODES[mode])
     wire, process = over_the_wire(told, lost), in_process(told, lost)
     assert len(wire) == len(process) == len(told) - len(lost)
     first = next((n for n, (one, other) in enumerate(zip(wire, process, strict=True)) if one != other), None)
     assert first is None, (first, DRIVE.unpack(wire[first or 0]), DRIVE.unpack(process[first or 0]))
     statuswords = {DRIVE.unpack(inputs)[0] & 0x6F for inputs in process}
-    assert {0x40, 0x21, 0x23, 0x27, 0x07} <= statuswords
+    assert {0x40, 0x21, 0x23, 0x27, state} <= statuswords

@@ -1,0 +1,36 @@
+"""What a joint's limits leave room for: accelerations that a speed allows, speeds that a range allows."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+_INSIDE = 1.0 - 1e-6
+"""What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
+
+
+def allowed_acceleration(
+    acceleration: float, speed: float, fastest: float, most: float, jerk: float
+) -> float:
+    """Return the acceleration, rad/s^2, cut to `most`, and to what ends before the speed passes `fastest`.
+
+    An acceleration a that falls to 0 with the jerk j still adds a^2 / 2j to the speed.
+    """
+    outward = acceleration if speed >= 0.0 else -acceleration
+    bound = most
+    if outward > 0.0:
+        left = fastest - (speed if speed >= 0.0 else -speed)
+        rising = sqrt(2.0 * jerk * left) if left > 0.0 else 0.0
+        bound = rising if rising < most else most
+    bound *= _INSIDE
+    return bound if acceleration > bound else -bound if acceleration < -bound else acceleration
+
+
+def stoppable_speed(room: float, acceleration: float, jerk: float) -> float:
+    """Return the speed, rad/s, that comes to rest within `room` rad, with a ramp of the acceleration before it.
+
+    v^2 / 2a + v a / 2j = room, solved for v.
+    """
+    if not room > 0.0:
+        return 0.0
+    ramp = 0.5 * acceleration * acceleration / jerk
+    return sqrt(ramp * ramp + 2.0 * acceleration * room) - ramp

@@ -1,0 +1,192 @@
+"""The mode `stream`: smooth between targets at any rate, late and out-of-order ones dropped, at rest when they cease."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtcp.motion.state import Phase, Reason
+from rtcp.motion.stream import TIMEOUT_S, StreamMode
+
+PERIOD = 0.0005
+ZERO = [0.0] * 6
+
+
+@pytest.fixture
+def mode(bounds: Any) -> StreamMode:
+    return StreamMode(bounds, PERIOD)
+
+
+def stream(
+    drive: Any, mode: StreamMode, wanted: Callable[[float], list[float]], seconds: float, interval: float, jitter: float = 0.0
+) -> None:
+    """Feed what the sender says every `interval` s, with a network that delays each by up to `jitter` s."""
+    chance = random.Random(1)
+    began = drive.state.now_ns
+    due = [(k * interval + chance.uniform(0.0, jitter), k * interval) for k in range(round(seconds / interval))]
+    due.sort()
+    while due:
+        now = (drive.state.now_ns - began) * 1e-9
+        while due and due[0][0] <= now + 1e-9:
+            stamp = due.pop(0)[1]
+            mode.feed(wanted(stamp), 1000.0 + stamp, drive.state.now_ns)
+        drive.cycle(mode)
+
+
+def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.1 * (1.0 - math.cos(math.pi * t))] * 6, 2.0, 1 / 30)
+    assert mode.phase is Phase.MOVE
+    assert drive.until_rest(mode) < TIMEOUT_S + 0.5
+    assert mode.reason is Reason.STREAM_ENDED
+    assert (mode.accepted, mode.dropped) == (60, 0)
+    assert drive.state.position == pytest.approx([0.1 * (1.0 - math.cos(math.pi * 59 / 30))] * 6, abs=1e-6)
+
+
+def test_the_last_target_is_reached_and_not_passed_by_much(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
+    drive.until_rest(mode)
+    assert drive.state.position == pytest.approx([0.3 * 0.98] * 6, abs=1e-6)
+    assert max(q[0] for q in drive.path) < 0.3 * 0.98 + 0.3**2 / (2 * 2.0) + 0.3 * 0.06
+
+
+def test_one_target_is_moved_to_as_long_as_it_is_renewed(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda _: [0.2] * 6, 3.0, 0.1)
+    assert drive.state.position == pytest.approx([0.2] * 6, abs=1e-9)
+
+
+@pytest.mark.parametrize("interval", [0.001, 0.004, 0.0333, 0.1, 0.15])
+def test_any_rate_is_followed_smoothly(new_drive: Any, interval: float) -> None:
+    drive = new_drive(with_jerk=True)
+    mode = StreamMode(drive.limits, PERIOD)
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.2 * math.sin(math.pi * t) ** 2] * 6, 4.0, interval)
+    errors = [
+        abs(q[0] - 0.2 * math.sin(math.pi * ((k + 1) * PERIOD - 1.25 * interval)) ** 2) for k, q in enumerate(drive.path)
+    ]
+    assert max(errors[2000:]) < 0.01 + 0.3 * interval
+    assert mode.dropped == 0
+
+
+def test_jitter_of_the_network_does_not_stop_the_motion(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.2 * t] * 6, 2.0, 0.03, jitter=0.015)
+    speeds = [(b[0] - a[0]) / PERIOD for a, b in zip(drive.path[1000:], drive.path[1001:], strict=False)]
+    assert min(speeds) > 0.05
+
+
+def test_what_is_out_of_order_or_stamped_alike_is_dropped(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    assert mode.feed(ZERO, 5.0, 0)
+    assert not mode.feed([0.1] * 6, 5.0, 1_000_000)
+    assert not mode.feed([0.1] * 6, 4.5, 1_000_000)
+    assert mode.late_s == pytest.approx(0.5)
+    assert mode.feed(ZERO, 5.001, 1_000_000)
+    assert (mode.accepted, mode.dropped) == (2, 2)
+
+
+def test_what_comes_later_than_the_others_by_the_timeout_is_dropped(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    assert mode.feed(ZERO, 100.0, 0)
+    assert mode.feed(ZERO, 100.1, 100_000_000)
+    assert not mode.feed([0.1] * 6, 100.15, 400_000_000)
+    assert mode.late_s == pytest.approx(0.25, abs=1e-3)
+    assert mode.feed(ZERO, 100.39, 400_000_000)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3.2, -1e300])
+def test_what_is_no_number_or_out_of_range_is_dropped(drive: Any, mode: StreamMode, value: float) -> None:
+    mode.start(drive.state)
+    assert not mode.feed([value, *ZERO[1:]], 1.0, 0)
+    assert not mode.feed([*ZERO[1:], value], 1.0, 0)
+    assert mode.dropped == 2
+    assert mode.late_s == 0.0
+    drive.until_rest(mode)
+    assert drive.state.position == ZERO
+
+
+@pytest.mark.parametrize("stamp", [math.nan, math.inf])
+def test_a_stamp_that_is_no_number_is_dropped(drive: Any, mode: StreamMode, stamp: float) -> None:
+    mode.start(drive.state)
+    assert not mode.feed(ZERO, stamp, 0)
+
+
+def test_nothing_is_taken_before_the_start_and_after_a_stop(drive: Any, mode: StreamMode) -> None:
+    assert not mode.feed(ZERO, 1.0, 0)
+    mode.start(drive.state)
+    assert mode.feed([0.3] * 6, 1.0, 0)
+    drive.run(mode, 300)
+    mode.stop(drive.state)
+    assert not mode.feed([0.3] * 6, 1.1, drive.state.now_ns)
+    drive.until_rest(mode)
+    assert mode.reason is Reason.NONE
+
+
+def test_a_stream_that_begins_in_motion_brings_the_arm_to_rest_until_a_target_comes(
+    drive: Any, mode: StreamMode
+) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
+    assert drive.state.velocity[0] > 0.2
+    mode.start(drive.state)
+    drive.run(mode, 100)
+    assert mode.feed([0.1] * 6, 1.0, drive.state.now_ns)
+    drive.until_rest(mode)
+
+
+def test_targets_at_the_edge_of_a_range_do_not_carry_a_joint_beyond(drive: Any, mode: StreamMode) -> None:
+    drive.at([2.8, 1.7, 2.1, 2.8, 1.7, 2.8])
+    mode.start(drive.state)
+    start, high = list(drive.state.position), drive.limits.high
+    stream(drive, mode, lambda t: [min(q + 0.45 * t, h) for q, h in zip(start, high, strict=True)], 1.0, 0.05)
+    drive.until_rest(mode)
+    assert drive.state.position == pytest.approx(high, abs=1e-6)
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6))
+def test_no_stream_whatever_breaks_a_limit(new_drive: Any, seed: int) -> None:
+    chance, drive = random.Random(seed), new_drive()
+    mode = StreamMode(drive.limits, PERIOD)
+    mode.start(drive.state)
+    stamp = 0.0
+    for _ in range(40):
+        stamp += chance.choice([0.001, 0.01, 0.05, -0.02, 0.3])
+        target = [chance.uniform(low, high) for low, high in zip(drive.limits.low, drive.limits.high, strict=True)]
+        mode.feed(target, stamp, drive.state.now_ns)
+        drive.run(mode, chance.randint(1, 200))
+        if chance.random() < 0.05:
+            mode.stop(drive.state)
+            drive.run(mode, chance.randint(1, 50))
+            mode.start(drive.state)
+    drive.until_rest(mode)
+
+
+def lag(path: list[list[float]], amplitude: float, omega: float) -> tuple[float, float]:
+    """Delay, s, and gain of a sampled sine, by its first harmonic over whole periods."""
+    whole = round(2 * math.pi / omega / PERIOD)
+    tail = [q[0] for q in path[-2 * whole :]]
+    at = len(path) - len(tail)
+    a = sum(q * math.sin(omega * (at + k + 1) * PERIOD) for k, q in enumerate(tail)) * 2 / len(tail)
+    b = sum(q * math.cos(omega * (at + k + 1) * PERIOD) for k, q in enumerate(tail)) * 2 / len(tail)
+    return -math.atan2(b, a) / omega, math.hypot(a, b) / amplitude
+
+
+def test_a_sine_at_30_hz_lags_by_little_more_than_the_senders_interval(new_drive: Any) -> None:
+    # pi/8 rad with a period of 2 s needs 1.23 rad/s and 3.9 rad/s^2.
+    drive = new_drive()
+    drive.limits.velocity[:], drive.limits.acceleration[:], drive.limits.jerk[:] = [2.0] * 6, [8.0] * 6, [100.0] * 6
+    mode = StreamMode(drive.limits, PERIOD)
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [math.pi / 8 * math.sin(math.pi * t)] * 6, 10.0, 1 / 30)
+    behind, gain = lag(drive.path, math.pi / 8, math.pi)
+    assert 0.02 < behind < 0.06
+    assert gain == pytest.approx(1.0, abs=0.01)
