@@ -51,7 +51,7 @@ class Arm:
             DriveMode.CSV: VelocityLaw(joints),
             DriveMode.CST: self._torque_law,
         }
-        self.set_mode(MODES[config.mode])
+        self.set_mode(self.motions.drive_mode_of(self.motions.mode))
 
     def set_mode(self, mode: DriveMode) -> None:
         """Let the drives change to `mode`; only at standstill."""

@@ -279,6 +279,8 @@ class Bench:
     def start(self) -> Bench:
         self.service.all_op = True
         self.until(State.READY)
+        # What the inputs mean counts once it has lasted.
+        self.run(0.01)
         return self
 
     def enable(self) -> Bench:

@@ -266,15 +266,16 @@ def test_outputs_do_not_count_below_op(config: ArmConfig) -> None:
 
 
 def test_a_drive_without_sync0_steps_with_the_frames_and_knows_no_sync_error(config: ArmConfig) -> None:
-    free = [replace(slave, device=replace(slave.device, assign_activate=0)) for slave in config.slaves]
-    master = Master(replace(config, slaves=tuple(free)))
+    box, first, second = config.slaves
+    free = (box, replace(first, device=replace(first.device, assign_activate=0)), second)
+    master = Master(replace(config, slaves=free))
     master.tell(1, 0, position=55)
     master.exchange()
     assert master.drives[0].objects[0x607A, 0].value == 55
     for _ in range(SYNC_LIMIT):
         master.data.lose(1, heard=False)
         master.exchange(2)
-    assert master.states()[1] == (State.OP, False, 0)
+    assert master.states()[1:] == [(State.OP, False, 0), (State.SAFE_OP, True, 0x001A)]
 
 
 # -- what goes wrong ------------------------------------------------------------------------------------------------
