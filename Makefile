@@ -17,7 +17,7 @@ oracles: setup ## add what the kinematics is compared with (Pinocchio, EAIK); wi
 	@$(BIN)/python -m pip install --quiet --editable '.[dev,oracles]'
 
 run: setup ## run the demonstration: virtual segment, master, a move, the figures
-	@$(BIN)/rtcp demo
+	@$(BIN)/rtcp demo --square xy
 
 test: setup ## run all tests
 	@$(BIN)/python -m pytest

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 import rtcp
-from rtcp.cli import arm, bus, demo, motion, start, status
+from rtcp.cli import arm, bus, demo, jog, limits, machine, motion, start, status, stick
 from rtcp.cli.outcome import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.errors import ConfigError
@@ -49,7 +49,7 @@ def _print_help(context: typer.Context) -> None:
         emit(text.rstrip())
 
 
-for _group in (start, status, motion, arm, bus, demo):
+for _group in (start, status, machine, motion, jog, limits, stick, arm, bus, demo):
     _group.register(app)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.motion import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report, show
 

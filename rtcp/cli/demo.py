@@ -7,10 +7,12 @@ import signal
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rtcp.cli import demo_square
 from rtcp.cli.connection import connect
 from rtcp.cli.launch import launch, refuse_a_second_platform
 from rtcp.cli.motion import arrival, move
@@ -47,27 +49,44 @@ def _demo(
     config: ConfigFile = None,
     bus: BusName = None,
     seconds: Annotated[float, typer.Option("--seconds", metavar="N", help="How long to move, s.")] = 6.0,
+    square: Annotated[
+        str | None, typer.Option("--square", metavar="xy|yz|xz", help="Drive a square of 200 mm in this plane instead.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE", help="Where the square's picture goes; PNG, SVG or PDF.")
+    ] = None,
 ) -> None:
-    """Start, enable, move through a few poses and back, stop, and show how well the cycle held."""
+    """Start, enable, move, come back, stop, and show how well the cycle held.
+
+    The motion is a few poses, or with --square a square of straight lines at 50 mm/s, of which a picture is drawn:
+    path, deviation, joint angles, speeds and torques.
+    """
     if not 0 < seconds <= LONGEST_S:
         raise CommandError(f"--seconds {seconds:g} is not allowed: above 0, at most {LONGEST_S:g}")
+    if picture is not None and square is None:
+        raise CommandError("--picture needs --square xy, yz or xz: it is the square's")
     refuse_a_second_platform()
-    joints = offline.configuration(config).joints
+    arm = offline.configuration(config)
+    drive = demo_square.prepare(arm, square, picture) if square is not None else None
     from rtcp.runtime.launcher import StartOptions
 
     options = StartOptions(config=config, bus=bus, mode="csp")
     try:
         with orderly_signals(), _platform(options) as started_s, connect("demo") as client:
-            status, mean_ns = _run(client, joints, seconds)
+            status, mean_ns = _run(client, arm.joints, seconds, drive)
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: the platform has been stopped", interruption_code(interruption)) from None
     given = status.get("start_to_op_s")
     from rtcp.cli.demo_view import table
 
     show(table(status, given if isinstance(given, int | float) else started_s, mean_ns))
+    if drive is not None:
+        drive.tell()
 
 
-def _run(client: ControlClient, joints: Sequence[Joint], seconds: float) -> tuple[dict[str, Any], float | None]:
+def _run(
+    client: ControlClient, joints: Sequence[Joint], seconds: float, drive: demo_square.SquareDrive | None
+) -> tuple[dict[str, Any], float | None]:
     """Enable, move, come back, and return the last status with the drives enabled and the mean cycle, ns."""
     _wait_for_the_clocks(client)
     client.call("enable")
@@ -77,12 +96,10 @@ def _run(client: ControlClient, joints: Sequence[Joint], seconds: float) -> tupl
         min(joint.position.max, max(joint.position.min, float(position)))
         for joint, position in zip(joints, before["joints"]["position"], strict=True)
     ]
-    until = time.monotonic() + seconds
-    number = 0
-    while number == 0 or time.monotonic() < until:
-        target = pose(home, joints, POSES[number % len(POSES)])
-        number += 1
-        report(f"pose {number}: {arrival(move(client, target, None, _unseen))}")
+    if drive is not None:
+        drive.run(client)
+    else:
+        _poses(client, joints, home, seconds)
     report(f"back: {arrival(move(client, home, None, _unseen))}")
     after, passed_ns = client.call("status"), time.monotonic_ns() - since_ns
     client.call("disable")
@@ -98,6 +115,15 @@ def pose(home: Sequence[float], joints: Sequence[Joint], directions: Sequence[in
         wanted = start + math.copysign(REACH, directions[number % len(directions)])
         target.append(min(joint.position.max - margin, max(joint.position.min + margin, wanted)))
     return target
+
+
+def _poses(client: ControlClient, joints: Sequence[Joint], home: Sequence[float], seconds: float) -> None:
+    until = time.monotonic() + seconds
+    number = 0
+    while number == 0 or time.monotonic() < until:
+        target = pose(home, joints, POSES[number % len(POSES)])
+        number += 1
+        report(f"pose {number}: {arrival(move(client, target, None, _unseen))}")
 
 
 def _wait_for_the_clocks(client: ControlClient) -> None:

@@ -12,6 +12,7 @@ from rtcp.motion.guard import Guard
 from rtcp.motion.limits import Limits
 from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
 from rtcp.motion.state import MotionState, Phase
+from rtcp.runtime.gripper import DrivenGripper
 from rtcp.runtime.motions import Motions
 
 MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
@@ -33,13 +34,22 @@ class Arm:
     Args:
         config: joints, limits, cycle, the mode at the start.
         drives: one a joint, in the order of the joints, with the index of its slave.
+        gripper: one with a drive of its own, or None. What is asked of all drives below is asked of its drive too, as
+            the one after the joints'.
     """
 
-    def __init__(self, config: ArmConfig, drives: Sequence[tuple[int, Cia402Drive]]) -> None:
+    def __init__(
+        self,
+        config: ArmConfig,
+        drives: Sequence[tuple[int, Cia402Drive]],
+        gripper: DrivenGripper | None = None,
+    ) -> None:
         joints = config.joints
         self.period_s = config.cycle.period_us * 1e-6
         self.drives = [drive for _, drive in drives]
         self.pairs = list(drives)
+        self.gripper = gripper
+        self.all_drives = self.drives if gripper is None else [*self.drives, gripper.drive]
         self.state = MotionState(len(joints))
         self.limits = Limits(config)
         self.guards = SetPointGuard(config, self.limits, self.period_s)
@@ -70,15 +80,19 @@ class Arm:
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque
+        if self.gripper is not None:
+            self.gripper.decode(data)
 
     def encode(self, data: ProcessData) -> None:
         """Hand over the drives' outputs."""
         for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
+        if self.gripper is not None:
+            self.gripper.encode(data)
 
     def lead(self, goal: DriveGoal) -> None:
         """Lead every drive one step towards `goal`."""
-        for drive in self.drives:
+        for drive in self.all_drives:
             drive.advance(goal)
 
     def hold_target(self) -> None:
@@ -98,6 +112,8 @@ class Arm:
                 position[i] = drive.target_position = high if here > high else low if here < low else here
                 latch(i, drive.target_position)
         self.guards.latch(self.state)
+        if self.gripper is not None:
+            self.gripper.follow()
 
     def command(self) -> Verdict:
         """Write the targets of this cycle: the active mode, its guards, the law, the last clamp."""
@@ -109,18 +125,20 @@ class Arm:
         else:
             self._law.update(state.position, state.velocity, drives)
         self.guard.check(drives)
+        if self.gripper is not None:
+            self.gripper.command()
         return verdict
 
     def first_not_enabled(self) -> int:
         """Return the first joint whose drive is not enabled, or -1."""
-        for axis, drive in enumerate(self.drives):
+        for axis, drive in enumerate(self.all_drives):
             if drive.state is not _ENABLED:
                 return axis
         return -1
 
     def first_with_torque(self) -> int:
         """Return the first joint whose drive gives torque: enabled, in a quick stop or reacting to a fault; or -1."""
-        for axis, drive in enumerate(self.drives):
+        for axis, drive in enumerate(self.all_drives):
             if drive.state in WITH_TORQUE:
                 return axis
         return -1
@@ -135,14 +153,14 @@ class Arm:
 
     def first_in_fault(self) -> int:
         """Return the first joint whose drive is in fault, or -1."""
-        for axis, drive in enumerate(self.drives):
+        for axis, drive in enumerate(self.all_drives):
             if drive.state is DriveState.FAULT:
                 return axis
         return -1
 
     def first_moving(self) -> int:
         """Return the first joint that does not stand still, or -1."""
-        for axis, drive in enumerate(self.drives):
+        for axis, drive in enumerate(self.all_drives):
             if abs(drive.velocity) > _STILL_RAD_S:
                 return axis
         return -1
@@ -153,11 +171,11 @@ class Arm:
         for axis, drive in enumerate(self.drives):
             if not low[axis] - RANGE_MARGIN_RAD <= drive.position <= high[axis] + RANGE_MARGIN_RAD:
                 return axis
-        return -1
+        return len(self.drives) if self.gripper is not None and self.gripper.outside else -1
 
     def first_not_resting(self) -> int:
         """Return the first joint whose drive is in fault or enabled, or -1."""
-        for axis, drive in enumerate(self.drives):
+        for axis, drive in enumerate(self.all_drives):
             if drive.state not in RESTING:
                 return axis
         return -1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, Joint
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
@@ -14,6 +14,7 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.behaviour import Behaviour
 from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.gripper import gripper_of
 from rtcp.runtime.loop import Loop
 from rtcp.runtime.operator import Operator
 from rtcp.runtime.orders import Orders
@@ -46,6 +47,11 @@ def drives_of(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
         (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity, zero=zero))
         for joint, zero in zip(config.joints, zeros, strict=False)
     ]
+
+
+def position_of(config: ArmConfig, joint: Joint) -> int:
+    """Return the position on the cable, from 1, of the drive that moves `joint`."""
+    return next(slot for slot, slave in enumerate(config.slaves, 1) if slave.name == joint.slave)
 
 
 def box_of(config: ArmConfig) -> tuple[int, IoBox] | None:
@@ -90,7 +96,7 @@ def assemble(
     Raises:
         DeviceError: a device's description cannot serve.
     """
-    arm = Arm(config, drives_of(config))
+    arm = Arm(config, drives_of(config), gripper_of(config))
     slotted = box_of(config)
     box = None if slotted is None else slotted[1]
     operator = Operator(config, box)

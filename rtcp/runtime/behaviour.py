@@ -170,6 +170,8 @@ class Behaviour:
     def stop_motion(self) -> None:
         """Let the active mode come to rest."""
         self._arm.motions.stop(self._arm.state)
+        if self._arm.gripper is not None:
+            self._arm.gripper.stop()
         self._limited = False
         self.on(Event.STOP)
 
@@ -206,10 +208,10 @@ class Behaviour:
 
     def _fail_drive(self, code: Code, axis: int) -> None:
         self._service.explain_drive(axis)
-        self._fail(code, axis, float(self._arm.drives[axis].statusword))
+        self._fail(code, axis, float(self._arm.all_drives[axis].statusword))
 
     def _fail_mode(self, axis: int) -> None:
-        self._fail(Code.MODE_STUCK, axis, float(self._arm.drives[axis].mode_display), float(self._arm.mode))
+        self._fail(Code.MODE_STUCK, axis, float(self._arm.all_drives[axis].mode_display), float(self._arm.mode))
 
     def _stop_in_emergency(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         if self.state is State.EMERGENCY_STOP:
@@ -316,7 +318,7 @@ class Behaviour:
             return
         axis = arm.first_outside()
         if axis >= 0:
-            self._fail(Code.LEFT_RANGE, axis, arm.drives[axis].position)
+            self._fail(Code.LEFT_RANGE, axis, arm.all_drives[axis].position)
             return
         axis = arm.first_in_fault()
         if axis >= 0:
@@ -327,7 +329,8 @@ class Behaviour:
         arm.command()
         axis = arm.first_not_enabled()
         elsewhere = arm.first_in_another_mode() if axis < 0 else -1
-        if axis < 0 and elsewhere < 0:
+        gripper = arm.gripper
+        if axis < 0 and elsewhere < 0 and (gripper is None or gripper.enabled):
             self.enables += 1
             self.all_enabled = True
             self._watch.reset()
@@ -401,8 +404,9 @@ class Behaviour:
             self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
         elif homing.phase is HomingPhase.STUCK:
             self._fail_mode(axis)
-        elif homing.phase is HomingPhase.HOMED and arm.first_outside() >= 0:
-            self._fail(Code.LEFT_RANGE, axis, arm.drives[axis].position)
+        elif arm.first_outside() >= 0:
+            # While it searches, and where it begins to count anew: also a stop after the index was found does.
+            self._fail(Code.LEFT_RANGE, axis, arm.all_drives[axis].position)
         elif homing.ended:
             self._blackboard.event(_HOMING_ENDS[homing.phase], axis, self._homing_figure())
             self.on(Event.HOMED if homing.phase is HomingPhase.HOMED else Event.STOPPED)
@@ -476,7 +480,7 @@ class Behaviour:
         if self._waited > self._reset_cycles:
             axis = arm.first_moving()
             if axis >= 0 and good and self._service.all_op:
-                self._fail(Code.RESET_MOVING, axis, arm.drives[axis].velocity)
+                self._fail(Code.RESET_MOVING, axis, arm.all_drives[axis].velocity)
                 return
             axis = arm.first_not_resting()
             if axis >= 0 and self._service.all_op:

@@ -160,7 +160,7 @@ class Blackboard:
         """The same by words."""
         return self._words
 
-    def plan(self, slot: int) -> memoryview:
+    def plan(self, slot: int) -> memoryview[float]:
         """Return the doubles of a place for plans, row by row."""
         return self._plans[slot]
 

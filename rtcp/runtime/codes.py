@@ -32,7 +32,7 @@ class Command(IntEnum):
     VELOCITY = 14
     """[joint speeds .., at -1: for how long it counts, s]"""
     TORQUE = 15
-    """[joint torques .., at -3 and -2: the parts, 0 to 1, of the joints' stiffness and damping, at -1: for how long, s]"""
+    """[joint torques .., at -3 and -2: the parts of the joints' stiffness and damping, 0 to 1, at -1: for how long, s]"""
     LIMITS = 16
     """[slot, rows]"""
     GRIPPER = 17
@@ -117,6 +117,8 @@ class Refusal(IntEnum):
     IMPEDANCE = 39
     HOME_MODE = 40
     JOG_FRAME = 41
+    GRIPPER_RESTS = 42
+    """The gripper's drive is not enabled."""
     PLAN_LEAD = 38
     """No way leads from where the arm is to the plan's first point."""
 

@@ -14,16 +14,18 @@ import os
 import signal
 import struct
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rtcp.runtime.arguments import Arguments
-from rtcp.runtime.commander import Commander, CommandFailed, Progress
+from rtcp.runtime.carrier import CommandFailed, Progress
+from rtcp.runtime.held import Caller
 from rtcp.runtime.observer import BlackboardError, Observer
 from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.runtime.picture import Picture
 from rtcp.runtime.session import end, forget_processes, read_processes, read_session, wait_gone
+from rtcp.runtime.verbs import Verb, Verbs
 
 _FOLLOW_S = 0.02
 _LINE_LIMIT = 1 << 16
@@ -46,23 +48,16 @@ class Gateway:
         self._observer = Observer(blackboard_file(directory))
         started = json.loads((directory / "started.json").read_text())
         self._picture = Picture(self._observer, session, started)
-        self._commander = Commander(self._observer, self._picture, session.config)
+        self._arm = Verbs(self._observer, self._picture, session.config, session.bus, directory)
+        self._connections = 0
         self._ended = asyncio.Event()
         self._stopping = False
         self._following: asyncio.Task[None] | None = None
-        self._verbs: dict[str, Callable[[str, Arguments, Progress], Awaitable[dict[str, Any]]]] = {
+        self._verbs: dict[str, Verb] = {
             "status": self._status,
-            "enable": lambda client, args, tell: self._commander.enable(client),
-            "disable": lambda client, args, tell: self._commander.disable(client),
-            "reset": lambda client, args, tell: self._commander.reset(client),
-            "mode": lambda client, args, tell: self._commander.mode(client, args.text("name")),
-            "move": self._move,
-            "halt": lambda client, args, tell: self._commander.halt(client),
-            "output": self._output,
             "scan": self._scan,
-            "sdo_read": self._sdo_read,
-            "sdo_write": self._sdo_write,
             "stop": self._stop,
+            **self._arm.table,
         }
 
     async def serve(self, ready: Callable[[], None]) -> None:
@@ -79,10 +74,16 @@ class Gateway:
             loop.add_signal_handler(number, self._ended.set)
         self._watch_loop(loop)
         self._following = asyncio.create_task(self._follow())
+        # An earlier gateway may have died with inputs forced.
+        await self._arm.stick.let_go()
+        watching = asyncio.create_task(self._arm.stick.watch())
         ready()
         await self._ended.wait()
         # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
         server.close()
+        watching.cancel()
+        if self._picture.loop_lives and not self._stopping:
+            await self._arm.stick.let_go()
         self._following.cancel()
         path.unlink(missing_ok=True)
 
@@ -110,12 +111,17 @@ class Gateway:
     # -- clients ------------------------------------------------------------------------------------------------
 
     async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        with contextlib.suppress(ConnectionError, asyncio.CancelledError):
-            await self._converse(reader, writer)
+        self._connections += 1
+        connection = self._connections
+        try:
+            with contextlib.suppress(ConnectionError, asyncio.CancelledError):
+                await self._converse(reader, writer, connection)
+        finally:
+            await self._arm.gone(connection)
         with contextlib.suppress(ConnectionError):
             writer.close()
 
-    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, connection: int) -> None:
         line = asyncio.ensure_future(_read_line(reader))
         while True:
             given = await line
@@ -127,7 +133,7 @@ class Gateway:
                 await _let_go(reader)
                 return
             line = asyncio.ensure_future(_read_line(reader))
-            work = asyncio.ensure_future(self._answer(given, writer))
+            work = asyncio.ensure_future(self._answer(given, writer, connection))
             # A client that goes away ends what it asked for: its lease goes with it.
             await asyncio.wait({line, work}, return_when=asyncio.FIRST_COMPLETED)
             if not work.done() and line.done() and line.result() is None:
@@ -137,7 +143,7 @@ class Gateway:
                 return
             await work
 
-    async def _answer(self, given: bytes, writer: asyncio.StreamWriter) -> None:
+    async def _answer(self, given: bytes, writer: asyncio.StreamWriter, connection: int) -> None:
         number: Any = None
         try:
             request = _parse(given)
@@ -152,7 +158,8 @@ class Gateway:
             args = request.get("args") or {}
             if not isinstance(args, dict):
                 raise CommandFailed("invalid", f"args must be an object, not {type(args).__name__}")
-            result = await verb(str(request.get("client") or "an unnamed client"), Arguments(args), tell)
+            client = Caller(str(request.get("client") or "an unnamed client"), connection)
+            result = await verb(client, Arguments(args), tell)
             await _send(writer, {"id": number, "ok": True, "result": result})
         except CommandFailed as failed:
             await _send(writer, _refusal(number, failed.kind, str(failed)))
@@ -171,36 +178,23 @@ class Gateway:
 
     # -- verbs --------------------------------------------------------------------------------------------------
 
-    async def _status(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+    async def _status(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         self._picture.follow()
         return self._picture.status(read_processes(self._directory))
 
-    async def _move(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
-        return await self._commander.move(client, args.numbers("q"), args.number_or_none("speed"), tell)
-
-    async def _output(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
-        return await self._commander.output(client, args.integer("number"), args.truth("value"))
-
-    async def _scan(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+    async def _scan(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         slaves = json.loads((self._directory / "scan.json").read_text())
         states = self._picture.status(read_processes(self._directory))["slaves"]
         for slave, now in zip(slaves, states, strict=False):
             slave["state"] = now["state"]
         return {"slaves": slaves}
 
-    async def _sdo_read(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
-        return await self._commander.service({"do": "sdo_read", **_object(args)})
-
-    async def _sdo_write(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
-        request = {"do": "sdo_write", **_object(args), "hex": args.text("hex")}
-        return await self._commander.sdo_write(client, request)
-
-    async def _stop(self, client: str, args: Arguments, tell: Progress) -> dict[str, Any]:
+    async def _stop(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         processes = read_processes(self._directory)
         stopping_mark(self._directory).touch(mode=0o600)
         if self._picture.loop_lives:
             with contextlib.suppress(BlackboardError):
-                await self._commander.shut_down()
+                await self._arm.commander.shut_down()
             # The blocking waits run beside, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_gone, processes.loop, 6.0):
                 await asyncio.to_thread(end, processes.loop, 4.0)
@@ -233,10 +227,6 @@ async def _let_go(reader: asyncio.StreamReader) -> None:
 
     with contextlib.suppress(asyncio.TimeoutError):
         await asyncio.wait_for(rest(), _LET_GO_S)
-
-
-def _object(args: Arguments) -> dict[str, int]:
-    return {key: args.integer(key) for key in ("slave", "index", "subindex")}
 
 
 def _parse(given: bytes) -> dict[str, Any]:

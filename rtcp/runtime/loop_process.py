@@ -23,7 +23,7 @@ from rtcp.devices.codec import DeviceError
 from rtcp.fieldbus.bus import BusError, ProcessData
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.realtime import scheduling
-from rtcp.runtime.assembly import assemble, discipline_of, drives_of
+from rtcp.runtime.assembly import assemble, discipline_of, position_of
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.paths import blackboard_file
 from rtcp.runtime.service import Service
@@ -103,8 +103,8 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     service = Service(
         bus,
         blackboard,
-        [slot + 1 for slot, _ in drives_of(config)],
-        [joint.name for joint in config.joints],
+        [position_of(config, joint) for joint in config.axes],
+        [joint.name for joint in config.axes],
         config.bus.op_timeout_s,
         cpu,
         config.cycle.priority,

@@ -59,8 +59,8 @@ def page() -> str:
     return f"""# The machine's state
 
 Drawn from the table in `rtcp/runtime/machine.py` by `python -m rtcp.runtime.machine_drawing`; a test holds both
-together. Left out of the picture: `broken` leads to fault, `emergency` to emergency stop and `shutdown` to closing, from
-nearly everywhere.
+together. Left out of the picture: `broken` leads to fault, `emergency` to emergency stop and `shutdown` to closing,
+from nearly everywhere.
 
 ```mermaid
 {diagram()}

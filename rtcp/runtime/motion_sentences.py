@@ -62,6 +62,7 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             f"{number(m.value)} of a joint's stiffness or damping is not allowed: a part from 0 to 1 of cst_stiffness "
             f"and cst_damping (joints[] in {file})"
         ),
+        Refusal.GRIPPER_RESTS: lambda _: "the gripper's drive is not enabled: `rtcp enable` first",
         Refusal.JOG_FRAME: lambda m: f"frame {number(m.value)} is unknown: 0 base, 1 tool, 2 joints",
         Refusal.HOME_MODE: lambda _: "a drive is homed while the drives are in csp: `rtcp mode csp` first",
         Refusal.PLAN_LEAD: lambda _: "no way was found from where the arm is to the plan's first point",
@@ -93,7 +94,7 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
         ),
         Refusal.AXIS: lambda m: f"joint number {number(m.value)} does not exist: 0 to {number(m.limit - 1)}",
         Refusal.OFFSET: lambda m: (
-            f"{names.joint(m.axis)}: offset {number(m.value)} rad is not allowed: at most {number(m.limit)} rad either way"
+            f"{names.joint(m.axis)}: offset {number(m.value)} rad is not allowed: {number(m.limit)} rad either way"
         ),
         Refusal.JOG_SPEED: lambda m: (
             f"speed {number(m.value)} of direction {m.axis + 1} is not allowed: at most {number(m.limit)} either way"

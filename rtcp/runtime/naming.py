@@ -37,8 +37,12 @@ class Naming:
 
     def joint(self, axis: int) -> str:
         """Return the name of a joint."""
-        joints = self.config.joints
+        joints = self.config.axes
         return joints[axis].name if 0 <= axis < len(joints) else f"joint {axis + 1}"
+
+    def key(self, axis: int) -> str:
+        """Return where a joint stands in the file."""
+        return f"joints[{axis}]" if axis < len(self.config.joints) else "gripper.joint"
 
     def slave(self, position: int) -> str:
         """Return the name of the slave at `position`, from 1."""

@@ -93,8 +93,11 @@ class Operator:
             self._code_told = True
         elif stick.valid:
             self._code_told = False
-        if joystick.grip is not None and self.has_gripper:
-            self.grip(not joystick.grip)
+        if joystick.grip is not None:
+            if arm.gripper is not None:
+                arm.gripper.grip(not joystick.grip)
+            elif self.has_gripper:
+                self.grip(not joystick.grip)
             blackboard.event(Code.GRIPPER, -1, float(joystick.grip))
         jog.command(joystick.twist, joystick.frame)
         if jog.phase is Phase.HOLD and joystick.moves:

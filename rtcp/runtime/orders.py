@@ -114,11 +114,13 @@ class Orders:
             return (Refusal.CLOCK,)
         axis = arm.first_moving()
         if axis >= 0:
-            return Refusal.NOT_STILL, axis, arm.drives[axis].velocity
+            return Refusal.NOT_STILL, axis, arm.all_drives[axis].velocity
         for axis, drive in enumerate(arm.drives):
             low, high = arm.limits.low[axis], arm.limits.high[axis]
             if not low - RANGE_MARGIN_RAD <= drive.position <= high + RANGE_MARGIN_RAD:
                 return Refusal.OUTSIDE_LIMITS, axis, drive.position, high if drive.position > high else low
+        if arm.gripper is not None and arm.gripper.outside:
+            return Refusal.OUTSIDE_LIMITS, len(arm.drives), arm.gripper.drive.position
         arm.set_mode(DriveMode.CSP)
         arm.hold_target()
         self._operator.wait_for_neutral()
@@ -207,21 +209,28 @@ class Orders:
     def _gripper(self, lease: int, numbers: Sequence[float]) -> Verdict:
         if numbers[0] not in (0.0, 1.0):
             return Refusal.OUTPUT_VALUE, -1, numbers[0]
-        if not self._operator.has_gripper:
+        gripper = self._arm.gripper
+        if gripper is not None:
+            if not self._operator.permitted:
+                return (Refusal.NOT_PERMITTED,)
+            if not gripper.grip(numbers[0] == 0.0):
+                return (Refusal.GRIPPER_RESTS,)
+        elif self._operator.has_gripper:
+            self._operator.grip(numbers[0] == 0.0)
+        else:
             return (Refusal.NO_GRIPPER,)
-        self._operator.grip(numbers[0] == 0.0)
         self._blackboard.event(Code.GRIPPER, -1, numbers[0])
         return DONE
 
     def _zero(self, lease: int, numbers: Sequence[float]) -> Verdict:
         axis, offset = numbers[0], numbers[1]
-        if axis not in range(len(self._arm.drives)):
-            return Refusal.AXIS, -1, axis, float(len(self._arm.drives))
+        if axis not in range(len(self._arm.all_drives)):
+            return Refusal.AXIS, -1, axis, float(len(self._arm.all_drives))
         if not abs(offset) <= 100.0:
             return Refusal.OFFSET, int(axis), offset, 100.0
         if self._arm.first_with_torque() >= 0:
             return (Refusal.HAS_TORQUE,)
-        self._arm.drives[int(axis)].zero = offset
+        self._arm.all_drives[int(axis)].zero = offset
         self._blackboard.event(Code.ZERO, int(axis), offset)
         return DONE
 

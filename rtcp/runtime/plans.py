@@ -14,7 +14,7 @@ class PlanTooLong(ValueError):
     """More rows than fit; the message is a sentence."""
 
 
-def place(memory: mmap.mmap, slot: int) -> memoryview:
+def place(memory: mmap.mmap, slot: int) -> memoryview[float]:
     """Return the doubles of a place, row by row: for the loop, which reads them as it comes to them."""
     at = PLANS_AT + slot * PLAN_SIZE
     return memoryview(memory)[at : at + PLAN_SIZE].cast("d")

@@ -106,6 +106,9 @@ class Sentences:
     def _file(self) -> str:
         return self._names.file
 
+    def _key(self, matter: Matter) -> str:
+        return self._names.key(matter.axis)
+
     def _joint(self, matter: Matter) -> str:
         return self._names.joint(matter.axis)
 
@@ -123,24 +126,24 @@ class Sentences:
         return f"{command.name.lower()} is not possible while {TABLE[state].words}; it is while: {allowed}{way_out}"
 
     def _position_limit(self, matter: Matter) -> str:
-        joint = self._config.joints[matter.axis]
+        joint = self._config.axes[matter.axis]
         return (
             f"{joint.name}: target {number(matter.value)} rad is outside its range "
-            f"{joint.position.min:g} to {joint.position.max:g} rad (joints[{matter.axis}].position in {self._file})"
+            f"{joint.position.min:g} to {joint.position.max:g} rad ({self._key(matter)}.position in {self._file})"
         )
 
     def _outside_limits(self, matter: Matter) -> str:
-        joint = self._config.joints[matter.axis]
+        joint = self._config.axes[matter.axis]
         return (
             f"{joint.name} stands at {number(matter.value)} rad, outside its range {joint.position.min:g} to "
-            f"{joint.position.max:g} rad (joints[{matter.axis}].position in {self._file}): it is not enabled there"
+            f"{joint.position.max:g} rad ({self._key(matter)}.position in {self._file}): it is not enabled there"
         )
 
     def _left_range(self, matter: Matter) -> str:
-        joint = self._config.joints[matter.axis]
+        joint = self._config.axes[matter.axis]
         return (
-            f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being enabled: "
-            f"it stands at {number(matter.value)} rad (joints[{matter.axis}].position in {self._file})"
+            f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being enabled or homed: "
+            f"it stands at {number(matter.value)} rad ({self._key(matter)}.position in {self._file})"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:

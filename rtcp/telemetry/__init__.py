@@ -1,1 +1,1 @@
-"""Recordings and reports of what the platform did."""
+"""What is made of cycle records after the cycle: recordings, experiments, pictures."""

@@ -204,8 +204,8 @@ class Bench:
         return self.observer.events_since(self._events_before)
 
     @property
-    def codes(self) -> list[Code]:
-        return [Code(event.code) for event in self.events]
+    def codes(self) -> list[int]:
+        return [event.code if event.code > Code.ENDED else Code(event.code) for event in self.events]
 
     def cycle(self) -> None:
         data, behaviour = self.data, self.behaviour

@@ -6,6 +6,7 @@ import pytest
 
 from rtcp.config.find import default_config
 from rtcp.config.schema import load
+from rtcp.motion.state import Reason
 from rtcp.runtime.machine import ALLOWED, Code, Command, Refusal, State
 from rtcp.runtime.sentences import Sentences
 
@@ -17,9 +18,20 @@ def test_every_refusal_has_a_sentence(refusal: Refusal) -> None:
     assert len(SENTENCES.refusal(refusal, 1, 4.0, 2.0)) > 20
 
 
-@pytest.mark.parametrize("code", [code for code in Code if code is not Code.NONE])
+@pytest.mark.parametrize("code", [code for code in Code if code not in (Code.NONE, Code.ENDED)])
 def test_every_event_has_a_sentence(code: Code) -> None:
     assert len(SENTENCES.event(code, 1, 21.0, 20.0)) > 15
+
+
+@pytest.mark.parametrize("reason", [reason for reason in Reason if reason is not Reason.NONE])
+def test_every_reason_for_which_a_motion_ends_has_a_sentence(reason: Reason) -> None:
+    assert len(SENTENCES.event(Code.ENDED + reason, 1, 21.0, 20.0)) > 15
+
+
+def test_a_keep_out_box_is_told_with_its_name_and_key() -> None:
+    said = SENTENCES.event(Code.ENDED + Reason.KEEP_OUT, 0, 0.012, 0.0)
+    assert "the keep-out box user (cartesian.keep_out[0] in assistive_arm.yaml)" in said
+    assert "`rtcp reset`" in said
 
 
 def test_a_position_outside_its_range_is_told_with_joint_value_range_and_key() -> None:
@@ -35,4 +47,4 @@ def test_a_command_in_the_wrong_state_is_told_with_the_right_ones() -> None:
 def test_every_command_is_taken_in_some_state_and_the_end_in_all() -> None:
     assert set(ALLOWED) == set(Command)
     assert all(ALLOWED[command] for command in Command)
-    assert ALLOWED[Command.SHUTDOWN] == set(State)
+    assert ALLOWED[Command.SHUTDOWN] == set(State) - {State.OFF}

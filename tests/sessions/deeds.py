@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import sqrt
 from random import Random
 
 from kinematics import forward
+from rtcp.motion.limits import Values
 from rtcp.runtime.machine import Command, State
-from tests.sessions.driver import NONSENSE, STICK, Driver, configuration
+from tests.sessions.driver import NONSENSE, STICK, Driver, configuration, is_free
 
 COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
@@ -67,6 +69,22 @@ class Deeds:
             rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
         slot = self.driver.simulation.observer.write_plan(rows)
         self.order("TRAJECTORY", [self.or_nonsense(slot), self.or_nonsense(len(rows))])
+
+    def invade(self) -> None:
+        """A smooth trajectory to where a point of the arm would be in a keep-out box, or the tool outside its box."""
+        bounds, here = self.driver.bounds, self.driver.commanded
+        for _ in range(60):
+            near = self._near(0.8)
+            there = [max(a, min(b, q)) for q, a, b in zip(near, bounds.low, bounds.high, strict=True)]
+            if not is_free(bounds, there):
+                break
+        else:
+            return
+        took = 0.1 + max(abs(b - a) for a, b in zip(here, there, strict=True)) / self.random.choice((0.1, 0.25))
+        rows = [[t, *q, *[0.0] * 12, QUINTIC] for t, q in ((0.0, here), (took, there))]
+        slot = self.driver.simulation.observer.write_plan(rows)
+        if self.order("TRAJECTORY", [slot, len(rows)]):
+            self.seconds(0.5 * took, took)
 
     def line(self) -> None:
         """Straight pieces from where the tool is, planned by nobody: out of reach, too quick, through a singularity."""
@@ -153,6 +171,37 @@ class Deeds:
             if not self.goes_on(self.order("TORQUE", self._padded(numbers, *shares, hold_s))):
                 return
             self.seconds(0.02, 0.4)
+
+    # -- limits -----------------------------------------------------------------------------------------------------
+
+    def limits(self) -> None:
+        """Narrower ones, now and then too narrow for the arm, too wide, or none at all; or those of the start again."""
+        random, driver = self.random, self.driver
+        old = driver.limits
+        widest = Values.configured(driver.simulation.config)
+        if random.random() < 0.2:
+            driver.set_limits(widest)
+            return
+        here = driver.commanded
+        share = random.choice((0.2, 0.6, 0.9, 1.1))
+        changes: dict[str, object] = {}
+        if random.random() < 0.5:
+            low = [self.or_nonsense(q + share * (a - q), 0.005) for q, a in zip(here, widest.low, strict=True)]
+            high = [self.or_nonsense(q + share * (b - q), 0.005) for q, b in zip(here, widest.high, strict=True)]
+            changes |= {"low": tuple(low), "high": tuple(high)}
+        for name in ("velocity", "acceleration", "jerk", "torque"):
+            if random.random() < 0.3:
+                scale = random.choice((0.3, 0.7, 1.0, 1.0, 1.1))
+                changes[name] = tuple(self.or_nonsense(scale * x, 0.005) for x in getattr(widest, name))
+        if random.random() < 0.3 and widest.box is not None:
+            by = random.choice((0.05, 0.2, -0.1))
+            changes["box"] = tuple(x + (by if at < 3 else -by) for at, x in enumerate(widest.box))
+        if random.random() < 0.3:
+            by = random.choice((0.02, 0.1, -0.1))
+            changes["keep_out"] = tuple(
+                tuple(x - by if at < 3 else x + by for at, x in enumerate(box)) for box in widest.keep_out
+            )
+        driver.set_limits(replace(old, **changes))  # type: ignore[arg-type]
 
     # -- a hand at the arm ------------------------------------------------------------------------------------------
 

@@ -10,6 +10,8 @@ from math import inf, nan
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
+from rtcp.motion.limits import Values
+from rtcp.runtime.limit_rows import to_rows
 from rtcp.runtime.machine import Command, State
 from rtcp.virtual.simulation import Frame, Simulation
 from tests.sessions.geometry import Box, depth, points
@@ -34,8 +36,8 @@ def configuration() -> ArmConfig:
 def bounds_of(config: ArmConfig) -> Bounds:
     """Return the limits of the configuration."""
     joints = config.joints
-    cartesian = getattr(config, "cartesian", None)
-    keep_out: list[Box] = [(zone.min, zone.max) for zone in cartesian.keep_out] if cartesian else []
+    cartesian = config.cartesian
+    keep_out: list[Box] = [(zone.min, zone.max) for zone in cartesian.keep_out]
     return Bounds(
         [joint.position.min for joint in joints],
         [joint.position.max for joint in joints],
@@ -43,7 +45,7 @@ def bounds_of(config: ArmConfig) -> Bounds:
         [joint.acceleration for joint in joints],
         [joint.torque for joint in joints],
         [joint.csv_gain for joint in joints],
-        (cartesian.box.min, cartesian.box.max) if cartesian and cartesian.box else None,
+        None if cartesian.box is None else (cartesian.box.min, cartesian.box.max),
         keep_out,
     )
 
@@ -67,6 +69,7 @@ class Driver:
 
     def __init__(self, config: ArmConfig, seed: int, positions: Sequence[float]) -> None:
         self.bounds = bounds_of(config)
+        self.limits = Values.configured(config)
         self.simulation = Simulation(config, seed, positions=positions, follow_clock=False)
         slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
         self.judge = Judge(
@@ -138,6 +141,21 @@ class Driver:
             self.judge.zero[int(numbers[0])] = round(numbers[1] * COUNTS)
         return taken
 
+    def set_limits(self, new: Values) -> bool:
+        """Change the limits; the judge knows them from the frame on that is worked out under them."""
+        rows = to_rows(new)
+        slot = self.simulation.observer.write_plan(rows)
+        if not self.order(Command.LIMITS, [slot, len(rows)]):
+            return False
+        self.limits = new
+        bounds = self.bounds
+        bounds.low[:], bounds.high[:] = new.low, new.high
+        bounds.velocity[:], bounds.acceleration[:], bounds.torque[:] = new.velocity, new.acceleration, new.torque
+        bounds.box = None if new.box is None else (new.box[:3], new.box[3:])
+        bounds.keep_out[:] = [(box[:3], box[3:]) for box in new.keep_out]
+        self.judge.changed()
+        return True
+
     def happen(self, name: str, what: str = "") -> None:
         """Note a happening."""
         self.happenings[name] += 1
@@ -145,7 +163,7 @@ class Driver:
 
     def enable(self) -> None:
         """Enable, and come back from whatever keeps the arm from it."""
-        if self.state in (State.FAULT, *_stopped()):
+        if self.state in (State.FAULT, State.STOPPED_BY_LIMIT, State.EMERGENCY_STOP):
             self.order(Command.RESET)
             self.simulation.until(lambda: self.state in (State.READY, State.HOLDING, State.FAULT), 0.5)
         if self.state is State.READY:
@@ -203,11 +221,7 @@ class Driver:
             box.inputs = box.inputs | TOGGLE_BIT if arm else box.inputs & ~TOGGLE_BIT
 
 
-def _stopped() -> tuple[State, ...]:
-    return tuple(State[name] for name in ("STOPPED_BY_LIMIT", "EMERGENCY_STOP") if name in State.__members__)
-
-
 def with_start(config: ArmConfig, period_us: float, mode: str, motion: str = "joint") -> ArmConfig:
     """Return the configuration with another cycle, drive mode and motion mode."""
-    changed = replace(config, cycle=replace(config.cycle, period_us=period_us), mode=mode)  # type: ignore[arg-type]
-    return replace(changed, motion=motion) if hasattr(config, "motion") else changed  # type: ignore[arg-type]
+    cycle = replace(config.cycle, period_us=period_us)
+    return replace(config, cycle=cycle, mode=mode, motion=motion)  # type: ignore[arg-type]

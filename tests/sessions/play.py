@@ -96,6 +96,7 @@ class Player:
             (2, deeds.stick),
             (1, deeds.toggle),
             (1, deeds.emergency),
+            (3, deeds.limits),
         ]
 
     def _place(self, free: bool) -> list[float]:
@@ -124,7 +125,9 @@ class Player:
         elif motion == MOTIONS.index("joystick") + 1:
             deeds.stick()
         else:
-            self.random.choice((self._move, self._move, deeds.trajectory, deeds.line, deeds.stream, deeds.jog))()
+            self.random.choice(
+                (self._move, self._move, deeds.trajectory, deeds.invade, deeds.line, deeds.stream, deeds.jog)
+            )()
 
     def _change_motion(self) -> None:
         wanted = self.random.choices(range(1, 6), SHARES)[0]

@@ -71,21 +71,11 @@ class Axis:
         self.mechanics.advance(0.0, h)
         self.synchronise()
 
-    def track(self, fastest: float, h: float) -> None:
-        """Follow `demand`, at most `fastest` (rad/s), through a tracker that has no lag at constant speed.
-
-        The tracker is of second order and critically damped.
-        """
-        error = self.demand - self.reference
-        velocity = self.reference_velocity = self.reference_velocity + _TRACKER * _TRACKER * error * h
-        reference = self.reference = self.reference + (velocity + 2.0 * _TRACKER * error) * h
-        velocity += _POSITION_GAIN * (reference - velocity * h - self.mechanics.position - self.offset)
-        self.run(fastest if velocity > fastest else -fastest if velocity < -fastest else velocity, h)
-
     def glide(self, goal: float, slope: float, fastest: float, h: float, count: int) -> float:
-        """Move `demand` on by `slope` (rad/s) until it is at `goal`, `track` it; `count` times. Return the slope left.
+        """Move `demand` on by `slope` (rad/s) until it is at `goal`, follow it; `count` times. Return the slope left.
 
-        What a drive in CSP does all the time: `track`, `run` and `Mechanics.advance`, to the bit, without the calls.
+        It is followed, at most `fastest` (rad/s), through a tracker that has no lag at constant speed, of second order
+        and critically damped. What `run` and `Mechanics.advance` do is written out: a drive in CSP does nothing else.
         """
         mechanics = self.mechanics
         demand, reference, along = self.demand, self.reference, self.reference_velocity

@@ -1,0 +1,107 @@
+"""`rtcp enable`, `disable`, `reset`, `mode`, `output`, `gripper`, `zero`, `home`: what the machine is told."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rtcp.cli.connection import ask, connect
+from rtcp.cli.outcome import CommandError
+from rtcp.cli.output import report
+from rtcp.cli.progress import stopping
+
+HOMING_S = 200.0
+
+Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Its configured name, as joint2, or its number from 1.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this group's commands."""
+    for command in (_enable, _disable, _reset, _mode, _output, _gripper, _zero, _home):
+        app.command(command.__name__[1:])(command)
+
+
+def _enable() -> None:
+    """Enable the drives; the arm holds where it is."""
+    ask("enable", "enable")
+    report("enabled: the drives hold the arm where it is")
+
+
+def _disable() -> None:
+    """Disable the drives."""
+    ask("disable", "disable")
+    report("disabled: the drives are without torque")
+
+
+def _reset() -> None:
+    """Reset a fault, an emergency stop or a stop by a limit; enabling is a step of its own."""
+    with connect("reset") as client:
+        before = client.call("status").get("state")
+        client.call("reset")
+        holds = client.call("status").get("state") == "holding"
+    if before == "stopped_by_limit":
+        report("reset: the arm holds and takes commands again")
+        return
+    # A reset leaves the arm without torque: one that holds had nothing to reset.
+    report(
+        "nothing to reset: the arm is enabled and holds" if holds else "reset: no fault is left; `rtcp enable` goes on"
+    )
+
+
+def _mode(
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="joint, cartesian, joystick, velocity, torque; or csp, csv, cst.")
+    ],
+) -> None:
+    """Choose what the arm takes commands for, or the drives' mode for moves and lines; at standstill."""
+    ask("mode", "mode", {"name": name.lower()})
+    report(f"mode {name.lower()}")
+
+
+def _output(
+    number: Annotated[int, typer.Argument(metavar="N", help="Output of the IO box, from 1.")],
+    value: Annotated[str, typer.Argument(metavar="on|off")],
+) -> None:
+    """Switch a digital output of the IO box."""
+    switched = {"on": True, "1": True, "off": False, "0": False}.get(value.lower())
+    if switched is None:
+        raise CommandError(f"{value!r} is no state of an output: on or off")
+    ask("output", "output", {"number": number, "value": switched})
+    report(f"output {number} is {'on' if switched else 'off'}")
+
+
+def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> None:
+    """Open or close the gripper."""
+    opened = {"open": True, "close": False}.get(value.lower())
+    if opened is None:
+        raise CommandError(f"{value!r} is nothing that a gripper does: open or close")
+    ask("gripper", "gripper", {"open": opened})
+    report(f"the gripper is told to {value.lower()}")
+
+
+def _zero(joint: Joint) -> None:
+    """Let a joint's position now be its zero, kept in a file; only while the drives have no torque."""
+    result = ask("zero", "zero", {"joint": _name(joint)})
+    report(
+        f"{result['joint']} is at 0 here: its drive shows {result['offset']:.6f} rad (before: {result['before']:.6f}); "
+        f"kept in {result['file']}"
+    )
+
+
+def _home(joint: Joint) -> None:
+    """Let a joint's drive find its home by itself, as its start-up SDOs say; Ctrl-C stops it."""
+    with stopping(client := connect("home")):
+        result = client.call("home", {"joint": _name(joint)}, timeout_s=HOMING_S)
+    report(f"{result['joint']} is homed and stands at {result['position']:.6f} rad")
+
+
+def _name(joint: str) -> str:
+    """Return the joint's name; a number counts from the base."""
+    if not joint.isdecimal():
+        return joint
+    with connect("status") as client:
+        names = client.call("status").get("joint_names") or []
+    if not 1 <= int(joint) <= len(names):
+        raise CommandError(f"joint {joint} does not exist: 1 to {len(names)}, or one of {', '.join(names)}")
+    return str(names[int(joint) - 1])
