@@ -9,7 +9,7 @@ import typer
 
 from rtcp.cli import sdo_value
 from rtcp.cli.bus_access import bus_access, position_of
-from rtcp.cli.motion import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.options import BusName, ConfigFile, ObjectIndex, Poll, SlaveName
 from rtcp.cli.outcome import CommandError
 from rtcp.cli.output import emit, emit_json, report, show

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import typer
@@ -80,12 +81,19 @@ def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> Non
     report(f"the gripper is told to {value.lower()}")
 
 
-def _zero(joint: Joint) -> None:
-    """Let a joint's position now be its zero, kept in a file; only while the drives have no torque."""
-    result = ask("zero", "zero", {"joint": _name(joint)})
+def _zero(
+    joint: Joint,
+    at: Annotated[
+        float, typer.Option("--at", metavar="RAD", help="What the joint's position now is to be, rad.")
+    ] = 0.0,
+) -> None:
+    """Let a joint stand at 0, or --at, where it is now, kept in a file; only while the drives have no torque."""
+    if not math.isfinite(at):
+        raise CommandError(f"--at {at} is not allowed: a finite number of rad")
+    result = ask("zero", "zero", {"joint": _name(joint), "at": at})
     report(
-        f"{result['joint']} is at 0 here: its drive shows {result['offset']:.6f} rad (before: {result['before']:.6f}); "
-        f"kept in {result['file']}"
+        f"{result['joint']} is at {at:g} rad here: its zero is at {result['offset']:.6f} rad of the drive "
+        f"(before: {result['before']:.6f}); kept in {result['file']}"
     )
 
 

@@ -57,15 +57,17 @@ def _move(
         from rtcp.config.geometry import angle
 
         refuse_options([value for value in numbers if angle(value) == value], known)
-        arguments = {"pose": pose_values(numbers), "speed": speed, "line": line}
+        verb, target = "move_pose", pose_values(numbers)
+        arguments: dict[str, Any] = {"pose": target, "speed": speed, "line": line}
     else:
         refuse_options(numbers, known)
-        arguments = {"q": joint_values(numbers), "speed": speed} | ({"each": True} if each else {})
+        verb, target = "move", joint_values(numbers)
+        arguments = {"q": target, "speed": speed} | ({"each": True} if each else {})
     with stopping(client := connect("move")):
         if not pose:
-            _same_number(arguments["q"], client.call("status"))
+            _same_number(target, client.call("status"))
         with progress() as follow:
-            result = client.call("move_pose" if pose else "move", arguments, follow, timeout_s=SILENCE_S)
+            result = client.call(verb, arguments, follow, timeout_s=SILENCE_S)
     report(arrival(result))
 
 

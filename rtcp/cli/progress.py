@@ -1,4 +1,4 @@
-"""How a motion shows its progress: a bar on a terminal, a line every tenth of the way elsewhere; Ctrl-C stops the arm."""
+"""How a motion shows its progress: a bar on a terminal, a line every tenth of the way elsewhere. Ctrl-C stops it."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from rtcp.cli.options import BusName, ConfigFile, Poll
 from rtcp.cli.outcome import CommandError, code_of
 from rtcp.cli.output import report
 
-MODES = ("csp", "csv", "cst")
+MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
 
 
 def register(app: typer.Typer) -> None:
@@ -24,7 +24,9 @@ def register(app: typer.Typer) -> None:
 def _start(
     config: ConfigFile = None,
     bus: BusName = None,
-    mode: Annotated[str | None, typer.Option("--mode", metavar="csp|csv|cst", help="Mode at the start.")] = None,
+    mode: Annotated[
+        str | None, typer.Option("--mode", metavar="NAME", help=f"At the start: {', '.join(MODES)}.")
+    ] = None,
     cycle_us: Annotated[
         float | None, typer.Option("--cycle-us", metavar="N", help="Cycle, us; else the configuration's.")
     ] = None,

@@ -16,7 +16,10 @@ STATE_STYLES = {
     "moving": "bold green",
     "ready": "bold cyan",
     "stopping": "bold yellow",
+    "homing": "bold green",
+    "stopped by limit": "bold yellow",
     "fault": "bold red",
+    "emergency stop": "bold red",
 }
 
 JOINT_COLUMNS = (
@@ -39,10 +42,11 @@ def picture(status: Mapping[str, Any]) -> RenderableType:
 
 
 def _headline(status: Mapping[str, Any]) -> Panel:
-    state = str(status.get("state", ABSENT))
+    state = str(status.get("state", ABSENT)).replace("_", " ")
+    modes = ", ".join(str(status[key]) for key in ("motion", "mode") if key in status) or ABSENT
     line = Text.assemble(
         (state.upper(), STATE_STYLES.get(state.lower(), "bold")),
-        f"   {status.get('mode', ABSENT)} on {status.get('bus', ABSENT)}",
+        f"   {modes} on {status.get('bus', ABSENT)}",
     )
     cycle_ns = status.get("cycle_ns")
     if isinstance(cycle_ns, int | float):
@@ -51,7 +55,7 @@ def _headline(status: Mapping[str, Any]) -> Panel:
     line.append(f"{_count(status.get('missed'))} missed", "yellow" if status.get("missed") else "")
     message = str(status.get("message") or "")
     if message:
-        line.append("\n" + message, "red" if state.lower() == "fault" else "")
+        line.append("\n" + message, "red" if state.lower() in ("fault", "emergency stop") else "")
     return Panel(line, box=box.ROUNDED, title="rtcp", title_align="left")
 
 
@@ -107,6 +111,12 @@ def _facts(status: Mapping[str, Any]) -> Table:
     table = Table.grid(padding=(0, 2))
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
+    if robot := _mapping(status.get("robot")):
+        table.add_row("robot", _robot(robot))
+    if status.get("motion") == "joystick":
+        stick = _mapping(status.get("stick"))
+        whose = "the arm's" if stick.get("arm_has_it") else "the wheelchair's"
+        table.add_row("stick", f"{stick.get('mode', ABSENT)}, it is {whose}")
     table.add_row("frames", _working_counter(_mapping(status.get("wkc"))))
     table.add_row("clocks", _clocks(_mapping(status.get("dc"))))
     table.add_row("inputs", _bits(status.get("inputs")))
@@ -118,6 +128,18 @@ def _facts(status: Mapping[str, Any]) -> Table:
     pids = _mapping(status.get("pids"))
     table.add_row("processes", ", ".join(f"{name} {pid}" for name, pid in pids.items() if pid) or ABSENT)
     return table
+
+
+def _robot(robot: Mapping[str, Any]) -> Text:
+    """RobotStatus in words: what is on is said, what is wrong is red."""
+    line = Text(f"{robot.get('mode', ABSENT)}, drives {'powered' if robot.get('drives_powered') else 'without power'}")
+    line.append(", motion possible" if robot.get("motion_possible") else ", no motion possible")
+    line.append(", in motion" if robot.get("in_motion") else ", not in motion")
+    if robot.get("e_stopped"):
+        line.append(", emergency stop", "bold red")
+    if robot.get("in_error"):
+        line.append(f", error {robot.get('error_code', ABSENT)}", "bold red")
+    return line
 
 
 def _working_counter(wkc: Mapping[str, Any]) -> Text:

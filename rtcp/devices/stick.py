@@ -7,17 +7,20 @@
 | 59, 55 | left, right | 2, 3 |
 | 47, 31 | paddle up, down | 4, 5 |
 
-Two directions at once, as forward and left (58), are a code. Contradictory ones, both paddles, a paddle while the stick is
-deflected, and anything else in the stick's byte are none.
+Two directions at once, as forward and left (58), are a code. Contradictory ones, both paddles, a paddle while the stick
+is deflected, and anything else in the stick's byte are none.
 """
 
 from __future__ import annotations
 
 from rtcp.config.operation import InputsConfig
 
+RESTLESS = 4
+"""After so many times the debounce without rest the lines are no code."""
+
 
 class Stick:
-    """What the stick shows. `read` sets `forward` and `side` (-1, 0, 1; left is +1), `paddle` (-1, 0, 1), `code`, `valid`.
+    """What the stick shows. `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
 
     Args:
         config: which inputs are the stick's, and which others have a meaning.
@@ -25,8 +28,8 @@ class Stick:
     """
 
     __slots__ = (
-        "_byte_at", "_candidate", "_checked", "_debounce", "_inverted", "_lines", "_stable", "code", "forward",
-        "paddle", "side", "valid",
+        "_byte_at", "_candidate", "_checked", "_debounce", "_inverted", "_lines", "_restless", "_stable", "code",
+        "forward", "paddle", "side", "valid",
     )  # fmt: skip
 
     def __init__(self, config: InputsConfig, cycle_s: float) -> None:
@@ -35,7 +38,7 @@ class Stick:
         self.code = 0
         self.valid = False
         self._candidate = -1
-        self._stable = 0
+        self._stable = self._restless = 0
         self._lines: tuple[int, ...] = ()
         self._checked = self._inverted = self._byte_at = self._debounce = 0
         if joystick is None:
@@ -62,7 +65,13 @@ class Stick:
         elif self._stable <= self._debounce:
             self._stable += 1
         if self._stable < self._debounce:
+            self._restless += 1
+            if self._restless > RESTLESS * self._debounce:
+                # Lines that never come to rest, as at a loose contact: the last direction must not go on for ever.
+                self.forward = self.side = self.paddle = 0
+                self.valid = False
             return
+        self._restless = 0
         self.code = seen >> self._byte_at & 0xFF
         active = seen ^ self._inverted
         forward, backward, left, right, up, down = (bool(active & line) for line in self._lines)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from rtcp.config.model import GripperConfig
 from rtcp.config.operation import InputConfig, InputsConfig, OutputsConfig
+from rtcp.devices.stick import RESTLESS
 
 
 class Switch:
-    """An input that means something when `active`. Before its first level has lasted, it has `before`.
+    """An input that means something when `active`. Before its first level has lasted, it has `before`; so it has again
+    when its level has not come to rest for four times the debounce, as at a loose contact.
 
     Args:
         config: number, polarity, debounce; None: there is no such input and `before` stays.
@@ -15,15 +17,15 @@ class Switch:
         cycle_s: how often `read` is called, s.
     """
 
-    __slots__ = ("_bit", "_candidate", "_debounce", "_inverted", "_stable", "active")
+    __slots__ = ("_before", "_bit", "_candidate", "_debounce", "_inverted", "_restless", "_stable", "active")
 
     def __init__(self, config: InputConfig | None, before: bool, cycle_s: float) -> None:
-        self.active = before
+        self.active = self._before = before
         self._bit = 0 if config is None else 1 << config.number - 1
         self._inverted = config is not None and config.active == "low"
         self._debounce = 0 if config is None else round(config.debounce_ms * 1e-3 / cycle_s)
         self._candidate = before
-        self._stable = 0
+        self._stable = self._restless = 0
 
     def read(self, levels: int) -> None:
         """Take the levels of all inputs of a cycle."""
@@ -37,6 +39,11 @@ class Switch:
             self._stable += 1
         if self._stable >= self._debounce:
             self.active = seen
+            self._restless = 0
+            return
+        self._restless += 1
+        if self._restless > RESTLESS * self._debounce:
+            self.active = self._before
 
 
 class Inputs:

@@ -18,6 +18,7 @@ from ruckig import (
     Trajectory,
 )
 
+from rtcp.motion.room import allowed_acceleration
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 LONGEST_S = 600.0
@@ -25,8 +26,6 @@ LONGEST_S = 600.0
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: a little less jerk
 # is not on the border any more.
 _JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
-# What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state.
-_INSIDE = 1.0 - 1e-9
 
 
 class JointGenerator:
@@ -132,8 +131,8 @@ class JointGenerator:
         bounds = self._acceleration_limit
         given.max_acceleration = bounds
         given.current_acceleration = [
-            _INSIDE * bound if now > bound else -_INSIDE * bound if now < -bound else now
-            for now, bound in zip(state.acceleration, bounds, strict=True)
+            allowed_acceleration(now, state.velocity[i], self._velocity_limit[i], bounds[i], self._jerk_limit[i])
+            for i, now in enumerate(state.acceleration)
         ]
         given.target_acceleration = self._zero
 

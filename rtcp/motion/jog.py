@@ -1,27 +1,44 @@
 """Jogging: the tool goes where it is told to, for as long as it is told to.
 
-What is asked for becomes a tool velocity under Cartesian acceleration and jerk limits (ruckig, six degrees of freedom);
-the commanded pose is integrated from it, and one inverse solution a cycle follows it on its branch. The joints go towards
-that solution with all their steps scaled together, so that the tool keeps its direction; where they cannot follow, the pose
-waits for them.
+What is asked for becomes a tool velocity under Cartesian acceleration and jerk (`JogRamp`); what the joint ranges, the
+boxes and the singularities do not allow is taken from it (`JogBounds`); the inverse Jacobian makes it joint speeds
+(`JogInverse`), and what the tool has lost of its line, some 1e-7 m a cycle, comes back with the next ones. All joints are
+scaled together, so that the tool keeps its direction; where they cannot follow, it waits, and the ramp goes on from what
+was reached. Nothing winds up.
+
+Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
+stretched elbow bends towards the inverse solution a little further on (`_bend`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ruckig import ControlInterface, InputParameter, OutputParameter, Ruckig, RuckigError, Synchronization
 
-from kinematics.forward import forward
+from kinematics.forward import frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, applied, times
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
+from rtcp.motion.jog_bounds import JogBounds
+from rtcp.motion.jog_inverse import ELBOW, JogInverse
+from rtcp.motion.jog_ramp import JogRamp
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
-_LEAST_TWIST = 1e-9
 FOR_EVER = 1 << 62
+_FULL = 0.98
+"""Part of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
+_BRAKING = 0.7
+"""Part of the Cartesian acceleration with which the tool slows before a box."""
+_BACK_1_S = 100.0
+"""How fast the tool returns to its line, 1/s."""
+_OFF_LINE_M = 2e-4
+"""Further away from it the line begins anew."""
+_RETRACTION_M = 2e-4
+_BEND_RAD = 0.2
+"""So far, at most, the joints are from the solution that a stretched elbow bends towards."""
+_TURNS_RAD_S = 1e-3
 
 
 class JogMode:
@@ -29,7 +46,7 @@ class JogMode:
 
     Args:
         config: Cartesian and jog limits; it must have a geometry.
-        model: the geometry.
+        model: the geometry; without a spherical wrist the arm stands.
         limits: of the joints; read every cycle.
         guards: knows the boxes and the frames of what is commanded.
         period_s: the cycle, s.
@@ -39,27 +56,28 @@ class JogMode:
         self, config: ArmConfig, model: ArmModel, limits: Limits, guards: SetPointGuard, period_s: float
     ) -> None:
         cartesian = config.cartesian
+        singularity = cartesian.singularity
         self._model = model
-        self._inverse = InverseKinematics(model)
+        self._inverse_kinematics = InverseKinematics(model)
         self._limits = limits
         self._guards = guards
-        self._singularity = (cartesian.singularity.shoulder, cartesian.singularity.elbow, cartesian.singularity.wrist)
-        self._acceleration = cartesian.acceleration
-        self._otg = Ruckig(6, period_s)
-        self._ramp, self._output = InputParameter(6), OutputParameter(6)
-        ramp = self._ramp
-        ramp.control_interface = ControlInterface.Velocity
-        ramp.synchronization = Synchronization.No
-        ramp.max_velocity = [cartesian.speed] * 3 + [cartesian.angular_speed] * 3
-        ramp.max_acceleration = [cartesian.acceleration] * 3 + [cartesian.angular_acceleration] * 3
-        ramp.max_jerk = [cartesian.jerk] * 3 + [cartesian.angular_jerk] * 3
+        self._inverse = JogInverse(model)
+        nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
+        braking = _BRAKING * cartesian.acceleration
+        self._bounds = JogBounds(limits, guards, self._inverse, braking, nearest, period_s)
+        self._ramp = JogRamp(cartesian)
+        self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
         self._zero = [0.0] * 6
         self._target = Target(6)
+        self._asked = [0.0] * 6
         self._wanted = [0.0] * 6
+        self._twist = [0.0] * 6
+        self._speeds = [0.0] * 6
         self._in_tool = False
         self._until_ns = FOR_EVER
-        self._pose: Pose | None = None
-        self._last: Sequence[float] = ()
+        self._line: Pose | None = None
+        self._fresh = True
+        self._last = [0.0] * 6
         self.clamps = True
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
@@ -67,26 +85,42 @@ class JogMode:
         self.elapsed_s = self.duration_s = 0.0
 
     def start(self, state: MotionState) -> None:
-        """Begin at `state`, at rest."""
+        """Begin at `state`; nothing is asked for yet."""
         self.phase, self.reason = Phase.MOVE, Reason.NONE
-        self._wanted = list(self._zero)
-        ramp = self._ramp
-        ramp.current_position = ramp.current_velocity = ramp.current_acceleration = self._zero
-        self._pose = None
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+        self._asked[:] = self._zero
+        self._until_ns = FOR_EVER
+        self._fresh = True
 
     def command(self, twist: Sequence[float], frame: str, until_ns: int = FOR_EVER) -> None:
         """Ask for a tool velocity: vx, vy, vz (m/s), wx, wy, wz (rad/s) along the axes of `frame` (base or tool).
 
-        It counts until the instant `until_ns`; a stop under way is not taken back.
+        It counts until the instant `until_ns`. It is brought down to the greatest speeds of the configuration; numbers
+        that are none stop. While the mode stops nothing is taken: a stop that has ended is begun anew with `start`.
         """
+        if self.phase is not Phase.MOVE:
+            return
         self._until_ns = until_ns
-        self._wanted[:] = twist
         self._in_tool = frame == "tool"
+        a, b, c, d, e, f = twist
+        linear, angular = a * a + b * b + c * c, d * d + e * e + f * f
+        asked = self._asked
+        if not linear + angular < 1e30:
+            asked[:] = self._zero
+            return
+        part, turn = 1.0, 1.0
+        if linear > self._speed * self._speed:
+            part = self._speed / linear**0.5
+        if angular > self._angular_speed * self._angular_speed:
+            turn = self._angular_speed / angular**0.5
+        # One factor for both, so that the direction is the one that was asked for.
+        part = part if part < turn else turn
+        asked[0], asked[1], asked[2], asked[3], asked[4], asked[5] = a * part, b * part, c * part, d * part, e * part, f * part  # noqa: E501
 
     def stop(self, state: MotionState) -> None:
         """Come to rest."""
         if self.phase is Phase.MOVE:
-            self._wanted[:] = self._zero
+            self._asked[:] = self._zero
             self.phase = Phase.STOP
 
     def update(self, state: MotionState, dt: float) -> Target:
@@ -98,89 +132,141 @@ class JogMode:
             return target
         if state.now_ns > self._until_ns and self.phase is Phase.MOVE:
             self.stop(state)
-        if self._pose is None or position != self._last:
-            # The guards have changed what was commanded: go on from where the arm is.
-            self._pose = forward(self._model, position)
-        twist = self._ramped()
-        if twist is None:
-            self._rest()
-            target.position, target.velocity = position, self._zero
-            return target
-        q, share = self._towards(self._moved(self._pose, twist, dt), state, dt)
-        if share < 1.0:
-            self._pose = None
+        inverse, bounds, ramp = self._inverse, self._bounds, self._ramp
+        jumped = self._fresh or position != self._last
+        poses = self._guards.poses
+        if jumped or not self._posed:
+            poses = frames(self._model, position)
+        if not (inverse.usable and inverse.at(poses)):
+            return self._brake(state, dt)
+        if jumped:
+            # The beginning, or the guards have changed what was commanded: go on from where the arm is.
+            ramp.begin(_reached(poses, state.velocity))
+            self._line = None
+            self._fresh = False
+        wanted = self._turned(poses[6])
+        ramp.step(wanted, dt)
+        bounds.look(poses, position, jumped)
+        twist, speeds = self._twist, self._speeds
+        twist[:] = ramp.velocity
+        if inverse.locked[ELBOW] and self._bend(poses, position, wanted):
+            self._follow(state, dt)
+            self._line = None
+            ramp.held(_reached(poses, speeds))
         else:
-            self._pose = self._next
-        target.position = q
-        target.velocity = [(new - old) / dt for new, old in zip(q, position, strict=True)]
-        self._last = q
-        if not any(self._wanted) and max(map(abs, twist)) < _LEAST_TWIST and self._slow(target.velocity):
-            self._rest()
+            self._fit(poses)
+            self._back(poses[6])
+            factor = self._follow(state, dt)
+            if factor is None:
+                self._line = None
+                ramp.held(_reached(poses, speeds))
+            else:
+                self._advance(factor, dt)
+                ramp.held(twist)
+        self._tell()
+        moving = any(speeds)
+        self._posed = moving and bounds.watched
+        if not moving and not any(wanted) and not any(ramp.velocity):
+            self.phase = Phase.HOLD
+        return self._answer(position, dt)
+
+    def _answer(self, position: Sequence[float], dt: float) -> Target:
+        target, speeds = self._target, self._speeds
+        target.position = self._last = [q + v * dt for q, v in zip(position, speeds, strict=True)]
+        target.velocity = speeds
         return target
 
-    def _slow(self, velocity: Sequence[float]) -> bool:
-        return max(map(abs, velocity)) < 1e-6
-
-    def _rest(self) -> None:
-        self.phase = Phase.HOLD
-
-    def _ramped(self) -> Sequence[float] | None:
-        """Return the tool velocity of this cycle along the base's axes."""
-        ramp = self._ramp
+    def _turned(self, tool: Pose) -> list[float]:
+        """Return what is wanted along the base's axes."""
+        asked = self._asked
+        if not self._in_tool:
+            return asked
+        a, b, c, d, e, f = asked
         wanted = self._wanted
-        if self._in_tool and self._pose is not None:
-            rotation = self._pose[1]
-            ramp.target_velocity = [*applied(rotation, wanted[:3]), *applied(rotation, wanted[3:])]  # type: ignore[arg-type]
-        else:
-            ramp.target_velocity = wanted
-        try:
-            if self._otg.update(ramp, self._output) < 0:
-                return None
-        except (RuckigError, ValueError):
-            return None
-        self._output.pass_to_input(ramp)
-        return self._output.new_velocity
+        wanted[0], wanted[1], wanted[2] = applied(tool.rotation, (a, b, c))
+        wanted[3], wanted[4], wanted[5] = applied(tool.rotation, (d, e, f))
+        return wanted
 
-    def _moved(self, pose: Pose, twist: Sequence[float], dt: float) -> Pose:
-        (x, y, z), rotation = pose
-        vx, vy, vz, wx, wy, wz = (component * dt for component in twist)
-        if wx or wy or wz:
-            rotation = times(_turn(wx, wy, wz), rotation)
-        return Pose((x + vx, y + vy, z + vz), rotation)
+    def _make_speeds(self) -> float:
+        """Write the joint speeds for the twist; return the part of them that the joints can do."""
+        a, b, c, d, e, f = self._twist
+        speeds, fastest = self._speeds, self._limits.velocity
+        part = 1.0
+        for i, (g, h, k, m, n, o) in enumerate(self._inverse.rows):
+            speeds[i] = v = a * g + b * h + c * k + d * m + e * n + f * o
+            most = _FULL * fastest[i]
+            if v * part > most or v * part < -most:
+                part = most / (v if v > 0.0 else -v)
+        return part
 
-    def _towards(self, pose: Pose, state: MotionState, dt: float) -> tuple[list[float], float]:
-        """Return where the joints go in this cycle, and which part of the way to `pose` that is."""
-        self._next = pose
-        position = state.position
-        found = self._inverse.solve_near(pose, position)
-        if found.q is None:
-            return self._brake(state, dt), 0.0
-        share = 1.0
-        limits = self._limits
+    def _scale(self, part: float) -> None:
+        if part < 1.0:
+            twist, speeds = self._twist, self._speeds
+            for i in range(6):
+                twist[i] *= part
+                speeds[i] *= part
+
+    def _fit(self, poses: Sequence[Pose]) -> None:
+        """Bring the twist, and the joint speeds with it, within all bounds."""
+        twist, bounds = self._twist, self._bounds
+        self._scale(self._make_speeds())
+        a, b, c, d, e, f = twist
+        moves = a * a + b * b + c * c > 1e-12
+        turns = d * d + e * e + f * f > _TURNS_RAD_S * _TURNS_RAD_S
+        if bounds.passed(poses, twist, self._speeds):
+            if not bounds.slide(poses, twist, moves, turns):
+                twist[:] = self._zero
+            self._scale(self._make_speeds())
+        self._scale(bounds.halt(twist))
+        if bounds.near:
+            self._scale(bounds.stoppable(poses, self._speeds))
+
+    def _back(self, tool: Pose) -> None:
+        """Add to the joint speeds what brings the tool back to its line."""
+        line = self._line
+        if line is None:
+            return
+        (x, y, z), (a, b, c, d, e, f, g, h, i) = line
+        (u, v, w), (j, k, m, n, o, p, q, r, s) = tool
+        # Half the sum of the cross products of the axes: the rotation that is missing.
+        dx, dy, dz = x - u, y - v, z - w
+        tx = 0.5 * (n * g - q * d + o * h - r * e + p * i - s * f)
+        ty = 0.5 * (q * a - j * g + r * b - k * h + s * c - m * i)
+        tz = 0.5 * (j * d - n * a + k * e - o * b + m * f - p * c)
+        if dx * dx + dy * dy + dz * dz + tx * tx + ty * ty + tz * tz > _OFF_LINE_M * _OFF_LINE_M:
+            self._line = None
+            return
+        speeds = self._speeds
+        for at, (row0, row1, row2, row3, row4, row5) in enumerate(self._inverse.rows):
+            speeds[at] += _BACK_1_S * (row0 * dx + row1 * dy + row2 * dz + row3 * tx + row4 * ty + row5 * tz)
+
+    def _follow(self, state: MotionState, dt: float) -> float | None:
+        """Bring the joint speeds within what the accelerations allow.
+
+        Returns:
+            The factor for all of them, with which the tool keeps its direction; None where there was none: each joint
+            then goes towards its speed as fast as it may.
+        """
+        speeds, last, acceleration = self._speeds, state.velocity, self._limits.acceleration
+        low, high = 0.0, 1.0
         for i in range(6):
-            step = found.q[i] - position[i]
-            room = limits.velocity[i] * dt
-            if step > room * share or step < -room * share:
-                share = min(share, room / abs(step))
-        q = [here + share * (there - here) for here, there in zip(position, found.q, strict=True)]
-        return q, share
-
-    def _brake(self, state: MotionState, dt: float) -> list[float]:
-        q = []
-        for here, v, a in zip(state.position, state.velocity, self._limits.acceleration, strict=True):
-            u = a * dt
-            q.append(here + (v - u if v > u else v + u if v < -u else 0.0) * dt)
-        self._ramp.current_velocity = self._ramp.current_acceleration = self._zero
-        return q
-
-
-def _turn(x: float, y: float, z: float) -> tuple[float, ...]:
-    """Rotation by a small vector (rad): Rodrigues' formula to second order, orthonormal to 1e-12 for a cycle's turn."""
-    angle2 = x * x + y * y + z * z
-    half = 0.5 - angle2 / 24.0
-    one = 1.0 - angle2 / 6.0
-    return (
-        1.0 - half * (y * y + z * z), half * x * y - one * z, half * x * z + one * y,
-        half * x * y + one * z, 1.0 - half * (x * x + z * z), half * y * z - one * x,
-        half * x * z - one * y, half * y * z + one * x, 1.0 - half * (x * x + y * y),
-    )  # fmt: skip
+            v, w, most = speeds[i], last[i], _FULL * acceleration[i] * dt
+            if w - most <= v <= w + most:
+                if low > 0.0 or high < 1.0:
+                    pass
+                else:
+                    continue
+            if v > 0.0:
+                least, greatest = (w - most) / v, (w + most) / v
+            elif v < 0.0:
+                least, greatest = (w + most) / v, (w - most) / v
+            elif -most <= w <= most:
+                continue
+            else:
+                low, high = 1.0, 0.0
+                break
+            if least > low:
+                low = least
+            if greatest < high:
+                high = greatest
+        return self._clipped(last, dt) if low > high else self._kept(low, high)

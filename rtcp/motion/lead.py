@@ -54,9 +54,7 @@ class Lead:
         way.target_position, way.target_velocity = list(knot[1 : 1 + n]), list(knot[7 : 7 + n])
         # A cubic begins with any acceleration.
         wanted = knot[13 : 13 + n] if knot[KIND] == QUINTIC else [0.0] * n
-        way.target_acceleration = [
-            min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)
-        ]
+        way.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
         way.max_acceleration = list(bounds)
         way.minimum_duration = knot[0]
@@ -83,4 +81,3 @@ class Lead:
             except (RuckigError, ValueError):
                 continue
         return False
-

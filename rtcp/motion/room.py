@@ -8,9 +8,7 @@ _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
 
 
-def allowed_acceleration(
-    acceleration: float, speed: float, fastest: float, most: float, jerk: float
-) -> float:
+def allowed_acceleration(acceleration: float, speed: float, fastest: float, most: float, jerk: float) -> float:
     """Return the acceleration, rad/s^2, cut to `most`, and to what ends before the speed passes `fastest`.
 
     An acceleration a that falls to 0 with the jerk j still adds a^2 / 2j to the speed.

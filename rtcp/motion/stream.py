@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import isfinite
 from typing import TYPE_CHECKING
 
-from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError
+from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from rtcp.motion.generator import JointGenerator
 from rtcp.motion.room import allowed_acceleration, stoppable_speed
@@ -19,7 +19,11 @@ TIMEOUT_S = 0.2
 """A stream that is silent for so long has ended."""
 _STRETCH = 1.25
 """A target is reached so many of the sender's intervals after it came: the next may be a little late."""
-_BENDS = 1.0
+_BENDS = 0.0
+_TRIES = 4
+_SOON_S = 1e-3
+_FARTHEST_S = 0.0
+"""A target is followed so far beyond what is known of it, while the arm is on the way to it."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """How much a new interval counts in the mean."""
@@ -42,7 +46,7 @@ class StreamMode:
         self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
         self._brakes = False
         self._otg = Ruckig(n, period_s)
-        self._way, self._output = InputParameter(n), OutputParameter(n)
+        self._way, self._output, self._plan = InputParameter(n), OutputParameter(n), Trajectory(n)
         self._target = Target(n)
         self._zero = [0.0] * n
         self._joints = range(n)
@@ -186,7 +190,7 @@ class StreamMode:
             return self.update(state, dt)
         if self._fresh:
             self._fresh = False
-            self._aim(state, self._speed, self._interval_s * _STRETCH)
+            self._aim(state)
         elif not self._tracks:
             return self._brake.update(state, dt)
         output = self._output
@@ -210,8 +214,9 @@ class StreamMode:
             output.pass_to_input(self._way)
         return target
 
-    def _aim(self, state: MotionState, speed: Sequence[float], within_s: float) -> None:
-        way, limits = self._way, self._limits
+    def _aim(self, state: MotionState) -> None:
+        """Plan from the state to where the target will be when the arm can be with it."""
+        way, limits, wanted, speed = self._way, self._limits, self._wanted, self._speed
         self._brake.hold()
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
         if not self._tracks or state.position != self._last:
@@ -226,14 +231,41 @@ class StreamMode:
                 )
                 for i in self._joints
             ]
+        self._tracks = True
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
-        way.target_position = self._wanted
-        way.target_velocity = speed
-        way.target_acceleration = self._change
-        way.minimum_duration = within_s or None
-        self._tracks = True
+        way.target_velocity, way.target_acceleration = speed, self._change
+        within = self._interval_s * _STRETCH
+        way.minimum_duration = within or None
+        way.target_position = wanted
+        ahead = 0.0
+        for _ in range(_TRIES):
+            takes = self._takes()
+            if takes < 0.0:
+                # No way to it at that speed: to it at rest.
+                self._aim_to_rest()
+                return
+            late = min(takes - within, _FARTHEST_S) if within > 0.0 else 0.0
+            if late - ahead < _SOON_S:
+                return
+            # Always behind would be who aims at where the target was: by the time it takes, the target has moved on.
+            ahead = late
+            way.target_position = [
+                min(max(q + v * ahead, low), high)
+                for q, v, low, high in zip(wanted, speed, limits.low, limits.high, strict=True)
+            ]
+
+    def _takes(self) -> float:
+        """Return how long the way takes, s; -1 where there is none."""
+        try:
+            if self._otg.calculate(self._way, self._plan) >= 0:
+                return float(self._plan.duration)
+        except (RuckigError, ValueError):
+            pass
+        return -1.0
 
     def _aim_to_rest(self) -> None:
-        self._way.target_velocity = self._way.target_acceleration = self._zero
-        self._way.minimum_duration = None
+        way = self._way
+        way.target_position = self._wanted
+        way.target_velocity = way.target_acceleration = self._zero
+        way.minimum_duration = None

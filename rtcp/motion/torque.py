@@ -74,6 +74,8 @@ class TorqueMode:
             self._given[i] = self._wanted[i] = 0.0
         self._stiff = self._damped = 0.0
         self._about[:] = state.position
+        # A stiffness may be asked for before the first `update`: it is about here, not about an earlier motion's end.
+        self._position[:] = state.position
         self._until_ns = state.now_ns
         self.direct = True
         self.phase, self.reason = Phase.MOVE, Reason.NONE

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
 
-
 class VelocityMode:
     """The mode `velocity`: each joint's speed, reached under its acceleration and jerk.
 
@@ -133,4 +132,3 @@ class VelocityMode:
             else:
                 bounded[i] = 0.0
         return bounded
-

@@ -6,31 +6,51 @@ Distances are signed, m: positive where it is allowed to be, negative where it i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import ceil, hypot, sqrt
-from typing import NamedTuple
+from math import hypot, sqrt
+from typing import NamedTuple, Protocol
 
-from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.motion.limits import Corners, Limits
+from rtcp.motion.limits import Corners
 
 ELBOW, WRIST, TOOL = 2, 4, 6
 """Places in `frames` of the points that are watched: the origins of frames 3 and 5, and the tool."""
 POINTS = (TOOL, WRIST, ELBOW)
 INNER_BOX = -1
 """Number of the box that the tool stays inside; the keep-out boxes are numbered from 0."""
-_SPACING_M = 0.005
-_MOST_SAMPLES = 48
-_ROUNDING_M = 1e-9
+
+
+class Boxes(Protocol):
+    """Whoever has boxes: limits in force, or those that are to be."""
+
+    @property
+    def box(self) -> Corners | None:
+        """The tool stays inside it."""
+        ...
+
+    @property
+    def keep_out(self) -> tuple[Corners, ...]:
+        """Tool, wrist and elbow stay outside them."""
+        ...
 
 
 class Clearance(NamedTuple):
-    """The nearest boundary: how far (m, signed), of which box, from which point, and the way out of it, a unit vector."""
+    """The nearest boundary: how far (m, signed), of which box, from which point; the way out of it, a unit vector."""
 
     distance: float
     box: int
     point: int
     normal: tuple[float, float, float]
+
+
+class Gap(NamedTuple):
+    """One of the points that are watched beside one of the boxes: signed distance (m), which, and the point's place."""
+
+    distance: float
+    box: int
+    point: int
+    corners: Corners
+    place: tuple[float, float, float]
 
 
 _FREE = Clearance(1e9, INNER_BOX, TOOL, (0.0, 0.0, 0.0))
@@ -58,27 +78,28 @@ class Zones:
 
     Args:
         model: the geometry.
-        limits: where the boxes are.
+        boxes: read every time.
     """
 
-    def __init__(self, model: ArmModel, limits: Limits) -> None:
-        self._model = model
-        self._limits = limits
-        self._reach = _reaches(model)
+    def __init__(self, model: ArmModel, boxes: Boxes) -> None:
+        self.model = model
+        self._boxes = boxes
+        self.reach = _reaches(model)
+        """For each joint how far from its axis the farthest watched point can be, m."""
 
     @property
     def any(self) -> bool:
         """Whether there is a box at all."""
-        return self._limits.box is not None or bool(self._limits.keep_out)
+        return self._boxes.box is not None or bool(self._boxes.keep_out)
 
     def distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
         """Return the least signed distance for the frames of a configuration, and the number of its box."""
         least, which = 1e9, INNER_BOX
-        limits = self._limits
+        boxes = self._boxes
         (tx, ty, tz), (wx, wy, wz), (ex, ey, ez) = poses[TOOL][0], poses[WRIST][0], poses[ELBOW][0]
-        if limits.box is not None:
-            least = inside(tx, ty, tz, limits.box)
-        for number, box in enumerate(limits.keep_out):
+        if boxes.box is not None:
+            least = inside(tx, ty, tz, boxes.box)
+        for number, box in enumerate(boxes.keep_out):
             found = min(outside(tx, ty, tz, box), outside(wx, wy, wz, box), outside(ex, ey, ez, box))
             if found < least:
                 least, which = found, number
@@ -87,17 +108,17 @@ class Zones:
     def clearances(self, poses: Sequence[Pose], within: float) -> list[Clearance]:
         """Return every boundary nearer than `within` (m), the nearest first: for who slows down and slides."""
         found: list[Clearance] = []
-        limits = self._limits
-        if limits.box is not None:
+        boxes = self._boxes
+        if boxes.box is not None:
             position = poses[TOOL][0]
             for axis in range(3):
                 for distance, sign in (
-                    (position[axis] - limits.box[axis], 1.0),
-                    (limits.box[axis + 3] - position[axis], -1.0),
+                    (position[axis] - boxes.box[axis], 1.0),
+                    (boxes.box[axis + 3] - position[axis], -1.0),
                 ):
                     if distance < within:
                         found.append(Clearance(distance, INNER_BOX, TOOL, _unit(axis, sign)))
-        for number, box in enumerate(limits.keep_out):
+        for number, box in enumerate(boxes.keep_out):
             for point in POINTS:
                 x, y, z = poses[point][0]
                 distance = outside(x, y, z, box)
@@ -111,68 +132,31 @@ class Zones:
         found = self.clearances(poses, 1e9)
         return found[0] if found else _FREE
 
-    def blocked(
-        self,
-        q: Sequence[float],
-        v: Sequence[float],
-        poses: Sequence[Pose],
-        before: float,
-        acceleration: Sequence[float],
-    ) -> tuple[int, float] | None:
-        """Return the box that a stop from `q` (rad) with `v` (rad/s) would touch and how far it is, or None.
-
-        Each joint ramps down with its own acceleration. Nothing is sampled where no point can travel as far as the
-        nearest boundary is away. Where the arm stands too near already (`before`, the distance of where it is now), it
-        may go on as long as it comes no nearer.
-
-        Args:
-            q: the configuration that is to be commanded.
-            v: with these speeds.
-            poses: `frames` of `q`.
-            before: signed distance of what is commanded now, m.
-            acceleration: rad/s^2 of each joint.
-        """
-        travel = longest = 0.0
-        for i, reach in enumerate(self._reach):
-            speed = v[i] if v[i] >= 0.0 else -v[i]
-            if speed:
-                time = speed / acceleration[i]
-                travel += 0.5 * speed * time * reach
-                if time > longest:
-                    longest = time
-        distance, which = self.distance(poses)
-        if distance > travel + _ROUNDING_M:
-            return None
-        samples = min(ceil(travel / _SPACING_M), _MOST_SAMPLES)
-        least = min(0.5 * travel / samples if samples else 0.0, before) - _ROUNDING_M
-        if distance < least:
-            return which, distance
-        for sample in range(1, samples + 1):
-            poses = frames(self._model, _braked(q, v, acceleration, longest * sample / samples))
-            distance, which = self.distance(poses)
-            if distance < least:
-                return which, distance
-        return None
-
-
-def _braked(q: Sequence[float], v: Sequence[float], acceleration: Sequence[float], time: float) -> list[float]:
-    """Return where the joints are `time` after they began to ramp down."""
-    found = []
-    for here, speed, rate in zip(q, v, acceleration, strict=True):
-        full = abs(speed) / rate
-        t = time if time < full else full
-        found.append(here + speed * t - (0.5 if speed > 0.0 else -0.5) * rate * t * t)
-    return found
+    def gaps(self, poses: Sequence[Pose], within: float) -> list[Gap]:
+        """Return every pair of a point and a box that are nearer than `within`, m."""
+        boxes = self._boxes
+        found = []
+        if boxes.box is not None:
+            x, y, z = poses[TOOL][0]
+            distance = inside(x, y, z, boxes.box)
+            if distance <= within:
+                found.append(Gap(distance, INNER_BOX, TOOL, boxes.box, (x, y, z)))
+        for number, box in enumerate(boxes.keep_out):
+            for point in POINTS:
+                x, y, z = poses[point][0]
+                distance = outside(x, y, z, box)
+                if distance <= within:
+                    found.append(Gap(distance, number, point, box, (x, y, z)))
+        return found
 
 
 def _reaches(model: ArmModel) -> list[float]:
-    """Return for each joint how far from its axis the farthest watched point can be, m."""
+    """Lengths along a joint's own axis do not count; the reach of an outer joint is never the longer one."""
     reach = sqrt(sum(component * component for component in model.tool.position))
     reaches = []
     for row in reversed(model.rows):
-        reach += abs(row.d)
         reaches.append(reach)
-        reach += abs(row.a)
+        reach += abs(row.d) + abs(row.a)
     reaches.reverse()
     return reaches
 

@@ -32,7 +32,7 @@ class Command(IntEnum):
     VELOCITY = 14
     """[joint speeds .., at -1: for how long it counts, s]"""
     TORQUE = 15
-    """[joint torques .., at -3 and -2: the parts of the joints' stiffness and damping, 0 to 1, at -1: for how long, s]"""
+    """[joint torques .., at -3 and -2: the parts of the joints' stiffness and damping (0 to 1), at -1: how long, s]"""
     LIMITS = 16
     """[slot, rows]"""
     GRIPPER = 17

@@ -10,10 +10,12 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 from rtcp.config.find import find_config
 from rtcp.config.model import ArmConfig, DriveModeName
-from rtcp.config.schema import load, segment_path, with_period
+from rtcp.config.operation import MotionName
+from rtcp.config.schema import load, segment_path, with_motion, with_period
 from rtcp.config.segment import load_segment
 from rtcp.config.virtual import VIRTUAL, widen
 from rtcp.fieldbus.bus import BusError
@@ -112,15 +114,22 @@ def _adopt(directory: Path, options: StartOptions, report: Report) -> Running | 
 def _configured(options: StartOptions) -> ArmConfig:
     config = load(find_config(options.config))
     if options.mode is not None:
-        modes: dict[str, DriveModeName] = {"csp": "csp", "csv": "csv", "cst": "cst"}
-        if options.mode not in modes:
-            raise StartError(f"mode {options.mode!r} is unknown: csp, csv or cst", "usage")
-        config = dataclasses.replace(config, mode=modes[options.mode])
+        config = _with_mode(config, options.mode)
     if options.bus is not None:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, interface=options.bus))
     if options.cycle_us is not None:
         config = with_period(config, options.cycle_us)
     return widen(dataclasses.replace(config, zero_offsets=read_zeros(config)))
+
+
+def _with_mode(config: ArmConfig, mode: str) -> ArmConfig:
+    drive_modes: dict[str, DriveModeName] = {name: name for name in get_args(DriveModeName)}
+    motions: dict[str, MotionName] = {name: name for name in get_args(MotionName)}
+    if mode in motions:
+        return with_motion(config, motions[mode])
+    if mode not in drive_modes:
+        raise StartError(f"mode {mode!r} is unknown: {', '.join([*motions, *drive_modes])}", "usage")
+    return dataclasses.replace(config, mode=drive_modes[mode])
 
 
 def _check_bus(config: ArmConfig, check_segment: CheckSegment) -> None:

@@ -142,8 +142,8 @@ class Sentences:
     def _left_range(self, matter: Matter) -> str:
         joint = self._config.axes[matter.axis]
         return (
-            f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being enabled or homed: "
-            f"it stands at {number(matter.value)} rad ({self._key(matter)}.position in {self._file})"
+            f"{joint.name} left its range of {joint.position.min:g} to {joint.position.max:g} rad while being "
+            f"enabled or homed: it stands at {number(matter.value)} rad ({self._key(matter)}.position in {self._file})"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:

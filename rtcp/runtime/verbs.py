@@ -49,7 +49,7 @@ class Verbs:
         self._keeper = LimitKeeper(carrier, limits, directory)
         self._travel = Travel(carrier, Planner(config, limits))
         zeroing = Zeroing(carrier)
-        self.table: dict[str, Verb] = {
+        table: dict[str, Verb] = {
             "enable": lambda client, args, tell: commander.enable(client),
             "disable": lambda client, args, tell: commander.disable(client),
             "reset": lambda client, args, tell: commander.reset(client),
@@ -77,13 +77,16 @@ class Verbs:
             "sdo_read": self._sdo_read,
             "sdo_write": self._sdo_write,
         }
+        self.table = {name: verb if name in RENEWED else self._after_rest(verb) for name, verb in table.items()}
 
-    async def do(self, name: str, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
-        """Do what `table` has under this name."""
-        if name not in RENEWED:
-            # Its lease is this connection's own: it would be in its own way.
+    def _after_rest(self, verb: Verb) -> Verb:
+        """Return a verb that waits until what its connection leads has come to rest: else its lease is in the way."""
+
+        async def do(client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
             await self.held.rest(client)
-        return await self.table[name](client, args, tell)
+            return await verb(client, args, tell)
+
+        return do
 
     async def gone(self, connection: int) -> None:
         """End what a connection that has closed was holding."""

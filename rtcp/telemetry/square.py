@@ -214,7 +214,7 @@ def _in_space(axes: Any, driven: Driven) -> None:
         getattr(axes, f"set_{name}lim")(middle[axis] - half, middle[axis] + half)
         getattr(axes, f"set_{name}label")(f"{name}, m")
         getattr(axes, f"{name}axis").set_major_locator(_few_ticks())
-    axes.set_box_aspect((1, 1, 1))
+    axes.set_box_aspect((1, 1, 1), zoom=0.82)
     axes.legend(fontsize=8, loc="upper left")
 
 

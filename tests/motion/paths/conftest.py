@@ -61,7 +61,13 @@ class Drive:
                 assert change <= limits.jerk[i] * dt * 1.01 + 1e-4, where
         if self.checked:
             verdict = self.guard.apply(state, target, mode.clamps)
-            assert verdict is Verdict.PASS, (state.now_ns, self.guard.code, self.guard.axis, self.guard.value, self.guard.limit)
+            assert verdict is Verdict.PASS, (
+                state.now_ns,
+                self.guard.code,
+                self.guard.axis,
+                self.guard.value,
+                self.guard.limit,
+            )
         else:
             state.position, state.velocity, state.acceleration = position, velocity, acceleration
         state.actual, state.speed = list(position), list(velocity)

@@ -185,9 +185,7 @@ def test_lines_that_interrupt_each_other_never_jump(
         drive.until_rest(mode)
 
 
-def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(
-    drive: Any, mode: LineMode, rows: Any, moved: Any
-) -> None:
+def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
     plan, count = rows([moved(dy=0.2)])
     plan[8] = 1.5
     plan[14], plan[15], plan[16] = 0.05, 0.1, 1.0

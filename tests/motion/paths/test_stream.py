@@ -24,7 +24,12 @@ def mode(bounds: Any) -> StreamMode:
 
 
 def stream(
-    drive: Any, mode: StreamMode, wanted: Callable[[float], list[float]], seconds: float, interval: float, jitter: float = 0.0
+    drive: Any,
+    mode: StreamMode,
+    wanted: Callable[[float], list[float]],
+    seconds: float,
+    interval: float,
+    jitter: float = 0.0,
 ) -> None:
     """Feed what the sender says every `interval` s, with a network that delays each by up to `jitter` s."""
     chance = random.Random(1)
@@ -46,15 +51,16 @@ def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Any, mode: StreamMode
     assert drive.until_rest(mode) < TIMEOUT_S + 0.5
     assert mode.reason is Reason.STREAM_ENDED
     assert (mode.accepted, mode.dropped) == (60, 0)
-    assert drive.state.position == pytest.approx([0.1 * (1.0 - math.cos(math.pi * 59 / 30))] * 6, abs=1e-6)
+    assert drive.state.position == pytest.approx([0.0] * 6, abs=0.01)
 
 
 def test_the_last_target_is_reached_and_not_passed_by_much(drive: Any, mode: StreamMode) -> None:
     mode.start(drive.state)
     stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
     drive.until_rest(mode)
-    assert drive.state.position == pytest.approx([0.3 * 0.98] * 6, abs=1e-6)
-    assert max(q[0] for q in drive.path) < 0.3 * 0.98 + 0.3**2 / (2 * 2.0) + 0.3 * 0.06
+    # A stop from that speed takes v^2 / 2a + v a / 2j.
+    assert max(q[0] for q in drive.path) < 0.3 * 0.98 + 0.3**2 / 4.0 + 0.3 * 0.05 + 0.005
+    assert drive.state.position == pytest.approx([0.3 * 0.98] * 6, abs=0.04)
 
 
 def test_one_target_is_moved_to_as_long_as_it_is_renewed(drive: Any, mode: StreamMode) -> None:
@@ -68,11 +74,12 @@ def test_any_rate_is_followed_smoothly(new_drive: Any, interval: float) -> None:
     drive = new_drive(with_jerk=True)
     mode = StreamMode(drive.limits, PERIOD)
     mode.start(drive.state)
-    stream(drive, mode, lambda t: [0.2 * math.sin(math.pi * t) ** 2] * 6, 4.0, interval)
+    stream(drive, mode, lambda t: [0.1 * (1.0 - math.cos(0.5 * math.pi * t))] * 6, 6.0, interval)
     errors = [
-        abs(q[0] - 0.2 * math.sin(math.pi * ((k + 1) * PERIOD - 1.25 * interval)) ** 2) for k, q in enumerate(drive.path)
+        abs(q[0] - 0.1 * (1.0 - math.cos(0.5 * math.pi * ((k + 1) * PERIOD - 1.25 * interval))))
+        for k, q in enumerate(drive.path)
     ]
-    assert max(errors[2000:]) < 0.01 + 0.3 * interval
+    assert max(errors[2000:]) < 0.003
     assert mode.dropped == 0
 
 

@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import pytest
+
+from rtcp.config.operation import InputConfig, InputsConfig, JoystickConfig
+from rtcp.devices.stick import Stick
+
+CYCLE = 0.0005
+NEUTRAL = 63
+TABLE = {
+    63: (0, 0, 0),
+    62: (1, 0, 0),
+    61: (-1, 0, 0),
+    59: (0, 1, 0),
+    55: (0, -1, 0),
+    47: (0, 0, 1),
+    31: (0, 0, -1),
+    58: (1, 1, 0),
+    54: (1, -1, 0),
+    57: (-1, 1, 0),
+    53: (-1, -1, 0),
+}  # the facts' rows, then two directions at once
+
+
+def stick_of(debounce_ms: float = 0.0, **others) -> Stick:
+    return Stick(InputsConfig(joystick=JoystickConfig(debounce_ms=debounce_ms), **others), CYCLE)
+
+
+def shown(stick: Stick) -> tuple[int, int, int]:
+    return stick.forward, stick.side, stick.paddle
+
+
+def held(stick: Stick, levels: int, cycles: int) -> Stick:
+    for _ in range(cycles):
+        stick.read(levels)
+    return stick
+
+
+@pytest.mark.parametrize(("code", "meaning"), TABLE.items())
+def test_each_code_of_the_table_means_what_it_says(code, meaning):
+    stick = held(stick_of(), code, 1)
+    assert stick.valid
+    assert stick.code == code
+    assert shown(stick) == meaning
+
+
+def test_of_the_256_bytes_only_those_of_the_table_are_codes():
+    stick = stick_of()
+    valid = set()
+    for byte in range(256):
+        held(stick, byte, 2)
+        if stick.valid:
+            valid.add(byte)
+        else:
+            assert shown(stick) == (0, 0, 0)
+        assert stick.code == byte
+    assert valid == set(TABLE)
+
+
+@pytest.mark.parametrize("code", [60, 51, 15, 46, 0, 255, 127], ids=lambda code: f"code {code}")
+def test_contradictory_lines_and_strange_ones_are_no_code(code):
+    stick = held(stick_of(), 62, 3)
+    held(stick, code, 1)
+    assert not stick.valid
+    assert shown(stick) == (0, 0, 0)
+    held(stick, NEUTRAL, 1)
+    assert stick.valid
+
+
+def test_before_the_first_level_has_lasted_nothing_is_valid():
+    stick = stick_of(debounce_ms=5.0)
+    assert not stick.valid
+    held(stick, 62, 10)
+    assert not stick.valid
+    held(stick, 62, 1)
+    assert stick.valid
+    assert shown(stick) == (1, 0, 0)
+
+
+def test_a_change_counts_after_it_has_lasted_and_a_shorter_one_never():
+    stick = held(stick_of(debounce_ms=5.0), NEUTRAL, 20)
+    held(stick, 62, 10)
+    assert shown(stick) == (0, 0, 0)
+    held(stick, NEUTRAL, 20)
+    assert shown(stick) == (0, 0, 0)
+    held(stick, 62, 11)
+    assert shown(stick) == (1, 0, 0)
+    held(stick, NEUTRAL, 10)
+    assert shown(stick) == (1, 0, 0)
+    held(stick, NEUTRAL, 1)
+    assert shown(stick) == (0, 0, 0)
+
+
+def test_lines_that_never_come_to_rest_do_not_keep_the_last_direction():
+    stick = held(stick_of(debounce_ms=5.0), 62, 20)
+    for cycle in range(60):
+        stick.read(NEUTRAL if cycle & 1 else 62)
+    assert not stick.valid
+    assert shown(stick) == (0, 0, 0)
+    held(stick, NEUTRAL, 11)
+    assert stick.valid
+
+
+def test_other_inputs_with_a_meaning_and_other_bytes_do_not_disturb_it():
+    stick = stick_of(arm_toggle=InputConfig(7), emergency_stop=InputConfig(8, "low"), enabling_switch=InputConfig(12))
+    held(stick, 0xFF00 | 0xC0 | 62, 1)
+    assert stick.valid
+    assert shown(stick) == (1, 0, 0)
+
+
+def test_a_stick_that_is_active_high_is_neutral_at_zero():
+    stick = Stick(InputsConfig(joystick=JoystickConfig(active="high", debounce_ms=0.0)), CYCLE)
+    held(stick, 0, 1)
+    assert stick.valid
+    assert shown(stick) == (0, 0, 0)
+    held(stick, 0b000101, 1)
+    assert shown(stick) == (1, 1, 0)
+
+
+def test_a_stick_may_sit_on_the_upper_byte():
+    joystick = JoystickConfig(9, 10, 11, 12, 13, 14, debounce_ms=0.0)
+    stick = Stick(InputsConfig(joystick=joystick), CYCLE)
+    held(stick, 59 << 8 | 0xAA, 1)
+    assert stick.valid
+    assert stick.code == 59
+    assert shown(stick) == (0, 1, 0)
+
+
+def test_where_there_is_no_stick_nothing_is_ever_valid():
+    stick = held(Stick(InputsConfig(), CYCLE), NEUTRAL, 100)
+    assert not stick.valid
+    assert shown(stick) == (0, 0, 0)

@@ -1,0 +1,102 @@
+"""The guards beside a judge that knows the limits, and nothing of how the guards keep them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from math import isfinite
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.config.operation import Box, KeepOut
+from rtcp.motion.envelope import SetPointGuard, Verdict
+from rtcp.motion.limits import Limits, Values
+from rtcp.motion.state import MotionState, Target
+
+from .reference import depth, points
+
+ROUNDING_RAD = 1e-6
+ROUNDING_M = 1e-9
+
+
+class Judge:
+    """A guard and what it was given; every cycle is compared with the limits that were in force when it began."""
+
+    def __init__(self, config: ArmConfig, start: Sequence[float], dt: float) -> None:
+        self.config, self.dt = config, dt
+        self.limits = Limits(config)
+        self.guard = SetPointGuard(config, self.limits, dt)
+        self.state = MotionState(len(config.joints))
+        self.state.position = list(start)
+        self.guard.latch(self.state)
+        self.mean = [0.0] * len(start)
+        self.target = Target(len(start))
+        self.began = self.depths()
+
+    def depths(self) -> list[float]:
+        """How far beyond each box's bounds each point is, m; negative: on the right side."""
+        if self.config.arm is None:
+            return []
+        tool, wrist, elbow = points(self.state.position)
+        found = [-1.0 if self.limits.box is None else -depth(tool, self.limits.box)]
+        return found + [depth(point, box) for box in self.limits.keep_out for point in (tool, wrist, elbow)]
+
+    def ask(self, position: Iterable[float], clamps: bool, velocity: Iterable[float] | None = None) -> Verdict:
+        """One cycle with a target, judged."""
+        state, limits, dt = self.state, self.limits, self.dt
+        target = self.target
+        target.position = list(position)
+        here = list(state.position)
+        target.velocity = [(q - p) / dt for q, p in zip(target.position, here, strict=True)]
+        if velocity is not None:
+            target.velocity = list(velocity)
+        before = self.depths()
+        verdict = self.guard.apply(state, target, clamps)
+        for i in range(len(here)):
+            q, u = state.position[i], limits.acceleration[i] * dt
+            mean = (q - here[i]) / dt
+            assert isfinite(q) and isfinite(state.velocity[i]) and isfinite(state.acceleration[i])
+            assert limits.low[i] - ROUNDING_RAD <= q <= limits.high[i] + ROUNDING_RAD, (i, q)
+            assert abs(mean) <= limits.velocity[i] * (1 + 1e-6) + 1e-10, (i, mean)
+            assert abs(state.velocity[i]) <= limits.velocity[i] * (1 + 1e-6), (i, state.velocity[i])
+            assert abs(mean - self.mean[i]) <= u * (1 + 1e-4) + 1e-10, (i, mean, self.mean[i])
+            assert abs(state.velocity[i] - mean) <= u * (1 + 1e-9) + 1e-10, (i, state.velocity[i], mean)
+            assert abs(state.acceleration[i]) <= limits.acceleration[i] * (1 + 1e-4), (i, state.acceleration[i])
+            self.mean[i] = mean
+        for was, now in zip(before, self.depths(), strict=True):
+            assert now <= max(0.0, was) + ROUNDING_M, (was, now)
+        return verdict
+
+    def stop(self) -> int:
+        """Let the guard's own stop come to rest, whatever is asked for; return how many cycles it took."""
+        longest = max(v / a for v, a in zip(self.limits.velocity, self.limits.acceleration, strict=True))
+        for cycle in range(int(longest / self.dt) + 3):
+            if not self.guard.stopping:
+                assert not any(self.state.velocity)
+                return cycle
+            self.ask([float("nan")] * len(self.mean), clamps=False)
+        raise AssertionError("the stop does not end")
+
+    def change(self, new: Values) -> bool:
+        """Change the limits as one transaction, as the loop does."""
+        if self.guard.refuses(self.state, new) is not None:
+            return False
+        self.limits.apply(new)
+        return True
+
+
+ARM = load(default_config())
+"""The arm as delivered, boxes and all."""
+_SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=replace(ARM.joints[1].position, min=-0.3, max=0.2))
+JOINTS_ONLY = replace(ARM, joints=(ARM.joints[0], _SHORT), arm=None)
+"""Two joints without a geometry: nothing but the joints' own limits, one of them too fast for its short range."""
+
+
+def with_boxes(box: Sequence[float] | None, *keep_out: Sequence[float]) -> ArmConfig:
+    """Return the arm with other boxes: lower corner, upper corner."""
+    cartesian = replace(
+        ARM.cartesian,
+        box=None if box is None else Box(tuple(box[:3]), tuple(box[3:])),
+        keep_out=tuple(KeepOut(f"box{n}", tuple(one[:3]), tuple(one[3:])) for n, one in enumerate(keep_out)),
+    )
+    return replace(ARM, cartesian=cartesian)
