@@ -19,6 +19,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -37,6 +38,7 @@ from rtcp.runtime.launcher import Running, StartOptions, start
 from rtcp.runtime.layout import RECORDS
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.paths import blackboard_file, runtime_directory
+from rtcp.telemetry.square import SPEED_M_S, place
 
 THESIS = {
     200: (218.1, 21.4),
@@ -85,16 +87,54 @@ def cyclictest(cpu: int, priority: int, interval_us: int, seconds: float) -> Arr
     return np.repeat([bin_us for bin_us, _ in counts], [count for _, count in counts]).astype(float)
 
 
-def wander(stop: threading.Event) -> None:
-    """Move the arm to and fro until `stop`; a move that fails is told, and ends the wandering."""
+def wander(client: ControlClient, turn: int) -> None:
+    """Move the arm to and fro in joint space."""
     poses = ([0.4, -0.3, 0.5, 0.2, -0.4, 0.3], [0.0] * 6)
+    client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+
+
+def drive_squares(client: ControlClient, turn: int) -> None:
+    """Drive the square of the thesis along straight lines, over and over."""
+    square = place(load(find_config(None)), "xy")
+    if turn == 0:
+        client.call("move", {"q": list(square.start), "speed": None}, timeout_s=60.0)
+    client.call("line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
+
+
+def push_the_stick(client: ControlClient, turn: int) -> None:
+    """Hold the virtual joystick, forward and left, then backward and right, for a second each."""
+    if turn == 0:
+        client.call("move", {"q": list(place(load(find_config(None)), "xy").start), "speed": None}, timeout_s=60.0)
+        client.call("motion", {"name": "joystick"})
+        client.call("stick", {"byte": 63})
+        time.sleep(0.2)
+    pressed = ["forward", "left"] if turn % 2 == 0 else ["backward", "right"]
+    end = time.monotonic() + 1.0
+    while time.monotonic() < end:
+        client.call("stick", {"pressed": pressed, "hold_s": 0.5})
+        time.sleep(0.2)
+
+
+ACTIVE: dict[str, Callable[[ControlClient, int], None]] = {
+    "joint": wander,
+    "cartesian": drive_squares,
+    "joystick": push_the_stick,
+}
+"""What moves the arm while the cycle is measured."""
+
+
+def keep_moving(active: str, stop: threading.Event, moving: threading.Event) -> None:
+    """Move the arm until `stop`; a motion that fails is told, and ends the moving."""
     turn = 0
     with ControlClient("benchmark") as client:
         while not stop.is_set():
+            if turn == 1 or active == "joint":
+                moving.set()
             try:
-                client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+                ACTIVE[active](client, turn)
             except ControlError as error:
                 sys.stderr.write(f"the arm stopped moving: {error.message}\n")
+                moving.set()
                 return
             turn += 1
 
@@ -114,7 +154,9 @@ def timer_alone(directory: Path) -> Path:
     return arm
 
 
-def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool, config: Path | None = None) -> Round:
+def platform_round(
+    cycle_us: int, seconds: float, *, poll: bool, active: str | None, config: Path | None = None
+) -> Round:
     """Start the platform, enable, let it run (moving or holding), stop; return what the cycle records tell."""
     options = StartOptions(config=config, cycle_us=float(cycle_us), poll=poll)
     running: Running = start(options, lambda sentence: None)
@@ -122,10 +164,11 @@ def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool, con
         observer = Observer(blackboard_file(runtime_directory()))
         with ControlClient("benchmark") as client:
             client.call("enable")
-        stop = threading.Event()
-        mover = threading.Thread(target=wander, args=(stop,), daemon=True)
-        if move:
+        stop, moving = threading.Event(), threading.Event()
+        if active is not None:
+            mover = threading.Thread(target=keep_moving, args=(active, stop, moving), daemon=True)
             mover.start()
+            moving.wait(timeout=60.0)
         time.sleep(0.5)
         at, parts, lost = observer.head, [], 0
         until = time.monotonic() + seconds
@@ -137,7 +180,7 @@ def platform_round(cycle_us: int, seconds: float, *, poll: bool, move: bool, con
             parts.append(records)
         rss = resident_mb(running.processes.loop)
         stop.set()
-        if move:
+        if active is not None:
             mover.join()
         observer.close()
     finally:
@@ -176,7 +219,7 @@ def spread(samples: list[Array], name: str) -> str:
 
 
 def compare(
-    cycle_us: int, seconds: float, rounds: int, directory: Path, *, poll: bool, console: Console
+    cycle_us: int, seconds: float, rounds: int, directory: Path, *, poll: bool, active: str, console: Console
 ) -> dict[str, object]:
     """Alternate cyclictest and the platform; print the table; return the figures."""
     config = load(find_config(None))
@@ -187,8 +230,8 @@ def compare(
         measured = cyclictest(cpu, priority, cycle_us, seconds)
         if measured is not None:
             reference.append(measured)
-        runs.append(platform_round(cycle_us, seconds, poll=poll, move=True))
-        sleeping.append(platform_round(cycle_us, seconds, poll=poll, move=True, config=sleeper))
+        runs.append(platform_round(cycle_us, seconds, poll=poll, active=active))
+        sleeping.append(platform_round(cycle_us, seconds, poll=poll, active=active, config=sleeper))
     table = Table(title=f"{cycle_us} us cycle, {rounds} rounds of {seconds:g} s, CPU {cpu}, priority {priority}; us")
     for heading in ("", "p50", "p99", "p99.9", "max", "p99 over the rounds"):
         table.add_column(heading, justify="left" if not heading else "right")
@@ -245,7 +288,7 @@ def targets(seconds: float, *, poll: bool, console: Console) -> dict[str, object
         table.add_column(heading, justify="right")
     result: dict[str, object] = {}
     for target, (mean, deviation) in THESIS.items():
-        run = platform_round(target, seconds, poll=poll, move=False)
+        run = platform_round(target, seconds, poll=poll, active=None)
         own = float(run.period.mean())
         own_deviation = float(np.abs(run.period - own).mean())
         result[str(target)] = {"mean": own, "deviation": own_deviation, "skipped": run.missed}
@@ -265,17 +308,28 @@ def main() -> int:
     parser.add_argument("--cycle-us", type=int, default=500)
     parser.add_argument("--poll", action="store_true", help="let the segment poll on its own CPU")
     parser.add_argument("--no-targets", action="store_true", help="leave out the ten cycle targets")
+    parser.add_argument(
+        "--active", choices=sorted(ACTIVE), default="joint", help="what moves the arm: joint moves, lines, the stick"
+    )
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     given = parser.parse_args()
     console = Console()
     machine = (
         f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, Python {platform.python_version()}"
     )
-    console.print(f"{machine}, {date.today().isoformat()}")
+    console.print(f"{machine}, {date.today().isoformat()}, {given.active} motion")
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
         os.environ["RTCP_RUNTIME_DIR"] = directory
         found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
-        found |= compare(given.cycle_us, given.seconds, given.rounds, Path(directory), poll=given.poll, console=console)
+        found |= compare(
+            given.cycle_us,
+            given.seconds,
+            given.rounds,
+            Path(directory),
+            poll=given.poll,
+            active=given.active,
+            console=console,
+        )
         if not given.no_targets:
             found["targets"] = targets(given.seconds / 2, poll=given.poll, console=console)
     if given.json:

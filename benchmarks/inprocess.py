@@ -11,15 +11,9 @@ import argparse
 import cProfile
 import pstats
 import struct
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-
-# Not this folder, whose files are named as packages are, but the one that holds it.
-sys.path.pop(0)
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from rtcp.config import default_config, load
 from rtcp.runtime.machine import Command, State

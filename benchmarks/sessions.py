@@ -9,13 +9,14 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 
-# Not this folder, whose files are named as packages are, but the one that holds it.
-sys.path.pop(0)
+# The sessions are the tests' own.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.sessions.play import Outcome, play
@@ -42,6 +43,10 @@ def show(outcome: Outcome, wall_s: float) -> None:
             print(f"    {sentence}")
 
 
+def _ignore_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sessions", type=int, default=1000)
@@ -52,7 +57,8 @@ def main() -> int:
     total = Outcome()
     began = shown = time.monotonic()
     seeds = range(given.seed, given.seed + given.sessions)
-    with multiprocessing.Pool(given.processes) as pool:
+    # Ctrl-C ends it with what is known by then.
+    with suppress(KeyboardInterrupt), multiprocessing.Pool(given.processes, initializer=_ignore_interrupts) as pool:
         for outcome in pool.imap_unordered(play, seeds, chunksize=4):
             total.add(outcome)
             if time.monotonic() - shown > 10:

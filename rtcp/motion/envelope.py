@@ -146,8 +146,8 @@ class SetPointGuard:
         here, speeds, rates, most = state.position, target.velocity, self._limits.acceleration, self._limits.velocity
         velocity, acceleration = state.velocity, state.acceleration
         for i in self._joints:
-            w, speed, rate, fastest = mean[i], speeds[i], rates[i], most[i]
-            u = rate * dt
+            w, speed, rate, fastest = mean[i], speeds[i], rates[i], most[i] * (1.0 + _ROUNDING_SPEED)
+            u = rate * dt * (1.0 + _ROUNDING_CHANGE)
             if not (w - u <= speed <= w + u and -fastest <= speed <= fastest) or held >> i & 1:
                 speed = w
             change = (speed - velocity[i]) / dt

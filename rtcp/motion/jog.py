@@ -2,9 +2,9 @@
 
 What is asked for becomes a tool velocity under Cartesian acceleration and jerk (`JogRamp`); what the joint ranges, the
 boxes and the singularities do not allow is taken from it (`JogBounds`); the inverse Jacobian makes it joint speeds
-(`JogInverse`), and what the tool has lost of its line, some 1e-7 m a cycle, comes back with the next ones. All joints are
-scaled together, so that the tool keeps its direction; where they cannot follow, it waits, and the ramp goes on from what
-was reached. Nothing winds up.
+(`JogInverse`), and what the tool has lost of its line, some 1e-7 m a cycle, comes back with the next ones. All joints
+are scaled together, so that the tool keeps its direction; where they cannot follow, it waits, and the ramp goes on from
+what was reached. Nothing winds up.
 
 Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
 stretched elbow bends towards the inverse solution a little further on (`_bend`).
@@ -16,8 +16,9 @@ from collections.abc import Sequence
 
 from kinematics.forward import frames
 from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import jacobian_columns
 from kinematics.model import ArmModel
-from kinematics.pose import Pose, applied, times
+from kinematics.pose import Pose, Rotation, applied, times
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
 from rtcp.motion.jog_bounds import JogBounds
@@ -78,6 +79,8 @@ class JogMode:
         self._line: Pose | None = None
         self._fresh = True
         self._last = [0.0] * 6
+        self._posed = False
+        self._wrist = singularity.wrist
         self.clamps = True
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
@@ -115,7 +118,8 @@ class JogMode:
             turn = self._angular_speed / angular**0.5
         # One factor for both, so that the direction is the one that was asked for.
         part = part if part < turn else turn
-        asked[0], asked[1], asked[2], asked[3], asked[4], asked[5] = a * part, b * part, c * part, d * part, e * part, f * part  # noqa: E501
+        for i in range(6):
+            asked[i] = part * twist[i]
 
     def stop(self, state: MotionState) -> None:
         """Come to rest."""
@@ -161,9 +165,8 @@ class JogMode:
                 self._line = None
                 ramp.held(_reached(poses, speeds))
             else:
-                self._advance(factor, dt)
+                self._advance(factor, dt, poses[6])
                 ramp.held(twist)
-        self._tell()
         moving = any(speeds)
         self._posed = moving and bounds.watched
         if not moving and not any(wanted) and not any(ramp.velocity):
@@ -248,25 +251,123 @@ class JogMode:
             then goes towards its speed as fast as it may.
         """
         speeds, last, acceleration = self._speeds, state.velocity, self._limits.acceleration
-        low, high = 0.0, 1.0
+        step = _FULL * dt
         for i in range(6):
-            v, w, most = speeds[i], last[i], _FULL * acceleration[i] * dt
-            if w - most <= v <= w + most:
-                if low > 0.0 or high < 1.0:
-                    pass
-                else:
-                    continue
-            if v > 0.0:
+            change, most = speeds[i] - last[i], step * acceleration[i]
+            if change > most or change < -most:
+                break
+        else:
+            return 1.0
+        low, high = 0.0, 1e9
+        for i in range(6):
+            v, w, most = speeds[i], last[i], step * acceleration[i]
+            if v > 1e-12:
                 least, greatest = (w - most) / v, (w + most) / v
-            elif v < 0.0:
+            elif v < -1e-12:
                 least, greatest = (w + most) / v, (w - most) / v
             elif -most <= w <= most:
                 continue
             else:
                 low, high = 1.0, 0.0
                 break
-            if least > low:
-                low = least
-            if greatest < high:
-                high = greatest
-        return self._clipped(last, dt) if low > high else self._kept(low, high)
+            low, high = max(low, least), min(high, greatest)
+        if low > high:
+            self._clip(last, step)
+            return None
+        # Above 1 it brakes as fast as the joints can.
+        factor = low if low > 1.0 else high if high < 1.0 else 1.0
+        for i in range(6):
+            speeds[i] *= factor
+        return factor
+
+    def _clip(self, last: Sequence[float], step: float) -> None:
+        speeds, acceleration = self._speeds, self._limits.acceleration
+        for i in range(6):
+            most = step * acceleration[i]
+            v, w = speeds[i], last[i]
+            speeds[i] = w + most if v > w + most else w - most if v < w - most else v
+
+    def _advance(self, factor: float, dt: float, tool: Pose) -> None:
+        """Let the line go on with what the tool does in this cycle."""
+        twist = self._twist
+        if factor != 1.0:
+            for i in range(6):
+                twist[i] *= factor
+        if self._inverse.lost or not any(twist):
+            self._line = None
+            return
+        (x, y, z), rotation = tool if self._line is None else self._line
+        a, b, c, d, e, f = twist
+        if d or e or f:
+            rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
+        self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
+
+    def _bend(self, poses: Sequence[Pose], position: Sequence[float], wanted: Sequence[float]) -> bool:
+        """Write joint speeds that bend a stretched (or open a folded) elbow, where the tool is to go that way."""
+        inverse = self._inverse
+        row = inverse.lost[1 if inverse.locked[0] else 0]
+        outward = sum(one * other for one, other in zip(row, wanted, strict=True))
+        x, y, z, _, _, _ = row
+        (px, py, pz), (wx, wy, wz) = poses[1].position, poses[4].position
+        if x * (wx - px) + y * (wy - py) + z * (wz - pz) < 0.0:
+            outward = -outward
+        inward = -outward if inverse.stretched else outward
+        if inward < 1e-3:
+            return False
+        ahead = _RETRACTION_M / inward
+        a, b, c, d, e, f = (component * ahead for component in wanted)
+        (x, y, z), rotation = poses[6]
+        pose = Pose((x + a, y + b, z + c), times(_turn(d, e, f), rotation))
+        found = self._inverse_kinematics.solve_near(pose, position).q
+        if found is None:
+            return False
+        speeds, fastest, distance = self._speeds, self._limits.velocity, inverse.distance
+        rate = 1.0 / ahead
+        for i in range(6):
+            speeds[i] = step = found[i] - position[i]
+            size = step if step > 0.0 else -step
+            if size > _BEND_RAD:
+                return False
+            if size * rate > 0.5 * fastest[i]:
+                rate = 0.5 * fastest[i] / size
+        # Beside a wrist that is singular too, joint 5 may only lead away; the shoulder is not moved sideways by it.
+        if not inverse.locked[2] and distance[2] < self._wrist and speeds[4] * inverse.wrist_sign < 0.0:
+            return False
+        for i in range(6):
+            speeds[i] *= rate
+        return True
+
+    def _brake(self, state: MotionState, dt: float) -> Target:
+        """Each joint brakes as fast as it may: there is no inverse."""
+        speeds = self._speeds
+        speeds[:] = self._zero
+        self._clip(state.velocity, _FULL * dt)
+        self._line = None
+        self._fresh = True
+        self._posed = False
+        self.reason = Reason.NO_SOLUTION
+        if not any(speeds) and (self.phase is Phase.STOP or not any(self._asked)):
+            self.phase = Phase.HOLD
+        return self._answer(state.position, dt)
+
+
+def _reached(poses: Sequence[Pose], speeds: Sequence[float]) -> list[float]:
+    """Return the tool velocity of joint speeds."""
+    twist = [0.0] * 6
+    if any(speeds):
+        for v, column in zip(speeds, jacobian_columns(poses), strict=True):
+            for i in range(6):
+                twist[i] += v * column[i]
+    return twist
+
+
+def _turn(x: float, y: float, z: float) -> Rotation:
+    """Rotation by a small vector (rad): Rodrigues' formula to second order, orthonormal to 1e-12 for a cycle's turn."""
+    angle2 = x * x + y * y + z * z
+    half = 0.5 - angle2 / 24.0
+    one = 1.0 - angle2 / 6.0
+    return (
+        1.0 - half * (y * y + z * z), half * x * y - one * z, half * x * z + one * y,
+        half * x * y + one * z, 1.0 - half * (x * x + z * z), half * y * z - one * x,
+        half * x * z - one * y, half * y * z + one * x, 1.0 - half * (x * x + y * y),
+    )  # fmt: skip

@@ -1,7 +1,7 @@
 """What holds a jogged tool back: joint ranges, boxes and singularities, as bounds of the tool velocity.
 
-A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. Where one is passed, the part of the motion that
-passes it is taken away and the rest slides along (`slide`); singularities halt the whole of it instead (`halt`).
+A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. Where one is passed, the part of the motion
+that passes it is taken away and the rest slides along (`slide`); singularities halt the whole of it instead (`halt`).
 """
 
 from __future__ import annotations
@@ -52,30 +52,45 @@ class JogBounds:
         self._zones = guards.zones
         self._braking = braking
         self._nearest = tuple(singularity)
-        self._near: Sequence[Clearance] = ()
-        self._points: list[Row] = []
+        self.near: Sequence[Clearance] = ()
         self._idle = 0
         self._boxes: object = None
         self._turn2 = 1.0 / inverse.length**2
         self.axis = self.box = self.singular = -2
         """What held the motion back in this cycle: joint, box (-1: the inner one), singularity; -2: none."""
 
-    def look(self, poses: Sequence[Pose], jumped: bool) -> None:
+    def look(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
         """Find the boundaries that are near. They are looked for again when a point can have come near to one."""
         self.axis = self.box = self.singular = -2
+        self._position = position
         zones, limits = self._zones, self._limits
-        if zones is None or not zones.any:
-            self._near = ()
+        self.watched = zones is not None and zones.any
+        if zones is None or not self.watched:
+            self.near = ()
             return
         boxes = (limits.box, limits.keep_out)
         self._idle -= 1
         if self._idle > 0 and not jumped and boxes == self._boxes:
             return
         self._boxes = boxes
-        self._near = zones.clearances(poses, _WITHIN_M)
+        self.near = zones.clearances(poses, _WITHIN_M)
         self._idle = 0
-        if not self._near:
+        if not self.near:
             self._idle = int((zones.distance(poses)[0] - _WITHIN_M) / (_FASTEST_POINT_M_S * self._dt))
+
+    def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
+        """Return whether `twist`, with its joint speeds, passes a bound: `slide` is for that."""
+        if self.near or self._inverse.lost:
+            return True
+        limits, q = self._limits, self._position
+        low, high, acceleration = limits.low, limits.high, limits.acceleration
+        for i in range(6):
+            v = speeds[i]
+            room = (high[i] - q[i] if v > 0.0 else q[i] - low[i]) - JOINT_MARGIN_RAD
+            # v^2 > 2 a room, with room for the steps of time
+            if v * v > 1.8 * _BRAKES * acceleration[i] * room and v:
+                return True
+        return False
 
     def slide(self, poses: Sequence[Pose], twist: list[float], moves: bool, turns: bool) -> bool:
         """Take away from `twist` what the bounds do not allow; return False where nothing is left: the tool stands.
@@ -88,7 +103,7 @@ class JogBounds:
             moves: whether positions may be changed.
             turns: whether directions may.
         """
-        weight = self._weight = (1.0 if moves else 0.0, self._turn2 if turns else 0.0)
+        weight = (1.0 if moves else 0.0, self._turn2 if turns else 0.0)
         basis: list[Sequence[float]] = []
         for row in self._inverse.lost:
             along = _along(row, twist)
@@ -107,7 +122,7 @@ class JogBounds:
         limits, dt = self._limits, self._dt
         low, high, acceleration, fastest = limits.low, limits.high, limits.acceleration, limits.velocity
         a, b, c, d, e, f = twist
-        q = self.position
+        q = self._position
         worst, most = None, _TOLERANCE
         for i, row in enumerate(self._inverse.rows):
             r0, r1, r2, r3, r4, r5 = row
@@ -124,15 +139,12 @@ class JogBounds:
             excess = speed - stopping(room, rate, dt)
             if excess > most:
                 worst, most, self.axis = (r0, r1, r2, r3, r4, r5), excess, i
-        for clearance in self._near:
+        for clearance in self.near:
             row = self._approach(poses, clearance)
-            excess = _along(row, twist) - stopping(self._left(poses, clearance) - STANDOFF_M, self._braking, dt)
+            excess = _along(row, twist) - stopping(clearance.distance - STANDOFF_M, self._braking, dt)
             if excess > most:
                 worst, most, self.box = row, excess, clearance.box
         return worst, most
-
-    def _left(self, poses: Sequence[Pose], clearance: Clearance) -> float:
-        return clearance.distance
 
     def _approach(self, poses: Sequence[Pose], clearance: Clearance) -> Row:
         """Return the row of the speed with which a point comes nearer to a boundary."""
@@ -185,7 +197,7 @@ class JogBounds:
         """
         share = 1.0
         acceleration = self._limits.acceleration
-        for clearance in self._near:
+        for clearance in self.near:
             point = clearance.point
             x, y, z = clearance.normal
             px, py, pz = poses[point][0]
@@ -197,16 +209,11 @@ class JogBounds:
                     travel += towards * (v if v > 0.0 else -v) / acceleration[i]
             travel *= 0.5
             distance = clearance.distance
-            room = distance - _GUARD_M
-            if room < 0.4 * distance:
-                room = 0.4 * distance
+            room = max(distance - _GUARD_M, 0.4 * distance)
             if room > 0.0 and travel * share * share > room:
                 share = sqrt(room / travel)
                 self.box = clearance.box
         return share
-
-    position: Sequence[float] = ()
-    _weight = (1.0, 1.0)
 
 
 def stopping(room: float, rate: float, dt: float) -> float:

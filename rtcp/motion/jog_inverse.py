@@ -1,8 +1,9 @@
 """The inverse of the Jacobian at one configuration, row by row, and how far it is from the singularities.
 
 With a spherical wrist it falls apart: joints 1 to 3 move the wrist centre, joints 4 to 6 turn the hand. With axes 2 and
-3 parallel the first part does so again: joint 1 alone moves the centre along axis 2. Beside a singularity (`SHOULDER_M`,
-`SINE`) the joint that would have to move without bound is locked, and the direction that is lost is told in `lost`.
+3 parallel the first part does so again: joint 1 alone moves the centre along axis 2. Beside a singularity
+(`SHOULDER_M`, `SINE`) the joint that would have to move without bound is locked, and the direction that is lost is told
+in `lost`.
 """
 
 from __future__ import annotations
@@ -49,6 +50,8 @@ class JogInverse:
         self.locked = [False, False, False]
         self.lost: list[Row] = []
         self.stretched = True
+        self.wrist_sign = 1.0
+        """Which way joint 5 leads away from its singularity."""
         self.arm: Sequence[_Triple] = (_ZERO, _ZERO, _ZERO)
         """What joints 1 to 3 do to the wrist centre, m/s for 1 rad/s."""
         self.to_centre = _ZERO
@@ -155,6 +158,7 @@ class JogInverse:
         distance = self.distance
         distance[2] = asin(sine if 0.0 <= sine <= 1.0 else -sine if -1.0 <= sine < 0.0 else 1.0)
         dot = (hx * ix + hy * iy + hz * iz) * (ix * jx + iy * jy + iz * jz) - hx * jx - hy * jy - hz * jz
+        self.wrist_sign = 1.0 if dot * volume >= 0.0 else -1.0
         fifth = _signed(rows[4], dot * volume)
         if not self.parallel:
             self.rate = [rows[0], rows[2], fifth]

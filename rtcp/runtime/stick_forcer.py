@@ -57,20 +57,28 @@ class StickForcer:
         self, client: Caller, pressed: Sequence[str], byte: int | None, hold_s: float
     ) -> dict[str, Any]:  # fmt: skip
         """Hold the stick as `pressed` names it, or at `byte`, for `hold_s` at most: to be said again meanwhile."""
+        self._require(client)
+        if not 0.0 < hold_s <= LONGEST_HOLD_S:
+            raise CommandFailed("invalid", f"hold_s: found {hold_s}, allowed is more than 0 and at most 1")
+        mask, levels = forced(self._config, pressed, byte)
+        if mask == 0:
+            return await self.release(client)
+        self._owner, self._until = client, time.monotonic() + hold_s
+        await self._write(mask, levels)
+        return {"mask": mask, "levels": levels}
+
+    async def release(self, client: Caller) -> dict[str, Any]:
+        """Let go of what this client holds; of what another holds it is refused."""
+        self._require(client)
+        await self.let_go()
+        return {"mask": 0, "levels": 0}
+
+    def _require(self, client: Caller) -> None:
         if not self.possible:
             raise CommandFailed("refused", f"inputs are forced on the virtual bus only, not on {self._bus}")
         if self._owner is not None and self._owner.connection != client.connection:
             # What it holds ends by itself within a second.
             raise CommandFailed("refused", f"the stick is held by {self._owner}: wait until it lets go")
-        if not 0.0 < hold_s <= LONGEST_HOLD_S:
-            raise CommandFailed("invalid", f"hold_s: found {hold_s}, allowed is more than 0 and at most 1")
-        mask, levels = forced(self._config, pressed, byte)
-        if mask == 0:
-            await self.let_go()
-            return {"mask": 0, "levels": 0}
-        self._owner, self._until = client, time.monotonic() + hold_s
-        await self._write(mask, levels)
-        return {"mask": mask, "levels": levels}
 
     async def let_go(self) -> None:
         """Let go of everything; what fails is tried again by `watch`."""

@@ -76,27 +76,27 @@ class Travel:
         """Carry out a motion file; with `approach` the arm first moves to where the motion begins."""
         # In threads, as all planning: leases are renewed meanwhile.
         points, stops, speed = await asyncio.to_thread(self._planner.read, file)
-        return await self.follow(client, points, stops, speed, approach, progress)
+        return await self.follow(client, points, stops or None, speed, approach, progress)
 
     async def follow(
         self,
         client: str,
         points: Sequence[Point],
-        stops: Sequence[Stop],
+        stops: Sequence[Stop] | None,
         speed: float | None,
         approach: bool,
         progress: Progress,
     ) -> dict[str, Any]:
-        """Carry out the trajectory through `points`, or the path to `stops` (m/s) where there are none."""
+        """Carry out the path to `stops` (`speed`: m/s) or, where they are None, the trajectory through `points`."""
         async with self._carrier.lease(client) as lease:
             if approach and (points or stops):
-                first = await self._beginning(points, stops)
+                first = await self._beginning(points, stops or ())
                 await self._move(lease, first, None, False, progress)
-                if not points:
+                if stops is not None:
                     stops = stops[1:]
                     if not stops:
                         return await self._arrival(first, _SAME_RAD)
-            if points:
+            if stops is None:
                 plan = await asyncio.to_thread(self._planner.trajectory, points, self._commanded())
                 await self._carry_out(lease, Command.TRAJECTORY, plan, "the trajectory", progress)
             else:
@@ -105,7 +105,7 @@ class Travel:
         return await self._arrival(plan.end, _SAME_PLANNED_RAD) | _told(plan)
 
     async def _beginning(self, points: Sequence[Point], stops: Sequence[Stop]) -> Sequence[float]:
-        first = points[0].q if points else stops[0].q
+        first = stops[0].q if stops else points[0].q
         count = len(self._config.joints)
         if first is None:
             return await asyncio.to_thread(self._planner.joints_at, stops[0].pose or (), self._commanded())

@@ -114,7 +114,7 @@ class Verbs:
             Point(point.number("t"), tuple(point.numbers("q")), _tuple(point, "v"), _tuple(point, "a"))
             for point in args.objects("points")
         ]
-        return await self._travel.follow(client, points, (), None, args.truth_or_false("approach"), tell)
+        return await self._travel.follow(client, points, None, None, args.truth_or_false("approach"), tell)
 
     async def _path(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         stops = [
@@ -133,6 +133,8 @@ class Verbs:
         return self._keeper.show()
 
     async def _stick(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
+        if not (args.has("byte") or args.has("pressed")):
+            return await self.stick.release(client)
         pressed = args.texts("pressed") if args.has("pressed") else []
         hold_s = _or(args.number_or_none("hold_s"), STICK_HOLD_S)
         return await self.stick.force(client, pressed, args.integer_or_none("byte"), hold_s)

@@ -19,7 +19,7 @@ from rtcp.motion.velocity import VelocityMode
 
 from .judge import JOINTS_ONLY, Judge
 
-CYCLES_S = st.sampled_from([0.00025, 0.0005, 0.001, 0.01])
+CYCLES_S = st.sampled_from([0.0005, 0.002, 0.01])
 
 # What may be wanted of a joint, from where it is: (judge, joint) -> rad.
 WISHES: dict[str, Callable[[Judge, int], float]] = {
@@ -65,7 +65,7 @@ def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
 
 
 DEED = st.one_of(
-    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 120)),
+    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 60)),
     st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
 )
 
@@ -73,9 +73,9 @@ DEED = st.one_of(
 @given(
     dt=CYCLES_S,
     start=st.tuples(st.one_of(SHARES, st.sampled_from([0.0, 1.0])), st.one_of(SHARES, st.sampled_from([0.0, 1.0]))),
-    deeds=st.lists(DEED, min_size=1, max_size=25),
+    deeds=st.lists(DEED, min_size=1, max_size=15),
 )
-@settings(max_examples=400)
+@settings(max_examples=100)
 def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
     dt: float, start: tuple[float, float], deeds: list[tuple[object, ...]]
 ) -> None:
@@ -119,10 +119,10 @@ def test_from_the_fastest_stoppable_speed_the_stop_ends_exactly_at_the_edge(room
 
 @given(
     dt=CYCLES_S,
-    legs=st.lists(st.tuples(SHARES, SHARES, st.floats(0.05, 1.5), st.booleans(), st.integers(1, 4000)), max_size=4),
+    legs=st.lists(st.tuples(SHARES, SHARES, st.floats(0.05, 1.5), st.booleans(), st.integers(1, 1500)), max_size=3),
     jerky=st.booleans(),
 )
-@settings(max_examples=60)
+@settings(max_examples=25)
 def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     dt: float, legs: list[tuple[float, float, float, bool, int]], jerky: bool
 ) -> None:
@@ -152,6 +152,7 @@ def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     assert judge.state.position == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
 
 
+@settings(max_examples=40)
 @given(start=st.floats(-0.29, 0.19), dt=CYCLES_S, seed=st.randoms(use_true_random=False))
 def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start: float, dt: float, seed: object) -> None:
     judge = Judge(JOINTS_ONLY, [0.0, start], dt)
@@ -173,7 +174,7 @@ def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start
 # -- cuts -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dt", [0.0005, 0.001, 0.01])
+@pytest.mark.parametrize("dt", [0.001, 0.01])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float) -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)

@@ -3,104 +3,33 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import socket
-import subprocess
-import sys
-import tempfile
-import threading
-import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rtcp.config import default_config, load
-from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.layout import PER_JOINT, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.runtime.machine import Command
-from rtcp.runtime.paths import blackboard_file, control_socket
-from rtcp.runtime.session import Session
+from rtcp.runtime.paths import control_socket
+from tests.runtime.played_loop import JOINTS, Loop
 
-JOINTS = 6
-FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
-READY = 2
 LINE_LIMIT = 65536
 
 
-class Loop:
-    """Takes every command and every request for the service thread, as long as the arm is ready."""
-
-    def __init__(self, path: Path) -> None:
-        self.board = Blackboard(path, JOINTS, 500_000)
-        self.commands: list[tuple[float, ...]] = []
-        self.requests: list[dict[str, Any]] = []
-        self._record: list[float] = [0] * FIELDS
-        self._record[[name for name, _ in SCALARS[1:]].index("state")] = READY
-        self._ended = threading.Event()
-        self.board.publish(self._record)
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        words, memory = self.board.words, self.board.memory
-        while not self._ended.wait(0.001):
-            if self.board.command_waits():
-                number, _, *command = self.board.take_command()
-                self.commands.append(tuple(command))
-                self.board.answer(int(number))
-            if words[SERVICE_STATE_AT] == 1:
-                end = SERVICE_TEXT_AT + words[SERVICE_LENGTH_AT]
-                self.requests.append(json.loads(memory[SERVICE_TEXT_AT:end]))
-                memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + 13] = b'{"hex": "2a"}'
-                words[SERVICE_LENGTH_AT] = 13
-                words[SERVICE_STATE_AT] = 2
-            self.board.publish(self._record)
-
-    def end(self) -> None:
-        self._ended.set()
-        self._thread.join()
-        self.board.close()
-
-
-@pytest.fixture(scope="module")
-def directory() -> Iterator[Path]:
-    # Short: a control socket's path has 107 bytes at most.
-    made = Path(tempfile.mkdtemp(prefix="rtcp-gateway-", dir="/tmp"))
-    yield made
-    blackboard_file(made).unlink(missing_ok=True)
-    shutil.rmtree(made)
-
-
-@pytest.fixture(scope="module")
-def loop(directory: Path) -> Iterator[Loop]:
-    config = load(default_config())
-    Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory / "session.pickle")
-    (directory / "started.json").write_text("{}")
-    made = Loop(blackboard_file(directory))
-    reading, writing = os.pipe()
-    gateway = subprocess.Popen(
-        [sys.executable, "-m", "rtcp.runtime.gateway", "--directory", str(directory), "--ready-fd", str(writing)],
-        pass_fds=(writing,),
-    )
-    os.close(writing)
-    with open(reading) as pipe:
-        assert pipe.readline()
-    yield made
-    gateway.terminate()
-    gateway.wait()
-    made.end()
+@pytest.fixture
+def directory(gateway_directory: Path) -> Path:
+    return gateway_directory
 
 
 @pytest.fixture
-def client(directory: Path, loop: Loop) -> Iterator[ControlClient]:
-    loop.commands.clear()
-    loop.requests.clear()
-    with ControlClient("a test", control_socket(directory)) as made:
-        yield made
+def loop(gateway_loop: Loop) -> Loop:
+    return gateway_loop
+
+
+@pytest.fixture
+def client(gateway_client: ControlClient) -> ControlClient:
+    return gateway_client
 
 
 OBJECT = {"slave": 2, "index": 0x6065, "subindex": 0}
@@ -125,6 +54,26 @@ WRONG = {
     "a position as a text": ("move", {"q": ["0"] * JOINTS}, "allowed is a list of numbers"),
     "a position beyond all numbers": ("move", {"q": [10**400] * JOINTS}, "allowed is a list of numbers"),
     "a speed as a truth": ("move", {"q": Q, "speed": True}, "speed: found true, allowed is a number"),
+    "a pose as a text": ("move_pose", {"pose": "0"}, 'pose: found "0", allowed is a list of numbers'),
+    "a pose of five numbers": ("move_pose", {"pose": [0.0] * 5}, "the pose: found 5 numbers, allowed are 6"),
+    "poses that are none": ("line", {"poses": [1.0]}, "poses: found [1.0], allowed is a list of lists of numbers"),
+    "a line that is a number": ("move_pose", {"pose": Q, "line": 1}, "line: found 1, allowed is true or false"),
+    "a file beside a folder": ("run", {"file": "a.csv"}, "file: found 'a.csv', allowed is an absolute path"),
+    "a file that is not there": ("run", {"file": "/none/a.csv"}, "/none/a.csv"),
+    "a frame that is none": ("jog", {"v": Q, "frame": "world"}, "frame: found 'world', allowed is one of base"),
+    "five speeds": ("jog", {"v": [0.0] * 5, "frame": "base"}, "v: found 5 numbers, allowed are 6"),
+    "torques as a text": ("torque", {"numbers": "0"}, 'numbers: found "0", allowed is a list of numbers'),
+    "a target without a stamp": ("stream", {"q": Q}, "t is missing; it must be a number"),
+    "limits that are a list": ("limits", {"set": []}, "set: found [], allowed is an object of numbers"),
+    "no limits": ("limits", {"set": {}}, "no limit was named"),
+    "a limit of another name": ("limits", {"set": {"joint9.max": 1}}, "joint9.max: there is no such limit"),
+    "a limit that is no number": ("limits", {"set": {"joint1.max": float("inf")}}, "joint1.max: found inf"),
+    "a stick's position of another name": ("stick", {"pressed": ["away"]}, "pressed: found 'away', allowed"),
+    "a stick's byte beyond it": ("stick", {"pressed": [], "byte": 256}, "byte: found 256, allowed is 0 to 255"),
+    "a stick held for ever": ("stick", {"pressed": [], "hold_s": 60}, "hold_s: found 60.0, allowed is more than 0"),
+    "a joint that is none": ("zero", {"joint": "joint9"}, "joint: found 'joint9', allowed is one of joint1"),
+    "a gripper as a text": ("gripper", {"open": "yes"}, 'open: found "yes", allowed is true or false'),
+    "a mode of another name": ("mode", {"name": "fast"}, "mode 'fast' is unknown: one of joint, cartesian, joystick"),
     "a mode that is no text": ("mode", {"name": 8}, "name: found 8, allowed is a text"),
 }  # fmt: skip
 

@@ -1,0 +1,245 @@
+"""Tool, wrist and elbow never enter a keep-out box, and the tool never leaves its own; who begins inside may come out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from math import hypot, inf, nan
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from kinematics.forward import frames
+from rtcp.motion.envelope import Verdict
+from rtcp.motion.limits import Limits
+from rtcp.motion.state import Reason
+from rtcp.motion.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
+
+from .judge import ARM, Judge, with_boxes
+from .reference import Point, depth, points
+
+WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
+Q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
+CYCLES_S = st.sampled_from([0.002, 0.005, 0.02])
+SIGN = st.sampled_from([-1.0, 0.0, 1.0])
+DIRECTION = st.lists(st.one_of(SIGN, st.floats(-1.0, 1.0)), min_size=6, max_size=6)
+JOINTS = st.tuples(*(st.floats(0.9 * joint.position.min, 0.9 * joint.position.max) for joint in ARM.joints))
+
+
+def box_before(point: Point, axis: int, side: float, gap: float, shift: Sequence[float], size: float) -> list[float]:
+    """A box one of whose faces is `gap` from the point; `shift` (-1 to 1) moves it along the face, corners included."""
+    middle = [point[n] + shift[n % 2] * 1.1 * size for n in range(3)]
+    middle[axis] = point[axis] + side * (gap + size)
+    return [m - size for m in middle] + [m + size for m in middle]
+
+
+def driven(judge: Judge, direction: Sequence[float], cycles: int, clamps: bool = True) -> list[Verdict]:
+    """Ask for joint speeds in a direction, as parts of each joint's limit."""
+    verdicts = []
+    for _ in range(cycles):
+        speeds = [part * v for part, v in zip(direction, judge.limits.velocity, strict=True)]
+        verdicts.append(judge.ask([q + v * judge.dt for q, v in zip(judge.state.position, speeds, strict=True)], clamps))
+    return verdicts
+
+
+@given(q=JOINTS)
+def test_the_points_that_are_watched_are_where_the_table_of_the_facts_puts_them(q: Sequence[float]) -> None:
+    poses = frames(ARM.arm, q)  # type: ignore[arg-type]
+    for found, expected in zip((TOOL, WRIST, ELBOW), points(q), strict=True):
+        assert poses[found].position == pytest.approx(expected, abs=1e-12)
+
+
+@given(
+    q=JOINTS,
+    which=st.integers(0, 2),
+    axis=st.integers(0, 2),
+    side=st.sampled_from([-1.0, 1.0]),
+    gap=st.sampled_from([0.0, 1e-7, 1e-4, 2e-3, 0.03]),
+    shift=st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    size=st.sampled_from([0.004, 0.03, 0.2]),
+    dt=CYCLES_S,
+    legs=st.lists(st.tuples(DIRECTION, st.integers(1, 60), st.booleans()), min_size=1, max_size=6),
+)
+@settings(max_examples=200)
+def test_who_began_free_never_enters_a_keep_out_box(
+    q: Sequence[float],
+    which: int,
+    axis: int,
+    side: float,
+    gap: float,
+    shift: Sequence[float],
+    size: float,
+    dt: float,
+    legs: list[tuple[list[float], int, bool]],
+) -> None:
+    box = box_before(points(q)[which], axis, side, gap, shift, size)
+    assume(max(depth(point, box) for point in points(q)) <= 0.0)
+    judge = Judge(with_boxes(WIDE, box), q, dt)
+    for direction, cycles, clamps in legs:
+        driven(judge, direction, cycles, clamps)
+    judge.ask([nan] * 6, clamps=False)
+    judge.stop()
+
+
+@given(
+    q=JOINTS,
+    gaps=st.tuples(*[st.sampled_from([1e-6, 1e-3, 0.02, 0.5])] * 6),
+    dt=CYCLES_S,
+    legs=st.lists(st.tuples(DIRECTION, st.integers(1, 60), st.booleans()), min_size=1, max_size=6),
+)
+@settings(max_examples=60)
+def test_who_began_inside_its_box_never_leaves_it(
+    q: Sequence[float], gaps: Sequence[float], dt: float, legs: list[tuple[list[float], int, bool]]
+) -> None:
+    tool = points(q)[0]
+    box = [p - g for p, g in zip(tool, gaps[:3], strict=True)] + [p + g for p, g in zip(tool, gaps[3:], strict=True)]
+    judge = Judge(with_boxes(box), q, dt)
+    for direction, cycles, clamps in legs:
+        driven(judge, direction, cycles, clamps)
+
+
+@given(
+    q=JOINTS,
+    which=st.integers(0, 2),
+    depth_m=st.sampled_from([1e-6, 1e-3, 0.02, 0.09]),
+    dt=CYCLES_S,
+    legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40)), min_size=1, max_size=6),
+)
+@settings(max_examples=60)
+def test_who_began_inside_a_keep_out_box_only_moves_outward(
+    q: Sequence[float], which: int, depth_m: float, dt: float, legs: list[tuple[list[float], int]]
+) -> None:
+    # The judge finds every cycle in which a point is deeper than before.
+    judge = Judge(with_boxes(WIDE, box_before(points(q)[which], 0, 1.0, -depth_m, (0.0, 0.0), 0.1)), q, dt)
+    for direction, cycles in legs:
+        driven(judge, direction, cycles)
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.005])
+@pytest.mark.parametrize("gap", [-0.03, -1e-3, 0.0, 1e-3])
+@pytest.mark.parametrize("part", [1.0, 0.1])
+def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, part: float) -> None:
+    q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
+    tool = points(q)[0]
+    away = [part, 0.0, 0.0, 0.0, 0.0, 0.0] if tool[0] > 0 else [-part, 0.0, 0.0, 0.0, 0.0, 0.0]
+    # Joint 1 moves the tool along y; the box begins beside it.
+    box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
+    judge = Judge(with_boxes(WIDE, box), q, dt)
+    verdicts = driven(judge, away, round(0.5 / dt))
+    assert max(verdicts) <= Verdict.CLAMPED
+    assert points(judge.state.position)[0][1] > tool[1] + 0.02 * part
+    # And the way back in ends before the box.
+    verdicts = driven(judge, [-part for part in away], round(2.0 / dt))
+    assert Verdict.STOPPED in verdicts
+    assert judge.guard.code is Reason.KEEP_OUT
+    assert judge.guard.axis == 0
+    here = -depth(points(judge.state.position)[0], box)
+    assert 0.0 <= here < 0.004
+
+
+def test_a_stop_before_the_tools_own_box_names_it() -> None:
+    tool = points(Q)[0]
+    judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
+    verdicts = driven(judge, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 400)
+    assert Verdict.STOPPED in verdicts
+    assert (judge.guard.code, judge.guard.axis) == (Reason.KEEP_OUT, -1)
+    assert -0.05 < points(judge.state.position)[0][0] - tool[0] < 0.05
+
+
+@given(shares=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4), direction=DIRECTION, dt=CYCLES_S)
+@settings(max_examples=40)
+def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction: list[float], dt: float) -> None:
+    judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, dt)
+    limits = judge.limits
+    for share in shares:
+        driven(judge, direction, 30)
+        tool = points(judge.state.position)[0]
+        near = tuple(9.0 * share + (1.0 - share) * t for t in tool)
+        values = limits.widest.__class__.configured(judge.config)
+        new = values.__class__(**{**vars(values), "box": (*WIDE[:3], *(max(t, n) for t, n in zip(tool, near, strict=True)))})
+        judge.change(new)
+
+
+def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
+    counted = []
+    monkeypatch.setattr("rtcp.motion.envelope.frames", lambda *given: counted.append(1) or frames(*given))
+    judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
+    driven(judge, [0.5] * 6, 200)
+    assert len(counted) <= 1
+    assert judge.guard.poses == frames(ARM.arm, judge.state.position)  # type: ignore[arg-type]
+
+
+def test_to_probe_beside_a_box_changes_nothing() -> None:
+    tool = points(Q)[0]
+    judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
+    guard, poses = judge.guard, judge.guard.poses
+    step = [Q[0] + 1e-6, *Q[1:]]
+    assert guard.probe(judge.state, step, [0.0] * 6)
+    assert guard.poses is poses
+    assert judge.ask(step, clamps=False) is Verdict.PASS
+    assert guard.poses == frames(ARM.arm, step)  # type: ignore[arg-type]
+
+
+# -- distances ------------------------------------------------------------------------------------------------------
+
+
+POINT = st.tuples(*[st.floats(-2.0, 2.0)] * 3)
+
+
+@given(point=POINT)
+def test_outside_is_the_distance_to_the_nearest_point_of_the_box_and_inside_the_depth(point: Point) -> None:
+    box = (-1.0, -0.5, -0.2, 0.5, 0.5, 0.4)
+    nearest = [min(max(x, a), d) for x, a, d in zip(point, box[:3], box[3:], strict=True)]
+    away = hypot(*(x - n for x, n in zip(point, nearest, strict=True)))
+    expected = away if away > 0.0 else -depth(point, box)
+    assert outside(*point, box) == pytest.approx(expected, abs=1e-12)
+    assert inside(*point, box) == pytest.approx(depth(point, box), abs=1e-12)
+
+
+@given(q=JOINTS)
+@settings(max_examples=50)
+def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
+    limits = Limits(ARM)
+    zones = Zones(ARM.arm, limits)  # type: ignore[arg-type]
+    poses = frames(ARM.arm, q)  # type: ignore[arg-type]
+    found = zones.clearances(poses, inf)
+    assert [one.distance for one in found] == sorted(one.distance for one in found)
+    assert len(found) == 6 + 3 * len(limits.keep_out)
+    assert found[0] == zones.clearance(poses)
+    assert found[0].distance == zones.distance(poses)[0]
+    for one in found:
+        moved = tuple(p + 1e-6 * n for p, n in zip(poses[one.point].position, one.normal, strict=True))
+        if one.box >= 0:
+            further = outside(*moved, limits.keep_out[one.box]) - one.distance
+            assert further == pytest.approx(1e-6, rel=1e-3)
+    assert zones.clearances(poses, found[0].distance) == []
+
+
+@given(q=JOINTS, direction=DIRECTION)
+@settings(max_examples=60)
+def test_no_point_moves_further_than_the_reach_of_each_joint_says(
+    q: Sequence[float], direction: list[float]
+) -> None:
+    zones = Zones(ARM.arm, Limits(ARM))  # type: ignore[arg-type]
+    step = 1e-4
+    moved = [angle + step * part for angle, part in zip(q, direction, strict=True)]
+    bound = sum(step * abs(part) * reach for part, reach in zip(direction, zones.reach, strict=True))
+    for before, after in zip(points(q), points(moved), strict=True):
+        assert hypot(*(a - b for a, b in zip(after, before, strict=True))) <= bound * (1 + 1e-6) + 1e-12
+    assert list(zones.reach) == sorted(zones.reach, reverse=True)
+
+
+def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
+    # A plate 2 mm thin beside the tool, at each of many distances: the stop from full speed passes it between two samples.
+    q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
+    tool = points(q)[0]
+    for gap, sign in product([0.004 * n for n in range(1, 20)], [1.0, -1.0]):
+        y = tool[1] + sign * (gap + 0.001)
+        box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
+        judge = Judge(with_boxes(WIDE, box), q, 0.01)
+        side = -sign if tool[0] > 0 else sign
+        driven(judge, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
+        driven(judge, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
+        here = points(judge.state.position)[0][1]
+        assert sign * here < sign * y, (gap, sign)

@@ -1,0 +1,60 @@
+"""A gateway's process in front of a played loop."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.runtime.client import ControlClient
+from rtcp.runtime.paths import blackboard_file, control_socket
+from rtcp.runtime.session import Session
+from tests.runtime.played_loop import Loop
+
+
+@pytest.fixture(scope="module")
+def gateway_directory() -> Iterator[Path]:
+    # Short: a control socket's path has 107 bytes at most.
+    made = Path(tempfile.mkdtemp(prefix="rtcp-gateway-", dir="/tmp"))
+    yield made
+    blackboard_file(made).unlink(missing_ok=True)
+    shutil.rmtree(made)
+
+
+@pytest.fixture(scope="module")
+def gateway_loop(gateway_directory: Path) -> Iterator[Loop]:
+    directory = gateway_directory
+    config = load(default_config())
+    Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory / "session.pickle")
+    (directory / "started.json").write_text("{}")
+    made = Loop(blackboard_file(directory))
+    reading, writing = os.pipe()
+    gateway = subprocess.Popen(
+        [sys.executable, "-m", "rtcp.runtime.gateway", "--directory", str(directory), "--ready-fd", str(writing)],
+        pass_fds=(writing,),
+        env={**os.environ, "RTCP_STATE_DIR": str(directory / "state")},
+    )
+    os.close(writing)
+    try:
+        with open(reading) as pipe:
+            assert pipe.readline()
+        yield made
+    finally:
+        gateway.terminate()
+        gateway.wait()
+        made.end()
+
+
+@pytest.fixture
+def gateway_client(gateway_directory: Path, gateway_loop: Loop) -> Iterator[ControlClient]:
+    gateway_loop.clear()
+    with ControlClient("a test", control_socket(gateway_directory)) as made:
+        yield made
