@@ -38,10 +38,10 @@ def _disable() -> None:
 def _reset() -> None:
     """Reset a fault, an emergency stop or a stop by a limit; enabling is a step of its own."""
     with connect("reset") as client:
-        before = client.call("status").get("state")
+        before = str(client.call("status").get("state")).replace("_", " ")
         client.call("reset")
         holds = client.call("status").get("state") == "holding"
-    if before == "stopped_by_limit":
+    if before == "stopped by limit":
         report("reset: the arm holds and takes commands again")
         return
     # A reset leaves the arm without torque: one that holds had nothing to reset.

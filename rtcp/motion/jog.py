@@ -7,7 +7,7 @@ are scaled together, so that the tool keeps its direction; where they cannot fol
 what was reached. Nothing winds up.
 
 Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
-stretched elbow bends towards the inverse solution a little further on (`_bend`).
+stretched elbow is bent by its joints (`_bend`).
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from kinematics.forward import frames
-from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import jacobian_columns
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Rotation, applied, times
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
-from rtcp.motion.jog_bounds import JogBounds
-from rtcp.motion.jog_inverse import ELBOW, JogInverse
+from rtcp.motion.jog_bounds import JogBounds, stopping
+from rtcp.motion.jog_inverse import ELBOW, SHOULDER, WRIST, JogInverse
 from rtcp.motion.jog_ramp import JogRamp
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import MotionState, Phase, Reason, Target
@@ -36,10 +35,15 @@ _BACK_1_S = 100.0
 """How fast the tool returns to its line, 1/s."""
 _OFF_LINE_M = 2e-4
 """Further away from it the line begins anew."""
-_RETRACTION_M = 2e-4
-_BEND_RAD = 0.2
-"""So far, at most, the joints are from the solution that a stretched elbow bends towards."""
-_TURNS_RAD_S = 1e-3
+_INWARD_M_S = 1e-3
+"""An elbow that is stretched bends where the tool is wanted to come inwards faster than this."""
+_STRAIGHT_RAD = 1e-9
+_BENDING = 0.4
+"""Part of the joints' speeds with which it bends."""
+_LOST = 1e-3
+_LAST_RAD = 1e-6
+_AT_REST = 2e-3
+"""m/s, rad/s: what is slower is not taken for a motion that is wanted."""
 
 
 class JogMode:
@@ -59,7 +63,6 @@ class JogMode:
         cartesian = config.cartesian
         singularity = cartesian.singularity
         self._model = model
-        self._inverse_kinematics = InverseKinematics(model)
         self._limits = limits
         self._guards = guards
         self._inverse = JogInverse(model)
@@ -153,20 +156,16 @@ class JogMode:
         bounds.look(poses, position, jumped)
         twist, speeds = self._twist, self._speeds
         twist[:] = ramp.velocity
-        if inverse.locked[ELBOW] and self._bend(poses, position, wanted):
-            self._follow(state, dt)
+        self._fit(poses, wanted)
+        if inverse.locked[ELBOW]:
+            self._bend(poses, position, wanted)
+        self._back(poses[6])
+        if self._follow(state, dt):
+            self._advance(dt, poses[6])
+            ramp.held(twist)
+        else:
             self._line = None
             ramp.held(_reached(poses, speeds))
-        else:
-            self._fit(poses)
-            self._back(poses[6])
-            factor = self._follow(state, dt)
-            if factor is None:
-                self._line = None
-                ramp.held(_reached(poses, speeds))
-            else:
-                self._advance(factor, dt, poses[6])
-                ramp.held(twist)
         moving = any(speeds)
         self._posed = moving and bounds.watched
         if not moving and not any(wanted) and not any(ramp.velocity):
@@ -209,14 +208,14 @@ class JogMode:
                 twist[i] *= part
                 speeds[i] *= part
 
-    def _fit(self, poses: Sequence[Pose]) -> None:
+    def _fit(self, poses: Sequence[Pose], wanted: Sequence[float]) -> None:
         """Bring the twist, and the joint speeds with it, within all bounds."""
         twist, bounds = self._twist, self._bounds
         self._scale(self._make_speeds())
-        a, b, c, d, e, f = twist
-        moves = a * a + b * b + c * c > 1e-12
-        turns = d * d + e * e + f * f > _TURNS_RAD_S * _TURNS_RAD_S
         if bounds.passed(poses, twist, self._speeds):
+            a, b, c, d, e, f = twist
+            moves = any(wanted[:3]) or a * a + b * b + c * c > _AT_REST * _AT_REST
+            turns = any(wanted[3:]) or d * d + e * e + f * f > _AT_REST * _AT_REST
             if not bounds.slide(poses, twist, moves, turns):
                 twist[:] = self._zero
             self._scale(self._make_speeds())
@@ -227,7 +226,7 @@ class JogMode:
     def _back(self, tool: Pose) -> None:
         """Add to the joint speeds what brings the tool back to its line."""
         line = self._line
-        if line is None:
+        if line is None or self._bounds.axis >= 0:
             return
         (x, y, z), (a, b, c, d, e, f, g, h, i) = line
         (u, v, w), (j, k, m, n, o, p, q, r, s) = tool
@@ -239,25 +238,43 @@ class JogMode:
         if dx * dx + dy * dy + dz * dz + tx * tx + ty * ty + tz * tz > _OFF_LINE_M * _OFF_LINE_M:
             self._line = None
             return
-        speeds = self._speeds
+        speeds, fastest = self._speeds, self._limits.velocity
         for at, (row0, row1, row2, row3, row4, row5) in enumerate(self._inverse.rows):
-            speeds[at] += _BACK_1_S * (row0 * dx + row1 * dy + row2 * dz + row3 * tx + row4 * ty + row5 * tz)
+            v = speeds[at] + _BACK_1_S * (row0 * dx + row1 * dy + row2 * dz + row3 * tx + row4 * ty + row5 * tz)
+            most = fastest[at]
+            speeds[at] = most if v > most else -most if v < -most else v
 
-    def _follow(self, state: MotionState, dt: float) -> float | None:
-        """Bring the joint speeds within what the accelerations allow.
+    def _follow(self, state: MotionState, dt: float) -> bool:
+        """Bring the joint speeds, and the twist with them, within what the accelerations allow.
 
         Returns:
-            The factor for all of them, with which the tool keeps its direction; None where there was none: each joint
-            then goes towards its speed as fast as it may.
+            Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
+            goes towards its speed as fast as it may; so it does, too, where its range leaves no more.
         """
-        speeds, last, acceleration = self._speeds, state.velocity, self._limits.acceleration
+        speeds, last, limits = self._speeds, state.velocity, self._limits
+        acceleration = limits.acceleration
         step = _FULL * dt
+        together = True
         for i in range(6):
             change, most = speeds[i] - last[i], step * acceleration[i]
             if change > most or change < -most:
+                together = self._scaled_together(last, step)
                 break
-        else:
-            return 1.0
+        q, low, high = state.position, limits.low, limits.high
+        for i in range(6):
+            v, rate = speeds[i], acceleration[i]
+            room = high[i] - q[i] if v > 0.0 else q[i] - low[i]
+            if v * v > 1.8 * rate * room:
+                most = stopping(room - _LAST_RAD, rate, dt)
+                least = abs(last[i]) - step * rate if v * last[i] > 0.0 else 0.0
+                most = max(most, least)
+                if v > most or v < -most:
+                    speeds[i] = most if v > 0.0 else -most
+                    together = False
+        return together
+
+    def _scaled_together(self, last: Sequence[float], step: float) -> bool:
+        speeds, acceleration = self._speeds, self._limits.acceleration
         low, high = 0.0, 1e9
         for i in range(6):
             v, w, most = speeds[i], last[i], step * acceleration[i]
@@ -268,17 +285,19 @@ class JogMode:
             elif -most <= w <= most:
                 continue
             else:
-                low, high = 1.0, 0.0
+                high = -1.0
                 break
             low, high = max(low, least), min(high, greatest)
         if low > high:
             self._clip(last, step)
-            return None
+            return False
         # Above 1 it brakes as fast as the joints can.
         factor = low if low > 1.0 else high if high < 1.0 else 1.0
+        twist = self._twist
         for i in range(6):
             speeds[i] *= factor
-        return factor
+            twist[i] *= factor
+        return True
 
     def _clip(self, last: Sequence[float], step: float) -> None:
         speeds, acceleration = self._speeds, self._limits.acceleration
@@ -287,13 +306,10 @@ class JogMode:
             v, w = speeds[i], last[i]
             speeds[i] = w + most if v > w + most else w - most if v < w - most else v
 
-    def _advance(self, factor: float, dt: float, tool: Pose) -> None:
+    def _advance(self, dt: float, tool: Pose) -> None:
         """Let the line go on with what the tool does in this cycle."""
         twist = self._twist
-        if factor != 1.0:
-            for i in range(6):
-                twist[i] *= factor
-        if self._inverse.lost or not any(twist):
+        if self._inverse.lost or self._bounds.axis >= 0 or not any(twist):
             self._line = None
             return
         (x, y, z), rotation = tool if self._line is None else self._line
@@ -302,40 +318,48 @@ class JogMode:
             rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
         self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
 
-    def _bend(self, poses: Sequence[Pose], position: Sequence[float], wanted: Sequence[float]) -> bool:
-        """Write joint speeds that bend a stretched (or open a folded) elbow, where the tool is to go that way."""
-        inverse = self._inverse
-        row = inverse.lost[1 if inverse.locked[0] else 0]
-        outward = sum(one * other for one, other in zip(row, wanted, strict=True))
-        x, y, z, _, _, _ = row
+    def _bend(self, poses: Sequence[Pose], position: Sequence[float], wanted: Sequence[float]) -> None:
+        """Bend a stretched (or open a folded) elbow, where the tool is to go that way.
+
+        The joints then move as they can without moving the tool, to first order: joint 2 takes back what joint 3 does
+        to the wrist centre, and the hand keeps its direction. To second order the tool goes the only way that it can.
+        """
+        inverse, speeds, limits = self._inverse, self._speeds, self._limits
+        row = inverse.lost[1 if inverse.locked[SHOULDER] else 0]
+        x, y, z = row[:3]
         (px, py, pz), (wx, wy, wz) = poses[1].position, poses[4].position
-        if x * (wx - px) + y * (wy - py) + z * (wz - pz) < 0.0:
+        outward = sum(one * other for one, other in zip(row, wanted, strict=True))
+        if (x * (wx - px) + y * (wy - py) + z * (wz - pz) < 0.0) is inverse.stretched:
             outward = -outward
-        inward = -outward if inverse.stretched else outward
-        if inward < 1e-3:
-            return False
-        ahead = _RETRACTION_M / inward
-        a, b, c, d, e, f = (component * ahead for component in wanted)
-        (x, y, z), rotation = poses[6]
-        pose = Pose((x + a, y + b, z + c), times(_turn(d, e, f), rotation))
-        found = self._inverse_kinematics.solve_near(pose, position).q
-        if found is None:
-            return False
-        speeds, fastest, distance = self._speeds, self._limits.velocity, inverse.distance
-        rate = 1.0 / ahead
-        for i in range(6):
-            speeds[i] = step = found[i] - position[i]
-            size = step if step > 0.0 else -step
-            if size > _BEND_RAD:
-                return False
-            if size * rate > 0.5 * fastest[i]:
-                rate = 0.5 * fastest[i] / size
-        # Beside a wrist that is singular too, joint 5 may only lead away; the shoulder is not moved sideways by it.
-        if not inverse.locked[2] and distance[2] < self._wrist and speeds[4] * inverse.wrist_sign < 0.0:
-            return False
-        for i in range(6):
-            speeds[i] *= rate
-        return True
+        if outward > -_INWARD_M_S:
+            return
+        way = inverse.bend
+        if -_STRAIGHT_RAD < way < _STRAIGHT_RAD:
+            way = 1.0 if limits.high[2] - position[2] >= position[2] - limits.low[2] else -1.0
+        elif not inverse.stretched:
+            way = -way
+        third = 1.0 if way > 0.0 else -1.0
+        _, (a, b, c), (d, e, f) = inverse.arm
+        second = -third * (a * d + b * e + c * f) / (a * a + b * b + c * c)
+        _, _, x2, _, _, y2, _, _, z2 = poses[1].rotation
+        _, _, x3, _, _, y3, _, _, z3 = poses[2].rotation
+        x, y, z = -second * x2 - third * x3, -second * y2 - third * y3, -second * z2 - third * z3
+        ox, oy, oz = inverse.to_centre
+        # The twist that turns the hand about the wrist centre.
+        hand = (-y * oz + z * oy, -z * ox + x * oz, -x * oy + y * ox, x, y, z)
+        wrist = [sum(one * other for one, other in zip(inverse.rows[i], hand, strict=True)) for i in (3, 4, 5)]
+        if inverse.locked[WRIST]:
+            lost = sum(one * other for one, other in zip(inverse.lost[-1], hand, strict=True))
+            if abs(lost) > _LOST:
+                return
+        elif inverse.distance[WRIST] < self._wrist and wrist[1] * inverse.wrist_sign < 0.0:
+            return
+        rate = 1.0
+        for i, v in enumerate((0.0, second, third, *wrist)):
+            if abs(v) * rate > _BENDING * limits.velocity[i]:
+                rate = _BENDING * limits.velocity[i] / abs(v)
+        for i, v in enumerate((0.0, second, third, *wrist)):
+            speeds[i] += rate * v
 
     def _brake(self, state: MotionState, dt: float) -> Target:
         """Each joint brakes as fast as it may: there is no inverse."""

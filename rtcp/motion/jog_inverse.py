@@ -50,6 +50,8 @@ class JogInverse:
         self.locked = [False, False, False]
         self.lost: list[Row] = []
         self.stretched = True
+        self.bend = 0.0
+        """Joint 3 from where the elbow is stretched, rad, in its own sense."""
         self.wrist_sign = 1.0
         """Which way joint 5 leads away from its singularity."""
         self.arm: Sequence[_Triple] = (_ZERO, _ZERO, _ZERO)
@@ -89,7 +91,7 @@ class JogInverse:
             along = gx * fx + gy * fy + gz * fz - (gx * bx + gy * by + gz * bz) * (fx * bx + fy * by + fz * bz)
             turn = 1.0 if bx * cx + by * cy + bz * cz > 0.0 else -1.0
             self.stretched = along > 0.0
-            bend = atan2(turn * across, along)
+            self.bend = bend = turn * atan2(turn * across, along)
             if -SINE * abs(along) < across < SINE * abs(along):
                 locked[1] = True
                 n = 1.0 / (vx * vx + vy * vy + vz * vz)
@@ -173,7 +175,7 @@ class JogInverse:
         g, h, i, j, k, m = rows[2]
         self.rate = [
             (k2 * a + k3 * g, k2 * b + k3 * h, k2 * c + k3 * i, k2 * d + k3 * j, k2 * e + k3 * k, k2 * f + k3 * m),
-            _signed(rows[2], turn * bend if self.stretched else -turn * bend),
+            _signed(rows[2], bend if self.stretched else -bend),
             fifth,
         ]
         return True

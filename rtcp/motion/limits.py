@@ -8,6 +8,10 @@ from math import isfinite
 from typing import NamedTuple, TypeAlias
 
 from rtcp.config.model import ArmConfig
+from rtcp.motion.rows import COLUMNS, MOST_JOINTS
+
+_LEAST_PART = 1e-3
+"""Of a configured speed, acceleration, jerk or torque: less of it is no limit, but an arm that does not move."""
 
 Corners: TypeAlias = tuple[float, float, float, float, float, float]
 """A box along the base's axes, m: x, y, z of its lower corner, then of its upper one."""
@@ -17,18 +21,20 @@ class Wrong(IntEnum):
     """Why limits are not taken."""
 
     NO_LIMIT = 1
-    """A number that is none, or a range that is empty; `index`: joint, or -1 for a box."""
+    """A number that is none, or a range that is empty; `at`: joint, or -1 for a box."""
     WIDER = 2
-    """Beyond what the configuration allows; `index` as above."""
+    """Beyond what the configuration allows; `at` as above."""
     OUTSIDE = 3
-    """The arm stands, or would come to rest, outside; `index`: joint, or -1 for a box."""
+    """The arm stands, or would come to rest, outside; `at`: joint, or -1 for a box (`limit`: its number)."""
+    FASTER = 4
+    """The joint is moving faster than its new limit."""
 
 
 class Refused(NamedTuple):
     """The answer of a transaction that was not carried out: nothing has changed."""
 
     wrong: Wrong
-    index: int
+    at: int
     value: float
     limit: float
 
@@ -68,6 +74,41 @@ def corners(low: tuple[float, ...], high: tuple[float, ...]) -> Corners:
     return a, b, c, d, e, f
 
 
+def rows(values: Values) -> list[list[float]]:
+    """Return limits as rows of the plan area, numbers in front, for `read`.
+
+    Row 0: number of joints, 1 or 0 for a box or none, number of keep-out boxes. Then a row a joint: low, high,
+    velocity, acceleration, jerk, torque. Then the corners of each box, the one that the tool stays in first.
+    """
+    boxes = (*(() if values.box is None else (values.box,)), *values.keep_out)
+    numbers = (values.low, values.high, values.velocity, values.acceleration, values.jerk, values.torque)
+    head = [float(len(values.low)), float(values.box is not None), float(len(values.keep_out))]
+    return [head, *(list(joint) for joint in zip(*numbers, strict=True)), *(list(box) for box in boxes)]
+
+
+def read(plan: memoryview[float], count: int) -> Values | None:
+    """Return the limits in `count` rows of the plan area, whatever their numbers; None where the rows do not fit.
+
+    Args:
+        plan: doubles, `COLUMNS` a row.
+        count: rows that were written.
+    """
+    if not 0 < count <= len(plan) // COLUMNS:
+        return None
+    n, with_box, boxes = plan[0], plan[1], plan[2]
+    if n not in range(1, MOST_JOINTS + 1) or with_box not in (0.0, 1.0) or count != 1 + n + with_box + boxes:
+        return None
+    first = 1 + int(n)
+    joints = [plan[at * COLUMNS : at * COLUMNS + 6].tolist() for at in range(1, first)]
+    found: list[Corners] = []
+    for at in range(first, count):
+        a, b, c, d, e, f = plan[at * COLUMNS : at * COLUMNS + 6].tolist()
+        found.append((a, b, c, d, e, f))
+    low, high, velocity, acceleration, jerk, torque = zip(*joints, strict=True)
+    box = found.pop(0) if with_box else None
+    return Values(low, high, velocity, acceleration, jerk, torque, box, tuple(found))
+
+
 class Limits:
     """What is in force. Lists keep their identity: whoever holds one sees every change.
 
@@ -96,8 +137,10 @@ class Limits:
     def check(self, new: Values, position: list[float], velocity: list[float]) -> Refused | None:
         """Return why `new` cannot come into force for an arm at `position` (rad) with `velocity` (rad/s), or None.
 
-        The boxes are compared with the configuration's only; where the arm is in them is for the zones to say.
+        The boxes are compared with the configuration's only; where the arm is in them `SetPointGuard.refuses` says.
         """
+        if len(new.low) != len(self.low):
+            return Refused(Wrong.NO_LIMIT, -1, float(len(new.low)), float(len(self.low)))
         for axis, (q, v) in enumerate(zip(position, velocity, strict=True)):
             refused = self._joint(new, axis, q, v)
             if refused is not None:
@@ -115,19 +158,19 @@ class Limits:
             return Refused(Wrong.WIDER, axis, high, widest.high[axis])
         for name in ("velocity", "acceleration", "jerk", "torque"):
             found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
-            if not (isfinite(found) and found > 0.0):
-                return Refused(Wrong.NO_LIMIT, axis, found, 0.0)
+            if not (isfinite(found) and found >= _LEAST_PART * most):
+                return Refused(Wrong.NO_LIMIT, axis, found, _LEAST_PART * most)
             if found > most:
                 return Refused(Wrong.WIDER, axis, found, most)
         rest = q + 0.5 * v * abs(v) / new.acceleration[axis]
         if abs(v) > new.velocity[axis]:
-            return Refused(Wrong.OUTSIDE, axis, v, new.velocity[axis])
+            return Refused(Wrong.FASTER, axis, new.velocity[axis], abs(v))
         if not low <= min(q, rest) <= max(q, rest) <= high:
             return Refused(Wrong.OUTSIDE, axis, rest, high if rest > high or q > high else low)
         return None
 
     def _boxes(self, new: Values) -> Refused | None:
-        for box in (*new.keep_out, *([] if new.box is None else [new.box])):
+        for box in (*new.keep_out, *(() if new.box is None else (new.box,))):
             for lower, upper in zip(box[:3], box[3:], strict=True):
                 if not (isfinite(lower) and isfinite(upper) and lower < upper):
                     return Refused(Wrong.NO_LIMIT, -1, lower if not isfinite(lower) else upper, lower)
@@ -139,9 +182,9 @@ class Limits:
                 beyond = new.box[at] < widest.box[at] if at < 3 else new.box[at] > widest.box[at]
                 if beyond:
                     return Refused(Wrong.WIDER, -1, new.box[at], widest.box[at])
-        if len(new.keep_out) < len(widest.keep_out):
-            return Refused(Wrong.WIDER, -1, float(len(new.keep_out)), float(len(widest.keep_out)))
-        for box, least in zip(new.keep_out, widest.keep_out, strict=False):
+        if len(new.keep_out) != len(widest.keep_out):
+            return Refused(Wrong.NO_LIMIT, -1, float(len(new.keep_out)), float(len(widest.keep_out)))
+        for box, least in zip(new.keep_out, widest.keep_out, strict=True):
             for at in range(6):
                 if box[at] > least[at] if at < 3 else box[at] < least[at]:
                     return Refused(Wrong.WIDER, -1, box[at], least[at])

@@ -19,14 +19,10 @@ TIMEOUT_S = 0.2
 """A stream that is silent for so long has ended."""
 _STRETCH = 1.25
 """A target is reached so many of the sender's intervals after it came: the next may be a little late."""
-_BENDS = 0.0
-_TRIES = 4
-_SOON_S = 1e-3
-_FARTHEST_S = 0.0
-"""A target is followed so far beyond what is known of it, while the arm is on the way to it."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """How much a new interval counts in the mean."""
+_SLACK = 1e-6
 _DRIFT = 1e-4
 """The sender's clock may run so much slower than ours, as a fraction."""
 
@@ -53,8 +49,6 @@ class StreamMode:
         self._timeout_ns = round(timeout_s * 1e9)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
-        self._slope = [0.0] * n
-        self._change = [0.0] * n
         self._last: list[float] = []
         self._stamp_s = 0.0
         self._came_ns = 0
@@ -121,7 +115,7 @@ class StreamMode:
         if first:
             if self._samples == 0:
                 self._lag_s = lag
-            self._speed, self._change = list(self._zero), list(self._zero)
+            self._speed = list(self._zero)
             self._interval_s = 0.0
         else:
             self._learn(q, step)
@@ -140,24 +134,19 @@ class StreamMode:
         return all(low[i] <= q[i] <= high[i] for i in self._joints)
 
     def _learn(self, q: Sequence[float], step: float) -> None:
-        """Estimate the interval, and with which speed and acceleration the target moves."""
+        """Estimate the interval, and with which speed the target moves."""
         interval = self._interval_s
-        known = interval > 0.0
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
-        limits, wanted, speed, slope = self._limits, self._wanted, self._speed, self._slope
+        limits, wanted, speed = self._limits, self._wanted, self._speed
         over = 1.0 / step
         for i in self._joints:
-            mean, most = (q[i] - wanted[i]) * over, limits.acceleration[i]
-            bend = (mean - slope[i]) * over if known else 0.0
-            bend = most if bend > most else -most if bend < -most else bend
-            slope[i] = mean
-            v = mean + 0.5 * bend * step
+            v = (q[i] - wanted[i]) * over
             # Where the target is, the joint must still be able to stop inside its range.
             room = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
-            bound, stops = limits.velocity[i] * _INSIDE, stoppable_speed(0.9 * room, most, limits.jerk[i])
+            stops = stoppable_speed(0.9 * room, limits.acceleration[i], limits.jerk[i])
+            bound = limits.velocity[i] * _INSIDE
             bound = stops if stops < bound else bound
-            speed[i] = v = bound if v > bound else -bound if v < -bound else v
-            self._change[i] = allowed_acceleration(_BENDS * bend, v, bound, most, limits.jerk[i])
+            speed[i] = bound if v > bound else -bound if v < -bound else v
 
     def stop(self, state: MotionState) -> None:
         """Come to rest under the limits; further targets are dropped."""
@@ -215,8 +204,8 @@ class StreamMode:
         return target
 
     def _aim(self, state: MotionState) -> None:
-        """Plan from the state to where the target will be when the arm can be with it."""
-        way, limits, wanted, speed = self._way, self._limits, self._wanted, self._speed
+        """Plan from the state to the newest target, with the speed that it has; where that cannot be, to rest at it."""
+        way, limits = self._way, self._limits
         self._brake.hold()
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
         if not self._tracks or state.position != self._last:
@@ -234,38 +223,27 @@ class StreamMode:
         self._tracks = True
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
-        way.target_velocity, way.target_acceleration = speed, self._change
-        within = self._interval_s * _STRETCH
-        way.minimum_duration = within or None
-        way.target_position = wanted
-        ahead = 0.0
-        for _ in range(_TRIES):
-            takes = self._takes()
-            if takes < 0.0:
-                # No way to it at that speed: to it at rest.
-                self._aim_to_rest()
-                return
-            late = min(takes - within, _FARTHEST_S) if within > 0.0 else 0.0
-            if late - ahead < _SOON_S:
-                return
-            # Always behind would be who aims at where the target was: by the time it takes, the target has moved on.
-            ahead = late
-            way.target_position = [
-                min(max(q + v * ahead, low), high)
-                for q, v, low, high in zip(wanted, speed, limits.low, limits.high, strict=True)
-            ]
+        way.target_position, way.target_velocity = self._wanted, self._speed
+        # Not earlier than the next target comes, so that the speed need not fall in between.
+        way.minimum_duration = self._interval_s * _STRETCH or None
+        if not self._stays_inside(state):
+            self._aim_to_rest()
 
-    def _takes(self) -> float:
-        """Return how long the way takes, s; -1 where there is none."""
+    def _stays_inside(self, state: MotionState) -> bool:
+        """Whether there is a way to the target at its speed, and the run-up for it lies inside the range."""
         try:
-            if self._otg.calculate(self._way, self._plan) >= 0:
-                return float(self._plan.duration)
+            if self._otg.calculate(self._way, self._plan) < 0:
+                return False
         except (RuckigError, ValueError):
-            pass
-        return -1.0
+            return False
+        low, high, extrema = self._limits.low, self._limits.high, self._plan.position_extrema
+        for i in self._joints:
+            here = state.position[i]
+            if extrema[i].min < min(low[i], here) - _SLACK or extrema[i].max > max(high[i], here) + _SLACK:
+                return False
+        return True
 
     def _aim_to_rest(self) -> None:
         way = self._way
-        way.target_position = self._wanted
-        way.target_velocity = way.target_acceleration = self._zero
+        way.target_position, way.target_velocity = self._wanted, self._zero
         way.minimum_duration = None

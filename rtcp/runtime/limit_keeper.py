@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.motion.limits import Corners, Limits, Values
+from rtcp.motion.limits import Corners, Limits, Values, rows
 from rtcp.runtime.carrier import Carrier, CommandFailed
-from rtcp.runtime.limit_rows import to_rows
 from rtcp.runtime.machine import Command
 
 _JOINT_KEYS = {
@@ -64,9 +63,9 @@ class LimitKeeper:
         """Change limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`."""
         new = changed(self._config, now(self._limits), changes)
         async with self._carrier.lease(client) as lease:
-            rows = to_rows(new)
-            slot = self._carrier.observer.write_plan(rows)
-            await self._carrier.give(lease, Command.LIMITS, [slot, len(rows)])
+            plan = rows(new)
+            slot = self._carrier.observer.write_plan(plan)
+            await self._carrier.give(lease, Command.LIMITS, [slot, len(plan)])
             self._limits.apply(new)
             _write(self._file, new, self._carrier.observer.loop_pid)
         return self.show()
@@ -100,9 +99,9 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
         which, _, end = head.rpartition(".")
         box, _, side = which.rpartition(".")
         if rest and (head in names or head == ALL):
-            rows = per_joint[_JOINT_KEYS[rest]]
+            numbers = per_joint[_JOINT_KEYS[rest]]
             for joint in range(len(names)) if head == ALL else (names.index(head),):
-                rows[joint] = number
+                numbers[joint] = number
         elif box in boxes and side in _ENDS and end in ("x", "y", "z"):
             boxes[box][3 * _ENDS.index(side) + "xyz".index(end)] = number
         else:

@@ -100,6 +100,7 @@ class Platform:
     def __init__(self, directory: Path) -> None:
         self.status = status()
         self.refusals: dict[str, tuple[str, str]] = {}
+        self.answers: dict[str, dict[str, Any]] = {}
         self.objects: dict[tuple[int, int, int], bytes] = {}
         self.requests: list[dict[str, Any]] = []
         self.move_steps = 4
@@ -163,9 +164,11 @@ class Platform:
             result = {"hex": self.objects[args["slave"], args["index"], args["subindex"]].hex()}
         elif verb == "sdo_write":
             self.objects[args["slave"], args["index"], args["subindex"]] = bytes.fromhex(args["hex"])
-        elif verb == "move":
+        elif verb in self.answers:
+            result = self.answers[verb]
+        elif verb in ("move", "move_pose", "run"):
             self._move(request, connection)
-            result = {"q": args["q"], "error": 0.00042}
+            result = {"q": args.get("q"), "error": 0.00042}
         return {"ok": True, "result": result}
 
     def _move(self, request: dict[str, Any], connection: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""`rtcp enable`, `disable`, `reset`, `mode`, `move`, `output`."""
+"""`rtcp enable`, `disable`, `reset`, `mode`, `output`, `gripper`, `zero`, `home`, `move`, `run`."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import pty
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,7 +50,23 @@ def test_each_kind_of_error_has_its_exit_code(platform: Any, rtcp: Callable[...,
 
 @pytest.mark.parametrize(
     "arguments",
-    [("enable",), ("disable",), ("reset",), ("mode", "csp"), ("move", *HOME), ("output", "3", "on"), ("stop",)],
+    [
+        ("enable",),
+        ("disable",),
+        ("reset",),
+        ("mode", "csp"),
+        ("move", *HOME),
+        ("move", "--pose", *HOME),
+        ("jog", "x", "0.1", "--seconds", "1"),
+        ("stick", "forward"),
+        ("limits", "show"),
+        ("limits", "set", "joint1.max", "1"),
+        ("output", "3", "on"),
+        ("gripper", "open"),
+        ("zero", "joint1"),
+        ("home", "1"),
+        ("stop",),
+    ],
 )
 def test_without_a_platform_every_command_exits_with_4(rtcp: Callable[..., Any], arguments: tuple[str, ...]) -> None:
     ended = rtcp(*arguments)
@@ -73,6 +90,48 @@ def test_a_state_that_is_neither_on_nor_off_is_refused(platform: Any, rtcp: Call
     assert ended.code == 2
     assert "on or off" in ended.trouble
     assert platform.asked("output") == []
+
+
+@pytest.mark.parametrize(("word", "opened"), [("open", True), ("CLOSE", False)])
+def test_the_gripper_is_told_to_open_or_close(
+    platform: Any, rtcp: Callable[..., Any], word: str, opened: bool
+) -> None:  # fmt: skip
+    assert rtcp("gripper", word).code == 0
+    assert platform.asked("gripper") == [{"open": opened}]
+
+
+def test_what_a_gripper_cannot_do_is_refused(platform: Any, rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("gripper", "half")
+    assert (ended.code, platform.requests) == (2, [])
+    assert "open or close" in ended.trouble
+
+
+@pytest.mark.parametrize("joint", ["joint2", "2"])
+def test_a_joint_is_zeroed_by_its_name_or_its_number(platform: Any, rtcp: Callable[..., Any], joint: str) -> None:
+    platform.answers["zero"] = {"joint": "joint2", "offset": 0.25, "before": 0.0, "file": "/state/zero.yaml"}
+    ended = rtcp("zero", joint, "--at", "-0.5")
+    assert ended.code == 0
+    assert platform.asked("zero") == [{"joint": "joint2", "at": -0.5}]
+    assert "0.250000 rad" in ended.out
+    assert "/state/zero.yaml" in ended.out
+
+
+def test_a_joint_is_homed_and_told_where_it_stands(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.answers["home"] = {"joint": "joint6", "position": 0.5}
+    ended = rtcp("home", "joint6")
+    assert (ended.code, ended.out) == (0, "joint6 is homed and stands at 0.500000 rad\n")
+
+
+@pytest.mark.parametrize("verb", ["zero", "home"])
+def test_a_joint_beyond_the_last_is_refused(platform: Any, rtcp: Callable[..., Any], verb: str) -> None:
+    ended = rtcp(verb, "7")
+    assert (ended.code, platform.asked(verb)) == (2, [])
+    assert "1 to 6" in ended.trouble
+
+
+def test_a_reset_of_a_stop_by_a_limit_leaves_the_arm_holding(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status["state"] = "stopped_by_limit"
+    assert rtcp("reset").out == "reset: the arm holds and takes commands again\n"
 
 
 # -- move -----------------------------------------------------------------------------------------------------------
@@ -210,3 +269,84 @@ def test_an_option_behind_the_end_of_the_options_is_told_so(rtcp: Callable[..., 
     moved = rtcp("move", "--", *["0"] * 6, "--speed", "0.2")
     assert moved.code == 2
     assert "--speed stands behind --" in moved.trouble
+
+
+# -- poses and files ------------------------------------------------------------------------------------------------
+
+POSE = ("-0.4", "-.1", "0.8", "pi/2", "-pi/4", "0")
+
+
+@pytest.mark.parametrize(
+    ("options", "line", "speed"),
+    [((), False, None), (("--line",), True, None), (("--line", "--speed", "0.1"), True, 0.1)],
+)
+def test_a_pose_is_passed_on_with_fractions_of_pi_as_numbers(
+    platform: Any, rtcp: Callable[..., Any], options: tuple[str, ...], line: bool, speed: float | None
+) -> None:
+    assert rtcp("move", "--pose", *POSE, *options).code == 0
+    (asked,) = platform.asked("move_pose")
+    assert asked["pose"] == pytest.approx([-0.4, -0.1, 0.8, 1.5707963, -0.7853982, 0.0])
+    assert (asked["line"], asked["speed"]) == (line, speed)
+
+
+WRONG = {
+    "five numbers": (("move", "--pose", *POSE[:5]), "5 numbers for a pose of 6: give X Y Z RX RY RZ"),
+    "a length as a fraction of pi": (("move", "--pose", "pi", *POSE[1:]), "x: 'pi' is not a number (m)"),
+    "an angle that is not finite": (("move", "--pose", *POSE[:5], "inf"), "rz: inf is not finite"),
+    "a line without a pose": (("move", "--line", *HOME), "--line is for a pose"),
+    "each joint at its best for a pose": (("move", "--each", "--pose", *POSE), "--each is for joint positions"),
+    "a misspelt option": (("move", "--pose", *POSE, "--lin"), "did you mean --line?"),
+    "a speed of a line": (("move", "--pose", *POSE, "--line", "--speed", "0"), "--speed 0 is not allowed: a finite"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), WRONG.values(), ids=WRONG.keys())
+def test_a_pose_that_is_none_is_refused(
+    platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], sentence: str
+) -> None:
+    ended = rtcp(*arguments)
+    assert (ended.code, platform.requests) == (2, [])
+    assert sentence in ended.trouble
+
+
+def test_each_joint_at_its_best_is_passed_on(platform: Any, rtcp: Callable[..., Any]) -> None:
+    assert rtcp("move", *HOME, "--each").code == 0
+    assert platform.asked("move")[0]["each"] is True
+
+
+def test_a_file_is_named_by_its_whole_path(
+    platform: Any, rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "t.csv").write_text("t,q1,q2,q3,q4,q5,q6\n1,0,0,0,0,0,0\n")
+    monkeypatch.chdir(tmp_path)
+    ended = rtcp("run", "t.csv", "--approach")
+    assert ended.code == 0
+    assert "moving:  50%" in ended.out
+    assert platform.asked("run") == [{"file": str(tmp_path / "t.csv"), "approach": True}]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("t.csv", "t,q1\n1,0\n1,0\n", "t.csv:3: t: found 1 after 1; times must rise"),
+        ("t.csv", "t,q1\n1,nan\n", "t.csv:2: q1: found nan, allowed is a finite number"),
+        ("t.yaml", "way: []\n", "way"),
+        ("t.txt", "", "allowed are .yaml, .yml and .csv"),
+    ],
+)
+def test_a_mistake_in_a_file_is_told_without_a_platform(
+    rtcp: Callable[..., Any], tmp_path: Path, name: str, text: str, sentence: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    ended = rtcp("run", str(tmp_path / name))
+    assert ended.code == 2
+    assert sentence in ended.trouble
+
+
+def test_the_end_of_a_path_tells_its_length_and_whether_joints_slowed_it(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:  # fmt: skip
+    platform.answers["move_pose"] = {"error": 0.0001, "length_m": 0.2, "duration_s": 4.25, "slowed": 0.5}
+    ended = rtcp("move", "--pose", *POSE, "--line")
+    said = "there, largest error 0.000100 rad, 0.200 m, in 4.2 s, slowed to 50% of its speed by the joints' limits\n"
+    assert ended.out == said

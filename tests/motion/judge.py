@@ -31,7 +31,7 @@ class Judge:
         self.guard.latch(self.state)
         self.mean = [0.0] * len(start)
         self.target = Target(len(start))
-        self.began = self.depths()
+        self._depths = self.depths()
 
     def depths(self) -> list[float]:
         """How far beyond each box's bounds each point is, m; negative: on the right side."""
@@ -50,7 +50,6 @@ class Judge:
         target.velocity = [(q - p) / dt for q, p in zip(target.position, here, strict=True)]
         if velocity is not None:
             target.velocity = list(velocity)
-        before = self.depths()
         verdict = self.guard.apply(state, target, clamps)
         for i in range(len(here)):
             q, u = state.position[i], limits.acceleration[i] * dt
@@ -63,8 +62,10 @@ class Judge:
             assert abs(state.velocity[i] - mean) <= u * (1 + 1e-4) + 1e-10, (i, state.velocity[i], mean)
             assert abs(state.acceleration[i]) <= limits.acceleration[i] * (1 + 1e-4), (i, state.acceleration[i])
             self.mean[i] = mean
-        for was, now in zip(before, self.depths(), strict=True):
-            assert now <= max(0.0, was) + ROUNDING_M, (was, now)
+        now = self.depths()
+        for was, deep in zip(self._depths, now, strict=True):
+            assert deep <= max(0.0, was) + ROUNDING_M, (was, deep)
+        self._depths = now
         return verdict
 
     def stop(self) -> int:
@@ -82,6 +83,7 @@ class Judge:
         if self.guard.refuses(self.state, new) is not None:
             return False
         self.limits.apply(new)
+        self._depths = self.depths()
         return True
 
 

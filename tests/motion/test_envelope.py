@@ -65,7 +65,7 @@ def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
 
 
 DEED = st.one_of(
-    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 60)),
+    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 40)),
     st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
 )
 
@@ -75,7 +75,7 @@ DEED = st.one_of(
     start=st.tuples(st.one_of(SHARES, st.sampled_from([0.0, 1.0])), st.one_of(SHARES, st.sampled_from([0.0, 1.0]))),
     deeds=st.lists(DEED, min_size=1, max_size=15),
 )
-@settings(max_examples=100)
+@settings(max_examples=50)
 def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
     dt: float, start: tuple[float, float], deeds: list[tuple[object, ...]]
 ) -> None:
@@ -118,11 +118,11 @@ def test_from_the_fastest_stoppable_speed_the_stop_ends_exactly_at_the_edge(room
 
 
 @given(
-    dt=CYCLES_S,
+    dt=st.sampled_from([0.001, 0.004, 0.01]),
     legs=st.lists(st.tuples(SHARES, SHARES, st.floats(0.05, 1.5), st.booleans(), st.integers(1, 1500)), max_size=3),
     jerky=st.booleans(),
 )
-@settings(max_examples=25)
+@settings(max_examples=12)
 def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     dt: float, legs: list[tuple[float, float, float, bool, int]], jerky: bool
 ) -> None:
@@ -186,17 +186,17 @@ def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float
     assert max(map(abs, judge.state.velocity)) < 1e-9
 
 
-def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it_without_help() -> None:
-    judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.0005)
+def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it() -> None:
+    judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.001)
     mode = VelocityMode(judge.limits, judge.dt)
     mode.start(judge.state)
-    for cycle in range(8000):
+    for cycle in range(4000):
         if cycle % 100 == 0:
             mode.command([0.5, -1.5], 1.0, judge.state.now_ns)
         target = mode.update(judge.state, judge.dt)
         verdict = judge.ask(list(target.position), mode.clamps, list(target.velocity))
         assert verdict in (Verdict.PASS, Verdict.CLAMPED)
-        judge.state.now_ns += 500_000
+        judge.state.now_ns += 1_000_000
         assert judge.state.position[0] <= judge.limits.high[0]
         assert judge.state.position[1] >= judge.limits.low[1]
     assert judge.state.position == pytest.approx([judge.limits.high[0], judge.limits.low[1]], abs=1e-3)

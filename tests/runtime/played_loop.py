@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -83,6 +84,7 @@ class Loop:
                     if self.event_at_the_end:
                         self.board.event(*self.event_at_the_end)  # type: ignore[arg-type]
                     self.state = self.ends_in
+            self._record[SCALAR_AT["time_ns"]] = time.monotonic_ns()
             self.board.publish(self._record)
 
     def _take(self) -> None:

@@ -162,7 +162,7 @@ def test_a_motion_that_ends_early_is_no_arrival(client: ControlClient, loop: Loo
 
 def test_a_reset_of_a_stop_by_a_limit_waits_for_no_disabling(client: ControlClient, loop: Loop) -> None:
     loop.state = State.STOPPED_BY_LIMIT
-    wait_until(lambda: client.call("status")["state"] == "stopped_by_limit")
+    wait_until(lambda: client.call("status")["state"].replace("_", " ") == "stopped by limit")
     assert client.call("reset") == {}
     assert [command[0] for command in loop.commands] == [Command.RESET]
 

@@ -1,0 +1,278 @@
+"""`rtcp jog` and `rtcp stick`: what lasts only as long as a key, or as a time."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from rtcp.cli.keys import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey
+
+ARROW_UP, ARROW_LEFT = b"\x1b[A", b"\x1b[D"
+
+
+class Terminal:
+    """A command at a terminal, and its keyboard."""
+
+    def __init__(self, start: Callable[..., Any], *arguments: str) -> None:
+        self.master, end = pty.openpty()
+        self.process = start(*arguments, stdin=end, env={**os.environ, "TERM": "xterm"})
+        os.close(end)
+        self.first_line = self.process.stdout.readline()
+
+    def press(self, key: bytes) -> None:
+        os.write(self.master, key)
+
+    def hold(self, key: bytes, seconds: float, delay_s: float = 0.3, every_s: float = 0.04) -> None:
+        """Press a key as a keyboard does: once, then after a delay again and again."""
+        until = time.monotonic() + seconds
+        self.press(key)
+        time.sleep(delay_s)
+        while time.monotonic() < until:
+            self.press(key)
+            time.sleep(every_s)
+
+    def quit(self) -> int:
+        self.press(b"q")
+        return int(self.process.wait(20))
+
+
+@pytest.fixture
+def terminal(rtcp_process: Callable[..., Any]) -> Iterator[Callable[..., Terminal]]:
+    made: list[Terminal] = []
+
+    def start(*arguments: str) -> Terminal:
+        made.append(Terminal(rtcp_process, *arguments))
+        return made[-1]
+
+    yield start
+    for one in made:
+        os.close(one.master)
+
+
+# -- keys -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_tap_is_not_held() -> None:
+    key = HeldKey()
+    key.press("x", 0.0)
+    assert key.held(0.01) == ""
+
+
+def test_a_key_is_held_from_its_first_repetition_until_shortly_after_its_last() -> None:
+    key = HeldKey()
+    for at in (0.0, 0.6, 0.64, 0.68):
+        key.press("x", at)
+    assert key.held(0.68 + 0.9 * RELEASED_AFTER_S) == "x"
+    assert key.held(0.68 + 1.1 * RELEASED_AFTER_S) == ""
+
+
+def test_a_press_after_the_release_is_a_tap_again() -> None:
+    key = HeldKey()
+    for at in (0.0, 0.6, 0.64, 0.64 + 1.5 * RELEASED_AFTER_S):
+        key.press("x", at)
+    assert key.held(0.64 + 1.6 * RELEASED_AFTER_S) == ""
+
+
+def test_two_taps_far_apart_are_no_repetition() -> None:
+    key = HeldKey()
+    key.press("x", 0.0)
+    key.press("x", 1.1 * REPEATS_WITHIN_S)
+    assert key.held(1.1 * REPEATS_WITHIN_S) == ""
+
+
+def test_another_key_lets_go_of_the_first() -> None:
+    key = HeldKey()
+    for at in (0.0, 0.6, 0.64):
+        key.press("x", at)
+    key.press("y", 0.65)
+    assert key.held(0.66) == ""
+
+
+# -- jog ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "frame", "speeds"),
+    [
+        (("z", "-0.05"), "base", [0, 0, -0.05, 0, 0, 0]),
+        (("rx", "0.1", "--frame", "tool"), "tool", [0, 0, 0, 0.1, 0, 0]),
+        (("JOINT6", "-.2"), "joints", [0, 0, 0, 0, 0, -0.2]),
+    ],
+)
+def test_a_jog_for_a_time_is_said_again_and_again_and_ends_in_a_halt(
+    platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], frame: str, speeds: list[float]
+) -> None:
+    ended = rtcp("jog", *arguments, "--seconds", "0.4")
+    assert ended.code == 0
+    assert ended.out.startswith("stopped at 0.1000 -0.2000")
+    asked = platform.asked("jog")
+    assert 5 <= len(asked) <= 9
+    assert all(one == {"v": speeds, "frame": frame, "hold_s": 0.25} for one in asked)
+    assert platform.requests[-2]["do"] == "halt"
+
+
+WRONG = {
+    "an axis that is none": (("w", "0.1", "--seconds", "1"), "'w' is no axis: x, y, z, rx, ry, rz, or joint1"),
+    "a joint beyond the last": (("joint7", "0.1", "--seconds", "1"), "joint7 does not exist: joint1 to joint6"),
+    "a joint before the first": (("joint0", "0.1", "--seconds", "1"), "'joint0' is no axis"),
+    "a speed that is none": (("x", "fast", "--seconds", "1"), "'fast' is not a number (m/s)"),
+    "no speed": (("x", "0", "--seconds", "1"), "speed 0 is not allowed"),
+    "a speed without bound": (("rz", "inf", "--seconds", "1"), "speed inf is not allowed: a finite number of rad/s"),
+    "a frame that is none": (("x", "1", "--seconds", "1", "--frame", "world"), "--frame world is not known"),
+    "a time that is none": (("x", "1", "--seconds", "nan"), "--seconds nan is not allowed"),
+    "a time too long": (("x", "1", "--seconds", "61"), "at most 60"),
+    "a misspelt option": (("x", "1", "--second", "1"), "--second"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("arguments", "sentence"), WRONG.values(), ids=WRONG.keys())
+def test_a_jog_that_is_none_is_refused_in_a_sentence(
+    platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], sentence: str
+) -> None:
+    ended = rtcp("jog", *arguments)
+    assert (ended.code, platform.asked("jog")) == (2, [])
+    assert sentence in ended.trouble
+
+
+@pytest.mark.parametrize(
+    ("command", "words"), [(("jog", "x", "0.1"), "give --seconds N"), (("stick",), "give a position")]
+)
+def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
+    platform: Any, rtcp_process: Callable[..., Any], command: tuple[str, ...], words: str
+) -> None:
+    ended = rtcp_process(*command)
+    _, trouble = ended.communicate()
+    assert (ended.returncode, platform.requests) == (2, [])
+    assert words in trouble
+
+
+def test_an_interrupted_jog_closes_its_connection_and_says_that_the_arm_stops(
+    platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    jogging = rtcp_process("jog", "x", "0.1", "--seconds", "50")
+    wait_until(lambda: bool(platform.asked("jog")))
+    jogging.send_signal(signal.SIGINT)
+    _, trouble = jogging.communicate()
+    assert jogging.returncode == 130
+    assert trouble == "rtcp: interrupted: the connection is closed, so the arm comes to a controlled stop\n"
+
+
+def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_let_go(
+    platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
+) -> None:
+    keyboard = terminal("jog", "y", "0.1")
+    keyboard.hold(b" ", 1.0)
+    wait_until(lambda: bool(platform.asked("halt")), 2.0)
+    forward = len(platform.asked("jog"))
+    assert forward >= 5
+    keyboard.hold(ARROW_LEFT, 1.0)
+    wait_until(lambda: len(platform.asked("halt")) == 2, 2.0)
+    assert keyboard.quit() == 0
+    directions = [one["v"][1] for one in platform.asked("jog")]
+    assert set(directions[:forward]) == {0.1}
+    assert set(directions[forward:]) == {-0.1}
+
+
+def test_a_tap_moves_nothing(platform: Any, terminal: Callable[..., Terminal]) -> None:
+    keyboard = terminal("jog", "y", "0.1")
+    keyboard.press(b" ")
+    time.sleep(0.4)
+    assert keyboard.quit() == 0
+    assert platform.asked("jog") == []
+
+
+def test_a_key_that_is_held_when_the_command_is_ended_moves_no_further(
+    platform: Any, terminal: Callable[..., Terminal]
+) -> None:
+    keyboard = terminal("jog", "joint1", "0.1")
+    keyboard.hold(b" ", 0.7)
+    assert keyboard.quit() == 0
+    assert [request["do"] for request in platform.requests][-2:] == ["halt", "status"]
+
+
+# -- stick ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("words", "pressed", "byte"),
+    [
+        (("forward",), ["forward"], None),
+        (("backward", "left"), ["backward", "left"], None),
+        (("up",), ["mode_up"], None),
+        (("chair",), ["chair"], None),
+        (("estop",), ["emergency_stop"], None),
+        (("byte", "61"), [], 61),
+    ],
+)
+def test_a_position_is_held_for_a_time_by_saying_it_again(
+    platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], pressed: list[str], byte: int | None
+) -> None:
+    ended = rtcp("stick", *words, "--seconds", "0.4")
+    assert (ended.code, ended.out) == (0, "the stick is let go\n")
+    asked = platform.asked("stick")
+    assert 4 <= len(asked) <= 7
+    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4} for one in asked)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("sideways",), "'sideways' is no position of the stick"),
+        (("byte",), "byte is not allowed"),
+        (("byte", "256"), "byte 256 is not allowed: one number from 0 to 255"),
+        (("byte", "61", "62"), "one number from 0 to 255"),
+        (("forward", "release"), "'release' is no position"),
+        (("forward", "--seconds", "0"), "--seconds 0 is not allowed"),
+    ],
+)
+def test_what_is_no_position_is_refused(
+    platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], sentence: str
+) -> None:
+    ended = rtcp("stick", *words)
+    assert (ended.code, platform.requests) == (2, [])
+    assert sentence in ended.trouble
+
+
+def test_arrows_are_the_stick_and_letters_its_switches(
+    platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
+) -> None:
+    keyboard = terminal("stick")
+
+    def last() -> list[str]:
+        asked = platform.asked("stick")
+        return asked[-1]["pressed"] if asked else ["none"]
+
+    wait_until(lambda: last() == [])
+    keyboard.hold(ARROW_UP, 0.8)
+    assert last() == ["forward"]
+    wait_until(lambda: last() == [], 2.0)
+    keyboard.press(b"+")
+    wait_until(lambda: last() == ["mode_up"], 2.0)
+    wait_until(lambda: last() == [], 2.0)
+    keyboard.press(b"-")
+    wait_until(lambda: last() == ["mode_down"], 2.0)
+    keyboard.press(b"t")
+    wait_until(lambda: last() == ["chair"], 2.0)
+    keyboard.press(b"e")
+    wait_until(lambda: last() == ["chair", "emergency_stop"], 2.0)
+    keyboard.press(b"t")
+    wait_until(lambda: last() == ["emergency_stop"], 2.0)
+    assert keyboard.quit() == 0
+
+
+def test_a_stick_that_is_killed_is_gone_with_its_connection(
+    platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    playing = rtcp_process("stick", "forward", "--seconds", "50")
+    wait_until(lambda: bool(platform.asked("stick")))
+    playing.kill()
+    playing.wait()
+    asked = len(platform.asked("stick"))
+    time.sleep(0.3)
+    assert len(platform.asked("stick")) <= asked + 1

@@ -1,0 +1,213 @@
+"""Motion commands on a whole platform: real processes, the virtual segment, the control socket and the command line."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from kinematics.forward import forward
+from rtcp.config import default_config, load
+from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.paths import control_socket
+from tests.e2e.conftest import Platform
+
+BENT = [0.0, 0.2, 1.57, 0.0, 0.4, 0.0]
+NUMBERS = [f"{q:g}" for q in BENT]
+
+
+@pytest.fixture
+def bent(enabled: Platform) -> Iterator[Platform]:
+    """The shared platform, enabled, the arm bent away from all limits, taking moves; as it was afterwards."""
+    enabled.rtcp("mode", "joint")
+    enabled.rtcp("move", *NUMBERS)
+    yield enabled
+    enabled.until(lambda found: found["state"] in ("holding", "stopped_by_limit"), "rest")
+    enabled.rtcp("reset")
+    enabled.rtcp("mode", "joint")
+
+
+@pytest.fixture
+def client(bent: Platform) -> Iterator[ControlClient]:
+    with ControlClient("a test", control_socket(bent.directory)) as made:
+        yield made
+
+
+def tool(status: dict[str, Any]) -> list[float]:
+    """Where the commanded joints have the tool, m."""
+    model = load(default_config()).arm
+    assert model is not None
+    return list(forward(model, status["joints"]["target"]).position)
+
+
+def far(one: list[float], other: list[float]) -> float:
+    return max(abs(a - b) for a, b in zip(one, other, strict=True))
+
+
+def test_a_pose_is_reached_on_a_line_and_by_the_joints(bent: Platform) -> None:
+    x, y, z = tool(bent.status())
+    for options in (("--line", "--speed", "0.1"), ()):
+        y += 0.06
+        pose = [f"{number:.5f}" for number in (x, y, z)]
+        model = load(default_config()).arm
+        assert model is not None
+        turn = [f"{number:.6f}" for number in forward(model, BENT).rpy]
+        done = bent.rtcp("move", "--pose", *pose, *turn, *options)
+        assert "there, largest error" in done.stdout
+        assert far(tool(bent.status()), [x, y, z]) < 1e-4
+
+
+def test_a_pose_out_of_reach_is_refused_with_the_reason_and_nothing_moves(bent: Platform) -> None:
+    before = bent.status()["joints"]["target"]
+    for options in ((), ("--line",)):
+        done = bent.rtcp("move", "--pose", "-2", "0", "0.6", "0", "0", "0", *options, check=3)
+        assert "out of reach" in done.stderr
+    assert bent.status()["joints"]["target"] == before
+
+
+def test_a_trajectory_file_is_run_with_progress(bent: Platform, tmp_path: Path) -> None:
+    file = tmp_path / "motion.yaml"
+    there = [0.3, *BENT[1:]]
+    file.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 2, q: {there}}}\n  - {{t: 4, q: {BENT}}}\n")
+    done = bent.rtcp("run", str(file))
+    assert "moving:" in done.stdout
+    assert far(bent.status()["joints"]["target"], BENT) < 1e-6
+
+
+def test_ctrl_c_stops_a_line_on_its_way(bent: Platform) -> None:
+    x, y, z = tool(bent.status())
+    model = load(default_config()).arm
+    assert model is not None
+    turn = [f"{number:.6f}" for number in forward(model, BENT).rpy]
+    moving = bent.background(
+        "move", "--pose", f"{x:.5f}", f"{y + 0.3:.5f}", f"{z:.5f}", *turn, "--line", "--speed", "0.03"
+    )
+    bent.until(lambda found: tool(found)[1] > y + 0.03, "motion")
+    moving.send_signal(signal.SIGINT)
+    _, trouble = moving.communicate(timeout=20)
+    assert moving.returncode == 130
+    assert "controlled stop" in trouble
+    found = bent.until(lambda found: found["state"] == "holding", "rest")
+    at = tool(found)
+    assert y + 0.03 < at[1] < y + 0.25
+    # Braked along the line, not off it.
+    assert far([at[0], at[2]], [x, z]) < 1e-4
+
+
+def test_a_jog_moves_along_its_axis_and_comes_to_rest(bent: Platform) -> None:
+    before = tool(bent.status())
+    bent.rtcp("jog", "y", "0.05", "--seconds", "1")
+    after = tool(bent.status())
+    assert bent.status()["state"] == "holding"
+    assert 0.03 < after[1] - before[1] < 0.08
+    assert far([after[0], after[2]], [before[0], before[2]]) < 1e-3
+
+
+def test_a_jogger_that_is_killed_leaves_an_arm_at_rest(bent: Platform) -> None:
+    jogging = bent.background("jog", "joint1", "0.2", "--seconds", "30")
+    bent.until_moving()
+    jogging.kill()
+    jogging.communicate()
+    found = bent.until(lambda found: found["state"] == "holding", "rest")
+    assert found["lease"]["holder"] in ("", None)
+    again = bent.status()["joints"]["target"]
+    assert again == found["joints"]["target"]
+
+
+def test_a_second_jogger_is_refused_with_the_firsts_name(bent: Platform, client: ControlClient) -> None:
+    client.call("jog", {"v": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
+    with ControlClient("another", control_socket(bent.directory)) as other:
+        with pytest.raises(ControlError, match="the arm is commanded by a test") as raised:
+            other.call("jog", {"v": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
+    assert raised.value.kind == "refused"
+
+
+def test_a_stream_is_followed_and_its_end_stops_the_arm(bent: Platform, client: ControlClient) -> None:
+    q = list(BENT)
+    for _ in range(50):
+        q[0] += 0.004
+        client.call("stream", {"q": q, "t": time.monotonic()})
+        time.sleep(0.02)
+    found = bent.until(lambda found: found["state"] == "holding", "rest")
+    assert abs(found["joints"]["target"][0] - q[0]) < 0.03
+
+
+def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: ControlClient) -> None:
+    with pytest.raises(ControlError, match="the arm is in mode joint"):
+        client.call("velocity", {"numbers": [0.1, 0, 0, 0, 0, 0]})
+    client.call("motion", {"name": "velocity"})
+    start = client.call("status")["joints"]["target"][0]
+    for _ in range(20):
+        client.call("velocity", {"numbers": [0.1, 0, 0, 0, 0, 0]})
+        time.sleep(0.05)
+    found = bent.until(lambda found: found["state"] == "holding", "rest")
+    assert found["mode"] == "csv"
+    assert 0.05 < found["joints"]["target"][0] - start < 0.25
+
+
+def test_a_stiffness_in_mode_torque_holds_the_arm_where_it_is(bent: Platform, client: ControlClient) -> None:
+    client.call("motion", {"name": "torque"})
+    start = client.call("status")["joints"]["position"]
+    for _ in range(20):
+        client.call("torque", {"numbers": [0] * 6, "stiffness": 1.0, "damping": 1.0})
+        time.sleep(0.05)
+    assert far(client.call("status")["joints"]["position"], start) < 0.01
+
+
+def test_the_stick_moves_the_arm_and_silence_lets_it_go(bent: Platform, client: ControlClient) -> None:
+    client.call("motion", {"name": "joystick"})
+    client.call("stick", {"byte": 63})
+    start = tool(client.call("status"))
+    until = time.monotonic() + 1.5
+    while time.monotonic() < until:
+        client.call("stick", {"byte": 61})
+        time.sleep(0.1)
+    moved = client.call("status")
+    assert moved["state"] == "moving"
+    assert tool(moved)[0] < start[0] - 0.03
+    found = bent.until(lambda found: found["state"] == "holding", "rest after the last word")
+    assert found["inputs"] & 0xFF == 63
+
+
+def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> None:
+    moving = bent.background("move", "2.5", *NUMBERS[1:], "--speed", "0.2")
+    bent.until_moving()
+    bent.rtcp("stick", "estop", "--seconds", "0.3")
+    _, trouble = moving.communicate(timeout=20)
+    assert moving.returncode == 5
+    assert "emergency stop" in trouble
+    found = bent.until(lambda found: not found["robot"]["drives_powered"], "torque off")
+    assert found["state"] == "emergency_stop"
+    bent.rtcp("reset")
+    bent.rtcp("enable")
+
+
+def test_limits_are_narrowed_shown_and_kept_to(bent: Platform) -> None:
+    bent.rtcp("limits", "set", "joint1.max", "0.5")
+    try:
+        assert json.loads(bent.rtcp("limits", "show", "--json").stdout)["limits"]["max"][0] == 0.5
+        done = bent.rtcp("move", "0.6", *NUMBERS[1:], check=3)
+        assert "joint1" in done.stderr
+        done = bent.rtcp("limits", "set", "joint1.max", "-0.5", check=3)
+        assert "joint1" in done.stderr
+        assert "nothing was changed" in done.stderr
+        bent.rtcp("limits", "set", "joint1.max", "9", check=3)
+    finally:
+        bent.rtcp("limits", "set", "joint1.max", "3.1")
+
+
+def test_the_gripper_switches_its_output(bent: Platform) -> None:
+    for word, on in (("close", True), ("open", False)):
+        bent.rtcp("gripper", word)
+        bent.until(lambda found, on=on: bool(found["outputs"] >> 3 & 1) is on, f"gripper to {word}")
+
+
+def test_a_joint_is_homed_and_holds_again(bent: Platform) -> None:
+    done = bent.rtcp("home", "joint6")
+    assert "joint6 is homed" in done.stdout
+    assert bent.status()["state"] == "holding"

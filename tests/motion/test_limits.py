@@ -1,0 +1,192 @@
+"""Limits change as one transaction: refused with a reason, or taken whole."""
+
+from __future__ import annotations
+
+import array
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf, nan
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rtcp.motion.limits import Limits, Refused, Values, Wrong, read, rows
+from rtcp.motion.rows import COLUMNS
+
+from .judge import ARM, JOINTS_ONLY, Judge, with_boxes
+from .reference import points
+
+WIDEST = Values.configured(ARM)
+STILL = [0.0] * 6
+
+
+def memory(plan: Sequence[Sequence[float]]) -> memoryview:
+    """The rows as the plan area holds them."""
+    return memoryview(array.array("d", [x for row in plan for x in (*row, *[0.0] * (COLUMNS - len(row)))]))
+
+
+def of_first(values: Values, name: str, number: float) -> Values:
+    """The same with another number for the first joint."""
+    return replace(values, **{name: (number, *getattr(values, name)[1:])})
+
+
+def check(new: Values, position: Sequence[float] = STILL, velocity: Sequence[float] = STILL) -> Refused | None:
+    return Limits(ARM).check(new, list(position), list(velocity))
+
+
+def test_what_is_configured_is_taken() -> None:
+    assert check(WIDEST) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "expected"),
+    [
+        ("low", -3.2, (Wrong.WIDER, 0, -3.2, -3.1)),
+        ("high", 3.2, (Wrong.WIDER, 0, 3.2, 3.1)),
+        ("low", -inf, (Wrong.NO_LIMIT, 0, -inf, -inf)),
+        ("high", -3.1, (Wrong.NO_LIMIT, 0, -3.1, -3.1)),
+        ("velocity", 0.6, (Wrong.WIDER, 0, 0.6, 0.5)),
+        ("velocity", 0.0, (Wrong.NO_LIMIT, 0, 0.0, 0.0005)),
+        ("velocity", 1e-300, (Wrong.NO_LIMIT, 0, 1e-300, 0.0005)),
+        ("acceleration", 2.1, (Wrong.WIDER, 0, 2.1, 2.0)),
+        ("acceleration", -1.0, (Wrong.NO_LIMIT, 0, -1.0, 0.002)),
+        ("jerk", inf, (Wrong.NO_LIMIT, 0, inf, 0.02)),
+        ("torque", 50.0, (Wrong.WIDER, 0, 50.0, 49.0)),
+        ("high", -0.1, (Wrong.OUTSIDE, 0, 0.0, -0.1)),
+        ("low", 0.1, (Wrong.OUTSIDE, 0, 0.0, 0.1)),
+    ],
+)
+def test_a_joints_limit_that_cannot_be_is_refused_with_the_number_and_what_is_allowed(
+    name: str, number: float, expected: tuple[Wrong, int, float, float]
+) -> None:
+    assert check(of_first(WIDEST, name, number)) == expected
+
+
+@pytest.mark.parametrize("name", ["low", "high", "velocity", "acceleration", "jerk", "torque"])
+def test_no_number_is_no_limit(name: str) -> None:
+    refused = check(of_first(WIDEST, name, nan))
+    assert refused is not None
+    assert refused.wrong is Wrong.NO_LIMIT
+
+
+def test_a_joint_that_would_come_to_rest_outside_refuses_the_range_and_one_that_is_too_fast_the_speed() -> None:
+    moving = [0.4, *STILL[1:]]
+    # From 0.4 rad/s with 2 rad/s^2 the stop takes 0.04 rad.
+    assert check(of_first(WIDEST, "high", 0.041), velocity=moving) is None
+    assert check(of_first(WIDEST, "high", 0.039), velocity=moving) == (Wrong.OUTSIDE, 0, pytest.approx(0.04), 0.039)
+    slower = of_first(of_first(WIDEST, "high", 0.041), "acceleration", 1.0)
+    assert check(slower, velocity=moving) == (Wrong.OUTSIDE, 0, pytest.approx(0.08), 0.041)
+    assert check(of_first(WIDEST, "velocity", 0.3), velocity=moving) == (Wrong.FASTER, 0, 0.3, 0.4)
+
+
+@pytest.mark.parametrize("which", ["box", "keep_out"])
+@pytest.mark.parametrize("at", range(6))
+def test_a_box_only_becomes_narrower_and_a_keep_out_box_only_wider(which: str, at: int) -> None:
+    outward = (-0.01 if at < 3 else 0.01) * (1.0 if which == "box" else -1.0)
+
+    def moved(by: float) -> Values:
+        if which == "box":
+            return replace(WIDEST, box=tuple(x + (by if n == at else 0.0) for n, x in enumerate(WIDEST.box or ())))
+        first, *others = WIDEST.keep_out
+        return replace(WIDEST, keep_out=(tuple(x + (by if n == at else 0.0) for n, x in enumerate(first)), *others))
+
+    assert check(moved(-outward)) is None
+    refused = check(moved(outward))
+    assert refused is not None
+    assert (refused.wrong, refused.at) == (Wrong.WIDER, -1)
+    for number in (nan, inf, -inf):
+        assert check(moved(number)) is not None
+
+
+def test_no_box_is_taken_away_or_added() -> None:
+    assert check(replace(WIDEST, box=None)) == (Wrong.WIDER, -1, 0.0, 0.0)
+    for boxes in (WIDEST.keep_out[:1], (*WIDEST.keep_out, WIDEST.keep_out[0])):
+        assert check(replace(WIDEST, keep_out=boxes)) == (Wrong.NO_LIMIT, -1, len(boxes), 2)
+
+
+def test_other_joints_than_the_arms_are_refused() -> None:
+    two = Values.configured(JOINTS_ONLY)
+    assert check(two) == (Wrong.NO_LIMIT, -1, 2, 6)
+
+
+def test_whoever_holds_a_list_sees_the_change() -> None:
+    limits = Limits(ARM)
+    held = limits.high
+    limits.apply(of_first(WIDEST, "high", 1.0))
+    assert held is limits.high
+    assert held[0] == 1.0
+    assert limits.widest.high[0] == 3.1
+
+
+# -- the arm in the boxes -------------------------------------------------------------------------------------------
+
+
+def test_boxes_that_the_arm_stands_in_or_would_come_to_rest_in_are_refused() -> None:
+    q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
+    wide = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
+    judge = Judge(with_boxes(wide), q, 0.002)
+    tool = points(q)[0]
+
+    def up_to(x: float) -> Values:
+        return replace(judge.limits.widest, box=(*wide[:3], x, *wide[4:]))
+
+    assert judge.guard.refuses(judge.state, up_to(tool[0] + 1e-4)) is None
+    refused = judge.guard.refuses(judge.state, up_to(tool[0] - 1e-4))
+    assert refused == (Wrong.OUTSIDE, -1, pytest.approx(-1e-4), -1.0)
+    sign = -1.0 if tool[1] > 0 else 1.0
+    for _ in range(150):
+        judge.ask([judge.state.position[0] + sign * 0.5 * judge.dt, *q[1:]], clamps=True)
+    here = points(judge.state.position)[0][0]
+    assert here > tool[0]
+    assert judge.guard.refuses(judge.state, up_to(here + 0.2)) is None
+    assert judge.guard.refuses(judge.state, up_to(here + 1e-3)) is not None
+    assert judge.change(up_to(here + 0.03))
+    for _ in range(300):
+        judge.ask([judge.state.position[0] + sign * 0.5 * judge.dt, *q[1:]], clamps=True)
+
+
+def test_an_arm_that_stands_in_a_box_already_may_still_be_slowed_down() -> None:
+    q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
+    tool = points(q)[0]
+    judge = Judge(with_boxes(None, [*(x - 0.1 for x in tool), *(x + 0.1 for x in tool)]), q, 0.002)
+    assert judge.change(of_first(judge.limits.widest, "velocity", 0.1))
+    first = judge.limits.keep_out[0]
+    assert not judge.change(replace(judge.limits.widest, keep_out=((first[0] - 0.1, *first[1:]),)))
+
+
+# -- as rows --------------------------------------------------------------------------------------------------------
+
+
+NUMBER = st.floats(width=64)
+JOINT = st.tuples(*[NUMBER] * 6)
+
+
+@given(joints=st.lists(JOINT, min_size=1, max_size=6), box=st.none() | JOINT, keep_out=st.lists(JOINT, max_size=4))
+def test_limits_come_back_from_their_rows_as_they_were(joints: list[Any], box: Any, keep_out: list[Any]) -> None:
+    values = Values(*zip(*joints, strict=True), box=box, keep_out=tuple(keep_out))
+    plan = rows(values)
+    assert repr(read(memory(plan), len(plan))) == repr(values)
+
+
+@pytest.mark.parametrize("count", [-1, 0, 1, 9, 11, 400])
+def test_another_count_of_rows_is_none(count: int) -> None:
+    plan = rows(WIDEST)
+    assert len(plan) == 10
+    assert read(memory(plan), count) is None
+
+
+@pytest.mark.parametrize("column", [0, 1, 2])
+@pytest.mark.parametrize("number", [nan, inf, -1.0, 0.5, 1e18, 7.0, 0.0])
+def test_a_head_that_does_not_fit_the_rows_is_none(column: int, number: float) -> None:
+    plan = rows(WIDEST)
+    plan[0][column] = number
+    assert read(memory(plan), len(plan)) is None
+
+
+@given(plan=st.lists(st.lists(NUMBER, min_size=COLUMNS, max_size=COLUMNS), min_size=1, max_size=9), count=st.integers())
+def test_whatever_is_in_memory_nothing_but_none_or_limits_comes_of_it(plan: list[list[float]], count: int) -> None:
+    found = read(memory(plan), count)
+    if found is not None:
+        check(found)
