@@ -106,16 +106,20 @@ class SetPointGuard:
         refused = self._limits.check(new, state.position, self._mean)
         if refused is not None or self._model is None:
             return refused
+        limits, mean = self._limits, self._mean
+        same = new.box == limits.box and new.keep_out == limits.keep_out
+        slower = any(rate < now for rate, now in zip(new.acceleration, limits.acceleration, strict=True))
+        # Also where the arm is on the wrong side of a box already: nothing becomes worse.
+        if same and not (slower and any(mean)):
+            return None
         zones, poses = Zones(self._model, new), frames(self._model, state.position)
         distance, which = zones.distance(poses)
         if distance >= 0.0:
-            found = touched(zones, poses, poses, state.position, self._mean, new.acceleration, self._dt)
-            if found is None:
+            stop = touched(zones, poses, poses, state.position, mean, new.acceleration, self._dt)
+            if stop is None:
                 return None
-            which, distance = found
-        # Where the arm is already on the wrong side, limits may change that do not make it worse.
-        same = new.box == self._limits.box and new.keep_out == self._limits.keep_out
-        return None if same and not any(self._mean) else Refused(Wrong.OUTSIDE, -1, distance, float(which))
+            which, distance = stop
+        return Refused(Wrong.OUTSIDE, -1, distance, float(which))
 
     def apply(self, state: MotionState, target: Target, clamps: bool) -> Verdict:
         """Write what may be commanded of `target` into `state`: position, velocity, acceleration.

@@ -163,8 +163,11 @@ class Limits:
             if found > most:
                 return Refused(Wrong.WIDER, axis, found, most)
         rest = q + 0.5 * v * abs(v) / new.acceleration[axis]
-        if abs(v) > new.velocity[axis]:
+        if abs(v) > new.velocity[axis] < self.velocity[axis]:
             return Refused(Wrong.FASTER, axis, new.velocity[axis], abs(v))
+        # What is not narrowed needs no room: the guards see to it, to a rounding.
+        if low <= self.low[axis] and high >= self.high[axis] and new.acceleration[axis] >= self.acceleration[axis]:
+            return None
         if not low <= min(q, rest) <= max(q, rest) <= high:
             return Refused(Wrong.OUTSIDE, axis, rest, high if rest > high or q > high else low)
         return None

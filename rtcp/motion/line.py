@@ -42,7 +42,7 @@ class LineMode:
         self._inverse = InverseKinematics(model)
         self._limits = limits
         self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self._brakes = self._settles = False
+        self._brakes = False
         self._otg = Ruckig(1, period_s)
         self._way, self._halt = InputParameter(1), InputParameter(1)
         self._halt.control_interface = ControlInterface.Velocity
@@ -75,32 +75,29 @@ class LineMode:
     def start(self, state: MotionState, rows: memoryview[float], count: int) -> Refused | None:
         """Begin a plan of `count` straight pieces (`rtcp.motion.rows`) from `state`; return why not, or None.
 
-        At rest the tool has to be where the first piece begins. In motion the arm first comes to rest under its limits,
-        and the first piece then leads from there to its end. Where it is refused, what was under way goes on.
+        The arm has to be at rest, and the tool where the first piece begins: all that it does was checked beforehand.
+        Where it is refused, what was under way goes on.
         """
         first = read_row(rows, 0)
         if (wrong := damaged_line(first, 0)) is not None:
             return wrong
-        moves = any(abs(v) > _STILL_RAD_S for v in state.velocity)
+        for i, v in enumerate(state.velocity):
+            if not -_STILL_RAD_S <= v <= _STILL_RAD_S:
+                return Refused(Wrong.MOVING, i, v, 0.0)
         tool = forward(self._model, state.position)
-        if not moves:
-            far = hypot(*(a - b for a, b in zip(tool.position, first[0:3], strict=True)))
-            if not far <= AT_START_M:
-                return Refused(Wrong.START, -1, far, AT_START_M)
-            _, turn = turn_between(quaternion(tool.rotation), first[3:7])
-            if not turn <= AT_START_RAD:
-                return Refused(Wrong.START, -1, turn, AT_START_RAD)
+        far = hypot(*(a - b for a, b in zip(tool.position, first[0:3], strict=True)))
+        if not far <= AT_START_M:
+            return Refused(Wrong.START, -1, far, AT_START_M)
+        _, turn = turn_between(quaternion(tool.rotation), first[3:7])
+        if not turn <= AT_START_RAD:
+            return Refused(Wrong.START, -1, turn, AT_START_RAD)
         self._rows, self._row, self._count = rows, 0, count
-        self._settles, self._brakes = moves, False
+        self._brakes = False
         self.elapsed_s = self._done_s = 0.0
         self.duration_s = first[18]
         self.phase, self.reason = Phase.MOVE, Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self._piece = first
-        if moves:
-            self._stop_joints(state)
-        else:
-            self._begin(state, first)
+        self._begin(state, first)
         return None
 
     def _begin(self, state: MotionState, row: list[float]) -> None:
@@ -127,20 +124,6 @@ class LineMode:
         self._otg.reset()
         self._active = way
 
-    def _begin_here(self, state: MotionState, row: list[float]) -> None:
-        """The first piece from where the arm came to rest: as fast as the planned one, in m/s and rad/s."""
-        tool = forward(self._model, state.position)
-        here = quaternion(tool.rotation)
-        planned = hypot(row[7] - row[0], row[8] - row[1], row[9] - row[2])
-        length = hypot(*(a - b for a, b in zip(row[7:10], tool.position, strict=True)))
-        _, planned_turn = turn_between(row[3:7], row[10:14])
-        _, turn = turn_between(here, row[10:14])
-        longer = max(1.0, length / max(planned, 1e-3), turn / max(planned_turn, 1e-2))
-        self._begin(
-            state,
-            [*tool.position, *here, *row[7:14], row[14] / longer, row[15] / longer, row[16] / longer, *row[17:]],
-        )
-
     def _stop_joints(self, state: MotionState) -> None:
         brake, limits = self._brake, self._limits
         brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
@@ -152,9 +135,6 @@ class LineMode:
         if self.phase is not Phase.MOVE:
             return
         self.phase = Phase.STOP
-        if self._settles:
-            self._brakes, self._settles = True, False
-            return
         way, halt = self._way, self._halt
         halt.current_position, halt.current_velocity = way.current_position, way.current_velocity
         halt.current_acceleration = way.current_acceleration
@@ -172,12 +152,7 @@ class LineMode:
             if not self._brake.phase:
                 self._brakes, self.phase = False, Phase.HOLD
             return target
-        if self._settles:
-            if self._brake.phase:
-                return self._brake.update(state, dt)
-            self._settles = False
-            self._begin_here(state, self._piece)
-        elif self._ended and not self._begin_next(state):
+        if self._ended and not self._begin_next(state):
             return self._give_up(state, dt, Reason.PLAN, self.axis, self.value, self.limit)
         return self._along(state, dt)
 
@@ -243,7 +218,7 @@ class LineMode:
     def _give_up(self, state: MotionState, dt: float, reason: Reason, axis: int, value: float, limit: float) -> Target:
         self.phase, self.reason, self.axis, self.value, self.limit = Phase.STOP, reason, axis, value, limit
         self._stop_joints(state)
-        self._brakes, self._settles = True, False
+        self._brakes = True
         return self.update(state, dt)
 
 

@@ -48,6 +48,8 @@ class Wrong(IntEnum):
     """It begins at time 0 with another speed than the arm has; `at`: the joint."""
     UNREACHABLE = 4
     """The way to its beginning cannot be made; `at`: the joint or -1."""
+    MOVING = 5
+    """A line begins at rest; `at`: the first joint that is commanded to move, `value`: its speed."""
 
 
 class Refused(NamedTuple):

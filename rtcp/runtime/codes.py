@@ -121,6 +121,8 @@ class Refusal(IntEnum):
     """The gripper's drive is not enabled."""
     PLAN_LEAD = 38
     """No way leads from where the arm is to the plan's first point."""
+    PLAN_MOVING = 43
+    """Lines begin at rest; axis: the first joint that moves, value: its speed, rad/s."""
 
 
 class Code(IntEnum):

@@ -34,6 +34,7 @@ _PLAN_REFUSALS = {
     Wrong.START: Refusal.PLAN_START,
     Wrong.START_SPEED: Refusal.PLAN_SPEED,
     Wrong.UNREACHABLE: Refusal.PLAN_LEAD,
+    Wrong.MOVING: Refusal.PLAN_MOVING,
 }
 
 

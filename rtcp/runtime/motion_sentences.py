@@ -66,6 +66,9 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
         Refusal.JOG_FRAME: lambda m: f"frame {number(m.value)} is unknown: 0 base, 1 tool, 2 joints",
         Refusal.HOME_MODE: lambda _: "a drive is homed while the drives are in csp: `rtcp mode csp` first",
         Refusal.PLAN_LEAD: lambda _: "no way was found from where the arm is to the plan's first point",
+        Refusal.PLAN_MOVING: lambda m: (
+            f"a path begins at rest, and {names.joint(m.axis)} moves at {number(m.value)} rad/s: stop first"
+        ),
         Refusal.TORQUE_LIMIT: lambda m: (
             f"{names.joint(m.axis)}: torque {number(m.value)} Nm is beyond its limit of {number(m.limit)} Nm "
             f"(joints[{m.axis}].torque in {file})"

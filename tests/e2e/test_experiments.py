@@ -3,66 +3,23 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
+import pytest
 
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file
+from rtcp.config import default_config, load
+from rtcp.runtime.client import ControlClient
+from rtcp.runtime.paths import blackboard_file, control_socket
+from rtcp.telemetry.recording import recording
+from rtcp.telemetry.square import SPEED_M_S, judge, place
 from tests.e2e.conftest import Platform
-
-Array = npt.NDArray[np.float64]
-
-
-@dataclass
-class Recording:
-    """Cycle records of a motion: shape (cycles,) of the blackboard's record type."""
-
-    records: list[npt.NDArray[np.void]] = field(default_factory=list)
-    lost: int = 0
-    period_s: float = 0.0
-
-    def column(self, name: str) -> Array:
-        return np.concatenate([part[name] for part in self.records]).astype(float)
-
-
-@contextmanager
-def recording(platform: Platform) -> Iterator[Recording]:
-    """Record every cycle meanwhile."""
-    observer = Observer(blackboard_file(platform.directory))
-    made = Recording(period_s=observer.period_ns * 1e-9)
-    done = threading.Event()
-    at = observer.head
-
-    def follow() -> None:
-        nonlocal at
-        last = False
-        while not last:
-            last = done.wait(0.2)
-            records, lost = observer.since(at)
-            if len(records):
-                at = int(records[-1]["number"])
-                made.records.append(records)
-                made.lost += lost
-
-    thread = threading.Thread(target=follow)
-    thread.start()
-    try:
-        yield made
-    finally:
-        done.set()
-        thread.join()
-        observer.close()
 
 
 def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform) -> None:
     start = enabled.status()["joints"]["position"]
     target = [start[0] + (1.35 if start[0] < 0.5 else -1.35), *start[1:]]
-    with recording(enabled) as made:
+    with recording(blackboard_file(enabled.directory)) as made:
         enabled.rtcp("move", *(f"{q:.6f}" for q in target), "--speed", "0.2")
     assert made.lost == 0
     commanded, actual = made.column("target")[:, 0], made.column("position")[:, 0]
@@ -73,3 +30,33 @@ def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform)
     assert abs(commanded[-1] - commanded[begun]) > 1.34
     assert settled_s <= 7.5
     assert abs(actual[-1] - target[0]) < 0.0007
+
+
+@pytest.mark.parametrize("plane", ["xy", "yz"])
+def test_a_square_of_200_mm_at_50_mm_s_is_driven_within_1_mm_commanded_and_3_mm_actual(
+    enabled: Platform, plane: str
+) -> None:
+    config = load(default_config())
+    assert config.arm is not None
+    square = place(config, plane)
+    with ControlClient("the experiment", control_socket(enabled.directory)) as client:
+        client.call("move", {"q": list(square.start), "speed": None}, timeout_s=60.0)
+        with recording(blackboard_file(enabled.directory)) as made:
+            client.call("line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
+    driven = judge(config.arm, square, made)
+    commanded, actual = driven.worst
+    assert driven.lost == 0
+    assert commanded < 1e-3
+    assert actual < 3e-3
+    corners = np.array(square.corners)
+    assert max(np.linalg.norm(driven.actual - corner, axis=1).min() for corner in corners) < 3e-3
+    speeds = np.linalg.norm(np.diff(driven.commanded, axis=0), axis=1) / made.period_s
+    assert np.percentile(speeds, 90) == pytest.approx(SPEED_M_S, rel=1e-3)
+
+
+def test_the_demonstration_drives_the_square_and_draws_it(platform: Platform) -> None:
+    platform.be_patient(2000)
+    picture = Path(platform.directory) / "square.png"
+    printed = platform.rtcp("demo", "--square", "yz", "--picture", str(picture)).stdout
+    assert "largest deviation from the square: 0.0" in printed
+    assert picture.read_bytes().startswith(b"\x89PNG")

@@ -71,6 +71,14 @@ def test_no_number_is_no_limit(name: str) -> None:
     assert refused.wrong is Wrong.NO_LIMIT
 
 
+def test_a_joint_at_the_edge_or_at_full_speed_does_not_hinder_what_narrows_neither() -> None:
+    edge = [WIDEST.high[0] + 1e-7, *STILL[1:]]
+    fast = [WIDEST.velocity[0] * (1 + 1e-12), *STILL[1:]]
+    for name in ("velocity", "jerk", "torque"):
+        assert check(replace(WIDEST, **{name: tuple(0.9 * x for x in getattr(WIDEST, name))}), edge) is None
+    assert check(of_first(WIDEST, "torque", 1.0), edge, fast) is None
+
+
 def test_a_joint_that_would_come_to_rest_outside_refuses_the_range_and_one_that_is_too_fast_the_speed() -> None:
     moving = [0.4, *STILL[1:]]
     # From 0.4 rad/s with 2 rad/s^2 the stop takes 0.04 rad.

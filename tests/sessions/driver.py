@@ -10,8 +10,7 @@ from math import inf, nan
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.motion.limits import Values
-from rtcp.runtime.limit_rows import to_rows
+from rtcp.motion.limits import Values, rows
 from rtcp.runtime.machine import Command, State
 from rtcp.virtual.simulation import Frame, Simulation
 from tests.sessions.geometry import Box, depth, points
@@ -143,9 +142,9 @@ class Driver:
 
     def set_limits(self, new: Values) -> bool:
         """Change the limits; the judge knows them from the frame on that is worked out under them."""
-        rows = to_rows(new)
-        slot = self.simulation.observer.write_plan(rows)
-        if not self.order(Command.LIMITS, [slot, len(rows)]):
+        plan = rows(new)
+        slot = self.simulation.observer.write_plan(plan)
+        if not self.order(Command.LIMITS, [slot, len(plan)]):
             return False
         self.limits = new
         bounds = self.bounds
