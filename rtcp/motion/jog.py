@@ -249,7 +249,7 @@ class JogMode:
 
         Returns:
             Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
-            goes towards its speed as fast as it may; so it does, too, where its range leaves no more.
+                goes towards its speed as fast as it may; so it does, too, where its limits leave no more.
         """
         speeds, last, limits = self._speeds, state.velocity, self._limits
         acceleration = limits.acceleration
@@ -260,9 +260,14 @@ class JogMode:
             if change > most or change < -most:
                 together = self._scaled_together(last, step)
                 break
-        q, low, high = state.position, limits.low, limits.high
+        q, low, high, fastest = state.position, limits.low, limits.high, limits.velocity
         for i in range(6):
-            v, rate = speeds[i], acceleration[i]
+            v, rate, most = speeds[i], acceleration[i], fastest[i]
+            if v > most or v < -most:
+                least = abs(last[i]) - step * rate
+                most = max(most, least)
+                speeds[i] = v = most if v > most else -most if v < -most else v
+                together = False
             room = high[i] - q[i] if v > 0.0 else q[i] - low[i]
             if v * v > 1.8 * rate * room:
                 most = stopping(room - _LAST_RAD, rate, dt)

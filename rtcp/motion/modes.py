@@ -8,9 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from math import exp
 from typing import Protocol
 
 from rtcp.config.model import Joint
+
+
+_FADE_S = 0.3
+"""Time constant with which the drive's own following error gives way to the position loop closed here."""
 
 
 class DriveMode(IntEnum):
@@ -65,18 +70,23 @@ class VelocityLaw:
 
     mode = DriveMode.CSV
 
-    def __init__(self, joints: Sequence[Joint]) -> None:
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
         self._gain = [joint.csv_gain for joint in joints]
+        self._keep = exp(-period_s / _FADE_S)
+        self._bias = [0.0] * len(self._gain)
 
     def start(self, drives: Sequence[Commanded]) -> None:
-        """Nothing is kept."""
+        """Begin without a pull: what a drive is away from its target now is taken back little by little."""
+        for i, drive in enumerate(drives):
+            self._bias[i] = drive.target_position - drive.position
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write target velocities (rad/s)."""
-        gain = self._gain
+        gain, bias, keep = self._gain, self._bias, self._keep
         for i, drive in enumerate(drives):
+            bias[i] *= keep
             drive.target_position = position[i]
-            drive.target_velocity = velocity[i] + gain[i] * (position[i] - drive.position)
+            drive.target_velocity = velocity[i] + gain[i] * (position[i] - drive.position - bias[i])
             drive.target_torque = 0.0
 
 
@@ -91,9 +101,11 @@ class TorqueLaw:
         self._integral_step = [joint.cst_integral * period_s for joint in joints]
         self._bound = [joint.torque for joint in joints]
         self._integral = [0.0] * len(self._bound)
+        self._passed = False
 
     def start(self, drives: Sequence[Commanded]) -> None:
         """Begin with the torque that holds the arm now, so that it does not sag on the change."""
+        self._passed = False
         for i, drive in enumerate(drives):
             bound = self._bound[i]
             self._integral[i] = min(max(drive.torque, -bound), bound)
@@ -101,9 +113,10 @@ class TorqueLaw:
     def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
         """Write `torque` (Nm) itself, with nothing about a set-point; `position` (rad) is where the arm is.
 
-        What `update` adds up begins there: it takes over without a step.
+        `update` takes over without a step, wherever its set-point is.
         """
         integral = self._integral
+        self._passed = True
         for i, drive in enumerate(drives):
             bound, wanted = self._bound[i], torque[i]
             integral[i] = bounded = bound if wanted > bound else -bound if wanted < -bound else wanted
@@ -117,6 +130,8 @@ class TorqueLaw:
         for i, drive in enumerate(drives):
             error = position[i] - drive.position
             bound = self._bound[i]
+            if self._passed:
+                integral[i] -= self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
             summed = integral[i] + self._integral_step[i] * error
             integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
             drive.target_position = position[i]
@@ -124,3 +139,4 @@ class TorqueLaw:
             drive.target_torque = (
                 self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity) + summed
             )
+        self._passed = False

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 _RATE_S = 0.1
 """A torque goes from 0 to the joint's largest in no less."""
 _FADE = 0.3
-"""Torque in the direction of motion fades out over the last part of the speed that a joint may have."""
+"""Torque fades out over the last part of the speed that a joint may have in its direction."""
+_FREE = 1.0 - _FADE
 _STILL_RAD_S = 0.01
 _MARGIN_RAD = 0.02
-"""So far inside its range a joint is brought to rest."""
+"""So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
 
 
 class TorqueMode:
@@ -54,6 +55,8 @@ class TorqueMode:
         self._given = [0.0] * n
         self._bias = [0.0] * n
         self._about = [0.0] * n
+        self._extra_low, self._extra_high = [0.0] * n, [0.0] * n
+        """What begins nearer to its edge than the margin is not pushed away from it, rad."""
         self._stiff = self._damped = 0.0
         self._until_ns = 0
         self.direct = False
@@ -72,6 +75,9 @@ class TorqueMode:
             if rests:
                 self._bias[i] = state.torque[i] - carried[i]
             self._given[i] = self._wanted[i] = 0.0
+            q, limits = state.actual[i], self._limits
+            self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
+            self._extra_high[i] = max(0.0, q - limits.high[i] + _MARGIN_RAD)
         self._stiff = self._damped = 0.0
         self._about[:] = state.position
         # A stiffness may be asked for before the first `update`: it is about here, not about an earlier motion's end.
@@ -136,19 +142,20 @@ class TorqueMode:
             change = self._wanted[i] - given[i]
             given[i] += step if change > step else -step if change < -step else change
             pushed = given[i] + self._stiff * self._stiffness[i] * (self._about[i] - q)
-            room = high[i] - q if v > 0.0 else q - low[i]
-            room -= _MARGIN_RAD
-            bound = sqrt(2.0 * slowing[i] * room) if room > 0.0 else 0.0
-            bound = bound if bound < fastest[i] else fastest[i]
-            speed = v if v >= 0.0 else -v
-            if pushed * v > 0.0:
-                left = (bound - speed) / (_FADE * fastest[i])
-                pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
-            beyond = speed - bound * (1.0 - _FADE)
+            above = high[i] - _MARGIN_RAD + self._extra_high[i] - q
+            below = q - low[i] - _MARGIN_RAD + self._extra_low[i]
+            top, slow = fastest[i], slowing[i]
+            up, down = _bound(above, top, slow), _bound(below, top, slow)
+            # Towards the edge nothing is left of a torque, whether the joint moves or stands.
+            left = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
+            pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
             drag = self._damped * v
-            if beyond > 0.0:
-                drag += beyond if v > 0.0 else -beyond
-            whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag
+            if v > up * _FREE:
+                drag += v - up * _FREE
+            elif v < -down * _FREE:
+                drag += v + down * _FREE
+            wall = above if above < 0.0 else -below if below < 0.0 else 0.0
+            whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i], velocity[i] = q, v
         target.position, target.velocity, target.torque = position, velocity, torque
@@ -156,3 +163,9 @@ class TorqueMode:
 
     def _carried(self, position: Sequence[float]) -> Sequence[float]:
         return self._zero if self._model is None else gravity_torques(self._model, position)
+
+
+def _bound(room: float, fastest: float, slowing: float) -> float:
+    """The speed that stops within `room` rad."""
+    bound = sqrt(2.0 * slowing * room) if room > 0.0 else 0.0
+    return bound if bound < fastest else fastest

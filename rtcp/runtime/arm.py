@@ -15,7 +15,6 @@ from rtcp.motion.state import MotionState, Phase
 from rtcp.runtime.gripper import DrivenGripper
 from rtcp.runtime.motions import Motions
 
-MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
 """Drive states without torque and without a fault."""
@@ -58,7 +57,7 @@ class Arm:
         self._torque_law = TorqueLaw(joints, self.period_s)
         self._laws: dict[DriveMode, ModeLaw] = {
             DriveMode.CSP: PositionLaw(),
-            DriveMode.CSV: VelocityLaw(joints),
+            DriveMode.CSV: VelocityLaw(joints, self.period_s),
             DriveMode.CST: self._torque_law,
         }
         self.set_mode(self.motions.drive_mode_of(self.motions.mode))

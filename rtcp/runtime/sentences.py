@@ -127,6 +127,9 @@ class Sentences:
 
     def _position_limit(self, matter: Matter) -> str:
         joint = self._config.axes[matter.axis]
+        if matter.limit not in (joint.position.min, joint.position.max):
+            narrowed = f"{number(matter.limit)} rad, to which its range is narrowed (`rtcp limits show`)"
+            return f"{joint.name}: target {number(matter.value)} rad is beyond {narrowed}"
         return (
             f"{joint.name}: target {number(matter.value)} rad is outside its range "
             f"{joint.position.min:g} to {joint.position.max:g} rad ({self._key(matter)}.position in {self._file})"

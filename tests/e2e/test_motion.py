@@ -121,9 +121,11 @@ def test_a_jogger_that_is_killed_leaves_an_arm_at_rest(bent: Platform) -> None:
 
 def test_a_second_jogger_is_refused_with_the_firsts_name(bent: Platform, client: ControlClient) -> None:
     client.call("jog", {"v": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
-    with ControlClient("another", control_socket(bent.directory)) as other:
-        with pytest.raises(ControlError, match="the arm is commanded by a test") as raised:
-            other.call("jog", {"v": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
+    with (
+        ControlClient("another", control_socket(bent.directory)) as other,
+        pytest.raises(ControlError, match="the arm is commanded by a test") as raised,
+    ):
+        other.call("jog", {"v": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
     assert raised.value.kind == "refused"
 
 
@@ -175,7 +177,7 @@ def test_the_stick_moves_the_arm_and_silence_lets_it_go(bent: Platform, client: 
 
 
 def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> None:
-    moving = bent.background("move", "2.5", *NUMBERS[1:], "--speed", "0.2")
+    moving = bent.background("move", "0.9", *NUMBERS[1:], "--speed", "0.05")
     bent.until_moving()
     bent.rtcp("stick", "estop", "--seconds", "0.3")
     _, trouble = moving.communicate(timeout=20)

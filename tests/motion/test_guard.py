@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 from hypothesis import given
@@ -11,9 +11,13 @@ from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
 from rtcp.motion.guard import Guard
+from rtcp.motion.limits import Limits
+
+from .judge import ARM
 
 PERIOD = 0.0005
 JOINT = Joint("shoulder", "drive", Range(-1.0, 2.0), velocity=0.5, acceleration=2.0, jerk=20.0, torque=10.0)
+CONFIG = replace(ARM, joints=(JOINT,), arm=None)
 STEP = 0.5 * PERIOD
 
 
@@ -29,7 +33,7 @@ class Drive:
 
 
 def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
-    guard = Guard([JOINT], PERIOD)
+    guard = Guard(Limits(CONFIG), PERIOD)
     guard.latch(0, last)
     guard.check([drive])
     return drive, guard.held
@@ -70,7 +74,7 @@ def test_beyond_the_range_speed_only_leads_back() -> None:
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
 def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float], start: float) -> None:
-    guard, drive, before = Guard([JOINT], PERIOD), Drive(), start
+    guard, drive, before = Guard(Limits(CONFIG), PERIOD), Drive(), start
     guard.latch(0, start)
     for target in wanted:
         drive.target_position = target
@@ -78,3 +82,16 @@ def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float
         assert -1.0 <= drive.target_position <= 2.0
         assert abs(drive.target_position - before) <= STEP * (1 + 1e-5)
         before = drive.target_position
+
+
+def test_limits_that_change_are_those_that_count_from_then_on() -> None:
+    limits = Limits(CONFIG)
+    guard, drive = Guard(limits, PERIOD), Drive(target_position=9.0)
+    guard.latch(0, 1.0)
+    limits.apply(replace(limits.widest, high=(0.9,), velocity=(0.1,), torque=(2.0,)))
+    guard.take(limits)
+    drive.target_velocity = drive.target_torque = 99.0
+    guard.check([drive])
+    # Step by step back into the range, at the new speed.
+    assert drive.target_position == pytest.approx(1.0 - 0.1 * PERIOD, abs=1e-9)
+    assert (drive.target_velocity, drive.target_torque) == (0.1, 2.0)

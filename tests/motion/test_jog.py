@@ -1,118 +1,162 @@
-"""Jogging, cycle by cycle, behind the guards and without a loop."""
+"""Jogging far from all limits, in a simulated loop: the mode, then the guards, which never have to cut."""
 
 from __future__ import annotations
 
-from math import dist, hypot, pi
-from pathlib import Path
+import math
+import random
 
 import pytest
 
-from kinematics import forward, frames, singularity_distances
-from rtcp.config import load
-from rtcp.config.model import ArmConfig
-from rtcp.motion.envelope import SetPointGuard, Verdict
-from rtcp.motion.jog import JogMode
-from rtcp.motion.limits import Limits
-from rtcp.motion.nearness import nearness
-from rtcp.motion.state import MotionState, Phase
+from kinematics.forward import forward, frames
+from kinematics.jacobian import jacobian, singularity_distances
+from rtcp.config import default_config, load
+from rtcp.motion.jog_inverse import JogInverse
+from rtcp.motion.state import Phase, Reason
 
-DT = 0.0005
-BENT = [0.3, -0.4, 1.4, 0.2, 0.9, 0.1]
-
-
-class Bench:
-    def __init__(self, config: ArmConfig, q: list[float]) -> None:
-        assert config.arm is not None
-        self.model = config.arm
-        self.limits = Limits(config)
-        self.guards = SetPointGuard(config, self.limits, DT)
-        self.jog = JogMode(config, config.arm, self.limits, self.guards, DT)
-        self.state = MotionState(6)
-        self.state.position = list(q)
-        self.guards.latch(self.state)
-        self.jog.start(self.state)
-        self.verdicts: set[Verdict] = set()
-
-    def run(self, twist: list[float], seconds: float, frame: str = "base") -> list[list[float]]:
-        path = []
-        for _ in range(round(seconds / DT)):
-            self.jog.command(twist, frame)
-            target = self.jog.update(self.state, DT)
-            self.verdicts.add(self.guards.apply(self.state, target, True))
-            path.append(list(self.state.position))
-        return path
-
-    def tool(self) -> tuple[float, float, float]:
-        return forward(self.model, self.state.position).position
+MODEL = load(default_config()).arm
+ZERO = [0.0] * 6
+PERIOD = 0.0005
+BENT = [0.3, 0.2, 1.5, 0.2, 0.9, 0.1]
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+WAYS = [sign + axis for axis in AXES for sign in "+-"]
 
 
-@pytest.fixture
-def config() -> ArmConfig:
-    return load(Path("config/assistive_arm.yaml"))
+def twist_of(ways: str, speed: float = 0.1, turning: float = 0.3) -> list[float]:
+    twist = [0.0] * 6
+    for way in ways.split():
+        axis = AXES.index(way[1:])
+        twist[axis] = (1.0 if way[0] == "+" else -1.0) * (speed if axis < 3 else turning)
+    return twist
 
 
-def along(axis: int, speed: float) -> list[float]:
-    return [speed if i == axis else 0.0 for i in range(6)]
+def off_line(start, direction, point) -> float:
+    size = math.hypot(*direction)
+    along = sum((p - s) * d for p, s, d in zip(point, start, direction, strict=True)) / size
+    return math.hypot(*(p - s - along * d / size for p, s, d in zip(point, start, direction, strict=True)))
 
 
-def test_the_tool_keeps_to_a_straight_line(config: ArmConfig) -> None:
-    bench = Bench(config, BENT)
-    x, y, z = bench.tool()
-    for q in bench.run(along(1, 0.05), 1.0):
-        px, _, pz = forward(bench.model, q).position
-        assert hypot(px - x, pz - z) < 1e-4
-    assert bench.tool()[1] - y > 0.03
+def turned_between(one, other) -> float:
+    trace = sum(a * b for a, b in zip(one.rotation, other.rotation, strict=True))
+    return math.acos(max(-1.0, min(1.0, 0.5 * (trace - 1.0))))
 
 
-@pytest.mark.parametrize("axis", range(6))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_it_comes_to_rest_when_nothing_is_asked_for(config: ArmConfig, axis: int, sign: float) -> None:
-    bench = Bench(config, BENT)
-    bench.run(along(axis, sign * 0.1), 4.0)
-    bench.run([0.0] * 6, 1.5)
-    assert bench.jog.phase is Phase.HOLD
-    assert max(map(abs, bench.state.velocity)) == 0.0
+@pytest.mark.parametrize("speed", [0.1, 0.25])
+@pytest.mark.parametrize("ways", ["+x", "-x", "+y", "-y", "+z", "-z", "+x +y", "-y -z"])
+def test_the_tool_keeps_to_its_straight_line_and_to_its_direction(jogged, ways, speed):
+    drive = jogged(BENT)
+    pose = forward(MODEL, BENT)
+    twist = twist_of(ways, speed)
+    drive.run(twist, 1.0)
+    drive.until_rest()
+    drive.path.append(drive.tool)
+    assert math.dist(drive.tool, pose.position) > 0.09
+    assert max(off_line(pose.position, twist[:3], point) for point in drive.path) < 2e-6
+    assert turned_between(pose, forward(MODEL, drive.state.position)) < 2e-6
+
+
+@pytest.mark.parametrize("ways", ["+rx", "-rx", "+ry", "-ry", "+rz", "-rz", "+rx -rz"])
+@pytest.mark.parametrize("frame", ["base", "tool"])
+def test_a_turn_leaves_the_tool_where_it_is(jogged, ways, frame):
+    drive = jogged(BENT).run(twist_of(ways), 1.5, frame)
+    drive.until_rest()
+    assert math.dist(drive.tool, forward(MODEL, BENT).position) < 2e-6
+    assert turned_between(forward(MODEL, BENT), forward(MODEL, drive.state.position)) > 0.3
 
 
 @pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_it_stays_out_of_singularities_and_boxes_and_comes_back(config: ArmConfig, axis: int, sign: float) -> None:
-    bench = Bench(config, BENT)
-    least = config.cartesian.singularity
-    for q in bench.run(along(axis, sign * 0.1), 9.0)[::50]:
-        shoulder, elbow, wrist = nearness(frames(bench.model, q))
-        assert shoulder > least.shoulder - 1e-3
-        assert elbow > least.elbow - 2e-3
-        assert wrist > least.wrist - 2e-3
-    bench.run([0.0] * 6, 1.5)
-    before = bench.tool()
-    bench.jog.start(bench.state)
-    bench.run(along(axis, -sign * 0.1), 2.0)
-    assert -sign * (bench.tool()[axis] - before[axis]) > 0.05
-    assert not bench.verdicts & {Verdict.STOPPING, Verdict.STOPPED}
+def test_in_the_frame_of_the_tool_the_line_is_along_the_tools_axis(jogged, axis):
+    drive = jogged(BENT)
+    rotation = forward(MODEL, BENT).rotation
+    start = drive.tool
+    twist = [0.05 if i == axis else 0.0 for i in range(6)]
+    drive.run(twist, 1.0, "tool")
+    direction = [rotation[3 * row + axis] for row in range(3)]
+    assert max(off_line(start, direction, point) for point in drive.path) < 2e-6
+    assert sum((b - a) * d for a, b, d in zip(start, drive.tool, direction, strict=True)) > 0.03
 
 
-def test_from_straight_up_it_can_be_led_down(config: ArmConfig) -> None:
-    bench = Bench(config, [0.0] * 6)
-    bench.run(along(2, -0.1), 3.0)
-    assert bench.tool()[2] < 1.25
+def test_at_full_deflection_the_tool_has_the_speed_that_is_asked_for(jogged):
+    drive = jogged(BENT).run(twist_of("+z"), 1.0)
+    before = drive.tool
+    drive.run(twist_of("+z"), 0.1)
+    assert math.dist(before, drive.tool) == pytest.approx(0.01, rel=1e-6)
 
 
-def test_from_straight_up_it_does_not_move_where_it_cannot(config: ArmConfig) -> None:
-    bench = Bench(config, [0.0] * 6)
-    bench.run(along(2, 0.1), 1.0)
-    assert dist(bench.tool(), (0.0, 0.0, 1.3)) < 1e-3
+def test_no_command_makes_the_tool_faster_than_250_mm_a_second(jogged):
+    drive = jogged(BENT)
+    fastest = 0.0
+    for _ in range(120):
+        before = drive.tool
+        drive.run([0.25, 0.25, -0.25, 0.0, 0.0, 0.0], 0.01)
+        fastest = max(fastest, math.dist(before, drive.tool) / 0.01)
+    assert 0.1 < fastest < 0.2501
 
 
-def test_a_stop_is_not_taken_back(config: ArmConfig) -> None:
-    bench = Bench(config, BENT)
-    bench.run(along(1, 0.05), 0.5)
-    bench.jog.stop(bench.state)
-    bench.run(along(1, 0.05), 1.0)
-    assert bench.jog.phase is Phase.HOLD
+@pytest.mark.parametrize("ways", WAYS)
+@pytest.mark.parametrize("after", [0.02, 0.3, 1.5])
+def test_released_it_comes_to_rest_within_eight_tenths_of_a_second(jogged, ways, after):
+    drive = jogged(BENT).run(twist_of(ways, 0.25, 0.5), after)
+    assert not drive.still
+    assert drive.until_rest() < 0.8
 
 
-def test_nearness_is_what_the_kinematics_says(config: ArmConfig) -> None:
-    assert config.arm is not None
-    for q in (BENT, [0.0] * 6, [0.0, 0.0, pi / 2, 0.0, 0.4, 0.0], [1.0, -1.0, -2.0, 0.5, -1.2, 2.0]):
-        assert nearness(frames(config.arm, q)) == pytest.approx(singularity_distances(config.arm, q)[:3], abs=1e-9)
+def test_a_stop_that_is_under_way_is_not_taken_back_by_a_command(jogged):
+    drive = jogged(BENT).run(twist_of("+z"), 1.0)
+    drive.jog.stop(drive.state)
+    for _ in range(round(0.8 / PERIOD)):
+        drive.jog.command(twist_of("+z"), "base")
+        drive.cycle()
+    assert drive.jog.phase is Phase.HOLD
+    assert drive.jog.reason is Reason.NONE
+
+
+def test_a_command_counts_until_its_instant_and_not_longer(jogged):
+    drive = jogged(BENT)
+    drive.jog.start(drive.state)
+    drive.jog.command(twist_of("+z"), "base", 500_000_000)
+    while drive.state.now_ns < 500_000_000:
+        drive.cycle()
+    assert drive.jog.phase is Phase.MOVE
+    for _ in range(round(0.6 / PERIOD)):
+        drive.cycle()
+    assert drive.jog.phase is Phase.HOLD
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e300])
+def test_a_command_that_is_no_number_stops(jogged, number):
+    drive = jogged(BENT).run(twist_of("+z"), 0.5)
+    drive.run([0.0, number, 0.0, 0.0, 0.0, 0.0], 1.0)
+    assert drive.still
+
+
+def test_started_while_the_arm_moves_it_goes_on_without_a_jump(jogged):
+    drive = jogged(BENT).run(twist_of("+x"), 0.5)
+    drive.jog.start(drive.state)
+    drive.run(twist_of("+x"), 0.5)
+    drive.until_rest()
+
+
+def test_the_inverse_and_the_distances_are_those_of_the_kinematics():
+    chance = random.Random(3)
+    inverse = JogInverse(MODEL)
+    for _ in range(300):
+        q = [chance.uniform(limit.lower, limit.upper) for limit in MODEL.limits]
+        poses = frames(MODEL, q)
+        assert inverse.at(poses)
+        if any(inverse.locked):
+            continue
+        columns = list(zip(*jacobian(MODEL, q), strict=True))
+        for i, row in enumerate(inverse.rows):
+            for k, column in enumerate(columns):
+                assert sum(a * b for a, b in zip(row, column, strict=True)) == pytest.approx(float(i == k), abs=1e-9)
+        told = singularity_distances(MODEL, q)[:3]
+        assert inverse.distance[0] == pytest.approx(told[0], abs=1e-12)
+        assert min(inverse.distance[1], math.pi - inverse.distance[1]) == pytest.approx(told[1], abs=1e-12)
+        assert inverse.distance[2] == pytest.approx(told[2], abs=1e-9)
+        speeds = [chance.uniform(-1.0, 1.0) for _ in range(6)]
+        twist = [sum(v * column[k] for v, column in zip(speeds, columns, strict=True)) for k in range(6)]
+        rates = [sum(a * b for a, b in zip(row, twist, strict=True)) for row in inverse.rate]
+        before = list(inverse.distance)
+        inverse.at(frames(MODEL, [a + 1e-7 * v for a, v in zip(q, speeds, strict=True)]))
+        for old, new, rate in zip(before, inverse.distance, rates, strict=True):
+            assert (new - old) / 1e-7 == pytest.approx(rate, abs=1e-4)

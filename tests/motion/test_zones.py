@@ -61,7 +61,7 @@ def test_the_points_that_are_watched_are_where_the_table_of_the_facts_puts_them(
     dt=CYCLES_S,
     legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40), st.booleans()), min_size=1, max_size=4),
 )
-@settings(max_examples=60)
+@settings(max_examples=250)
 def test_who_began_free_never_enters_a_keep_out_box(
     q: Sequence[float],
     which: int,
@@ -88,7 +88,7 @@ def test_who_began_free_never_enters_a_keep_out_box(
     dt=CYCLES_S,
     legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40), st.booleans()), min_size=1, max_size=4),
 )
-@settings(max_examples=25)
+@settings(max_examples=100)
 def test_who_began_inside_its_box_never_leaves_it(
     q: Sequence[float], gaps: Sequence[float], dt: float, legs: list[tuple[list[float], int, bool]]
 ) -> None:
@@ -116,7 +116,7 @@ def test_who_began_inside_a_keep_out_box_only_moves_outward(
         driven(judge, direction, cycles)
 
 
-@pytest.mark.parametrize("dt", [0.001, 0.01])
+@pytest.mark.parametrize("dt", [0.002, 0.01])
 @pytest.mark.parametrize("gap", [-0.03, -1e-3, 0.0, 1e-3])
 @pytest.mark.parametrize("part", [1.0, 0.1])
 def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, part: float) -> None:
@@ -126,11 +126,11 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     # Joint 1 moves the tool along y; the box begins beside it.
     box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
     judge = Judge(with_boxes(WIDE, box), q, dt)
-    while points(judge.state.position)[0][1] < tool[1] + 0.05:
+    while points(judge.state.position)[0][1] < box[4] + 0.01:
         assert driven(judge, away, 1)[0] <= Verdict.CLAMPED
     # And the way back in ends before the box.
-    verdicts = driven(judge, [-part for part in away], round(3.0 / dt))
-    assert Verdict.STOPPED in verdicts
+    while driven(judge, [-part for part in away], 1)[0] is not Verdict.STOPPED:
+        assert points(judge.state.position)[0][1] > box[4]
     assert judge.guard.code is Reason.KEEP_OUT
     assert judge.guard.axis == 0
     here = -depth(points(judge.state.position)[0], box)

@@ -214,9 +214,10 @@ def test_limits_are_changed_all_at_once_and_shown(client: ControlClient, loop: L
     assert shown["limits"] == shown["configured"]
     client.call("limits", {"set": {"joint2.max": 1.0, "joints.velocity": 0.4, "user.max.z": 0.9}})
     (rows,) = loop.plans
-    assert rows[1][:JOINTS] == [3.1, 1.0, 2.4, 3.1, 2.0, 3.1]
-    assert rows[2][:JOINTS] == [0.4] * JOINTS
-    assert rows[7][:6] == [0.42, -0.35, -0.1, 1.1, 0.35, 0.9]
+    joints, boxes = rows[1 : 1 + JOINTS], rows[1 + JOINTS :]
+    assert [joint[1] for joint in joints] == [3.1, 1.0, 2.4, 3.1, 2.0, 3.1]
+    assert [joint[2] for joint in joints] == [0.4] * JOINTS
+    assert boxes[1][:6] == [0.42, -0.35, -0.1, 1.1, 0.35, 0.9]
     assert client.call("limits")["limits"]["max"][1] == 1.0
     client.call("limits", {"set": {"joint2.max": 2.0, "joints.velocity": 0.5, "user.max.z": 0.85}})
     assert client.call("limits")["limits"] == shown["limits"]

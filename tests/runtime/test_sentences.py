@@ -39,6 +39,11 @@ def test_a_position_outside_its_range_is_told_with_joint_value_range_and_key() -
     assert said == "joint2: target 9 rad is outside its range -2 to 2 rad (joints[1].position in assistive_arm.yaml)"
 
 
+def test_a_position_outside_a_narrowed_range_is_told_with_the_limit_in_force() -> None:
+    said = SENTENCES.refusal(Refusal.POSITION_LIMIT, 0, 0.7, 0.5)
+    assert said == "joint1: target 0.7 rad is beyond 0.5 rad, to which its range is narrowed (`rtcp limits show`)"
+
+
 def test_a_command_in_the_wrong_state_is_told_with_the_right_ones() -> None:
     said = SENTENCES.refusal(Refusal.NOT_IN_THIS_STATE, State.READY, Command.MOVE, 0.0)
     assert said == "move is not possible while ready; it is while: holding, moving"

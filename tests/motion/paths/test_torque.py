@@ -1,0 +1,257 @@
+"""The mode `torque`: what is asked for on top of gravity, and what its bounds leave of it, on simulated joints."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from kinematics.model import LinkMass
+from rtcp.motion.envelope import SetPointGuard
+from rtcp.motion.limits import Limits
+from rtcp.motion.modes import TorqueLaw
+from rtcp.motion.state import MotionState, Phase, Reason
+from rtcp.motion.torque import TorqueMode
+
+PERIOD = 0.0005
+MASS, ARM_M, G = 3.0, 0.4, 9.80665
+INERTIA = (1.2, 1.5, 0.8, 0.4, 0.2, 0.08)
+"""kg m^2, of each joint with what it carries, and the rotor."""
+FREE = [0.0] * 6
+
+
+@dataclass
+class Joint:
+    """What the law sees of a drive."""
+
+    position: float = 0.0
+    velocity: float = 0.0
+    torque: float = 0.0
+    target_position: float = 0.0
+    target_velocity: float = 0.0
+    target_torque: float = 0.0
+
+
+class Plant:
+    """Six joints without friction; one link hangs on joint 2: its weight's potential is m g r cos(q2)."""
+
+    def __init__(self, arm: Any, q: Sequence[float] = FREE, payload: float = 0.0) -> None:
+        no_mass, link = LinkMass(0.0, (0.0, 0.0, 0.0)), LinkMass(MASS, (ARM_M, 0.0, 0.0))
+        model = replace(arm.arm, links=(no_mass, link, no_mass, no_mass, no_mass, no_mass))
+        self.weight = (MASS + payload) * G * ARM_M
+        self.joints = [Joint(position=angle, torque=t) for angle, t in zip(q, self.holding(q), strict=True)]
+        self.limits = Limits(arm)
+        self.state = MotionState(6)
+        self.state.position, self.state.actual = list(q), list(q)
+        self.state.torque = self.holding(q)
+        self.guard = SetPointGuard(replace(arm, arm=None), self.limits, PERIOD)
+        self.guard.latch(self.state)
+        self.law = TorqueLaw(arm.joints, PERIOD)
+        self.law.start(self.joints)
+        self.mode = TorqueMode(arm.joints, self.limits, PERIOD, model)
+        self.seen: list[tuple[list[float], list[float], list[float]]] = []
+        """Position, speed and torque of all joints after each cycle."""
+
+    def holding(self, q: Sequence[float]) -> list[float]:
+        return [0.0, -self.weight * math.sin(q[1]), 0.0, 0.0, 0.0, 0.0]
+
+    def cycle(self) -> None:
+        state, joints = self.state, self.joints
+        target = self.mode.update(state, PERIOD)
+        self.guard.apply(state, target, self.mode.clamps)
+        if self.mode.direct:
+            self.law.pass_on(state.position, target.torque, joints)
+        else:
+            self.law.update(state.position, state.velocity, joints)
+        held = self.holding([joint.position for joint in joints])
+        for i, joint in enumerate(joints):
+            joint.torque = joint.target_torque
+            joint.velocity += (joint.torque - held[i]) / INERTIA[i] * PERIOD
+            joint.position += joint.velocity * PERIOD
+        state.actual = [joint.position for joint in joints]
+        state.speed = [joint.velocity for joint in joints]
+        state.torque = [joint.torque for joint in joints]
+        state.now_ns += round(PERIOD * 1e9)
+        self.seen.append((list(state.actual), list(state.speed), list(state.torque)))
+
+    def run(self, seconds: float, torques: Sequence[float] | None = None, **given: float) -> None:
+        """So long, with a command said again every 50 ms."""
+        for k in range(round(seconds / PERIOD)):
+            if torques is not None and k % 100 == 0:
+                self.mode.command(torques, 0.2, self.state.now_ns, **given)
+            self.cycle()
+
+    def check(self) -> None:
+        """Torque within its limit, speed within 5 %, position inside the range; in every cycle."""
+        limits = self.limits
+        for positions, speeds, torques in self.seen:
+            for i in range(6):
+                assert abs(torques[i]) <= limits.torque[i] * (1 + 1e-9), i
+                assert abs(speeds[i]) <= 1.05 * limits.velocity[i], (i, speeds[i])
+                assert limits.low[i] <= positions[i] <= limits.high[i], (i, positions[i])
+
+    def largest_step(self, since: int = 1) -> float:
+        """Nm that the torque of any joint changed by in a cycle."""
+        torques = [torque for _, _, torque in self.seen]
+        return max(
+            abs(b - a)
+            for before, after in zip(torques[since - 1 :], torques[since:], strict=False)
+            for a, b in zip(before, after, strict=True)
+        )
+
+
+@pytest.fixture
+def plant(arm: Any) -> Plant:
+    return Plant(arm, [0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(scope="session")
+def new_plant(arm: Any) -> Callable[..., Plant]:
+    return lambda *given, **more: Plant(arm, *given, **more)
+
+
+@pytest.mark.parametrize("angle", [-1.5, 0.5, 1.2])
+def test_without_a_torque_asked_for_the_arm_floats_where_it_is(new_plant: Any, angle: float) -> None:
+    plant = new_plant([0.0, angle, 0.0, 0.0, 0.0, 0.0])
+    plant.mode.start(plant.state)
+    plant.run(1.0, FREE)
+    assert plant.state.actual == pytest.approx([0.0, angle, 0.0, 0.0, 0.0, 0.0], abs=1e-6)
+    assert plant.state.torque[1] == pytest.approx(-MASS * G * ARM_M * math.sin(angle))
+
+
+def test_gravity_is_carried_wherever_the_arm_is_pushed_to(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(0.5, [0.0, 2.0, 0.0, 0.0, 0.0, 0.0])
+    plant.run(1.0, [0.0, -2.0, 0.0, 0.0, 0.0, 0.0])
+    for (before, _, _), (_, _, torques) in zip(plant.seen, plant.seen[1:], strict=False):
+        gravity = -MASS * G * ARM_M * math.sin(before[1])
+        assert abs(torques[1] - gravity) <= 2.0 + 60.0 * 0.3 * 0.5 + 1e-6
+    moved = [positions[1] for positions, _, _ in plant.seen]
+    assert max(moved) > 0.6
+    plant.check()
+
+
+def test_a_weight_that_the_model_does_not_know_is_held_at_the_start(new_plant: Any) -> None:
+    plant = new_plant([0.0, 1.0, 0.0, 0.0, 0.0, 0.0], payload=1.0)
+    plant.mode.start(plant.state)
+    plant.run(0.5, FREE)
+    assert plant.state.actual[1] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_torque_accelerates_as_the_inertia_says(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(0.2, [1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    # 1 rad/s^2, but for the ramp of the torque: 1.2 of 49 Nm in 2.4 ms.
+    assert plant.state.speed[0] == pytest.approx(0.2, abs=0.003)
+
+
+def test_the_torque_asked_for_rises_no_faster_than_to_its_limit_in_a_tenth_of_a_second(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.cycle()
+    plant.run(0.02, plant.limits.torque)
+    assert plant.largest_step() <= 49.0 * PERIOD / 0.1 * 1.2
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sign: float) -> None:
+    plant.mode.start(plant.state)
+    # Against the edge of the range, and on against it.
+    plant.run(9.0, [sign * torque for torque in plant.limits.torque])
+    plant.check()
+    edges = plant.limits.high if sign > 0 else plant.limits.low
+    assert plant.state.actual == pytest.approx(edges, abs=0.03)
+    assert max(map(abs, plant.state.speed)) < 1e-3
+    assert max(abs(speeds[0]) for _, speeds, _ in plant.seen) > 0.45
+    # From the edge a torque leads back.
+    plant.run(1.0, [-sign * torque for torque in plant.limits.torque])
+    assert all(abs(q - edge) > 0.1 for q, edge in zip(plant.state.actual, edges, strict=True))
+    plant.check()
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 10**6))
+def test_no_torques_whatever_break_a_bound(new_plant: Any, seed: int) -> None:
+    chance = random.Random(seed)
+    limits = new_plant().limits
+    ends = list(zip(limits.low, limits.high, strict=True))
+    plant = new_plant([chance.uniform(low + 0.03, high - 0.03) for low, high in ends])
+    plant.mode.start(plant.state)
+    for _ in range(6):
+        asked = [chance.choice((-1.0, 1.0, chance.uniform(-1.0, 1.0))) * torque for torque in limits.torque]
+        plant.run(chance.uniform(0.02, 0.8), asked, stiffness=chance.choice((0.0, 1.0)), damping=chance.random())
+    plant.check()
+
+
+def test_it_ends_by_itself_when_it_is_not_said_again(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(0.3, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    plant.run(0.1)
+    assert plant.mode.phase is Phase.MOVE
+    plant.run(1.5)
+    assert (plant.mode.phase, plant.mode.reason, plant.mode.direct) == (Phase.HOLD, Reason.COMMAND_ENDED, False)
+    assert max(map(abs, plant.state.speed)) < 2e-3
+    plant.check()
+
+
+def test_the_law_of_cst_takes_over_and_gives_back_without_a_step(plant: Plant) -> None:
+    plant.run(0.1)
+    handed = len(plant.seen)
+    plant.mode.start(plant.state)
+    plant.run(0.3, [2.0, -1.0, 0.5, 0.0, 0.0, 0.0])
+    plant.mode.stop(plant.state)
+    assert not plant.mode.direct
+    plant.run(1.5)
+    plant.mode.start(plant.state)
+    plant.run(0.2, FREE)
+    # The ramp of what is asked for is 0.25 Nm a cycle at most; the law follows its set-point's deceleration.
+    assert plant.largest_step(handed) < 0.4
+    plant.check()
+
+
+def test_a_law_whose_set_point_is_elsewhere_takes_over_without_a_step(plant: Plant) -> None:
+    """As after a blow that the guards let the set-point follow only slowly."""
+    joint = plant.joints
+    plant.law.pass_on([0.05] * 6, [3.0] * 6, joint)
+    plant.law.update([0.05] * 6, [0.2] * 6, joint)
+    for i in range(6):
+        assert joint[i].target_torque == pytest.approx(3.0, abs=0.05)
+
+
+def test_stiffness_holds_the_arm_about_where_it_was_asked_for(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(2.0, [6.0, 0.0, 0.0, 0.0, 0.0, 0.0], stiffness=0.5, damping=1.0)
+    # 6 Nm on half of 600 Nm/rad.
+    assert plant.state.actual[0] == pytest.approx(0.02, rel=0.02)
+    plant.check()
+
+
+def test_damping_slows_a_motion_down(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(2.0, [6.0, 0.0, 0.0, 0.0, 0.0, 0.0], damping=1.0)
+    assert plant.state.speed[0] == pytest.approx(6.0 / 60.0, rel=0.05)
+
+
+def test_beside_the_edge_it_begins_without_a_push(new_plant: Any) -> None:
+    plant = new_plant([3.09, 0.5, -2.395, 0.0, 0.0, 0.0])
+    before = list(plant.state.torque)
+    plant.mode.start(plant.state)
+    plant.cycle()
+    assert plant.state.torque == pytest.approx(before, abs=0.01)
+    plant.run(1.0, plant.limits.torque)
+    plant.check()
+
+
+def test_while_it_stops_no_torque_is_taken(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    plant.run(0.2, [1.0] * 6)
+    plant.mode.stop(plant.state)
+    plant.mode.command(plant.limits.torque, 1.0, plant.state.now_ns)
+    plant.run(1.0)
+    assert plant.mode.phase is Phase.HOLD
+    plant.check()

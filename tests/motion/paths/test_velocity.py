@@ -1,0 +1,131 @@
+"""The mode `velocity`: ramps, limits, the edges of a range, and that a speed has to be said again."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtcp.motion.state import Phase, Reason
+from rtcp.motion.velocity import VelocityMode
+
+PERIOD = 0.0005
+NONE = [0.0] * 6
+
+
+@pytest.fixture
+def mode(bounds: Any) -> VelocityMode:
+    return VelocityMode(bounds, PERIOD)
+
+
+def test_a_speed_is_reached_by_a_ramp_of_acceleration_and_jerk(new_drive: Any) -> None:
+    drive = new_drive(with_jerk=True)
+    mode = VelocityMode(drive.limits, PERIOD)
+    mode.start(drive.state)
+    mode.command([0.4, -0.2, 0.0, 0.1, 0.3, -0.4], 1.0, 0)
+    # v / a + a / j = 0.4 / 2 + 2 / 20 s for the fastest.
+    drive.run(mode, 598)
+    assert drive.state.velocity[0] < 0.4
+    drive.run(mode, 4)
+    assert drive.state.velocity == pytest.approx([0.4, -0.2, 0.0, 0.1, 0.3, -0.4], abs=1e-9)
+    # Half way up the ramp it has the whole acceleration, and no joint waits for another.
+    assert (drive.path[300][0] - 2 * drive.path[299][0] + drive.path[298][0]) / PERIOD**2 == pytest.approx(2.0, rel=1e-3)
+    assert mode.phase is Phase.MOVE
+
+
+def test_a_speed_beyond_the_limit_is_cut_to_it(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    mode.command([9.0, -9.0, 0.0, 0.0, 0.0, 0.0], 1.0, 0)
+    drive.run(mode, 1500)
+    assert drive.state.velocity[:2] == pytest.approx([0.5, -0.5])
+
+
+def test_a_speed_that_is_not_said_again_ends_in_a_stop(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    for k in range(4):
+        mode.command([0.3] * 6, 0.5, drive.state.now_ns)
+        drive.run(mode, 600 + 100 * k)
+        assert mode.phase is Phase.MOVE
+    assert drive.state.velocity == pytest.approx([0.3] * 6)
+    # 0.05 s are left of the last one, then the ramp: v / a + a / j.
+    assert drive.until_rest(mode) == pytest.approx(0.05 + 0.3 / 2.0 + 2.0 / 20.0, abs=0.01)
+    assert mode.reason is Reason.COMMAND_ENDED
+
+
+def test_standing_still_it_ends_without_a_reason(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    mode.command(NONE, 0.1, 0)
+    drive.run(mode, 300)
+    assert (mode.phase, mode.reason) == (Phase.HOLD, Reason.NONE)
+    assert drive.state.position == NONE
+
+
+def test_a_stop_ramps_down_and_takes_no_speeds_until_a_new_start(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    mode.command([0.5] * 6, 1.0, 0)
+    drive.run(mode, 1000)
+    mode.stop(drive.state)
+    mode.command([0.5] * 6, 1.0, drive.state.now_ns)
+    assert drive.until_rest(mode) == pytest.approx(0.5 / 2.0 + 2.0 / 20.0, abs=0.005)
+    assert mode.reason is Reason.NONE
+    mode.start(drive.state)
+    mode.command([-0.1] * 6, 1.0, drive.state.now_ns)
+    drive.run(mode, 500)
+    assert drive.state.velocity == pytest.approx([-0.1] * 6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("speed", [0.05, 0.5])
+def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
+    drive: Any, mode: VelocityMode, sign: float, speed: float
+) -> None:
+    edges = drive.limits.high if sign > 0 else drive.limits.low
+    start = [edge - sign * 0.1 for edge in edges]
+    drive.at(start)
+    mode.start(drive.state)
+    for _ in range(25):
+        mode.command([sign * speed] * 6, 0.5, drive.state.now_ns)
+        drive.run(mode, 200)
+    assert drive.state.position == pytest.approx(edges, abs=2e-3)
+    assert max(map(abs, drive.state.velocity)) < 0.01
+    assert mode.phase is Phase.MOVE
+    mode.command([-sign * speed] * 6, 0.5, drive.state.now_ns)
+    drive.run(mode, 1000)
+    assert drive.state.velocity == pytest.approx([-sign * speed] * 6)
+
+
+def test_the_other_joints_go_on_while_one_stands_at_its_edge(drive: Any, mode: VelocityMode) -> None:
+    drive.at([3.05, 0.0, 0.0, 0.0, 0.0, 0.0])
+    mode.start(drive.state)
+    for _ in range(6):
+        mode.command([0.4] * 6, 0.5, drive.state.now_ns)
+        drive.run(mode, 300)
+    assert drive.state.velocity[1:] == pytest.approx([0.4] * 5)
+
+
+def test_narrower_limits_count_from_the_next_cycle_on(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    drive.limits.high[0] = 0.1
+    for _ in range(8):
+        mode.command([0.5] * 6, 0.5, drive.state.now_ns)
+        drive.run(mode, 250)
+    assert drive.state.position[0] == pytest.approx(0.1, abs=2e-3)
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 10**6))
+def test_no_speeds_whatever_break_a_limit(new_drive: Any, seed: int) -> None:
+    chance, drive = random.Random(seed), new_drive()
+    drive.at([chance.uniform(low, high) for low, high in zip(drive.limits.low, drive.limits.high, strict=True)])
+    mode = VelocityMode(drive.limits, PERIOD)
+    mode.start(drive.state)
+    for _ in range(25):
+        mode.command([chance.uniform(-0.6, 0.6) for _ in range(6)], chance.choice((0.02, 0.5)), drive.state.now_ns)
+        drive.run(mode, chance.randint(1, 300))
+        if mode.phase is Phase.HOLD:
+            mode.start(drive.state)
+    mode.stop(drive.state)
+    drive.until_rest(mode)

@@ -1,0 +1,202 @@
+"""Jogging into limits, boxes and singularities and away from them: the mode stops by itself, the guards never cut."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+
+from kinematics.forward import forward
+from kinematics.jacobian import jacobian
+from rtcp.config import default_config, load
+from rtcp.motion.state import Phase
+
+ARM = load(default_config())
+MODEL = ARM.arm
+BOX = ARM.cartesian.box
+ZERO = [0.0] * 6
+BENT = [0.3, 0.2, 1.5, 0.2, 0.9, 0.1]
+NEAREST = (ARM.cartesian.singularity.shoulder, ARM.cartesian.singularity.elbow, ARM.cartesian.singularity.wrist)
+STANDOFF = 0.008
+# Where the tool comes to each wall, and along which axis.
+WALLS = [
+    ([0.1, -1.35, 0.35, 0.2, 0.8, 0.0], 0, -1), ([2.6, -1.0, 0.6, 0.2, 0.9, 0.0], 0, 1),
+    ([1.4, -1.0, 0.6, 0.2, 0.9, 0.0], 1, -1), ([-1.4, -1.0, 0.6, 0.2, 0.9, 0.0], 1, 1),
+    ([0.3, -0.9, 1.3, 0.1, 1.6, 0.0], 2, -1), ([0.2, 0.0, 0.4, 0.1, -0.9, 0.0], 2, 1),
+]  # fmt: skip
+
+
+def along(axis: int, sign: float, speed: float = 0.25) -> list[float]:
+    return [sign * speed if i == axis else 0.0 for i in range(6)]
+
+
+def of_joints(q: list[float], speeds: list[float]) -> list[float]:
+    """The tool velocity of joint speeds, brought down to what may be asked for."""
+    twist = [sum(a * v for a, v in zip(row, speeds, strict=True)) for row in jacobian(MODEL, q)]
+    part = min(1.0, 0.2 / (math.hypot(*twist[:3]) + 1e-9), 0.4 / (math.hypot(*twist[3:]) + 1e-9))
+    return [part * component for component in twist]
+
+
+@pytest.mark.parametrize(("q", "axis", "sign"), WALLS)
+@pytest.mark.parametrize("across", [0, 1])
+def test_before_a_wall_of_the_box_the_tool_stops_slides_and_comes_away(jogged, q, axis, sign, across):
+    drive = jogged(q)
+    twist = along(axis, sign)
+    if across:
+        # Both at once: what leads into the wall is taken away and the other goes on.
+        twist[(axis + 1) % 3] = 0.05 * (-1.0 if drive.tool[(axis + 1) % 3] > 0.0 else 1.0)
+    drive.run(twist, 5.0)
+    assert drive.least_distance > STANDOFF - 1e-3
+    drive.until_rest()
+    before = drive.tool
+    drive.run(along(axis, -sign), 1.0)
+    assert (drive.tool[axis] - before[axis]) * -sign > 0.02
+    drive.until_rest()
+
+
+@pytest.mark.parametrize(
+    ("q", "axis", "sign"),
+    [
+        ([2.7, 0.3, 1.6, 0.1, 1.6, 0.0], 0, 1),
+        ([2.0, 0.2, 1.9, 0.1, 1.0, 0.0], 0, 1),
+        ([1.9, -0.6, 1.6, 0.0, 1.2, 0.0], 0, 1),
+        ([-2.0, -0.6, 1.6, 0.0, 1.2, 0.0], 1, -1),
+        ([2.6, 0.1, 1.2, 0.1, 1.0, 0.0], 2, -1),
+    ],
+)
+@pytest.mark.parametrize("speed", [0.1, 0.25])
+def test_before_the_user_and_the_chair_the_arm_stops_and_comes_away(jogged, q, axis, sign, speed):
+    drive = jogged(q)
+    assert drive.distance() > 0.02
+    drive.run(along(axis, sign, speed), 6.0)
+    assert drive.least_distance > STANDOFF - 2e-3
+    drive.until_rest()
+    before = drive.tool
+    drive.run(along(axis, -sign, speed), 1.0)
+    assert (drive.tool[axis] - before[axis]) * -sign > 0.02
+
+
+def test_along_a_wall_the_tool_slides_on(jogged):
+    q, axis, sign = WALLS[5]
+    drive = jogged(q).run(along(axis, sign), 3.0)
+    wall = BOX.max[2]
+    assert wall - drive.tool[2] == pytest.approx(STANDOFF, abs=1e-3)
+    before = drive.tool
+    drive.run([-0.05, 0.0, 0.1, 0.0, 0.0, 0.0], 1.5)
+    assert before[0] - drive.tool[0] > 0.03
+    assert wall - drive.tool[2] > STANDOFF - 1e-3
+
+
+@pytest.mark.parametrize("joint", range(6))
+@pytest.mark.parametrize("side", [-1, 1])
+def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side):
+    q = list(BENT)
+    limit = MODEL.limits[joint]
+    q[joint] = (limit.upper if side > 0 else limit.lower) - 0.3 * side
+    drive = jogged(q)
+    if drive.distance() < 0.05:
+        q[1], q[2] = (q[1], 0.9) if joint != 2 else (-0.2, q[2])
+        drive = jogged(q)
+    for _ in range(30):
+        drive.run(of_joints(drive.state.position, [0.3 * side if i == joint else 0.0 for i in range(6)]), 0.1)
+    drive.until_rest()
+    reached = drive.state.position[joint]
+    assert limit.lower <= reached <= limit.upper
+    drive.run(of_joints(drive.state.position, [-0.3 * side if i == joint else 0.0 for i in range(6)]), 0.7)
+    assert (drive.state.position[joint] - reached) * -side > 0.02
+    drive.until_rest()
+
+
+@pytest.mark.parametrize(
+    ("which", "q", "axis", "sign"),
+    [
+        (0, [0.0, 0.6, 1.4, 0.0, 1.2, 0.0], 0, 1),
+        (0, [0.2, 0.6, 1.4, 0.1, 1.2, 0.0], 0, 1),
+        (1, BENT, 0, -1),
+        (1, BENT, 2, 1),
+        (2, [0.3, 0.2, 1.5, 0.1, 0.4, 0.1], 4, -1),
+        (2, [0.3, 0.2, 1.5, 0.1, 0.4, 0.1], 2, 1),
+        (2, [0.3, 0.2, 1.5, 0.1, -0.4, 0.1], 4, 1),
+    ],
+)
+@pytest.mark.parametrize("speed", [0.1, 0.25])
+def test_before_a_singularity_the_tool_halts_and_motion_away_is_free(jogged, which, q, axis, sign, speed):
+    drive = jogged(q).run(along(axis, sign, speed), 12.0)
+    distances = drive.singularities
+    assert all(found > least - 1e-3 for found, least in zip(distances, NEAREST, strict=True))
+    assert drive.until_rest() < 0.8
+    before = drive.singularities
+    pose = forward(MODEL, drive.state.position)
+    drive.run(along(axis, -sign, speed), 0.7)
+    after = forward(MODEL, drive.state.position)
+    assert max(map(abs, (a - b for a, b in zip(pose.rotation + pose.position, after.rotation + after.position)))) > 0.01  # noqa: B905
+    assert drive.singularities[which] > before[which] + 0.005
+    drive.until_rest()
+
+
+def test_where_it_stands_for_long_nothing_winds_up(jogged):
+    drive = jogged(BENT).run(along(0, -1), 20.0)
+    assert drive.still
+    before = drive.tool
+    drive.run(along(0, 1), 0.3)
+    assert drive.tool[0] - before[0] > 5e-4
+
+
+@pytest.mark.parametrize("sideways", [0.0, 0.03, -0.03])
+def test_straight_up_where_all_three_are_singular_the_tool_comes_down(jogged, sideways):
+    drive = jogged(ZERO).run([sideways, 0.0, -0.1, 0.0, 0.0, 0.0], 3.0)
+    x, y, z = drive.tool
+    assert z < 1.2
+    assert abs(y) < 1e-9
+    assert x * sideways >= 0.0
+    assert abs(x) < 1e-9 or abs(x) > 0.02
+    assert drive.until_rest() < 0.8
+    assert forward(MODEL, drive.state.position).rotation == pytest.approx((1, 0, 0, 0, 1, 0, 0, 0, 1), abs=1e-4)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_straight_up_it_goes_sideways_in_the_plane_of_its_joints(jogged, sign):
+    drive = jogged(ZERO).run(along(0, sign, 0.1), 2.0)
+    assert drive.tool[0] * sign > 0.1
+    drive.until_rest()
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(2, 1), (1, 1), (1, -1), (3, 1)])
+def test_straight_up_it_stands_where_it_cannot_go(jogged, axis, sign):
+    drive = jogged(ZERO).run(along(axis, sign, 0.1), 1.0)
+    assert math.dist(drive.tool, (0.0, 0.0, 1.3)) < 1e-6
+    assert drive.until_rest() < 0.1
+
+
+@pytest.mark.parametrize("bend", [-0.04, -0.001, 1e-5, 0.001, 0.03])
+def test_a_nearly_stretched_elbow_comes_in_again(jogged, bend):
+    drive = jogged([0.2, -0.8, bend, 0.1, 0.7, 0.0])
+    wrist = drive.guards.poses[4].position
+    out = [w - s for w, s in zip(wrist, (0.0, 0.0, 0.17), strict=True)]
+    drive.run([-0.1 * component for component in out] + [0.0] * 3, 2.0)
+    assert drive.singularities[1] > 0.3
+
+
+def stick(chance: random.Random) -> list[float]:
+    kind = chance.random()
+    if kind < 0.2:
+        return list(ZERO)
+    sizes = [0.25] * 3 + [0.5] * 3
+    if kind < 0.7:
+        kept = range(3) if kind < 0.5 else range(3, 6)
+        return [chance.choice((-1, 0, 1)) * size if i in kept else 0.0 for i, size in enumerate(sizes)]
+    return [chance.uniform(-1.0, 1.0) * size for size in sizes]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_random_stick_never_needs_the_guards(jogged, seed):
+    chance = random.Random(seed)
+    drive = jogged(ZERO)
+    while seed % 5 and not drive.distance() > 0.2:
+        drive = jogged([chance.uniform(0.9 * limit.lower, 0.9 * limit.upper) for limit in MODEL.limits])
+    for _ in range(12):
+        drive.run(stick(chance), chance.choice((0.05, 0.3, 1.0, 2.0)), chance.choice(("base", "tool")))
+    assert drive.least_distance > 0.003
+    assert drive.until_rest(1.5) < 1.5
+    assert drive.jog.phase is Phase.HOLD
