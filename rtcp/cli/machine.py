@@ -1,4 +1,4 @@
-"""`rtcp enable`, `disable`, `reset`, `mode`, `output`, `gripper`, `zero`, `home`: what the machine is told."""
+"""`rtcp enable`, `disable`, `reset`, `halt`, `mode`, `output`, `gripper`, `zero`, `home`: what the machine is told."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Its configured name
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
-    for command in (_enable, _disable, _reset, _mode, _output, _gripper, _zero, _home):
+    for command in (_enable, _disable, _reset, _halt, _mode, _output, _gripper, _zero, _home):
         app.command(command.__name__[1:])(command)
 
 
@@ -48,6 +48,12 @@ def _reset() -> None:
     report(
         "nothing to reset: the arm is enabled and holds" if holds else "reset: no fault is left; `rtcp enable` goes on"
     )
+
+
+def _halt() -> None:
+    """Stop a motion in a controlled way, whoever began it; returns when the arm holds."""
+    ask("halt", "halt")
+    report("halted: the arm holds where it stopped")
 
 
 def _mode(

@@ -27,6 +27,11 @@ class Switch:
         self._candidate = before
         self._stable = self._restless = 0
 
+    def forget(self) -> None:
+        """Count as not active until a level that says otherwise has lasted."""
+        self.active = self._candidate = False
+        self._stable = self._restless = 0
+
     def read(self, levels: int) -> None:
         """Take the levels of all inputs of a cycle."""
         if not self._bit:

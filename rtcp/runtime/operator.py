@@ -56,6 +56,11 @@ class Operator:
         self.permitted = inputs.enabling_switch.active
         self.arm_has_stick = inputs.arm_toggle.active
 
+    def forget_press(self) -> None:
+        """Let the emergency stop count as released until the box is heard to say otherwise."""
+        self._inputs.emergency_stop.forget()
+        self.emergency_stop = False
+
     def show(self, powered: bool, moving: bool) -> None:
         """Switch the lamps and toggle the heartbeat."""
         if self._box is not None:

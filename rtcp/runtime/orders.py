@@ -144,8 +144,10 @@ class Orders:
         if behaviour.state is State.STOPPED_BY_LIMIT:
             behaviour.release()
             return DONE
-        if self._operator.emergency_stop:
+        if self._operator.emergency_stop and behaviour.lost == 0:
             return (Refusal.PRESSED,)
+        # Parked in PRE-OP the box says nothing: whether it is still pressed shows once the slaves are back in OP.
+        self._operator.forget_press()
         self._service.recover()
         behaviour.on(Event.RESET)
         return DONE

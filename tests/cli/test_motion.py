@@ -14,7 +14,7 @@ import pytest
 HOME = ("0", "0", "0", "0", "0", "0")
 
 
-@pytest.mark.parametrize("verb", ["enable", "disable", "reset"])
+@pytest.mark.parametrize("verb", ["enable", "disable", "reset", "halt"])
 def test_a_plain_verb_is_passed_on_and_answered_with_a_sentence(
     platform: Any, rtcp: Callable[..., Any], verb: str
 ) -> None:
@@ -54,6 +54,7 @@ def test_each_kind_of_error_has_its_exit_code(platform: Any, rtcp: Callable[...,
         ("enable",),
         ("disable",),
         ("reset",),
+        ("halt",),
         ("mode", "csp"),
         ("move", *HOME),
         ("move", "--pose", *HOME),

@@ -84,3 +84,21 @@ def test_a_reader_that_goes_away_ends_the_command_quietly(
     process.stdout.close()
     trouble = process.stderr.read()
     assert (process.wait(), trouble) == (0, "")
+
+
+def test_the_robot_status_and_the_states_are_told_in_words(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status |= {
+        "state": "stopped_by_limit",
+        "motion": "joystick",
+        "stick": {"mode": "Z-yaw", "arm_has_it": False},
+        "robot": {"mode": "manual", "e_stopped": True, "drives_powered": True, "motion_possible": False,
+                  "in_motion": False, "in_error": True, "error_code": 107},
+    }  # fmt: skip
+    shown = " ".join(rtcp("status").out.split())
+    assert "STOPPED BY LIMIT joystick, csp on virtual" in shown
+    assert "robot manual, drives powered, no motion possible, not in motion, emergency stop, error 107" in shown
+    assert "stick Z-yaw, it is the wheelchair's" in shown
+
+
+def test_a_status_without_a_robot_has_no_line_for_it(platform: Any, rtcp: Callable[..., Any]) -> None:
+    assert not any(line.startswith(("robot", "stick")) for line in rtcp("status").out.splitlines())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import event, given, settings
+from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
 from kinematics.forward import frames
@@ -68,13 +68,13 @@ def test_no_point_travels_further_than_is_said(
     q=JOINTS,
     parts=SPEEDS,
     rates=RATES,
-    dt=st.sampled_from([0.004, 0.02]),
+    dt=st.sampled_from([0.01, 0.02]),
     which=st.integers(0, 2),
     when=st.floats(0.0, 1.0),
     off=st.tuples(*[st.floats(-1.3, 1.3)] * 3),
     sizes=st.tuples(SIZES, SIZES, SIZES),
 )
-@settings(max_examples=500)
+@settings(max_examples=300)
 def test_a_stop_that_is_said_to_be_free_is_free_in_every_cycle_and_one_with_room_is_said_to_be(
     q: Sequence[float],
     parts: Sequence[float],
@@ -92,13 +92,11 @@ def test_a_stop_that_is_said_to_be_free_is_free_in_every_cycle_and_one_with_room
     at = points(way[round(when * (len(way) - 1))])[which]
     middle = [x + part * size for x, part, size in zip(at, off, sizes, strict=True)]
     box = [x - size for x, size in zip(middle, sizes, strict=True)] + [x + size for x, size in zip(middle, sizes, strict=True)]
+    assume(max(depth(point, box) for point in points(before)) <= 0.0)
     zones = Zones(MODEL, Limits(with_boxes(WIDE, box)))
     found = touched(zones, frames(MODEL, before), frames(MODEL, q), q, speeds, rates, dt)
     room = [min(apart(point, box) for point in points(angles)) for angles in way]
     inside = [max(depth(point, box) for point in points(angles)) for angles in way]
-    if inside[0] > 0.0:
-        event("begins inside")
-        return
     if found is None:
         event("free")
         assert max(inside) <= 1e-9

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
+from rtcp.motion.state import MotionState, Reason, Target
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.assembly import assemble
@@ -25,7 +26,6 @@ from rtcp.runtime.machine import Code, Command, State
 from rtcp.runtime.observer import Answer, Event, Observer
 from rtcp.runtime.sentences import FAULTS, Sentences
 from rtcp.runtime.service import Service
-from rtcp.motion.state import MotionState, Reason, Target
 from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
@@ -176,7 +176,9 @@ class Bench:
     The service thread is not started; the bench does what it would do: slaves reach OP, and come back after a reset.
     """
 
-    def __init__(self, board: Blackboard, observer: Observer, *, with_box: bool = True) -> None:
+    def __init__(
+        self, board: Blackboard, observer: Observer, *, with_box: bool = True, config: ArmConfig = CONFIG
+    ) -> None:
         self.data = Segment()
         self.models = self.data.drives
         self.board, self.observer = board, observer
@@ -185,7 +187,8 @@ class Bench:
         self.discipline.locked = True
         self.service = Service(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
         self.slaves_come_back = True
-        config = CONFIG if with_box else replace(CONFIG, slaves=(replace(CONFIG.slaves[0], device=NO_BOX), *CONFIG.slaves[1:]))
+        if not with_box:
+            config = replace(config, slaves=(replace(config.slaves[0], device=NO_BOX), *config.slaves[1:]))
         parts = assemble(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
         self.arm, self.box, self.operator = parts.arm, parts.box, parts.operator
         self.behaviour, self.orders, self.loop = parts.behaviour, parts.orders, parts.loop

@@ -1,13 +1,15 @@
-"""The emergency path, and the stop by a limit: the real classes and device models, cycle by cycle (see test_behaviour)."""
+"""The emergency path and the stop by a limit: the real classes and device models, cycle by cycle (see test_behaviour)."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from rtcp.config.operation import InputConfig
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Observer
@@ -84,6 +86,32 @@ def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(bench: Bench) -> 
     bench.until(State.READY)
     bench.press()
     assert bench.refused(bench.order(Command.ENABLE)) == PRESSED_SAYS
+
+
+def test_released_while_the_parked_box_says_nothing_it_is_reset(bench: Bench) -> None:
+    bench.hold().press()
+    bench.run(1.0)
+    bench.data.carries = False
+    bench.run(0.1)
+    bench.press(False)
+    bench.do(Command.RESET)
+    bench.data.carries = True
+    bench.until(State.READY)
+    bench.enable()
+
+
+def test_still_pressed_when_the_parked_box_is_heard_again_it_is_an_emergency_stop_and_no_drive_is_enabled(
+    bench: Bench,
+) -> None:
+    bench.hold().press()
+    bench.run(1.0)
+    bench.data.carries = False
+    bench.run(0.1)
+    bench.do(Command.RESET)
+    bench.data.carries = True
+    bench.run(0.5)
+    assert bench.refused(bench.order(Command.ENABLE))
+    assert bench.arm.first_with_torque() == -1
 
 
 def test_released_it_moves_nothing_until_reset_and_enable(bench: Bench) -> None:
@@ -233,7 +261,48 @@ def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(be
     assert (bench.codes[-1], bench.events[-1].axis) == (Code.LEFT_RANGE, 1)
 
 
-# -- lamps and the enabling switch ----------------------------------------------------------------------------------
+# -- the enabling switch --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def held(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+    """A bench with an enabling switch at input 11."""
+    switch = InputConfig(11)
+    made = Bench(*board, config=replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=switch)))
+    yield made
+    board[1].release(made.lease)
+
+
+def permit(bench: Bench, pressed: bool) -> None:
+    bench.data.devices[0].set_input(10, pressed)
+    bench.run(0.01)
+
+
+def test_without_the_enabling_switch_no_motion_begins(held: Bench) -> None:
+    held.hold()
+    answer = held.order(Command.MOVE, move_numbers(0.1, 0.1))
+    assert held.refused(answer) == ("the enabling switch is not pressed (inputs.enabling_switch in assistive_arm.yaml)")
+    assert held.state is State.HOLDING
+
+
+def test_letting_go_of_the_enabling_switch_is_a_controlled_stop_and_pressing_it_again_moves_nothing(
+    held: Bench,
+) -> None:
+    held.hold()
+    permit(held, True)
+    held.move(1.0, 1.0)
+    held.run(0.5)
+    permit(held, False)
+    assert Code.NOT_PERMITTED in held.codes
+    held.until(State.HOLDING)
+    rest = [said.target for said in held.log[-1].drives]
+    permit(held, True)
+    held.run(0.5)
+    assert [said.target for said in held.log[-1].drives] == rest
+    assert all(held.longest_step(axis) <= LONGEST_STEP for axis in range(2))
+
+
+# -- lamps and the gripper ------------------------------------------------------------------------------------------
 
 
 def test_the_lamps_show_torque_and_motion_and_the_heartbeat_changes_each_cycle(bench: Bench) -> None:

@@ -15,7 +15,7 @@ from rtcp.config import load
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard, Verdict
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import Mode, MotionState, Phase
+from rtcp.motion.state import Mode, MotionState, Phase, Target
 
 PERIOD = 0.0005
 
@@ -30,6 +30,8 @@ class Drive:
     with_jerk: bool = False
     checked: bool = True
     path: list[list[float]] = field(default_factory=list)
+    means: list[float] = field(default_factory=lambda: [0.0] * 6)
+    cuts: int = 0
 
     def __post_init__(self) -> None:
         self.limits = Limits(self.config)
@@ -46,7 +48,11 @@ class Drive:
         """One cycle: continuous, inside range, speed and acceleration."""
         state, dt, limits = self.state, self.period_s, self.limits
         target = mode.update(state, dt)
+        before = list(state.position)
         position, velocity = list(target.position), list(target.velocity)
+        if mode.clamps:
+            self.clamped(mode, target, before)
+            return
         acceleration = [(after - before) / dt for before, after in zip(state.velocity, velocity, strict=True)]
         for i in range(6 if self.checked else 0):
             where = (i, state.now_ns, mode.phase, mode.reason)
@@ -70,9 +76,28 @@ class Drive:
             )
         else:
             state.position, state.velocity, state.acceleration = position, velocity, acceleration
-        state.actual, state.speed = list(position), list(velocity)
-        state.now_ns += round(dt * 1e9)
-        self.path.append(position)
+        self._measured()
+
+    def clamped(self, mode: Mode, target: Target, before: Sequence[float]) -> None:
+        """A mode that the guards may cut: what they make of it keeps to the limits, and they never have to stop it."""
+        state, dt, limits = self.state, self.period_s, self.limits
+        speeds = list(self.means)
+        verdict = self.guard.apply(state, target, mode.clamps)
+        assert verdict in (Verdict.PASS, Verdict.CLAMPED), (state.now_ns, verdict)
+        self.cuts += verdict is Verdict.CLAMPED
+        self.means = [(after - q) / dt for after, q in zip(state.position, before, strict=True)]
+        for i, (mean, last) in enumerate(zip(self.means, speeds, strict=True)):
+            where = (i, state.now_ns, mode.phase, mode.reason)
+            assert limits.low[i] - 1e-6 <= state.position[i] <= limits.high[i] + 1e-6, where
+            assert abs(mean) <= limits.velocity[i] * (1 + 1e-6), where
+            assert abs(mean - last) <= limits.acceleration[i] * dt * (1 + 1e-3) + 1e-6, where
+        self._measured()
+
+    def _measured(self) -> None:
+        state = self.state
+        state.actual, state.speed = list(state.position), list(state.velocity)
+        state.now_ns += round(self.period_s * 1e9)
+        self.path.append(list(state.position))
 
     def run(self, mode: Mode, cycles: int) -> None:
         """So many cycles."""

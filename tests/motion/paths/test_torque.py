@@ -217,8 +217,9 @@ def test_the_law_of_cst_takes_over_and_gives_back_without_a_step(plant: Plant) -
 def test_a_law_whose_set_point_is_elsewhere_takes_over_without_a_step(plant: Plant) -> None:
     """As after a blow that the guards let the set-point follow only slowly."""
     joint = plant.joints
-    plant.law.pass_on([0.05] * 6, [3.0] * 6, joint)
-    plant.law.update([0.05] * 6, [0.2] * 6, joint)
+    there = [drive.position + 0.05 for drive in joint]
+    plant.law.pass_on(there, [3.0] * 6, joint)
+    plant.law.update(there, [0.2] * 6, joint)
     for i in range(6):
         assert joint[i].target_torque == pytest.approx(3.0, abs=0.05)
 

@@ -1,0 +1,161 @@
+"""The stick, the toggle and the modes through the whole loop, in simulated time (bus `inprocess`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from kinematics import forward
+from rtcp.config import default_config, load
+from rtcp.runtime.codes import Code, Command, MotionMode
+from rtcp.runtime.machine import State
+from rtcp.virtual.simulation import Simulation
+
+from .test_picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
+
+CONFIG = load(default_config())
+TOGGLE = 0x100
+START = (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)
+
+
+class Arm:
+    """A simulation in the motion mode joystick, and what is seen of it."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+
+    @property
+    def tool(self) -> tuple[float, float, float]:
+        assert CONFIG.arm is not None
+        return forward(CONFIG.arm, self.simulation.parts.arm.state.position).position
+
+    def stick(self, code: int, seconds: float, *, toggle: bool = True) -> None:
+        box = self.simulation.box
+        assert box is not None
+        box.inputs = box.inputs & ~0x1FF | code | (TOGGLE if toggle else 0)
+        self.simulation.run(seconds)
+
+    @property
+    def codes(self) -> list[int]:
+        return [event.code for event in self.simulation.events]
+
+
+@pytest.fixture
+def arm() -> Iterator[Arm]:
+    config = replace(CONFIG, motion="joystick", cycle=replace(CONFIG.cycle, period_us=2000.0))
+    with Simulation(config, seed=3, positions=START) as simulation:
+        assert simulation.until(lambda: simulation.state is State.READY, 5.0)
+        simulation.run(0.1)
+        simulation.acquire()
+        assert simulation.order(Command.ENABLE).refusal == 0
+        assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+        simulation.run(0.1)
+        yield Arm(simulation)
+
+
+def test_a_motion_lasts_for_as_long_as_the_stick_is_held(arm: Arm) -> None:
+    before = arm.tool
+    arm.stick(BACKWARD, 0.8)
+    assert arm.simulation.state is State.MOVING
+    arm.stick(NEUTRAL, 0.6)
+    assert arm.simulation.state is State.HOLDING
+    after = arm.tool
+    assert after[0] < before[0] - 0.03
+    assert after[1:] == pytest.approx(before[1:], abs=1e-4)
+    arm.stick(NEUTRAL, 0.5)
+    assert arm.tool == after
+
+
+def test_two_directions_at_once_go_diagonally(arm: Arm) -> None:
+    before = arm.tool
+    arm.stick(BACKWARD & LEFT, 0.8)
+    arm.stick(NEUTRAL, 0.6)
+    way = [b - a for a, b in zip(before, arm.tool, strict=True)]
+    assert way[0] < -0.03
+    assert way[1] == pytest.approx(-way[0], rel=0.05)
+    assert way[2] == pytest.approx(0.0, abs=1e-4)
+
+
+def test_a_stick_that_is_deflected_when_the_arm_is_enabled_does_nothing_until_neutral(arm: Arm) -> None:
+    simulation = arm.simulation
+    simulation.order(Command.DISABLE)
+    assert simulation.until(lambda: simulation.state is State.READY, 5.0)
+    arm.stick(BACKWARD, 0.2)
+    simulation.order(Command.ENABLE)
+    assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+    before = arm.tool
+    arm.stick(BACKWARD, 1.0)
+    assert arm.tool == before
+    arm.stick(NEUTRAL, 0.1)
+    arm.stick(BACKWARD, 0.5)
+    assert simulation.state is State.MOVING
+
+
+def test_a_byte_that_is_no_code_stops_the_motion_until_neutral(arm: Arm) -> None:
+    arm.stick(BACKWARD, 0.5)
+    arm.stick(FORWARD & BACKWARD, 1.0)
+    assert arm.simulation.state is State.HOLDING
+    assert Code.CAME_OUT in arm.codes
+    rest = arm.tool
+    arm.stick(BACKWARD, 0.5)
+    assert arm.tool == rest
+    arm.stick(NEUTRAL, 0.1)
+    arm.stick(BACKWARD, 0.5)
+    assert arm.simulation.state is State.MOVING
+
+
+def test_the_toggle_gives_the_stick_to_the_chair_and_the_arm_holds_still(arm: Arm) -> None:
+    arm.stick(BACKWARD, 0.5)
+    arm.stick(BACKWARD, 1.0, toggle=False)
+    assert arm.simulation.state is State.HOLDING
+    rest = arm.tool
+    arm.stick(FORWARD, 1.0, toggle=False)
+    assert arm.tool == rest
+    # Given back while it is deflected: it counts from its neutral position on.
+    arm.stick(FORWARD, 0.5)
+    assert arm.tool == rest
+    arm.stick(NEUTRAL, 0.1)
+    arm.stick(FORWARD, 0.5)
+    assert arm.tool[0] > rest[0] + 0.01
+
+
+def test_a_paddle_changes_the_mode_when_it_is_released(arm: Arm) -> None:
+    operator = arm.simulation.parts.operator
+    arm.stick(PADDLE_UP, 0.3)
+    assert operator.stick_mode == 0
+    arm.stick(NEUTRAL, 0.1)
+    assert operator.stick_mode == 1
+    before = arm.tool
+    arm.stick(BACKWARD, 0.6)
+    arm.stick(NEUTRAL, 0.5)
+    assert arm.tool[2] > before[2] + 0.02
+
+
+@pytest.mark.parametrize("command", [Command.MOVE, Command.STREAM])
+def test_under_the_stick_nobody_else_moves_the_arm(arm: Arm, command: Command) -> None:
+    answer = arm.simulation.order(command, [*START, 0, 0, 0, 0, 0, 0.2])
+    assert answer.refusal != 0
+    assert arm.simulation.state is State.HOLDING
+
+
+def test_the_stick_moves_nothing_in_another_motion_mode(arm: Arm) -> None:
+    arm.stick(NEUTRAL, 0.1)
+    assert arm.simulation.order(Command.MOTION, [MotionMode.JOINT]).refusal == 0
+    before = arm.tool
+    arm.stick(BACKWARD, 1.0)
+    assert arm.tool == before
+
+
+def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
+    simulation = arm.simulation
+    arm.stick(BACKWARD, 0.6)
+    assert simulation.box is not None
+    simulation.box.inputs &= ~0x200
+    simulation.run(1.5)
+    assert simulation.state is State.EMERGENCY_STOP
+    assert max(map(abs, simulation.parts.arm.state.speed)) < 0.01
+    assert simulation.parts.arm.first_with_torque() == -1
+    simulation.run(0.2)
+    assert {slave.state.name for slave in simulation.bus.read_states()} == {"PRE_OP"}
