@@ -23,7 +23,7 @@ from rtcp.motion.zones import Zones
 
 # So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
 # cycle; and of a change that a limit demands.
-_ROUNDING_RAD = 1e-9
+_ROUNDING_RAD = 1e-7
 _ROUNDING_SPEED = 5e-7
 _ROUNDING_CHANGE = 5e-5
 _ROUNDING_RAD_S = 1e-10

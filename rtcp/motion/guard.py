@@ -1,7 +1,8 @@
 """The last place before the drives: no target outside a limit passes, whatever asked for it.
 
 Promises 1 and 2 of the design: position inside the joint's range, no step beyond speed x cycle, speed and torque
-inside their bounds, never a number that is none.
+inside their bounds, never a number that is none; and no target velocity that changes by more than acceleration x cycle,
+whatever the position loop that is closed in CSV makes of a disturbance.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ class Guard:
         self._period_s = period_s
         self.take(limits)
         self._last = [0.0] * len(self._low)
+        self._velocity = [0.0] * len(self._low)
         self.held = 0
 
     def take(self, limits: Limits) -> None:
@@ -29,11 +31,13 @@ class Guard:
         self._low, self._high = limits.low, limits.high
         self._speed, self._torque = limits.velocity, limits.torque
         # Rounding of the set-points is no violation.
+        self._change = [acceleration * self._period_s for acceleration in limits.acceleration]
         self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
 
     def latch(self, axis: int, position: float) -> None:
         """Take `position` (rad) as the target sent last: while a drive has no torque, its target is where it is."""
         self._last[axis] = position
+        self._velocity[axis] = 0.0
 
     def check(self, drives: Sequence[Commanded]) -> None:
         """Clamp every target of every drive in place."""
@@ -74,6 +78,11 @@ class Guard:
                 outward = False
             if outward:
                 held |= 1 << i
-            drive.target_velocity = speed
+            before, change = self._velocity[i], self._change[i]
+            if speed > before + change:
+                speed = before + change
+            elif speed < before - change:
+                speed = before - change
+            self._velocity[i] = drive.target_velocity = speed
             drive.target_torque = torque
         self.held = held

@@ -123,7 +123,8 @@ class JogBounds:
         low, high, acceleration, fastest = limits.low, limits.high, limits.acceleration, limits.velocity
         a, b, c, d, e, f = twist
         q = self._position
-        worst, most = None, _TOLERANCE
+        worst: Row | None = None
+        most = _TOLERANCE
         for i, row in enumerate(self._inverse.rows):
             r0, r1, r2, r3, r4, r5 = row
             speed = r0 * a + r1 * b + r2 * c + r3 * d + r4 * e + r5 * f

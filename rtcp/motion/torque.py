@@ -21,6 +21,10 @@ _FADE = 0.3
 """Torque fades out over the last part of the speed that a joint may have in its direction."""
 _FREE = 1.0 - _FADE
 _STILL_RAD_S = 0.01
+_AHEAD_RAD_S = 0.1
+"""Torque fades out by where the arm is so much faster than its set-point; twice as much is damped."""
+_CATCH_UP = 20.0
+"""1/s: how fast the set-point goes to where the arm is, on the last bit of the way."""
 _MARGIN_RAD = 0.02
 """So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
 
@@ -28,7 +32,8 @@ _MARGIN_RAD = 0.02
 class TorqueMode:
     """The mode `torque`.
 
-    While `direct` is true the set-point follows the arm, and `Target.torque` is the whole torque of each joint
+    While `direct` is true the set-point follows the arm under the joints' speed and acceleration; what would carry the arm
+    away from it faster than that fades out, so that the arm keeps to them too. And `Target.torque` is the whole torque of each joint
     (`TorqueLaw.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the law holds.
 
     Args:
@@ -49,7 +54,8 @@ class TorqueMode:
         self._zero = [0.0] * n
         self._joints = range(n)
         self._position = [0.0] * n
-        self._velocity = [0.0] * n
+        self._follows, self._speed = [0.0] * n, [0.0] * n
+        """The set-point, rad and rad/s."""
         self._torque = [0.0] * n
         self._wanted = [0.0] * n
         self._given = [0.0] * n
@@ -135,7 +141,8 @@ class TorqueMode:
         limits = self._limits
         low, high, fastest, slowing, most = limits.low, limits.high, limits.velocity, limits.acceleration, limits.torque
         carried = self._carried(state.actual)
-        position, velocity, torque, given = self._position, self._velocity, self._torque, self._given
+        position, torque, given = self._position, self._torque, self._given
+        follows, speeds = self._follows, self._speed
         for i in self._joints:
             q, v = state.actual[i], state.speed[i]
             step = most[i] * dt / _RATE_S
@@ -148,17 +155,27 @@ class TorqueMode:
             up, down = _bound(above, top, slow), _bound(below, top, slow)
             # Towards the edge nothing is left of a torque, whether the joint moves or stands.
             left = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
+            # Nor where the arm runs away from its set-point, which keeps to the acceleration.
+            ahead = v - state.velocity[i]
+            slack = 1.0 - (ahead if pushed > 0.0 else -ahead) / _AHEAD_RAD_S
+            left = slack if slack < left else left
             pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
             drag = self._damped * v
             if v > up * _FREE:
                 drag += v - up * _FREE
             elif v < -down * _FREE:
                 drag += v + down * _FREE
+            if ahead > 2.0 * _AHEAD_RAD_S:
+                drag += ahead - 2.0 * _AHEAD_RAD_S
+            elif ahead < -2.0 * _AHEAD_RAD_S:
+                drag += ahead + 2.0 * _AHEAD_RAD_S
             wall = above if above < 0.0 else -below if below < 0.0 else 0.0
             whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
-            position[i], velocity[i] = q, v
-        target.position, target.velocity, target.torque = position, velocity, torque
+            position[i] = q
+            speeds[i] = speed = _chase(q - state.position[i], v, state.velocity[i], top, slow, dt)
+            follows[i] = state.position[i] + speed * dt
+        target.position, target.velocity, target.torque = follows, speeds, torque
         return target
 
     def _carried(self, position: Sequence[float]) -> Sequence[float]:
@@ -169,3 +186,14 @@ def _bound(room: float, fastest: float, slowing: float) -> float:
     """The speed that stops within `room` rad."""
     bound = sqrt(2.0 * slowing * room) if room > 0.0 else 0.0
     return bound if bound < fastest else fastest
+
+
+def _chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
+    """The set-point's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
+    far = lag if lag >= 0.0 else -lag
+    closing = sqrt(acceleration * far)
+    closing = closing if closing < _CATCH_UP * far else _CATCH_UP * far
+    wanted = speed + (closing if lag >= 0.0 else -closing)
+    wanted = fastest if wanted > fastest else -fastest if wanted < -fastest else wanted
+    most = acceleration * dt
+    return now + most if wanted > now + most else now - most if wanted < now - most else wanted

@@ -7,11 +7,18 @@ from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
 
-from rtcp.motion.room import allowed_acceleration, stoppable_speed
+from rtcp.motion.room import allowed_acceleration
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
+
+_POSITION, _VELOCITY = ControlInterface.Position, ControlInterface.Velocity
+_HALT = [0.0, 0.0, 0.0, 0.0]
+_EARLY = 1.5
+_NEAR_RAD = 0.02
+"""A joint heads for the edge of its range where it is so much nearer than it takes to stop."""
+_SLOWEST_RAD_S = 1e-5
 
 
 class VelocityMode:
@@ -27,17 +34,15 @@ class VelocityMode:
         self._limits = limits
         self._otg = Ruckig(n, period_s)
         self._way, self._output = InputParameter(n), OutputParameter(n)
-        self._way.control_interface = ControlInterface.Velocity
         self._way.synchronization = Synchronization.No
         self._way.target_acceleration = [0.0] * n
         self._target = Target(n)
         self._zero = [0.0] * n
         self._joints = range(n)
         self._wanted = [0.0] * n
-        self._bounded = [0.0] * n
-        self._said = [0.0] * n
+        self._goals: list[float] = []
+        self._said: list[float] = []
         self._until_ns = 0
-        self._holds = False
         self._last: list[float] = []
         self.clamps = True
         self.phase = Phase.HOLD
@@ -83,30 +88,19 @@ class VelocityMode:
                 self.reason, self.value = Reason.COMMAND_ENDED, 0.0
             self.stop(state)
         way, output = self._way, self._output
-        bounded = self._bound(state, dt)
+        self._goals, goals = self._said, self._goals
+        self._set_goals(state, goals)
         # What the guards changed, or what is asked for anew, begins at the state; else the ramp goes on.
-        if bounded != self._said or state.position != self._last:
-            self._said[:] = bounded
-            way.target_velocity = bounded
-            way.current_position = state.position
-            way.current_velocity = state.velocity
-            limits = self._limits
-            way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
-            if state.position != self._last:
-                way.current_acceleration = [
-                    allowed_acceleration(
-                        state.acceleration[i],
-                        state.velocity[i],
-                        limits.velocity[i],
-                        limits.acceleration[i],
-                        limits.jerk[i],
-                    )
-                    for i in self._joints
-                ]
-        try:
-            result = self._otg.update(way, output)
-        except (RuckigError, ValueError):
-            result = Result.Error
+        moved = state.position != self._last
+        if moved or goals != self._goals:
+            self._plan(state, goals, moved)
+        self._said = goals
+        result = self._step()
+        if result < 0:
+            # ruckig finds no way to an edge where a distance is exactly a border between two profiles: a ramp it finds.
+            self._plan(state, _HALT * len(self._wanted), moved=True)
+            self._said = []
+            result = self._step()
         if result < 0:
             self.phase, self.reason = Phase.HOLD, Reason.GENERATOR
             target.position, target.velocity = state.position, self._zero
@@ -114,21 +108,54 @@ class VelocityMode:
         target.position, target.velocity = output.new_position, output.new_velocity
         self._last = output.new_position
         output.pass_to_input(way)
-        if self.phase is Phase.STOP and result == Result.Finished and not any(bounded):
+        if self.phase is Phase.STOP and result == Result.Finished:
             self.phase = Phase.HOLD
             target.velocity = self._zero
         return target
 
-    def _bound(self, state: MotionState, dt: float) -> list[float]:
-        """The speeds asked for, each no faster than it can still be slowed down from inside the joint's range."""
-        bounded, limits = self._bounded, self._limits
-        low, high, acceleration, jerk = limits.low, limits.high, limits.acceleration, limits.jerk
-        position = state.position
-        for i, v in enumerate(self._wanted):
-            if v:
-                room = high[i] - position[i] if v > 0.0 else position[i] - low[i]
-                stops = stoppable_speed(room, acceleration[i], jerk[i])
-                bounded[i] = stops if v > stops else -stops if v < -stops else v
+    def _step(self) -> Result:
+        try:
+            return self._otg.update(self._way, self._output)
+        except (RuckigError, ValueError):
+            return Result.Error
+
+    def _set_goals(self, state: MotionState, goals: list[float]) -> None:
+        """Write what each joint goes to: four numbers each, of which the first says whether it is a position."""
+        goals.clear()
+        limits = self._limits
+        for i, wanted in enumerate(self._wanted):
+            acceleration, jerk, now = limits.acceleration[i], limits.jerk[i], state.velocity[i]
+            edge = limits.high[i] if wanted > 0.0 else limits.low[i]
+            room = edge - state.position[i] if wanted > 0.0 else state.position[i] - edge
+            fast, faster = abs(now), abs(wanted)
+            fast = (fast if fast > faster else faster) + 0.5 * acceleration * acceleration / jerk
+            near = room < _EARLY * fast * (0.5 * fast / acceleration + acceleration / jerk) + _NEAR_RAD
+            if wanted and near:
+                # Rounding beside the edge; and ruckig knows no ways that take hours.
+                goals += (1.0, edge, faster, jerk) if faster > _SLOWEST_RAD_S else (0.0, 0.0, acceleration, jerk)
             else:
-                bounded[i] = 0.0
-        return bounded
+                goals += (0.0, wanted, acceleration, jerk)
+
+    def _plan(self, state: MotionState, goals: list[float], moved: bool) -> None:
+        """Give ruckig the goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
+        way, limits = self._way, self._limits
+        kinds, targets = [goal == 1.0 for goal in goals[::4]], goals[1::4]
+        way.per_dof_control_interface = [_POSITION if kind else _VELOCITY for kind in kinds]
+        way.target_position = [target if kind else 0.0 for kind, target in zip(kinds, targets, strict=True)]
+        way.target_velocity = [0.0 if kind else target for kind, target in zip(kinds, targets, strict=True)]
+        way.max_velocity = [
+            goals[4 * i + 2] if kind else limits.velocity[i] for i, kind in enumerate(kinds)
+        ]  # fmt: skip
+        way.current_position, way.current_velocity = state.position, state.velocity
+        way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
+        if moved:
+            way.current_acceleration = [
+                allowed_acceleration(
+                    state.acceleration[i],
+                    state.velocity[i],
+                    limits.velocity[i],
+                    limits.acceleration[i],
+                    limits.jerk[i],
+                )
+                for i in self._joints
+            ]

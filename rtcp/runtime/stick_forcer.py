@@ -19,8 +19,10 @@ from rtcp.runtime.carrier import CommandFailed
 from rtcp.runtime.commander import Commander
 from rtcp.runtime.held import Caller
 
-OBJECT, MASK, LEVELS = 0x2000, 1, 2
-"""Of the virtual IO box: which inputs are forced, and to what (`rtcp.virtual.models.diewu`)."""
+OBJECT, MASK, LEVELS, HOLD = 0x2000, 1, 2, 3
+"""Of the virtual IO box: which inputs are forced, to what, and for how long (`rtcp.virtual.models.diewu`)."""
+_BOX_HOLD_MS, _SAY_AGAIN_S = 1500, 0.4
+"""The box lets go by itself where this process is killed."""
 DIRECTIONS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 CHAIR, EMERGENCY_STOP, ENABLING_SWITCH = "chair", "emergency_stop", "enabling_switch"
 LONGEST_HOLD_S = 1.0
@@ -47,6 +49,7 @@ class StickForcer:
         self._until = 0.0
         self._written: dict[int, int] = {}
         self._writing = asyncio.Lock()
+        self._said = 0.0
 
     @property
     def possible(self) -> bool:
@@ -102,15 +105,19 @@ class StickForcer:
 
     async def _write(self, mask: int, levels: int) -> None:
         async with self._writing:
+            if mask and time.monotonic() - self._said > _SAY_AGAIN_S:
+                await self._tell(HOLD, _BOX_HOLD_MS)
+                self._said = time.monotonic()
             # The levels come first, so that no input takes one that nobody asked for; but none is let go of late.
             for sub_index, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
                 if self._written.get(sub_index) != value:
                     self._written.pop(sub_index, None)
-                    request = {"slave": self._slave, "index": OBJECT, "subindex": sub_index}
-                    await self._commander.service(
-                        {"do": "sdo_write", **request, "hex": value.to_bytes(2, "little").hex()}
-                    )
+                    await self._tell(sub_index, value)
                     self._written[sub_index] = value
+
+    async def _tell(self, sub_index: int, value: int) -> None:
+        request = {"slave": self._slave, "index": OBJECT, "subindex": sub_index}
+        await self._commander.service({"do": "sdo_write", **request, "hex": value.to_bytes(2, "little").hex()})
 
 
 def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> tuple[int, int]:

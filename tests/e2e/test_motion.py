@@ -213,3 +213,12 @@ def test_a_joint_is_homed_and_holds_again(bent: Platform) -> None:
     done = bent.rtcp("home", "joint6")
     assert "joint6 is homed" in done.stdout
     assert bent.status()["state"] == "holding"
+
+
+def test_a_stick_is_let_go_of_by_the_box_itself_when_the_gateway_is_killed(running: Platform) -> None:
+    with ControlClient("a test", control_socket(running.directory)) as client:
+        client.call("stick", {"byte": 62, "hold_s": 1.0})
+        running.until(lambda found: found["inputs"] & 0xFF == 62, "the forced byte")
+        kill(running.pids()["gateway"])
+    running.rtcp("start", "--detach")
+    running.until(lambda found: found["inputs"] & 0xFF == 63, "neutral")

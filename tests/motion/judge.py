@@ -54,7 +54,7 @@ class Judge:
         for i in range(len(here)):
             q, u = state.position[i], limits.acceleration[i] * dt
             mean = (q - here[i]) / dt
-            assert isfinite(q) and isfinite(state.velocity[i]) and isfinite(state.acceleration[i])
+            assert all(map(isfinite, (q, state.velocity[i], state.acceleration[i])))
             assert limits.low[i] - ROUNDING_RAD <= q <= limits.high[i] + ROUNDING_RAD, (i, q)
             assert abs(mean) <= limits.velocity[i] * (1 + 1e-6) + 1e-10, (i, mean)
             assert abs(state.velocity[i]) <= limits.velocity[i] * (1 + 1e-6), (i, state.velocity[i])
@@ -89,7 +89,8 @@ class Judge:
 
 ARM = load(default_config())
 """The arm as delivered, boxes and all."""
-_SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=replace(ARM.joints[1].position, min=-0.3, max=0.2))
+_RANGE = replace(ARM.joints[1].position, min=-0.3, max=0.2)
+_SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=_RANGE)
 JOINTS_ONLY = replace(ARM, joints=(ARM.joints[0], _SHORT), arm=None)
 """Two joints without a geometry: nothing but the joints' own limits, one of them too fast for its short range."""
 

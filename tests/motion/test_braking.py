@@ -91,7 +91,7 @@ def test_a_stop_that_is_said_to_be_free_is_free_in_every_cycle_and_one_with_room
     # A box of any shape beside, or across, the way of one of the points.
     at = points(way[round(when * (len(way) - 1))])[which]
     middle = [x + part * size for x, part, size in zip(at, off, sizes, strict=True)]
-    box = [x - size for x, size in zip(middle, sizes, strict=True)] + [x + size for x, size in zip(middle, sizes, strict=True)]
+    box = [x + sign * size for sign in (-1.0, 1.0) for x, size in zip(middle, sizes, strict=True)]
     assume(max(depth(point, box) for point in points(before)) <= 0.0)
     zones = Zones(MODEL, Limits(with_boxes(WIDE, box)))
     found = touched(zones, frames(MODEL, before), frames(MODEL, q), q, speeds, rates, dt)

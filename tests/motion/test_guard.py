@@ -32,10 +32,25 @@ class Drive:
     target_torque: float = 0.0
 
 
+CHANGE = 2.0 * PERIOD
+"""What a target velocity may change by in a cycle, rad/s."""
+
+
 def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
     guard = Guard(Limits(CONFIG), PERIOD)
     guard.latch(0, last)
     guard.check([drive])
+    return drive, guard.held
+
+
+def in_the_end(last: float, drive: Drive) -> tuple[Drive, int]:
+    """What becomes of a velocity that is wanted for so long that its change bounds it no more."""
+    guard = Guard(Limits(CONFIG), PERIOD)
+    guard.latch(0, last)
+    wanted = drive.target_velocity
+    for _ in range(1000):
+        drive.target_velocity = wanted
+        guard.check([drive])
     return drive, guard.held
 
 
@@ -59,7 +74,7 @@ def test_a_target_is_held_inside_range_and_step(last: float, wanted: float, pass
 
 @pytest.mark.parametrize(("wanted", "passed"), [(0.4, 0.4), (9.0, 0.5), (-9.0, -0.5), (math.nan, 0.0)])
 def test_a_speed_is_held_inside_its_bound(wanted: float, passed: float) -> None:
-    assert guarded(0.0, Drive(target_velocity=wanted))[0].target_velocity == passed
+    assert in_the_end(0.0, Drive(target_velocity=wanted))[0].target_velocity == passed
 
 
 @pytest.mark.parametrize(("wanted", "passed"), [(4.0, 4.0), (99.0, 10.0), (-99.0, -10.0), (math.nan, 0.0)])
@@ -68,8 +83,8 @@ def test_a_torque_is_held_inside_its_bound(wanted: float, passed: float) -> None
 
 
 def test_beyond_the_range_speed_only_leads_back() -> None:
-    assert guarded(2.0, Drive(position=2.01, target_position=2.0, target_velocity=0.1))[0].target_velocity == 0.0
-    assert guarded(2.0, Drive(position=2.01, target_position=2.0, target_velocity=-0.1))[0].target_velocity == -0.1
+    assert in_the_end(2.0, Drive(position=2.01, target_position=2.0, target_velocity=0.1))[0].target_velocity == 0.0
+    assert in_the_end(2.0, Drive(position=2.01, target_position=2.0, target_velocity=-0.1))[0].target_velocity == -0.1
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
@@ -92,6 +107,23 @@ def test_limits_that_change_are_those_that_count_from_then_on() -> None:
     guard.take(limits)
     drive.target_velocity = drive.target_torque = 99.0
     guard.check([drive])
+    assert drive.target_velocity == pytest.approx(CHANGE)
     # Step by step back into the range, at the new speed.
     assert drive.target_position == pytest.approx(1.0 - 0.1 * PERIOD, abs=1e-9)
-    assert (drive.target_velocity, drive.target_torque) == (0.1, 2.0)
+    assert drive.target_torque == 2.0
+    for _ in range(200):
+        drive.target_velocity = 99.0
+        guard.check([drive])
+    assert drive.target_velocity == 0.1
+
+
+@given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50))
+def test_a_target_velocity_changes_by_no_more_than_acceleration_x_cycle(wanted: list[float]) -> None:
+    guard, drive = Guard(Limits(CONFIG), PERIOD), Drive()
+    before = 0.0
+    for speed in wanted:
+        drive.target_velocity = speed
+        guard.check([drive])
+        assert abs(drive.target_velocity - before) <= CHANGE * (1 + 1e-9)
+        assert abs(drive.target_velocity) <= 0.5
+        before = drive.target_velocity

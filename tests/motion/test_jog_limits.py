@@ -14,17 +14,13 @@ from rtcp.motion.state import Phase
 
 ARM = load(default_config())
 MODEL = ARM.arm
-BOX = ARM.cartesian.box
 ZERO = [0.0] * 6
 BENT = [0.3, 0.2, 1.5, 0.2, 0.9, 0.1]
 NEAREST = (ARM.cartesian.singularity.shoulder, ARM.cartesian.singularity.elbow, ARM.cartesian.singularity.wrist)
 STANDOFF = 0.008
-# Where the tool comes to each wall, and along which axis.
-WALLS = [
-    ([0.1, -1.35, 0.35, 0.2, 0.8, 0.0], 0, -1), ([2.6, -1.0, 0.6, 0.2, 0.9, 0.0], 0, 1),
-    ([1.4, -1.0, 0.6, 0.2, 0.9, 0.0], 1, -1), ([-1.4, -1.0, 0.6, 0.2, 0.9, 0.0], 1, 1),
-    ([0.3, -0.9, 1.3, 0.1, 1.6, 0.0], 2, -1), ([0.2, 0.0, 0.4, 0.1, -0.9, 0.0], 2, 1),
-]  # fmt: skip
+WALLED = (-0.8, -0.7, -0.3, 0.7, 0.7, 1.0)
+"""A box whose walls are all in reach, m."""
+WALLS = [(axis, sign) for axis in range(3) for sign in (-1, 1)]
 
 
 def along(axis: int, sign: float, speed: float = 0.25) -> list[float]:
@@ -38,20 +34,46 @@ def of_joints(q: list[float], speeds: list[float]) -> list[float]:
     return [part * component for component in twist]
 
 
-@pytest.mark.parametrize(("q", "axis", "sign"), WALLS)
-@pytest.mark.parametrize("across", [0, 1])
-def test_before_a_wall_of_the_box_the_tool_stops_slides_and_comes_away(jogged, q, axis, sign, across):
-    drive = jogged(q)
-    twist = along(axis, sign)
-    if across:
-        # Both at once: what leads into the wall is taken away and the other goes on.
-        twist[(axis + 1) % 3] = 0.05 * (-1.0 if drive.tool[(axis + 1) % 3] > 0.0 else 1.0)
-    drive.run(twist, 5.0)
-    assert drive.least_distance > STANDOFF - 1e-3
+def before_wall(jogged, axis: int, sign: int):
+    """The arm somewhere before a wall, and far from all else."""
+    chance = random.Random(10 * axis + sign)
+    while True:
+        q = [chance.uniform(0.7 * limit.lower, 0.7 * limit.upper) for limit in MODEL.limits]
+        drive = jogged(q)
+        drive.limits.box = WALLED
+        wall = WALLED[axis + 3 if sign > 0 else axis]
+        shoulder, elbow, wrist = drive.singularities
+        if drive.distance() > 0.08 and abs(wall - drive.tool[axis]) < 0.2 and min(2 * shoulder, elbow, wrist) > 0.5:
+            drive.guards.latch(drive.state)
+            return drive, wall
+
+
+@pytest.mark.parametrize(("axis", "sign"), WALLS)
+@pytest.mark.parametrize("speed", [0.05, 0.25])
+def test_before_each_wall_of_the_box_the_tool_stops_and_comes_away(jogged, axis, sign, speed):
+    drive, wall = before_wall(jogged, axis, sign)
+    drive.run(along(axis, sign, speed), 6.0)
+    assert abs(wall - drive.tool[axis]) == pytest.approx(STANDOFF, abs=2e-4)
+    assert drive.least_distance > STANDOFF - 2e-4
     drive.until_rest()
     before = drive.tool
-    drive.run(along(axis, -sign), 1.0)
-    assert (drive.tool[axis] - before[axis]) * -sign > 0.02
+    drive.run(along(axis, -sign, speed), 0.7)
+    assert (drive.tool[axis] - before[axis]) * -sign > 0.01
+    drive.until_rest()
+
+
+@pytest.mark.parametrize(("axis", "sign"), WALLS)
+@pytest.mark.parametrize("speed", [0.1, 0.25])
+def test_along_each_wall_the_tool_slides_with_what_is_left_of_two_directions(jogged, axis, sign, speed):
+    drive, wall = before_wall(jogged, axis, sign)
+    across = (axis + 1) % 3
+    twist = along(axis, sign, speed)
+    drive.run(twist, 3.0)
+    before = drive.tool
+    twist[across] = -0.05 if before[across] > 0.2 else 0.05
+    drive.run(twist, 1.0)
+    assert abs(drive.tool[across] - before[across]) > 0.02
+    assert abs(wall - drive.tool[axis]) == pytest.approx(STANDOFF, abs=5e-4)
     drive.until_rest()
 
 
@@ -77,17 +99,6 @@ def test_before_the_user_and_the_chair_the_arm_stops_and_comes_away(jogged, q, a
     assert (drive.tool[axis] - before[axis]) * -sign > 0.02
 
 
-def test_along_a_wall_the_tool_slides_on(jogged):
-    q, axis, sign = WALLS[5]
-    drive = jogged(q).run(along(axis, sign), 3.0)
-    wall = BOX.max[2]
-    assert wall - drive.tool[2] == pytest.approx(STANDOFF, abs=1e-3)
-    before = drive.tool
-    drive.run([-0.05, 0.0, 0.1, 0.0, 0.0, 0.0], 1.5)
-    assert before[0] - drive.tool[0] > 0.03
-    assert wall - drive.tool[2] > STANDOFF - 1e-3
-
-
 @pytest.mark.parametrize("joint", range(6))
 @pytest.mark.parametrize("side", [-1, 1])
 def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side):
@@ -95,9 +106,8 @@ def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side
     limit = MODEL.limits[joint]
     q[joint] = (limit.upper if side > 0 else limit.lower) - 0.3 * side
     drive = jogged(q)
-    if drive.distance() < 0.05:
-        q[1], q[2] = (q[1], 0.9) if joint != 2 else (-0.2, q[2])
-        drive = jogged(q)
+    drive.limits.box, drive.limits.keep_out = None, ()
+    drive.guards.latch(drive.state)
     for _ in range(30):
         drive.run(of_joints(drive.state.position, [0.3 * side if i == joint else 0.0 for i in range(6)]), 0.1)
     drive.until_rest()
@@ -115,9 +125,9 @@ def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side
         (0, [0.2, 0.6, 1.4, 0.1, 1.2, 0.0], 0, 1),
         (1, BENT, 0, -1),
         (1, BENT, 2, 1),
-        (2, [0.3, 0.2, 1.5, 0.1, 0.4, 0.1], 4, -1),
-        (2, [0.3, 0.2, 1.5, 0.1, 0.4, 0.1], 2, 1),
-        (2, [0.3, 0.2, 1.5, 0.1, -0.4, 0.1], 4, 1),
+        (2, [0.0, 0.2, 1.5, 0.0, 0.4, 0.1], 4, -1),
+        (2, [0.0, 0.2, 1.5, 0.0, 0.4, 0.1], 2, 1),
+        (2, [0.0, 0.2, 1.5, 0.0, -0.4, 0.1], 4, 1),
     ],
 )
 @pytest.mark.parametrize("speed", [0.1, 0.25])
@@ -127,11 +137,9 @@ def test_before_a_singularity_the_tool_halts_and_motion_away_is_free(jogged, whi
     assert all(found > least - 1e-3 for found, least in zip(distances, NEAREST, strict=True))
     assert drive.until_rest() < 0.8
     before = drive.singularities
-    pose = forward(MODEL, drive.state.position)
+    assert before[which] == pytest.approx(NEAREST[which], abs=2e-3)
     drive.run(along(axis, -sign, speed), 0.7)
-    after = forward(MODEL, drive.state.position)
-    assert max(map(abs, (a - b for a, b in zip(pose.rotation + pose.position, after.rotation + after.position)))) > 0.01  # noqa: B905
-    assert drive.singularities[which] > before[which] + 0.005
+    assert drive.singularities[which] > before[which] + 0.002
     drive.until_rest()
 
 

@@ -95,9 +95,7 @@ def test_the_limits_that_are_in_force_are_those_that_count() -> None:
 
 
 @given(
-    cycles=st.lists(
-        st.tuples(*[st.sampled_from([0.0, 1.0, -1.0, 1.01, -1.01, 7.0, nan])] * 6), min_size=1, max_size=60
-    )
+    cycles=st.lists(st.tuples(*[st.sampled_from([0.0, 1.0, -1.0, 1.01, -1.01, 7.0, nan])] * 6), min_size=1, max_size=60)
 )
 def test_found_is_exactly_what_was_bad_in_each_of_the_last_cycles(cycles: Sequence[Sequence[float]]) -> None:
     seen = Seen()

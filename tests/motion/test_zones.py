@@ -1,8 +1,9 @@
-"""Tool, wrist and elbow never enter a keep-out box, and the tool never leaves its own; who begins inside may come out."""
+"""Tool, wrist and elbow never enter a keep-out box, the tool never leaves its own; who begins inside may come out."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import product
 from math import hypot, inf, nan
 
@@ -38,8 +39,8 @@ def driven(judge: Judge, direction: Sequence[float], cycles: int, clamps: bool =
     """Ask for joint speeds in a direction, as parts of each joint's limit."""
     verdicts = []
     for _ in range(cycles):
-        speeds = [part * v for part, v in zip(direction, judge.limits.velocity, strict=True)]
-        verdicts.append(judge.ask([q + v * judge.dt for q, v in zip(judge.state.position, speeds, strict=True)], clamps))
+        steps = [part * v * judge.dt for part, v in zip(direction, judge.limits.velocity, strict=True)]
+        verdicts.append(judge.ask([q + way for q, way in zip(judge.state.position, steps, strict=True)], clamps))
     return verdicts
 
 
@@ -154,10 +155,8 @@ def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction:
     for share in shares:
         driven(judge, direction, 30)
         tool = points(judge.state.position)[0]
-        near = tuple(9.0 * share + (1.0 - share) * t for t in tool)
-        values = limits.widest.__class__.configured(judge.config)
-        new = values.__class__(**{**vars(values), "box": (*WIDE[:3], *(max(t, n) for t, n in zip(tool, near, strict=True)))})
-        judge.change(new)
+        walls = [t + 0.2 * share for t in tool]
+        judge.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
 
 
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -217,9 +216,7 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
 
 @given(q=JOINTS, direction=DIRECTION)
 @settings(max_examples=60)
-def test_no_point_moves_further_than_the_reach_of_each_joint_says(
-    q: Sequence[float], direction: list[float]
-) -> None:
+def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[float], direction: list[float]) -> None:
     zones = Zones(ARM.arm, Limits(ARM))  # type: ignore[arg-type]
     step = 1e-4
     moved = [angle + step * part for angle, part in zip(q, direction, strict=True)]
@@ -230,7 +227,7 @@ def test_no_point_moves_further_than_the_reach_of_each_joint_says(
 
 
 def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
-    # A plate 2 mm thin beside the tool, at each of many distances: the stop from full speed passes it between two samples.
+    # A plate 2 mm thin beside the tool, at each of many distances: a stop from full speed passes it in a cycle.
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
     for gap, sign in product([0.004 * n for n in range(1, 20)], [1.0, -1.0]):

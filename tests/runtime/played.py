@@ -133,6 +133,14 @@ class Played:
         self.picture = Picture(self.observer, session, {})
         self.verbs = Verbs(self.observer, self.picture, self.config, bus, directory)
 
+    def show(self, *, motion: MotionMode | None = None, state: State | None = None) -> None:
+        """Let the loop be in another mode or state, and return when its records say so."""
+        self.loop.motion = self.loop.motion if motion is None else motion
+        self.loop.state = self.loop.state if state is None else state
+        seen = self.observer.head
+        while self.observer.head < seen + 2:
+            time.sleep(0.001)
+
     async def call(self, verb: str, args: dict[str, Any], client: str = "one", connection: int = 1) -> dict[str, Any]:
         """Ask as a client's request does."""
 

@@ -49,7 +49,11 @@ def tool_at(q: list[float]) -> list[float]:
 
 
 def forced(loop: Loop) -> list[tuple[int, int]]:
-    """The writes to the forced inputs: subindex and value."""
+    """The writes to the forced inputs, subindex and value, but for how long they hold."""
+    return [write for write in written(loop) if write[0] != HOLD]
+
+
+def written(loop: Loop) -> list[tuple[int, int]]:
     return [
         (request["subindex"], int.from_bytes(bytes.fromhex(request["hex"]), "little"))
         for request in loop.requests
@@ -238,6 +242,11 @@ def test_the_stick_is_forced_by_levels_first_and_let_go_of_by_the_mask(client: C
     client.call("stick", {"pressed": ["forward"], "hold_s": 0.3})
     assert forced(loop) == [(LEVELS, 62), (MASK, 63)]
     wait_until(lambda: forced(loop)[-1] == (MASK, 0))
+
+
+def test_the_box_is_told_to_let_go_by_itself_before_anything_is_forced(client: ControlClient, loop: Loop) -> None:
+    client.call("stick", {"pressed": ["forward"], "hold_s": 0.3})
+    assert written(loop)[0] == (HOLD, 1500)
 
 
 def test_the_stick_is_let_go_of_when_its_holder_falls_silent(client: ControlClient, loop: Loop) -> None:

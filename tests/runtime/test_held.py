@@ -72,7 +72,7 @@ def test_an_argument_of_another_form_is_one_sentence_and_nothing_is_commanded(
 
 
 def test_joints_are_jogged_as_joint_speeds_where_the_arm_is_in_mode_velocity(arm: Played) -> None:
-    arm.loop.motion = MotionMode.VELOCITY
+    arm.show(motion=MotionMode.VELOCITY)
     arm.ask("jog", v=SIX, frame="joints")
     assert [kind for kind, *_ in arm.loop.commands] == [Command.VELOCITY]
 

@@ -79,7 +79,7 @@ def test_levels_are_written_before_the_mask_that_lets_them_count(arm: Played) ->
 
 
 def test_inputs_are_forced_while_the_arm_moves(arm: Played) -> None:
-    arm.loop.state = State.STOPPING
+    arm.show(state=State.STOPPING)
     arm.ask("stick", byte=61)
     assert written(arm) == [(2, 61), (1, 0xFF)]
 

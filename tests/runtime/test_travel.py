@@ -118,7 +118,7 @@ def test_a_pose_out_of_reach_is_refused_with_the_kinematics_reason(arm: Played) 
 
 
 def test_a_pose_is_moved_to_on_a_line_where_the_arm_is_in_mode_cartesian(arm: Played) -> None:
-    arm.loop.motion = MotionMode.CARTESIAN
+    arm.show(motion=MotionMode.CARTESIAN)
     arm.loop.ends[Command.LINE] = end_of_line(arm, beside(arm, 0.05))
     arm.ask("move_pose", pose=beside(arm, 0.05))
     assert [kind for kind, *_ in arm.loop.commands] == [Command.LINE]
@@ -176,6 +176,15 @@ def test_a_file_is_run_after_an_approach_to_where_it_begins(arm: Played, tmp_pat
     assert list(arm.loop.taken(Command.MOVE)[0][:6]) == first
 
 
+def test_a_path_is_run_from_its_second_pose_on_after_an_approach_to_its_first(arm: Played) -> None:
+    arm.loop.ends[Command.LINE] = end_of_line(arm, beside(arm, 0.1))
+    arm.ask("path", path=[{"pose": beside(arm, 0.05)}, {"pose": beside(arm, 0.1)}], approach=True)
+    assert [kind for kind, *_ in arm.loop.commands] == [Command.MOVE, Command.LINE]
+    [[row]] = arm.loop.plans
+    assert row[0:3] == pytest.approx(beside(arm, 0.05)[:3])
+    assert row[7:10] == pytest.approx(beside(arm, 0.1)[:3])
+
+
 def test_a_mistake_in_a_file_is_named_with_its_line(arm: Played, tmp_path: Path) -> None:
     file = tmp_path / "motion.csv"
     file.write_text("t,q1,q2,q3,q4,q5,q6\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n")
@@ -201,6 +210,7 @@ def test_a_motion_that_ends_early_is_told_with_its_reason(arm: Played) -> None:
             arm.loop.q = list(BENT)
             arm.loop.state = State.HOLDING
             arm.loop.board.event(Code.NOT_PERMITTED)
+            arm.loop.board.event(Code.STOPPED)
         publish()
 
     arm.loop._publish = stopped  # type: ignore[method-assign]

@@ -43,7 +43,6 @@ def bounds_of(config: ArmConfig) -> Bounds:
         [joint.velocity for joint in joints],
         [joint.acceleration for joint in joints],
         [joint.torque for joint in joints],
-        [joint.csv_gain for joint in joints],
         None if cartesian.box is None else (cartesian.box.min, cartesian.box.max),
         keep_out,
     )

@@ -41,7 +41,6 @@ class Bounds:
     velocity: list[float]
     acceleration: list[float]
     torque: list[float]
-    csv_gain: list[float]
     box: Box | None = None
     keep_out: list[Box] = field(default_factory=list)
 
@@ -88,7 +87,6 @@ class Judge:
         self._look_again = 0
         self._excused = True
         """Whether the arm was enabled inside a zone and has not come out of it yet."""
-        self._used = [0] * len(self._joints)
         """Actual position of each joint in the answer before: what this frame was worked out from."""
 
     def changed(self) -> None:
@@ -109,7 +107,6 @@ class Judge:
             status, actual, _, _, shown = WIRE.unpack(frame.received[slot])
             joint = self._joints[axis]
             position, actual = position - self.zero[axis], actual - self.zero[axis]
-            used, self._used[axis] = self._used[axis], actual
             if control != ENABLE_OPERATION or status & STATE_MASK != OPERATION_ENABLED or mode not in (CSP, CSV, CST):
                 if joint.mode:
                     self._joints[axis] = _Joint()
@@ -131,7 +128,7 @@ class Judge:
                 if frame.heard:
                     self._judge_heard(axis, joint, position, frame.now_ns)
                 if mode == CSV:
-                    self._judge_velocity(axis, joint, velocity, position, used, answered, frame.now_ns)
+                    self._judge_velocity(axis, joint, velocity, answered, frame.now_ns)
             if mode != CST and joint.mode == mode and not joint.positions:
                 joint.positions.append(position)
             joint.last = position
@@ -205,22 +202,15 @@ class Judge:
             self._violation(now, axis, f"the drive hears {position}, and heard {joint.heard} before that")
         joint.heard = position
 
-    def _judge_velocity(
-        self, axis: int, joint: _Joint, velocity: int, position: int, used: int, answered: bool, now: int
-    ) -> None:
-        """In CSV the set-point's velocity is told with what pulls the joint back to its position: it is taken off."""
-        bounds, past, gain = self.bounds, joint.velocities, self.bounds.csv_gain[axis]
+    def _judge_velocity(self, axis: int, joint: _Joint, velocity: int, answered: bool, now: int) -> None:
+        """In CSV the velocity itself is on the wire, with what pulls the joint back to its position."""
+        bounds, past = self.bounds, joint.velocities
         bound = bounds.velocity[axis] * COUNTS + 1
         if abs(velocity) > bound:
             self._violation(now, axis, f"target velocity {velocity}, allowed {bound:.0f}")
-        inside = bounds.low[axis] * COUNTS <= used <= bounds.high[axis] * COUNTS
-        if abs(velocity) >= bound - 2 or not inside:
-            # Cut to its limit, or not driven further out: nothing to be told from it.
-            past.clear()
-            return
         if not answered:
             return
-        past.append(velocity - gain * (position - used))
+        past.append(velocity)
         if len(past) > _KEPT:
             del past[0]
         newest = len(past) - 1
@@ -228,8 +218,7 @@ class Judge:
             if newest < n:
                 break
             change = abs(past[newest] - past[newest - n])
-            # A mode tells the speed at the end of its cycle, a guard's stop the mean of it: half a cycle apart.
-            allowed = bounds.acceleration[axis] * (n + 0.5) * self._dt * COUNTS + ROUNDING + gain
+            allowed = bounds.acceleration[axis] * n * self._dt * COUNTS + ROUNDING
             self.largest_acceleration = max(self.largest_acceleration, change / allowed)
             if change > allowed:
                 self._violation(

@@ -24,7 +24,7 @@ class DiewuIoBox:
     """The IO box; options as in `IO_BOX_OPTIONS`.
 
     The world outside sets `inputs` (or one of them with `set_input`) and turns the encoder; whoever is on the bus may
-    force inputs through 0x2000 (mask, levels) and set the counter through 0x2001:1.
+    force inputs through 0x2000 (mask, levels, and for how long) and set the counter through 0x2001:1.
 
     Raises:
         ValueError: an option that does not exist or is out of range.
@@ -52,6 +52,8 @@ class DiewuIoBox:
         self._levels_entry = number(objects, 0x2000, 2)
         self._terminal_entry = number(objects, 0x2002)
         objects[0x2001, 1].on_write = self._preset
+        objects[0x2000, 3].on_write = self._hold
+        self._held_s = 0.0
         define_pdo_objects(
             objects,
             {0x1600: ((0x7000, 1, 16),)},
@@ -96,6 +98,11 @@ class DiewuIoBox:
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass: drive the output terminals, read the inputs, count edges."""
         self._terminal_entry.value = self._output_entry.value if self._outputs_valid else 0
+        if self._held_s > 0.0:
+            self._held_s -= dt
+            if self._held_s <= 0.0:
+                # Nobody has said it again: a stick that stays deflected for ever is the known accident.
+                self._mask_entry.value = 0
         mask = self._mask_entry.value
         self._input_entry.value = self._inputs & ~mask | self._levels_entry.value & mask
         turned = self._turned + self.counter_rate * dt
@@ -103,6 +110,9 @@ class DiewuIoBox:
             whole = int(turned)
             self._turned = turned - whole
             self._counter_entry.value = (self._counter_entry.value + whole + 0x80000000) % 0x100000000 - 0x80000000
+
+    def _hold(self, _: Entry, value: Value) -> None:
+        self._held_s = int(value) * 1e-3
 
     def _preset(self, _: Entry, value: Value) -> None:
         self._counter_entry.value = int(value)
@@ -129,6 +139,7 @@ def _build_objects(identity: Identity, inputs: int) -> ObjectDictionary:
     objects.record(0x2000, "Forced inputs", [
         Entry(0x2000, 1, "Mask of the forced inputs", _U16, 0, Access.RW),
         Entry(0x2000, 2, "Levels of the forced inputs", _U16, 0, Access.RW),
+        Entry(0x2000, 3, "Milliseconds until they are let go, 0: never", _U16, 0, Access.RW),
     ])  # fmt: skip
     objects.record(0x2001, "Counter settings", [Entry(0x2001, 1, "Preset", _I32, 0, Access.RW)])
     objects.variable(0x2002, "Levels at the output terminals", _U16)

@@ -96,6 +96,12 @@ class Plant:
                 assert abs(speeds[i]) <= 1.05 * limits.velocity[i], (i, speeds[i])
                 assert limits.low[i] <= positions[i] <= limits.high[i], (i, positions[i])
 
+    def accelerations(self, axis: int, over_s: float = 0.1) -> list[float]:
+        """Mean acceleration of a joint over spans of `over_s`, rad/s^2."""
+        n = round(over_s / PERIOD)
+        speeds = [speed[axis] for _, speed, _ in self.seen]
+        return [(b - a) / over_s for a, b in zip(speeds, speeds[n:], strict=False)]
+
     def largest_step(self, since: int = 1) -> float:
         """Nm that the torque of any joint changed by in a cycle."""
         torques = [torque for _, _, torque in self.seen]
@@ -149,6 +155,23 @@ def test_a_torque_accelerates_as_the_inertia_says(plant: Plant) -> None:
     plant.run(0.2, [1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     # 1 rad/s^2, but for the ramp of the torque: 1.2 of 49 Nm in 2.4 ms.
     assert plant.state.speed[0] == pytest.approx(0.2, abs=0.003)
+
+
+def test_a_reversal_of_the_whole_torque_keeps_to_the_acceleration_and_the_set_point_follows(plant: Plant) -> None:
+    plant.mode.start(plant.state)
+    worst = 0.0
+    for sign in (1.0, -1.0, 1.0):
+        for _ in range(10):
+            plant.run(0.1, [sign * torque for torque in plant.limits.torque])
+            apart = zip(plant.state.position, plant.state.actual, strict=True)
+            worst = max(worst, *(abs(a - b) for a, b in apart))
+    # An emergency stop comes at 0.15 rad (watch.following_error).
+    assert worst < 0.05
+    for axis in range(6):
+        # The set-point has 2 rad/s^2, and the arm is at most 0.2 rad/s beside it.
+        assert max(map(abs, plant.accelerations(axis))) < 2.0 + 2 * 0.2 / 0.1
+        assert max(map(abs, plant.accelerations(axis, 0.4))) < 2.0 + 0.5
+    plant.check()
 
 
 def test_the_torque_asked_for_rises_no_faster_than_to_its_limit_in_a_tenth_of_a_second(plant: Plant) -> None:
@@ -230,6 +253,15 @@ def test_stiffness_holds_the_arm_about_where_it_was_asked_for(plant: Plant) -> N
     # 6 Nm on half of 600 Nm/rad.
     assert plant.state.actual[0] == pytest.approx(0.02, rel=0.02)
     plant.check()
+
+
+def test_stiffness_asked_for_at_once_is_about_where_the_arm_begins(new_plant: Any) -> None:
+    bent = [0.4, 0.5, 1.2, -0.3, 0.8, 0.1]
+    plant = new_plant(bent)
+    for _ in range(2):  # a second motion is not about the first one's end either
+        plant.mode.start(plant.state)
+        plant.run(0.5, FREE, stiffness=1.0, damping=1.0)
+        assert plant.state.actual == pytest.approx(bent, abs=1e-3)
 
 
 def test_damping_slows_a_motion_down(plant: Plant) -> None:

@@ -123,3 +123,24 @@ def test_the_process_data_are_fixed() -> None:
     assert PdoImage.from_assignment(box.objects, 0x1C13).byte_length == 6
     with pytest.raises(SdoAbort):
         sdo_access.write(box.objects, 0x1C12, 0, False, 2, b"\x00")
+
+
+def test_forced_inputs_are_let_go_when_their_time_has_run_out() -> None:
+    box = DiewuIoBox()
+    force(box, hold_ms=100)
+    box.step(0.06)
+    assert box.objects[0x6000, 1].value == 0x003E
+    force(box, hold_ms=100)
+    box.step(0.06)
+    assert box.objects[0x6000, 1].value == 0x003E
+    box.step(0.05)
+    box.step(0.001)
+    assert box.objects[0x6000, 1].value == 0x003F
+
+
+def force(box: DiewuIoBox, hold_ms: int) -> None:
+    for sub_index, value in ((3, hold_ms), (2, 0x003E), (1, 0x003F)):
+        entry = box.objects[0x2000, sub_index]
+        entry.value = value
+        if entry.on_write is not None:
+            entry.on_write(entry, value)
