@@ -1,4 +1,4 @@
-"""How fast and how exact the kinematics is: `python benchmarks/arm_kinematics.py [--rounds N] [--poses N] [--json FILE]`.
+"""How fast and exact the kinematics is: `python benchmarks/arm_kinematics.py [--rounds N] [--poses N] [--json FILE]`.
 
 In one run, round after round alternating: this project's functions, EAIK (analytic, C++), the numeric solver of
 roboticstoolbox-python (`ik_LM`, C++) and Pinocchio (C++, with a damped-least-squares loop in Python). What is not

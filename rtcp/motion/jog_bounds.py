@@ -110,10 +110,10 @@ class JogBounds:
             if (along > _TOLERANCE or along < -_TOLERANCE) and not _taken(twist, row, along, weight, basis):
                 return False
         for _ in range(_PASSES):
-            row, excess = self._worst(poses, twist)
-            if row is None:
+            worst, excess = self._worst(poses, twist)
+            if worst is None:
                 return True
-            if not _taken(twist, row, excess, weight, basis):
+            if not _taken(twist, worst, excess, weight, basis):
                 return False
         return self._worst(poses, twist)[0] is None
 

@@ -32,11 +32,11 @@ class Shown(Protocol):
 class Joystick:
     """Turns what the stick shows into a tool velocity, or into the gripper's opening.
 
-    `twist`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along `frame`; `moves`: whether it is one; `grip`: True to open, False to
-    close, in the cycle in which the stick asks for it, else None; `mode` as in the table.
+    `twist`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along `frame`; `moves`: whether it is one; `grip`: True to open, False
+    to close, in the cycle in which the stick asks for it, else None; `mode` as in the table.
 
-    A stick that is deflected when it begins to count (at the start, after a mode change, when it is given back, after what
-    was no code) counts only after it has been neutral.
+    A stick that is deflected when it begins to count (at the start, after a mode change, when it is given back, after
+    what was no code) counts only after it has been neutral.
     """
 
     def __init__(self, config: JogConfig) -> None:

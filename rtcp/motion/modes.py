@@ -13,7 +13,6 @@ from typing import Protocol
 
 from rtcp.config.model import Joint
 
-
 _FADE_S = 0.3
 """Time constant with which the drive's own following error gives way to the position loop closed here."""
 

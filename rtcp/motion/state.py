@@ -19,8 +19,8 @@ class Phase(IntEnum):
 class MotionState:
     """The arm as a mode sees it at the beginning of a cycle; lists have one number a joint, rad, rad/s, rad/s^2, Nm.
 
-    `position`, `velocity`, `acceleration` are what was commanded in the last cycle, after the guards: a mode that goes on
-    from them is continuous whatever the guards did. `actual`, `speed`, `torque` are measured.
+    `position`, `velocity`, `acceleration` are what was commanded in the last cycle, after the guards: a mode that goes
+    on from them is continuous whatever the guards did. `actual`, `speed`, `torque` are measured.
     """
 
     __slots__ = ("acceleration", "actual", "now_ns", "position", "speed", "torque", "velocity")
@@ -74,8 +74,8 @@ class Reason(IntEnum):
 
 
 class Mode(Protocol):
-    """A mode of motion. One `update` a cycle while it is the active one; nothing in it allocates without bound, blocks or
-    logs. It is started by its own method from a `MotionState`, and begins at the state's position, velocity and
+    """A mode of motion. One `update` a cycle while it is the active one; nothing in it allocates without bound, blocks
+    or logs. It is started by its own method from a `MotionState`, and begins at the state's position, velocity and
     acceleration.
     """
 

@@ -32,9 +32,10 @@ _MARGIN_RAD = 0.02
 class TorqueMode:
     """The mode `torque`.
 
-    While `direct` is true the set-point follows the arm under the joints' speed and acceleration; what would carry the arm
-    away from it faster than that fades out, so that the arm keeps to them too. And `Target.torque` is the whole torque of each joint
-    (`TorqueLaw.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the law holds.
+    While `direct` is true the set-point follows the arm under the joints' speed and acceleration; what would carry the
+    arm away from it faster than that fades out, so that the arm keeps to them too. `Target.torque` is the whole torque
+    of each joint (`TorqueLaw.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the
+    law holds.
 
     Args:
         joints: for the stiffness and damping that the impedance is a part of.

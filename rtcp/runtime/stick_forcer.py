@@ -86,6 +86,7 @@ class StickForcer:
     async def let_go(self) -> None:
         """Let go of everything; what fails is tried again by `watch`."""
         self._owner = None
+        self._said = 0.0
         if self.possible:
             with contextlib.suppress(CommandFailed):
                 await self._write(0, 0)

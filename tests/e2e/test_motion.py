@@ -15,7 +15,7 @@ from kinematics.forward import forward
 from rtcp.config import default_config, load
 from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.paths import control_socket
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import Platform, kill
 
 BENT = [0.0, 0.2, 1.57, 0.0, 0.4, 0.0]
 NUMBERS = [f"{q:g}" for q in BENT]

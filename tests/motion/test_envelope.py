@@ -36,6 +36,7 @@ WISHES: dict[str, Callable[[Judge, int], float]] = {
     "full acceleration up": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt),
     "full acceleration down": lambda judge, i: _at(judge, i, judge.mean[i] - judge.limits.acceleration[i] * judge.dt),
     "a bit too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.00004),
+    "too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.001),
     "full speed": lambda judge, i: _at(judge, i, judge.limits.velocity[i]),
     "as it goes": lambda judge, i: _at(judge, i, judge.mean[i]),
     "creep up": lambda judge, i: _at(judge, i, 1e-7),

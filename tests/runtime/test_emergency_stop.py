@@ -1,4 +1,4 @@
-"""The emergency path and the stop by a limit: the real classes and device models, cycle by cycle (see test_behaviour)."""
+"""The emergency path and the stop by a limit: the real classes and device models, cycle by cycle, as test_behaviour."""
 
 from __future__ import annotations
 

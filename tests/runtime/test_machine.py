@@ -73,7 +73,7 @@ def test_the_picture_shows_every_state() -> None:
     assert all(f"{state.name} :" in diagram() for state in State)
 
 
-# -- RobotStatus --------------------------------------------------------------------------------------------------------
+# -- RobotStatus ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("state", State)

@@ -18,30 +18,31 @@ from .test_behaviour import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, Benc
 
 # What is taken (x) where, written down a second time: a slip in the machine's own table shows here.
 TABLE = """
-           starting ready enabling holding moving stopping stopped_by_limit homing disabling fault emergency_stop resetting closing
-enable        .       x      .        .      .       .            .           .        .       .         .            .        .
-disable       .       x      x        x      x       x            x           x        x       x         x            x        .
-reset         .       .      .        .      .       .            x           .        .       x         x            .        .
-mode          .       x      .        x      .       .            .           .        .       .         .            .        .
-motion        .       x      .        x      .       .            .           .        .       .         .            .        .
-move          .       .      .        x      x       .            .           .        .       .         .            .        .
-trajectory    .       .      .        x      x       .            .           .        .       .         .            .        .
-line          .       .      .        x      x       .            .           .        .       .         .            .        .
-stream        .       .      .        x      x       .            .           .        .       .         .            .        .
-jog           .       .      .        x      x       .            .           .        .       .         .            .        .
-velocity      .       .      .        x      x       .            .           .        .       .         .            .        .
-torque        .       .      .        x      x       .            .           .        .       .         .            .        .
-stop          .       .      .        x      x       x            x           x        .       .         .            .        .
-output        .       x      x        x      x       x            x           x        .       x         .            .        .
-gripper       .       x      .        x      x       x            x           .        .       .         .            .        .
-limits        .       x      .        x      x       .            x           .        .       x         x            .        .
-zero          .       x      .        .      .       .            .           .        .       .         .            .        .
-home          .       .      .        x      .       .            .           .        .       .         .            .        .
-shutdown      x       x      x        x      x       x            x           x        x       x         x            x        x
+           starting ready enabling holding moving stopping limit homing disabling fault emergency resetting closing
+enable        .       x      .        .      .       .       .     .        .       .       .         .        .
+disable       .       x      x        x      x       x       x     x        x       x       x         x        .
+reset         .       .      .        .      .       .       x     .        .       x       x         .        .
+mode          .       x      .        x      .       .       .     .        .       .       .         .        .
+motion        .       x      .        x      .       .       .     .        .       .       .         .        .
+move          .       .      .        x      x       .       .     .        .       .       .         .        .
+trajectory    .       .      .        x      x       .       .     .        .       .       .         .        .
+line          .       .      .        x      x       .       .     .        .       .       .         .        .
+stream        .       .      .        x      x       .       .     .        .       .       .         .        .
+jog           .       .      .        x      x       .       .     .        .       .       .         .        .
+velocity      .       .      .        x      x       .       .     .        .       .       .         .        .
+torque        .       .      .        x      x       .       .     .        .       .       .         .        .
+stop          .       .      .        x      x       x       x     x        .       .       .         .        .
+output        .       x      x        x      x       x       x     x        .       x       .         .        .
+gripper       .       x      .        x      x       x       x     .        .       .       .         .        .
+limits        .       x      .        x      x       .       x     .        .       x       x         .        .
+zero          .       x      .        .      .       .       .     .        .       .       .         .        .
+home          .       .      .        x      .       .       .     .        .       .       .         .        .
+shutdown      x       x      x        x      x       x       x     x        x       x       x         x        x
 """
 _HEAD, *_ROWS = [line.split() for line in TABLE.strip().splitlines()]
+_SHORT = {"LIMIT": "STOPPED_BY_LIMIT", "EMERGENCY": "EMERGENCY_STOP"}
 PAIRS = [
-    (Command[row[0].upper()], State[state.upper()], mark == "x")
+    (Command[row[0].upper()], State[_SHORT.get(state.upper(), state.upper())], mark == "x")
     for row in _ROWS
     for state, mark in zip(_HEAD, row[1:], strict=True)
 ]

@@ -185,6 +185,11 @@ def test_a_path_is_run_from_its_second_pose_on_after_an_approach_to_its_first(ar
     assert row[7:10] == pytest.approx(beside(arm, 0.1)[:3])
 
 
+def test_a_path_of_one_pose_is_its_approach(arm: Played) -> None:
+    arm.ask("path", path=[{"pose": beside(arm, 0.05)}], approach=True)
+    assert [kind for kind, *_ in arm.loop.commands] == [Command.MOVE]
+
+
 def test_a_mistake_in_a_file_is_named_with_its_line(arm: Played, tmp_path: Path) -> None:
     file = tmp_path / "motion.csv"
     file.write_text("t,q1,q2,q3,q4,q5,q6\n1,0,0,0,0,0,0\n0.5,0,0,0,0,0,0\n")

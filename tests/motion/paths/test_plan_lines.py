@@ -1,4 +1,4 @@
-"""Plans of straight lines: refused with the place on the line, slowed down for the joints, and carried out as planned."""
+"""Plans of straight lines: refused with the place on the line, slowed down for the joints, carried out as planned."""
 
 from __future__ import annotations
 
