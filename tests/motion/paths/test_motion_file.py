@@ -105,7 +105,7 @@ def test_a_mistake_in_yaml_is_named_in_one_sentence(write: Write, text: str, sen
     assert sentence in found[0]
 
 
-HEADER = 'allowed is t,q1,..,q6 (and v1,..,v6 and a1,..,a6) or x,y,z,rx,ry,rz (and speed)'
+HEADER = "allowed is t,q1,..,q6 (and v1,..,v6 and a1,..,a6) or x,y,z,rx,ry,rz (and speed)"
 CSV = [
     ("\n# nothing\n", "a.csv: the file is empty; a header and rows of numbers are expected"),
     ("t,q1,q3\n0,0,0\n", f'a.csv:1: found the header "t,q1,q3", {HEADER}'),

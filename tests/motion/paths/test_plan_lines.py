@@ -99,9 +99,7 @@ def test_a_line_that_comes_too_near_to_a_singularity_is_refused(plan: Any) -> No
     at, _, of = where.removeprefix("the line at ").partition(" m of ")
     assert 0.0 < float(at) < float(of.removesuffix(" m"))
     assert what.startswith("the wrist is 0.07")
-    assert what.endswith(
-        " rad from its singularity, allowed is at least 0.08 rad (cartesian.singularity.wrist)"
-    )
+    assert what.endswith(" rad from its singularity, allowed is at least 0.08 rad (cartesian.singularity.wrist)")
 
 
 def test_a_line_beyond_a_limit_that_was_narrowed_is_refused(bounds: Any, plan: Any, moved: Any) -> None:

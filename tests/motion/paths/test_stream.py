@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -86,10 +87,28 @@ def test_any_rate_is_followed_smoothly(new_drive: Any, interval: float) -> None:
     assert mode.dropped == 0
 
 
+def test_between_rare_targets_the_speed_hardly_changes(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    stream(drive, mode, lambda t: [0.2 * t] * 6, 4.0, 0.1)
+    speeds = [(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path[4000:])]
+    assert 0.15 < min(speeds)
+    assert max(speeds) < 0.25
+
+
+def test_a_stream_has_ended_after_the_timeout_and_not_before(drive: Any, mode: StreamMode) -> None:
+    mode.start(drive.state)
+    assert mode.feed(ZERO, 1.0, 0)
+    drive.run(mode, round(TIMEOUT_S / PERIOD) + 1)
+    assert (mode.phase, mode.reason) == (Phase.MOVE, Reason.NONE)
+    drive.cycle(mode)
+    assert (mode.phase, mode.reason) == (Phase.HOLD, Reason.STREAM_ENDED)
+    assert (mode.value, mode.limit) == (pytest.approx(TIMEOUT_S + PERIOD), TIMEOUT_S)
+
+
 def test_jitter_of_the_network_does_not_stop_the_motion(drive: Any, mode: StreamMode) -> None:
     mode.start(drive.state)
     stream(drive, mode, lambda t: [0.2 * t] * 6, 2.0, 0.03, jitter=0.015)
-    speeds = [(b[0] - a[0]) / PERIOD for a, b in zip(drive.path[1000:], drive.path[1001:], strict=False)]
+    speeds = [(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path[1000:])]
     assert min(speeds) > 0.05
 
 
@@ -160,6 +179,16 @@ def test_targets_at_the_edge_of_a_range_do_not_carry_a_joint_beyond(drive: Any, 
     assert drive.state.position == pytest.approx(high, abs=1e-6)
     drive.until_rest(mode)
     assert drive.state.position == pytest.approx(high, abs=1e-6)
+
+
+def test_a_fast_stream_that_ends_beside_the_edge_leaves_room_to_stop(drive: Any, mode: StreamMode) -> None:
+    high = drive.limits.high
+    drive.at([h - 0.6 for h in high])
+    mode.start(drive.state)
+    # 0.45 rad/s up to 5 mrad from the edge: to stop from that speed takes 73 mrad.
+    stream(drive, mode, lambda t: [min(h - 0.6 + 0.45 * t, h - 0.005) for h in high], 1.33, 0.05)
+    drive.until_rest(mode)
+    assert mode.reason is Reason.STREAM_ENDED
 
 
 def test_a_run_up_that_would_leave_the_range_is_not_made(drive: Any, mode: StreamMode) -> None:

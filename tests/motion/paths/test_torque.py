@@ -66,6 +66,7 @@ class Plant:
         target = self.mode.update(state, PERIOD)
         self.guard.apply(state, target, self.mode.clamps)
         if self.mode.direct:
+            assert all(-most <= torque <= most for torque, most in zip(target.torque, self.limits.torque, strict=True))
             self.law.pass_on(state.position, target.torque, joints)
         else:
             self.law.update(state.position, state.velocity, joints)

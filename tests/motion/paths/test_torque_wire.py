@@ -56,6 +56,7 @@ def test_the_torque_on_the_wire_is_bounded_and_so_is_the_speed_that_it_makes(ben
     push(bench, 4.0, 2.0, 0.3)
     # Torques count in real time, in which the bench is faster.
     bench.until(State.HOLDING, 60.0)
+    bench.run(1.0)
     for axis, (drive, joint) in enumerate(zip(bench.arm.drives, CONFIG.joints, strict=True)):
         said = [cycle.drives[axis] for cycle in bench.log[begun:]]
         efforts = [drive_said.effort for drive_said in said]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -93,6 +94,8 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
         drive.run(mode, 200)
     assert drive.state.position == pytest.approx(edges, abs=1e-6)
     assert max(map(abs, drive.state.velocity)) < 1e-6
+    fastest = max(abs(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path))
+    assert fastest <= speed * (1 + 1e-6)
     # It does not go to and fro there, and it is the mode that stops it, not the guard.
     joint = [sign * q[0] for q in drive.path]
     assert joint == sorted(joint)
@@ -101,6 +104,17 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
     mode.command([-sign * speed] * 6, 0.5, drive.state.now_ns)
     drive.run(mode, 1000)
     assert drive.state.velocity == pytest.approx([-sign * speed] * 6)
+
+
+def test_what_the_guards_made_of_it_is_gone_on_from(drive: Any, mode: VelocityMode) -> None:
+    mode.start(drive.state)
+    mode.command([0.4] * 6, 1.0, 0)
+    drive.run(mode, 400)
+    # As after a stop before a box: at rest, a little behind.
+    drive.state.velocity, drive.state.acceleration = [0.0] * 6, [0.0] * 6
+    drive.at([q - 0.01 for q in drive.state.position])
+    before = list(drive.state.position)
+    assert mode.update(drive.state, PERIOD).position == pytest.approx(before, abs=1e-6)
 
 
 def test_the_other_joints_go_on_while_one_stands_at_its_edge(drive: Any, mode: VelocityMode) -> None:
