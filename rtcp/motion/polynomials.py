@@ -63,8 +63,6 @@ def sign_changes(coefficients: Sequence[float]) -> list[float]:
     for low, high, at_low, at_high in zip(edges, edges[1:], values, values[1:], strict=False):
         if at_low * at_high < 0.0:
             found.append(_root(coefficients, low, high, at_low < 0.0))
-        elif at_high == 0.0 and 0.0 < high < 1.0:
-            found.append(high)
     return found
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
-from rtcp.devices.homing import Homing, HomingPhase
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.modes import DriveMode
 from rtcp.motion.state import Phase, Reason
@@ -17,6 +16,7 @@ from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.emergency_stop import EmergencyStop
+from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.machine import TABLE, WITH_TORQUE, Code, Event, State
 from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
@@ -31,11 +31,6 @@ _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
 _ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
 """Reasons that are no limit: the arm has stopped and takes commands."""
-_HOMING_ENDS = {
-    HomingPhase.HOMED: Code.HOMED,
-    HomingPhase.FAILED: Code.HOMING_FAILED,
-    HomingPhase.STOPPED: Code.STOPPED,
-}
 _PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
 """States that the emergency stop's input ends. On the way to OP the inputs are not yet valid; while ready no drive has
 torque, and enabling is refused for as long as it is pressed."""
@@ -69,8 +64,7 @@ class Behaviour:
         self._service = service
         self._discipline = discipline
         self._watch = Watch(config, arm.limits)
-        self.homing = Homing(period_s)
-        self._homed_axis = 0
+        self.homing = HomingArm(arm, period_s)
         self._emergency = EmergencyStop(arm, service, blackboard, period_s)
         self._lost_limit = config.bus.lost_cycles
         self._enable_cycles = round(config.enable_timeout_s / period_s)
@@ -184,8 +178,7 @@ class Behaviour:
     def home(self, axis: int, lease: int) -> None:
         """Let the drive of a joint home by itself; the arm holds, in CSP."""
         self.lease = lease
-        self._homed_axis = axis
-        self.homing.start(self._arm.drives[axis])
+        self.homing.begin(axis)
         self.on(Event.HOME)
 
     def release(self) -> None:
@@ -389,7 +382,7 @@ class Behaviour:
         self._track(good)
 
     def _homing(self, good: bool) -> None:
-        arm, homing, axis = self._arm, self.homing, self._homed_axis
+        arm, homing = self._arm, self.homing
         if self._bus_fails(good) or not good:
             return
         left = arm.first_not_enabled()
@@ -398,40 +391,25 @@ class Behaviour:
             return
         if not self._operator.permitted or self._lease_ended():
             homing.stop()
-        self._step_homing()
+        homing.step()
         found = self._watch.look(arm.state)
         if found is not None:
             self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
-        elif homing.phase is HomingPhase.STUCK:
-            self._fail_mode(axis)
+        elif homing.stuck:
+            self._fail_mode(homing.axis)
         elif arm.first_outside() >= 0:
             # While it searches, and where it begins to count anew: also a stop after the index was found does.
+            axis = arm.first_outside()
             self._fail(Code.LEFT_RANGE, axis, arm.all_drives[axis].position)
         elif homing.ended:
-            self._blackboard.event(_HOMING_ENDS[homing.phase], axis, self._homing_figure())
-            self.on(Event.HOMED if homing.phase is HomingPhase.HOMED else Event.STOPPED)
-
-    def _homing_figure(self) -> float:
-        homing = self.homing
-        return homing.position if homing.phase is HomingPhase.HOMED else float(homing.shown)
-
-    def _step_homing(self) -> None:
-        """Let the drive that homes go on; its set-point is where it says it is, the other joints' stand."""
-        arm, axis = self._arm, self._homed_axis
-        self.homing.step()
-        arm.state.position[axis] = self.homing.position
-        arm.guard.latch(axis, self.homing.position)
-        arm.guards.latch(arm.state)
+            self._blackboard.event(*homing.outcome)
+            self.on(Event.HOMED if homing.homed else Event.STOPPED)
 
     def _homing_ends(self, good: bool) -> bool:
-        """Bring a homing to its end before the torque goes; return whether it is still under way."""
-        if self.homing.phase is HomingPhase.IDLE or self.homing.ended or self._arm.first_not_enabled() >= 0:
+        if not self.homing.still_ending(good):
             return False
-        self.homing.stop()
-        if good:
-            self._step_homing()
         self._since = self.cycle
-        return not self.homing.ended
+        return True
 
     def _disabling(self, good: bool) -> None:
         arm = self._arm

@@ -166,5 +166,17 @@ def test_a_line_is_slowed_down_until_the_joints_keep_their_limits(
     assert fastest > 0.8 * 0.15
 
 
+def test_a_line_is_accelerated_so_gently_that_the_joints_keep_their_limits(
+    arm: Any, new_drive: Any, moved: Any, memory: Any
+) -> None:
+    drive = new_drive().at(Q)
+    drive.limits.acceleration[:] = [0.3] * 6
+    made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.1)], speed=0.1)
+    mode = LineMode(arm.arm, drive.limits, PERIOD)
+    assert mode.start(drive.state, memory(made.rows), 1) is None
+    drive.until_rest(mode)
+    assert drive.state.position == pytest.approx(made.end, abs=1e-9)
+
+
 def test_a_line_that_no_joint_hinders_keeps_its_speed(plan: Any, moved: Any) -> None:
     assert plan([moved(0.0, 0.0, -0.1)], speed=0.02).slowed == 1.0

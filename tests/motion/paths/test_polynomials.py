@@ -72,6 +72,11 @@ def test_an_extreme_in_the_middle_of_a_piece_is_seen_to_the_last_digit() -> None
     assert beyond(c, -1.0, 1 / 16 + 1e-12) is None
 
 
+def test_a_flat_extreme_is_found_too() -> None:
+    # (x - 1/2)^4: all derivatives but the fourth vanish where it is least.
+    assert extremes([0.0625, -0.5, 1.5, -2.0, 1.0, 0.0])[:2] == pytest.approx((0.0, 0.5), abs=1e-12)
+
+
 def test_a_spline_is_twice_differentiable_and_at_rest_at_its_ends() -> None:
     chance = random.Random(3)
     times, values = [0.0, 0.7, 1.1, 2.5, 3.0], [chance.uniform(-1.0, 1.0) for _ in range(5)]

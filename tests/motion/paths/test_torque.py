@@ -55,6 +55,8 @@ class Plant:
         self.law = TorqueLaw(arm.joints, PERIOD)
         self.law.start(self.joints)
         self.mode = TorqueMode(arm.joints, self.limits, PERIOD, model)
+        self.outside = [0.0] * 6
+        """Torques from outside, as of a hand, Nm."""
         self.seen: list[tuple[list[float], list[float], list[float]]] = []
         """Position, speed and torque of all joints after each cycle."""
 
@@ -73,7 +75,7 @@ class Plant:
         held = self.holding([joint.position for joint in joints])
         for i, joint in enumerate(joints):
             joint.torque = joint.target_torque
-            joint.velocity += (joint.torque - held[i]) / INERTIA[i] * PERIOD
+            joint.velocity += (joint.torque + self.outside[i] - held[i]) / INERTIA[i] * PERIOD
             joint.position += joint.velocity * PERIOD
         state.actual = [joint.position for joint in joints]
         state.speed = [joint.velocity for joint in joints]
@@ -269,6 +271,16 @@ def test_damping_slows_a_motion_down(plant: Plant) -> None:
     plant.mode.start(plant.state)
     plant.run(2.0, [6.0, 0.0, 0.0, 0.0, 0.0, 0.0], damping=1.0)
     assert plant.state.speed[0] == pytest.approx(6.0 / 60.0, rel=0.05)
+
+
+def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plant: Any) -> None:
+    plant = new_plant([3.0, 0.5, 0.0, 0.0, 0.0, 0.0])
+    plant.mode.start(plant.state)
+    plant.outside[0] = 6.0
+    plant.run(4.0, FREE)
+    # 6 Nm on 600 Nm/rad, from where the margin of 0.02 rad begins.
+    assert plant.state.actual[0] == pytest.approx(3.1 - 0.02 + 0.01, abs=1e-3)
+    plant.check()
 
 
 def test_beside_the_edge_it_begins_without_a_push(new_plant: Any) -> None:

@@ -1,0 +1,78 @@
+"""The homing of one joint as the machine leads it: its drive homes by itself, the arm's set-points follow or stand."""
+
+from __future__ import annotations
+
+from rtcp.devices.homing import Homing, HomingPhase
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.codes import Code
+
+_CODES = {
+    HomingPhase.HOMED: Code.HOMED,
+    HomingPhase.FAILED: Code.HOMING_FAILED,
+    HomingPhase.STOPPED: Code.STOPPED,
+}
+
+
+class HomingArm:
+    """One homing at a time; `step` once a cycle until it has `ended`.
+
+    Args:
+        arm: enabled, at rest, in CSP.
+        period_s: the cycle, s.
+    """
+
+    def __init__(self, arm: Arm, period_s: float) -> None:
+        self._arm = arm
+        self._homing = Homing(period_s)
+        self.axis = 0
+
+    def begin(self, axis: int) -> None:
+        """Let the drive of a joint begin."""
+        self.axis = axis
+        self._homing.start(self._arm.drives[axis])
+
+    def stop(self) -> None:
+        """Let the drive come to rest and go back to CSP."""
+        self._homing.stop()
+
+    def abandon(self) -> None:
+        """Let go of the drive, which is led elsewhere."""
+        self._homing.abandon()
+
+    def step(self) -> None:
+        """Let the drive go on; its set-point is where it says it is, the other joints' stand."""
+        arm, axis, homing = self._arm, self.axis, self._homing
+        homing.step()
+        arm.state.position[axis] = homing.position
+        arm.guard.latch(axis, homing.position)
+        arm.guards.latch(arm.state)
+
+    def still_ending(self, good: bool) -> bool:
+        """Bring a homing to its end before the torque goes; return whether it is still under way."""
+        if self._homing.phase is HomingPhase.IDLE or self._homing.ended or self._arm.first_not_enabled() >= 0:
+            return False
+        self._homing.stop()
+        if good:
+            self.step()
+        return not self._homing.ended
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the drive does not change its mode."""
+        return self._homing.phase is HomingPhase.STUCK
+
+    @property
+    def ended(self) -> bool:
+        """Whether it is over."""
+        return self._homing.ended
+
+    @property
+    def homed(self) -> bool:
+        """Whether it has succeeded."""
+        return self._homing.phase is HomingPhase.HOMED
+
+    @property
+    def outcome(self) -> tuple[Code, int, float]:
+        """How it ended: an event, its joint, and the position (rad) or the statusword that it is told with."""
+        homing = self._homing
+        return _CODES[homing.phase], self.axis, homing.position if self.homed else float(homing.shown)
