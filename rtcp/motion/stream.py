@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 TIMEOUT_S = 0.2
 """A stream that is silent for so long has ended."""
-_STRETCH = 1.25
-"""A target is reached so many of the sender's intervals after it came: the next may be a little late."""
+_LATE = 2.5
+"""So many intervals after the last target one is missing; until then its speed is kept."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """How much a new interval counts in the mean."""
@@ -196,9 +196,10 @@ class StreamMode:
         if result == Result.Finished:
             self._tracks = any(self._way.target_velocity)
             if self._tracks:
-                # No new target in time: rest at the last one.
                 output.pass_to_input(self._way)
-                self._aim_to_rest()
+                # ruckig goes on at the target's speed; where no new one comes, back to rest at the last.
+                if not self._may_go_on(state):
+                    self._aim_to_rest()
         else:
             output.pass_to_input(self._way)
         return target
@@ -224,8 +225,6 @@ class StreamMode:
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
         way.target_position, way.target_velocity = self._wanted, self._speed
-        # Not earlier than the next target comes, so that the speed need not fall in between.
-        way.minimum_duration = self._interval_s * _STRETCH or None
         if not self._stays_inside(state):
             self._aim_to_rest()
 
@@ -243,7 +242,19 @@ class StreamMode:
                 return False
         return True
 
+    def _may_go_on(self, state: MotionState) -> bool:
+        """Whether a target may just be late, and the joints can still stop inside their range."""
+        if (state.now_ns - self._came_ns) * 1e-9 > _LATE * self._interval_s:
+            return False
+        limits, speed, position = self._limits, self._speed, state.position
+        for i in self._joints:
+            v = speed[i]
+            room = limits.high[i] - position[i] if v > 0.0 else position[i] - limits.low[i]
+            most = stoppable_speed(0.9 * room, limits.acceleration[i], limits.jerk[i])
+            if not -most <= v <= most:
+                return False
+        return True
+
     def _aim_to_rest(self) -> None:
         way = self._way
         way.target_position, way.target_velocity = self._wanted, self._zero
-        way.minimum_duration = None
