@@ -13,6 +13,7 @@ import os
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
@@ -160,7 +161,14 @@ def _disable_blindly(data: ProcessData, drives: Sequence[tuple[int, Cia402Drive]
 
 
 if __name__ == "__main__":
-    code = main()
+    try:
+        code = main()
+    except SystemExit as ending:
+        code = ending.code if isinstance(ending.code, int) else 1
+    except BaseException:
+        # A defect of ours: told whole, for the log.
+        traceback.print_exc()
+        code = 1
     sys.stderr.flush()
     # Past the interpreter's own end: with the collector off, ruckig's objects would be reported as leaked there.
     os._exit(code)
