@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ import pytest
 from kinematics.forward import forward
 from rtcp.config import default_config, load
 from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.paths import control_socket
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.paths import blackboard_file, control_socket
 from tests.e2e.conftest import Platform, kill
 
 BENT = [0.0, 0.2, 1.57, 0.0, 0.4, 0.0]
@@ -216,9 +217,22 @@ def test_a_joint_is_homed_and_holds_again(bent: Platform) -> None:
 
 
 def test_a_stick_is_let_go_of_by_the_box_itself_when_the_gateway_is_killed(running: Platform) -> None:
+    observer = Observer(blackboard_file(running.directory))
+
+    def shows(byte: int) -> bool:
+        latest = observer.latest()
+        return latest is not None and int(latest[0]["inputs"]) & 0xFF == byte
+
     with ControlClient("a test", control_socket(running.directory)) as client:
         client.call("stick", {"byte": 62, "hold_s": 1.0})
-        running.until(lambda found: found["inputs"] & 0xFF == 62, "the forced byte")
+        wait_for(lambda: shows(62))
         kill(running.pids()["gateway"])
-    running.rtcp("start", "--detach")
-    running.until(lambda found: found["inputs"] & 0xFF == 63, "neutral")
+    wait_for(lambda: shows(63))
+    observer.close()
+
+
+def wait_for(met: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not met():
+        assert time.monotonic() < end
+        time.sleep(0.005)
