@@ -92,7 +92,7 @@ def test_the_arm_holds_between_commands(enabled: Platform) -> None:
 
 
 def test_the_arm_holds_against_gravity_through_every_change_of_mode(enabled: Platform) -> None:
-    enabled.rtcp("move", "0", "1.2", "0.3", "0", "0", "0")
+    enabled.rtcp("move", "0", "-1.2", "-0.3", "0", "0", "0")
     before = enabled.status()["joints"]["position"]
     observer = Observer(blackboard_file(enabled.directory))
     first = observer.head
