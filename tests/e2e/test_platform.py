@@ -179,7 +179,7 @@ def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) 
 
 
 def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform) -> None:
-    moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+    moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.1")
     enabled.until_moving()
     moving.kill()
     moving.wait()
