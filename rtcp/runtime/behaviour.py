@@ -75,6 +75,8 @@ class Behaviour:
         self._unlocked = 0
         self._since = 0
         self._told = 0
+        self._closing_hard = False
+        """Whether an emergency came while closing: what still moves is then stopped as quickly as the drives can."""
         self._limited = False
         """Whether the stop that is under way ends in `stopped by limit`."""
         self.state = State.STARTING
@@ -163,6 +165,7 @@ class Behaviour:
 
     def stop_motion(self) -> None:
         """Let the active mode come to rest."""
+        self._operator.wait_for_neutral()
         self._arm.motions.stop(self._arm.state)
         if self._arm.gripper is not None:
             self._arm.gripper.stop()
@@ -184,6 +187,7 @@ class Behaviour:
     def release(self) -> None:
         """Go on after a stop by a limit."""
         self.limit = Reason.NONE
+        self._operator.wait_for_neutral()
         self.on(Event.RESET)
         self._blackboard.event(Code.RELEASED)
 
@@ -247,6 +251,8 @@ class Behaviour:
             # Codes follow the kinds: speed, torque, following error.
             self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
             return False
+        if arm.gripper is not None and arm.gripper.motion.moving and not self._operator.permitted:
+            arm.gripper.stop()
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         verdict = arm.command()
         if verdict is Verdict.PASS and arm.motions.active.reason is Reason.NONE:
@@ -274,6 +280,7 @@ class Behaviour:
         return True
 
     def _end(self, reason: Reason, axis: int, value: float, limit: float, limited: bool) -> None:
+        self._operator.wait_for_neutral()
         self._blackboard.event(Code.ENDED + reason, axis, value, limit)
         self._limited = limited
         if limited:
@@ -335,7 +342,7 @@ class Behaviour:
             if axis >= 0:
                 self._fail_drive(Code.ENABLE_STUCK, axis)
             else:
-                self._fail_mode(elsewhere)
+                self._fail_mode(elsewhere if elsewhere >= 0 else len(arm.drives))
 
     def _holding(self, good: bool) -> None:
         if not self._track(good):
@@ -395,6 +402,10 @@ class Behaviour:
         found = self._watch.look(arm.state)
         if found is not None:
             self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        elif arm.guards.zone_at(arm.state.actual) is not None and not homing.leaves:
+            # Before its home a drive does not know where it is: what can be told from its old zero is kept to.
+            self._blackboard.event(Code.ENDED + Reason.KEEP_OUT, arm.guards.zone_at(arm.state.actual) or 0)
+            homing.stop()
         elif homing.stuck:
             self._fail_mode(homing.axis)
         elif arm.first_outside() >= 0:
@@ -466,8 +477,29 @@ class Behaviour:
             else:
                 self._fail(Code.RESET_STUCK)
 
+    def _emergency_while_closing(self, good: bool) -> bool:
+        """Meet a press, or a measurement beyond its limit, on the way out; return whether the drives ramp down."""
+        arm = self._arm
+        if not self._closing_hard and arm.first_with_torque() >= 0:
+            found = self._watch.look(arm.state) if good and arm.first_not_enabled() < 0 else None
+            if self._operator.emergency_stop or found is not None:
+                self._closing_hard = True
+                arm.hold_target()
+                if found is None:
+                    self._blackboard.event(Code.PRESSED)
+                else:
+                    self._blackboard.event(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        if not self._closing_hard or arm.first_moving() < 0 or self._waited > self._closing_cycles:
+            return False
+        arm.lead(DriveGoal.QUICK_STOPPED)
+        if good:
+            arm.follow()
+        return True
+
     def _closing(self, good: bool) -> None:
         arm = self._arm
+        if self._emergency_while_closing(good):
+            return
         if self.lost >= self._lost_limit:
             arm.lead(DriveGoal.QUICK_STOPPED)
             self.done = self.lost >= self._lost_limit + _FAREWELL_CYCLES

@@ -62,6 +62,11 @@ class HomingArm:
         return self._homing.phase is HomingPhase.STUCK
 
     @property
+    def leaves(self) -> bool:
+        """Whether the drive no longer searches: it comes to rest, or goes back to CSP."""
+        return self._homing.phase not in (HomingPhase.ENTERING, HomingPhase.SEARCHING)
+
+    @property
     def ended(self) -> bool:
         """Whether it is over."""
         return self._homing.ended

@@ -161,7 +161,7 @@ class MotionOrders:
         return self._begin(lease, stream)
 
     def _jog(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(*AUTOMATIC, MotionMode.JOYSTICK):
+        if hindrance := self._hindered(*AUTOMATIC):
             return hindrance
         frame = numbers[-2]
         if frame not in tuple(JogFrame):
@@ -224,8 +224,8 @@ class MotionOrders:
         arm, axis = self._arm, numbers[0]
         if axis not in range(len(arm.drives)):
             return Refusal.AXIS, -1, axis, float(len(arm.drives))
-        if not self._operator.permitted:
-            return (Refusal.NOT_PERMITTED,)
+        if hindrance := self._hindered(*AUTOMATIC):
+            return hindrance
         if arm.mode is not DriveMode.CSP:
             return Refusal.HOME_MODE, -1, float(arm.mode)
         self._behaviour.home(int(axis), lease)

@@ -99,11 +99,13 @@ class Operator:
         elif stick.valid:
             self._code_told = False
         if joystick.grip is not None:
+            taken = self.has_gripper
             if arm.gripper is not None:
-                arm.gripper.grip(not joystick.grip)
-            elif self.has_gripper:
+                taken = arm.gripper.grip(not joystick.grip)
+            elif taken:
                 self.grip(not joystick.grip)
-            blackboard.event(Code.GRIPPER, -1, float(joystick.grip))
+            if taken:
+                blackboard.event(Code.GRIPPER, -1, float(joystick.grip))
         jog.command(joystick.twist, joystick.frame)
         if jog.phase is Phase.HOLD and joystick.moves:
             jog.start(arm.state)

@@ -136,6 +136,8 @@ class Orders:
             self._blackboard.event(Code.TORQUE_OFF)
         elif behaviour.state not in (State.READY, State.DISABLING, State.EMERGENCY_STOP):
             self._arm.motions.stop(self._arm.state)
+            if self._arm.gripper is not None:
+                self._arm.gripper.stop()
             behaviour.on(Event.DISABLE)
         return DONE
 
@@ -188,6 +190,8 @@ class Orders:
             self._arm.set_mode(mode)
 
     def _stop(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        if self._arm.gripper is not None:
+            self._arm.gripper.stop()
         if self._behaviour.state is State.MOVING:
             self._behaviour.stop_motion()
         elif self._behaviour.state is State.HOMING:

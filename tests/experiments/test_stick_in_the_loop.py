@@ -159,3 +159,37 @@ def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
     assert simulation.parts.arm.first_with_torque() == -1
     simulation.run(0.2)
     assert {slave.state.name for slave in simulation.bus.read_states()} == {"PRE_OP"}
+
+
+def test_a_halt_stops_a_held_stick_until_it_has_been_neutral(arm: Arm) -> None:
+    simulation = arm.simulation
+    arm.stick(BACKWARD, 0.5)
+    assert simulation.order(Command.STOP).refusal == 0
+    simulation.run(2.0)
+    assert simulation.state is State.HOLDING
+    arm.stick(NEUTRAL, 0.1)
+    arm.stick(BACKWARD, 0.3)
+    assert simulation.state is State.MOVING
+
+
+@pytest.mark.parametrize(
+    ("command", "numbers"), [(Command.JOG, [0.02, *([0.0] * 10), 0.5]), (Command.HOME, [0])], ids=["jog", "home"]
+)
+def test_no_command_takes_the_arm_away_from_the_stick(arm: Arm, command: Command, numbers: list[float]) -> None:
+    assert arm.simulation.order(command, numbers).refusal != 0
+    arm.stick(BACKWARD, 0.3)
+    assert arm.simulation.order(command, numbers).refusal != 0
+    arm.stick(NEUTRAL, 0.6)
+    assert arm.simulation.state is State.HOLDING
+
+
+def test_the_emergency_stop_is_met_while_the_loop_closes(arm: Arm) -> None:
+    simulation = arm.simulation
+    arm.stick(BACKWARD, 0.6)
+    simulation.order(Command.SHUTDOWN)
+    assert simulation.box is not None
+    simulation.box.inputs &= ~0x200
+    simulation.run(0.05)
+    assert {drive.controlword for drive in simulation.parts.arm.drives} == {0x0002}
+    assert simulation.until(lambda: simulation.done, 5.0)
+    assert simulation.parts.arm.first_with_torque() == -1
