@@ -107,12 +107,14 @@ def _next(
         x, y, z = there
         if number == INNER_BOX:
             distance = inside(x, y, z, corners)
-            free = near >= bend and distance >= bend
+            free, out = near >= bend and distance >= bend, True
         else:
             distance = outside(x, y, z, corners)
             free = near + distance > length or _before_one_face(place, there, corners, bend)
+            # Nor is it out that a thin box lies between: who was outside stays before the same face.
+            out = near < -_ROUNDING_M or _before_one_face(place, there, corners, -_ROUNDING_M)
         new = Gap(distance, number, point, corners, there)
-        if not free and not (distance >= near - _ROUNDING_M and (near < 0.0 or (once and near < bend))):
+        if not free and not (out and distance >= near - _ROUNDING_M and (near < 0.0 or (once and near < bend))):
             return after, new
         after.append(new)
     return after, None
@@ -187,6 +189,7 @@ class _Stop:
                 most = self.duration / _INSIDE_SAMPLES
             elif gap.distance < least:
                 least = gap.distance
-        if least < inf:
+        # A joint whose axis goes through the tool moves no point: nothing bends.
+        if least < inf and self._bound > 0.0:
             most = min(most, sqrt(0.25 * dt * dt + 4.0 * least / self._bound) - 0.5 * dt)
         return max(int(most / dt), 1) * dt
