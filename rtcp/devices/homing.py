@@ -43,7 +43,7 @@ SHOWN: dict[int, Shown] = {
 
 
 class HomingPhase(Enum):
-    """How far a homing is; the last four end it."""
+    """How far a homing is; the last five end it."""
 
     IDLE = "idle"
     ENTERING = "the drive changes to mode 6"
@@ -54,9 +54,10 @@ class HomingPhase(Enum):
     FAILED = "the drive reports a homing error, or found no home in time"
     STOPPED = "stopped before it was at home"
     STUCK = "the drive does not change its mode"
+    RUNNING = "the drive does not come to rest"
 
 
-ENDED = frozenset({HomingPhase.HOMED, HomingPhase.FAILED, HomingPhase.STOPPED, HomingPhase.STUCK})
+ENDED = frozenset({HomingPhase.HOMED, HomingPhase.FAILED, HomingPhase.STOPPED, HomingPhase.STUCK, HomingPhase.RUNNING})
 
 _P = HomingPhase
 _MODE_S = 1.0
@@ -98,7 +99,7 @@ class Homing:
 
     @property
     def ended(self) -> bool:
-        """Whether the homing is over, well or not; the drive is then in CSP, but where it is STUCK."""
+        """Whether the homing is over, well or not; the drive is then in CSP, but where it is STUCK or RUNNING."""
         return self.phase in ENDED
 
     @property
@@ -147,9 +148,11 @@ class Homing:
         elif phase is _P.SEARCHING:
             self._search(drive)
         elif phase is _P.STOPPING:
-            resting = abs(drive.velocity) < _STILL_RAD_S and self._cycles > _TOLD_CYCLES
-            if resting or self._cycles > self._rest:
+            if abs(drive.velocity) < _STILL_RAD_S and self._cycles > _TOLD_CYCLES:
                 self._leave(self._outcome)
+            elif self._cycles > self._rest:
+                # In CSP its target would stand where it is now: a jerk for a joint that turns. It is stopped otherwise.
+                self._enter(_P.RUNNING)
         elif drive.mode_display == CSP and self._cycles > 1:
             self._enter(self._outcome)
         elif self._cycles > self._mode_cycles:

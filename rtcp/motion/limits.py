@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 from rtcp.config.model import ArmConfig
 from rtcp.motion.rows import COLUMNS, MOST_JOINTS
 
-_LEAST_PART = 1e-3
+LEAST_PART = 1e-3
 """Of a configured speed, acceleration, jerk or torque: less of it is no limit, but an arm that does not move."""
 
 Corners: TypeAlias = tuple[float, float, float, float, float, float]
@@ -158,8 +158,8 @@ class Limits:
             return Refused(Wrong.WIDER, axis, high, widest.high[axis])
         for name in ("velocity", "acceleration", "jerk", "torque"):
             found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
-            if not (isfinite(found) and found >= _LEAST_PART * most):
-                return Refused(Wrong.NO_LIMIT, axis, found, _LEAST_PART * most)
+            if not (isfinite(found) and found >= LEAST_PART * most):
+                return Refused(Wrong.NO_LIMIT, axis, found, LEAST_PART * most)
             if found > most:
                 return Refused(Wrong.WIDER, axis, found, most)
         rest = q + 0.5 * v * abs(v) / new.acceleration[axis]

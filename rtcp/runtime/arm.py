@@ -183,3 +183,9 @@ class Arm:
     def still(self) -> bool:
         """Whether the set-points stand still."""
         return self.motions.active.phase is Phase.HOLD
+
+    @property
+    def all_still(self) -> bool:
+        """Whether the gripper's set-point stands still too, and no guard brakes: the torque may go."""
+        gripper = self.gripper
+        return self.still and not self.guards.stopping and (gripper is None or not gripper.motion.moving)

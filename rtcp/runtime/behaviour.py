@@ -10,25 +10,23 @@ from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.modes import DriveMode
-from rtcp.motion.state import Phase, Reason
+from rtcp.motion.state import Reason
 from rtcp.motion.watch import Watch
 from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.closing import Closing
 from rtcp.runtime.emergency_stop import EmergencyStop
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.machine import TABLE, WITH_TORQUE, Code, Event, State
 from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
 
-_CLOSING_S = 2.0
 _RESET_S = 3.0
 _MODE_S = 1.0
 _CLOCK_S = 1.0
 _TOLD_CYCLES = 5
 """What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
-_FAREWELL_CYCLES = 20
-"""Frames with quick stop for slaves that still listen when the bus is given up."""
 _ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
 """Reasons that are no limit: the arm has stopped and takes commands."""
 _PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
@@ -67,16 +65,14 @@ class Behaviour:
         self.homing = HomingArm(arm, period_s)
         self._emergency = EmergencyStop(arm, service, blackboard, period_s)
         self._lost_limit = config.bus.lost_cycles
+        self._closes = Closing(arm, self.homing, operator, self._watch, blackboard, self._lost_limit, period_s)
         self._enable_cycles = round(config.enable_timeout_s / period_s)
         self._reset_cycles = round(_RESET_S / period_s)
-        self._closing_cycles = round(_CLOSING_S / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
         self._clock_cycles = round(_CLOCK_S / period_s)
         self._unlocked = 0
         self._since = 0
         self._told = 0
-        self._closing_hard = False
-        """Whether an emergency came while closing: what still moves is then stopped as quickly as the drives can."""
         self._limited = False
         """Whether the stop that is under way ends in `stopped by limit`."""
         self.state = State.STARTING
@@ -129,6 +125,10 @@ class Behaviour:
             self._stop_in_emergency(Code.PRESSED)
         self._steps[self.state](good)
         operator.show(self.all_enabled, self.state is State.MOVING)
+        gripper = self._arm.gripper
+        if gripper is not None and gripper.came_to_rest():
+            motion = gripper.motion
+            self._blackboard.event(Code.GRIPPER_AT, len(self._arm.drives), motion.position, float(motion.gripped))
 
     def on(self, event: Event) -> None:
         """Change to the state that `event` leads to from the present one, as the table says."""
@@ -234,6 +234,20 @@ class Behaviour:
             return True
         return False
 
+    def _watch_stops(self) -> bool:
+        """Look at what is measured; return whether it ended in the emergency stop."""
+        arm, gripper = self._arm, self._arm.gripper
+        found = self._watch.look(arm.state)
+        if gripper is not None:
+            found = found or gripper.look()
+            if gripper.motion.moving and not (self._operator.permitted and self._leased(gripper.lease)):
+                gripper.stop()
+        if found is None:
+            return False
+        # Codes follow the kinds: speed, torque, following error.
+        self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        return True
+
     def _track(self, good: bool) -> bool:
         """Move on by one cycle while enabled; return False when the state has changed by it."""
         arm = self._arm
@@ -246,13 +260,8 @@ class Behaviour:
         if axis >= 0:
             self._fail_drive(Code.DRIVE_LEFT_ENABLED, axis)
             return False
-        found = self._watch.look(arm.state)
-        if found is not None:
-            # Codes follow the kinds: speed, torque, following error.
-            self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        if self._watch_stops():
             return False
-        if arm.gripper is not None and arm.gripper.motion.moving and not self._operator.permitted:
-            arm.gripper.stop()
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         verdict = arm.command()
         if verdict is Verdict.PASS and arm.motions.active.reason is Reason.NONE:
@@ -334,6 +343,8 @@ class Behaviour:
             self.enables += 1
             self.all_enabled = True
             self._watch.reset()
+            if gripper is not None:
+                gripper.watch.reset()
             self._blackboard.event(Code.ENABLED)
             self.on(Event.ENABLED)
             if self.wanted_mode is not DriveMode.CSP:
@@ -360,7 +371,7 @@ class Behaviour:
         operator, arm = self._operator, self._arm
         if not operator.permitted:
             self._blackboard.event(Code.NOT_PERMITTED)
-        elif self.lease and self._lease_ended():
+        elif not self._leased(self.lease):
             self._blackboard.event(Code.LEASE_ENDED)
         else:
             if not self.lease:
@@ -373,9 +384,12 @@ class Behaviour:
         self.stop_motion()
         self._stopping(good)
 
-    def _lease_ended(self) -> bool:
-        lease, renewed, duration = self._blackboard.lease()
-        return lease != self.lease or self.now_ns - renewed > duration
+    def _leased(self, lease: int) -> bool:
+        """Whether the commander of `lease` still holds it; 0: the stick, which needs none."""
+        if not lease:
+            return True
+        held, renewed, duration = self._blackboard.lease()
+        return held == lease and self.now_ns - renewed <= duration
 
     def _stopping(self, good: bool) -> None:
         if self._track(good) or self.state is State.STOPPING:
@@ -396,18 +410,19 @@ class Behaviour:
         if left >= 0:
             self._fail_drive(Code.DRIVE_LEFT_ENABLED, left)
             return
-        if not self._operator.permitted or self._lease_ended():
+        if not (self._operator.permitted and self._leased(self.lease)):
             homing.stop()
         homing.step()
-        found = self._watch.look(arm.state)
-        if found is not None:
-            self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
-        elif arm.guards.zone_at(arm.state.actual) is not None and not homing.leaves:
+        if self._watch_stops():
+            return
+        if arm.guards.zone_at(arm.state.actual) is not None and not homing.leaves:
             # Before its home a drive does not know where it is: what can be told from its old zero is kept to.
             self._blackboard.event(Code.ENDED + Reason.KEEP_OUT, arm.guards.zone_at(arm.state.actual) or 0)
             homing.stop()
         elif homing.stuck:
             self._fail_mode(homing.axis)
+        elif homing.running:
+            self._fail(Code.HOMING_RUNNING, homing.axis, arm.drives[homing.axis].velocity)
         elif arm.first_outside() >= 0:
             # While it searches, and where it begins to count anew: also a stop after the index was found does.
             axis = arm.first_outside()
@@ -426,7 +441,7 @@ class Behaviour:
         arm = self._arm
         if self._homing_ends(good):
             return
-        if not arm.still or arm.guards.stopping:
+        if not arm.all_still:
             # The time for disabling begins when the arm stands.
             self._since = self.cycle
             self._track(good)
@@ -477,48 +492,5 @@ class Behaviour:
             else:
                 self._fail(Code.RESET_STUCK)
 
-    def _emergency_while_closing(self, good: bool) -> bool:
-        """Meet a press, or a measurement beyond its limit, on the way out; return whether the drives ramp down."""
-        arm = self._arm
-        if not self._closing_hard and arm.first_with_torque() >= 0:
-            found = self._watch.look(arm.state) if good and arm.first_not_enabled() < 0 else None
-            if self._operator.emergency_stop or found is not None:
-                self._closing_hard = True
-                arm.hold_target()
-                if found is None:
-                    self._blackboard.event(Code.PRESSED)
-                else:
-                    self._blackboard.event(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
-        if not self._closing_hard or arm.first_moving() < 0 or self._waited > self._closing_cycles:
-            return False
-        arm.lead(DriveGoal.QUICK_STOPPED)
-        if good:
-            arm.follow()
-        return True
-
     def _closing(self, good: bool) -> None:
-        arm = self._arm
-        if self._emergency_while_closing(good):
-            return
-        if self.lost >= self._lost_limit:
-            arm.lead(DriveGoal.QUICK_STOPPED)
-            self.done = self.lost >= self._lost_limit + _FAREWELL_CYCLES
-            return
-        if self._waited > self._closing_cycles:
-            self.done = True
-            return
-        if not good or self._homing_ends(good):
-            return
-        if arm.motions.active.phase is Phase.MOVE:
-            arm.motions.stop(arm.state)
-        if (not arm.still or arm.guards.stopping) and arm.first_not_enabled() < 0:
-            self._since = self.cycle
-            if arm.command() is Verdict.STOPPED:
-                arm.motions.rest()
-            return
-        # In a fault the drives ramp down by themselves: their torque goes when they stand.
-        ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
-        arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
-        arm.follow()
-        self._told = 0 if ramping else self._told + 1
-        self.done = self._told > _TOLD_CYCLES and arm.first_with_torque() < 0
+        self.done = self._closes.lead(good, self.lost)

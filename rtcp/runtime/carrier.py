@@ -165,6 +165,24 @@ class Carrier:
                 found = event
         return found
 
+    async def happened(self, code: Code, since: int, patience_s: float) -> Event:
+        """Wait for an event after the one of the number `since`; return it.
+
+        Raises:
+            CommandFailed: a fault came first, or it took too long.
+        """
+        until = time.monotonic() + patience_s
+        while True:
+            self.check_loop()
+            for event in self.observer.events_since(since):
+                if event.code == code:
+                    return event
+                if event.code in FAULTS:
+                    raise CommandFailed("fault", self.sentence(event))
+            if time.monotonic() > until:
+                raise CommandFailed("timeout", f"it took longer than {patience_s:.1f} s")
+            await asyncio.sleep(POLL_S)
+
     def sentence(self, event: Event) -> str:
         """Return what an event says."""
         return self._sentences.event(event.code, event.axis, event.value, event.limit)

@@ -121,6 +121,8 @@ class Refusal(IntEnum):
     """The gripper's drive is not enabled."""
     PLAN_LEAD = 38
     """No way leads from where the arm is to the plan's first point."""
+    LIMITS_WEAK = 44
+    """The joint holds more than its new torque limit; axis, value held, limit, Nm."""
     PLAN_MOVING = 43
     """Lines begin at rest; axis: the first joint that moves, value: its speed, rad/s."""
 
@@ -171,6 +173,10 @@ class Code(IntEnum):
     HOMED = 35
     HOMING_FAILED = 36
     STICK_MODE = 37
+    HOMING_RUNNING = 39
+    """The drive does not come to rest after a homing that was stopped or has failed; value: its speed, rad/s."""
+    GRIPPER_AT = 40
+    """A gripper with a drive came to rest; value: position, rad, limit: 1 where it holds something."""
     CAME_OUT = 38
     """The stick's code was none, or came back to one."""
     ENDED = 100

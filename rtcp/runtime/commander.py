@@ -8,7 +8,7 @@ from typing import Any
 
 from rtcp.motion.modes import DriveMode
 from rtcp.runtime.carrier import MOVING, POLL_S, Carrier, CommandFailed
-from rtcp.runtime.codes import MotionMode
+from rtcp.runtime.codes import Code, MotionMode
 from rtcp.runtime.machine import Command, State
 
 DRIVE_MODES: dict[str, int] = {mode.name.lower(): mode for mode in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST)}
@@ -21,6 +21,7 @@ _RESETTING = frozenset({State.RESETTING})
 _HALTING = MOVING | {State.HOMING}
 _RESETTABLE = (State.FAULT, State.EMERGENCY_STOP, State.RESETTING)
 _SERVICE_S = 5.0
+_GRIPPER_S = 10.0
 
 
 class Commander:
@@ -93,10 +94,19 @@ class Commander:
         return {}
 
     async def gripper(self, client: str, opened: bool) -> dict[str, Any]:
-        """Open or close the gripper; returns when it has been told, not when it is there."""
-        async with self._carrier.lease(client) as lease:
-            await self._carrier.give(lease, Command.GRIPPER, [opened])
-        return {}
+        """Open or close the gripper.
+
+        One on an output has then been told; one with a drive, which moves only under the lease, has come to rest.
+        """
+        carrier, gripper = self._carrier, self._config.gripper
+        async with carrier.lease(client) as lease:
+            event = carrier.last_event()
+            await carrier.give(lease, Command.GRIPPER, [opened])
+            if gripper is None or gripper.joint is None:
+                return {}
+            way = gripper.joint.position.max - gripper.joint.position.min
+            rest = await carrier.happened(Code.GRIPPER_AT, event, _GRIPPER_S + 4 * way / gripper.joint.velocity)
+        return {"position": rest.value, "holds": rest.limit == 1.0}
 
     async def shut_down(self) -> None:
         """Tell the loop to stop, disable and end; its process's end is the answer."""

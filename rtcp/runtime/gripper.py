@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, Joint
+from rtcp.config.operation import WatchConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveGoal, DriveState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.motion.gripper import GripperMotion
+from rtcp.motion.watch import FOLLOWING_ERROR, SPEED, Found
 
 _RANGE_MARGIN_RAD = 0.02
 """So far beyond its range it may stand and still be enabled, to be brought back to the edge."""
@@ -17,11 +19,15 @@ class DrivenGripper:
     `decode` and `encode` beside the arm's; `follow` or `command` in each cycle in which the arm follows or commands.
     """
 
-    def __init__(self, slot: int, drive: Cia402Drive, motion: GripperMotion) -> None:
-        """Make it of its driver, the index of its slave and its motion; see `gripper_of`."""
+    def __init__(self, slot: int, drive: Cia402Drive, motion: GripperMotion, watch: GripperWatch) -> None:
+        """Make it of the index of its slave, its driver, its motion and what watches it; see `gripper_of`."""
         self.slot = slot
         self.drive = drive
         self.motion = motion
+        self.watch = watch
+        self._moved = False
+        self.lease = 0
+        """Lease of the commander that set it in motion; 0: the stick's, which needs none."""
 
     def decode(self, data: ProcessData) -> None:
         """Take the drive's inputs."""
@@ -60,13 +66,60 @@ class DrivenGripper:
         drive = self.drive
         drive.target_position = self.motion.update(drive.torque)
 
-    def grip(self, close: bool) -> bool:
-        """Close or open; return False, and do nothing, where its drive is not enabled."""
-        return self.enabled and self.motion.grip(close)
+    def grip(self, close: bool, lease: int = 0) -> bool:
+        """Close or open, for the commander of `lease`; return False, and do nothing, where its drive is not enabled."""
+        if not (self.enabled and self.motion.grip(close)):
+            return False
+        self.lease = lease
+        return True
+
+    def came_to_rest(self) -> bool:
+        """Whether its set-point moved in the last cycle and stands now."""
+        before, self._moved = self._moved, self.motion.moving
+        return before and not self._moved
+
+    def look(self) -> Found | None:
+        """Look at the cycle's measurements; return what has been beyond its limit for too long, or None."""
+        return self.watch.look(self.drive, self.motion)
 
     def stop(self) -> None:
         """Come to rest on the way."""
         self.motion.stop()
+
+
+class GripperWatch:
+    """What is measured of a gripper against its limit: speed, and how far it is from where it was commanded.
+
+    What it holds shows as torque, and as a distance where it is soft: its motion ends there, no stop does.
+
+    Args:
+        config: factors, and how many cycles in a row are too many.
+        joint: the gripper's.
+        axis: the joint's number, for the sentence.
+    """
+
+    def __init__(self, config: WatchConfig, joint: Joint, axis: int) -> None:
+        self._axis = axis
+        self._cycles = config.cycles
+        self._speed = config.speed * joint.velocity
+        self._error = config.following_error
+        self._fast = self._off = 0
+
+    def look(self, drive: Cia402Drive, motion: GripperMotion) -> Found | None:
+        """Look at one cycle's measurements; return what has been beyond its limit for too long, or None."""
+        # A comparison with NaN is false: it counts as beyond.
+        self._fast = 0 if abs(drive.velocity) <= self._speed else self._fast + 1
+        if self._fast >= self._cycles:
+            return Found(SPEED, self._axis, drive.velocity, self._speed)
+        error = drive.position - motion.position
+        self._off = 0 if motion.gripped or abs(error) <= self._error else self._off + 1
+        if self._off >= self._cycles:
+            return Found(FOLLOWING_ERROR, self._axis, error, self._error)
+        return None
+
+    def reset(self) -> None:
+        """Begin to count anew."""
+        self._fast = self._off = 0
 
 
 def gripper_of(config: ArmConfig) -> DrivenGripper | None:
@@ -84,4 +137,4 @@ def gripper_of(config: ArmConfig) -> DrivenGripper | None:
     drive = Cia402Drive(config.slaves[slot], speed_limit=joint.velocity, zero=zero)
     period_s = config.cycle.period_us * 1e-6
     motion = GripperMotion(joint, gripper.open_position, gripper.closed_position, period_s)
-    return DrivenGripper(slot, drive, motion)
+    return DrivenGripper(slot, drive, motion, GripperWatch(config.watch, joint, len(config.joints)))

@@ -40,12 +40,14 @@ class HomingArm:
         self._homing.abandon()
 
     def step(self) -> None:
-        """Let the drive go on; its set-point is where it says it is, the other joints' stand."""
+        """Let the drive go on; its set-point is where it says it is, the other joints' stand, the gripper's go on."""
         arm, axis, homing = self._arm, self.axis, self._homing
         homing.step()
         arm.state.position[axis] = homing.position
         arm.guard.latch(axis, homing.position)
         arm.guards.latch(arm.state)
+        if arm.gripper is not None:
+            arm.gripper.command()
 
     def still_ending(self, good: bool) -> bool:
         """Bring a homing to its end before the torque goes; return whether it is still under way."""
@@ -60,6 +62,11 @@ class HomingArm:
     def stuck(self) -> bool:
         """Whether the drive does not change its mode."""
         return self._homing.phase is HomingPhase.STUCK
+
+    @property
+    def running(self) -> bool:
+        """Whether the drive does not come to rest."""
+        return self._homing.phase is HomingPhase.RUNNING
 
     @property
     def leaves(self) -> bool:

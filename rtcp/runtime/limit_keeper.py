@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.motion.limits import Corners, Limits, Values, rows
+from rtcp.motion.limits import LEAST_PART, Corners, Limits, Values, rows
 from rtcp.runtime.carrier import Carrier, CommandFailed
 from rtcp.runtime.machine import Command
 
@@ -85,11 +85,8 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
     """
     if not changes:
         raise CommandFailed("invalid", f"no limit was named: give a key and a number, as {_example(config)}")
-    per_joint = {name: list(getattr(values, name)) for name in _JOINT_KEYS.values()}
-    boxes: dict[str, list[float]] = {} if values.box is None else {"box": list(values.box)}
-    keep_out = [one.name for one in config.cartesian.keep_out]
-    boxes |= {name: list(corners) for name, corners in zip(keep_out, values.keep_out, strict=True)}
     names = [joint.name for joint in config.joints]
+    per_joint, boxes = _lists(config, values)
     wrong = []
     for key, number in changes.items():
         if not math.isfinite(number):
@@ -102,15 +99,63 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
             numbers = per_joint[_JOINT_KEYS[rest]]
             for joint in range(len(names)) if head == ALL else (names.index(head),):
                 numbers[joint] = number
+                wrong += _joint_beyond(config, joint, rest, number)
         elif box in boxes and side in _ENDS and end in ("x", "y", "z"):
             boxes[box][3 * _ENDS.index(side) + "xyz".index(end)] = number
+            wrong += _corner_beyond(config, box, side, end, number)
         else:
             wrong.append(f"{key}: there is no such limit; allowed are {_example(config)}")
-    if wrong:
+    if wrong := wrong or [*_empty(names, per_joint, boxes)]:
         raise CommandFailed("invalid", "\n".join(wrong))
     joints = {name: tuple(numbers) for name, numbers in per_joint.items()}
-    inner = _corners(boxes["box"]) if "box" in boxes else None
-    return Values(**joints, box=inner, keep_out=tuple(_corners(boxes[name]) for name in keep_out))
+    inner = _corners(boxes.pop("box")) if values.box is not None else None
+    return Values(**joints, box=inner, keep_out=tuple(_corners(corners) for corners in boxes.values()))
+
+
+def _lists(config: ArmConfig, values: Values) -> tuple[dict[str, list[float]], dict[str, list[float]]]:
+    """Return limits as lists to change: of the joints by attribute, of the boxes by name, the inner one first."""
+    boxes = {} if values.box is None else {"box": list(values.box)}
+    named = zip((one.name for one in config.cartesian.keep_out), values.keep_out, strict=True)
+    boxes |= {name: list(corners) for name, corners in named}
+    return {name: list(getattr(values, name)) for name in _JOINT_KEYS.values()}, boxes
+
+
+def _joint_beyond(config: ArmConfig, joint: int, key: str, number: float) -> Iterator[str]:
+    """Say where a joint's limit is wider than the configuration's, or too narrow to be one."""
+    widest = Values.configured(config)
+    low, high = widest.low[joint], widest.high[joint]
+    if key not in _ENDS:
+        high = getattr(widest, _JOINT_KEYS[key])[joint]
+        low = LEAST_PART * high
+    if not low <= number <= high:
+        yield (
+            f"{config.joints[joint].name}.{key}: found {number:g}, allowed is {low:g} to {high:g} "
+            f"(joints[{joint}] in {config.source.name}: limits are only narrowed while running)"
+        )
+
+
+def _corner_beyond(config: ArmConfig, box: str, side: str, end: str, number: float) -> Iterator[str]:
+    """Say where a box allows more than the configuration's."""
+    widest = _lists(config, Values.configured(config))[1][box]
+    bound = widest[3 * _ENDS.index(side) + "xyz".index(end)]
+    at_least = (side == "min") is (box == "box")
+    if number < bound if at_least else number > bound:
+        where = "cartesian.box" if box == "box" else "cartesian.keep_out"
+        yield (
+            f"{box}.{side}.{end}: found {number:g}, allowed is at {'least' if at_least else 'most'} {bound:g} "
+            f"({where} in {config.source.name}: limits are only narrowed while running)"
+        )
+
+
+def _empty(names: list[str], joints: Mapping[str, list[float]], boxes: Mapping[str, list[float]]) -> Iterator[str]:
+    """Say which ranges and boxes have no room between their ends."""
+    ends = zip(names, joints["low"], joints["high"], strict=True)
+    ranges = [(name, "", low, high) for name, low, high in ends]
+    for name, six in boxes.items():
+        ranges += [(name, f".{axis}", low, high) for axis, low, high in zip("xyz", six[:3], six[3:], strict=True)]
+    for name, axis, low, high in ranges:
+        if not low < high:
+            yield f"{name}.min{axis}: found {low:g}, allowed is less than {name}.max{axis}, which is {high:g}"
 
 
 def _example(config: ArmConfig) -> str:

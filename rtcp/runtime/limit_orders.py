@@ -45,6 +45,11 @@ class LimitOrders:
         if refused is not None:
             return _REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
         limits = arm.limits
+        if arm.first_with_torque() >= 0:
+            for axis, held in enumerate(arm.state.torque):
+                most = new.torque[axis]
+                if most < limits.torque[axis] and abs(held) > most:
+                    return Refusal.LIMITS_WEAK, axis, abs(held), most
         limits.apply(new)
         arm.guard.take(limits)
         arm.motions.generator.set_limits(limits.velocity, limits.acceleration, limits.jerk)

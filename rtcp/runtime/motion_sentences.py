@@ -80,7 +80,8 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             f"{names.joint(m.axis)} stands or would come to rest at {number(m.value)} rad, outside the new limit "
             f"{number(m.limit)} rad: nothing was changed"
             if m.axis >= 0
-            else "the tool, the wrist or the elbow would stand outside the new boxes: nothing was changed"
+            else f"the tool, the wrist or the elbow would pass the new bounds of {names.box(int(m.limit))}: "
+            "nothing was changed"
         ),
         Refusal.LIMITS_WRONG: lambda m: (
             f"{names.joint(m.axis) if m.axis >= 0 else 'the Cartesian limits'}: {number(m.value)} is no limit that can "
@@ -89,6 +90,10 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
         Refusal.LIMITS_NARROW: lambda m: (
             f"{names.joint(m.axis) if m.axis >= 0 else 'the Cartesian limits'}: {number(m.value)} is beyond what the "
             f"configuration allows, {number(m.limit)} (in {file}): limits are only narrowed while running"
+        ),
+        Refusal.LIMITS_WEAK: lambda m: (
+            f"{names.joint(m.axis)} holds {number(m.value)} Nm, more than the new limit of {number(m.limit)} Nm: it "
+            "would sag, nothing was changed"
         ),
         Refusal.NO_GRIPPER: lambda _: f"no gripper is configured (gripper in {file})",
         Refusal.MEANT: lambda m: (
@@ -157,6 +162,9 @@ def motion_events(names: Naming) -> dict[int, Say]:
         Code.RELEASED: lambda _: "reset: the arm holds and takes commands again",
         Code.GRIPPER: lambda m: f"the gripper is told to {'open' if m.value else 'close'}",
         Code.ZERO: lambda m: f"{names.joint(m.axis)}: its zero is now at {number(m.value)} rad of the drive",
+        Code.GRIPPER_AT: lambda m: (
+            f"{names.joint(m.axis)} rests at {number(m.value)} rad" + (", it holds something" if m.limit else "")
+        ),
         Code.HOMED: lambda m: f"{names.joint(m.axis)} is homed: its drive reads {number(m.value)} rad",
         Code.HOMING_FAILED: lambda m: (
             f"{names.joint(m.axis)}: homing did not succeed (statusword 0x{int(m.value):04X}); the arm holds"

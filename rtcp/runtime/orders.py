@@ -219,7 +219,7 @@ class Orders:
         if gripper is not None:
             if not self._operator.permitted:
                 return (Refusal.NOT_PERMITTED,)
-            if not gripper.grip(numbers[0] == 0.0):
+            if not gripper.grip(numbers[0] == 0.0, lease):
                 return (Refusal.GRIPPER_RESTS,)
         elif self._operator.has_gripper:
             self._operator.grip(numbers[0] == 0.0)

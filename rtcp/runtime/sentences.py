@@ -76,6 +76,10 @@ class Sentences:
                 f"{joint(m.axis)} still turns, at {number(m.value)} rad/s, 3 s after the reset was asked for: "
                 "its torque goes only at standstill; `rtcp disable` takes it off at once"
             ),
+            Code.HOMING_RUNNING: lambda m: (
+                f"{joint(m.axis)} still turns, at {number(m.value)} rad/s, 3 s after its homing was over: all drives "
+                "are told to stop, `rtcp reset` goes on"
+            ),
             Code.GENERATOR: lambda _: (
                 "the trajectory generator refused its input; all drives are told to stop, `rtcp reset` goes on"
             ),
@@ -172,6 +176,7 @@ FAULTS = frozenset(
         Code.SLAVE_NOT_OP,
         Code.RESET_STUCK,
         Code.RESET_MOVING,
+        Code.HOMING_RUNNING,
         Code.GENERATOR,
         Code.MODE_STUCK,
         Code.DRIVE_FAULT,

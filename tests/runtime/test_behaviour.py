@@ -458,9 +458,18 @@ def joint_that_does_not_come_to_rest(bench: Bench) -> None:
     bench.do(Command.RESET)
 
 
+def joint_that_turns_on_after_its_homing(bench: Bench) -> None:
+    bench.bring_to(State.HOMING)
+    bench.run(0.1)
+    turned = bench.models[0].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 1e5, 0.015, 117.0
+    bench.do(Command.STOP)
+
+
 def joint_is_let_go(bench: Bench) -> None:
-    turned = bench.models[1].mechanics
-    turned.inertia, turned.velocity, turned.external_torque = 1.0, 0.0, 0.0
+    for model in bench.models:
+        turned = model.mechanics
+        turned.inertia, turned.velocity, turned.external_torque = 1.0, 0.0, 0.0
 
 
 def slave_that_leaves_op(bench: Bench) -> None:
@@ -551,6 +560,11 @@ FAULT_STORIES = (
         "a joint that does not come to rest", Code.RESET_MOVING, 1,
         ("joint2", "still turns", "rad/s", "3 s", "`rtcp disable`"),
         joint_that_does_not_come_to_rest, joint_is_let_go,
+    ),
+    Fault(
+        "a joint that turns on after its homing", Code.HOMING_RUNNING, 0,
+        ("joint1", "still turns", "rad/s", "3 s", "homing", "`rtcp reset`"),
+        joint_that_turns_on_after_its_homing, joint_is_let_go,
     ),
     Fault(
         "a slave that does not come back", Code.RESET_STUCK, -1,

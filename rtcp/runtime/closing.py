@@ -1,0 +1,122 @@
+"""The machine's way out: a controlled stop, torque off, end; an emergency on the way is met by the drives' ramps."""
+
+from __future__ import annotations
+
+from rtcp.devices.cia402 import DriveGoal
+from rtcp.motion.envelope import Verdict
+from rtcp.motion.state import Phase
+from rtcp.motion.watch import Watch
+from rtcp.runtime.arm import Arm
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.codes import Code
+from rtcp.runtime.homing_arm import HomingArm
+from rtcp.runtime.operator import Operator
+
+_CLOSING_S = 2.0
+_TOLD_CYCLES = 5
+"""What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
+_FAREWELL_CYCLES = 20
+"""Frames with quick stop for slaves that still listen when the bus is given up."""
+
+
+class Closing:
+    """Led once a cycle while the machine is in the state closing.
+
+    Args:
+        arm: the joints.
+        homing: one that is under way is brought to its end.
+        operator: knows whether the emergency stop is pressed.
+        watch: of the joints.
+        blackboard: where it is told that an emergency was met.
+        lost_limit: so many cycles in a row without frames give the bus up.
+        period_s: the cycle, s.
+    """
+
+    def __init__(
+        self,
+        arm: Arm,
+        homing: HomingArm,
+        operator: Operator,
+        watch: Watch,
+        blackboard: Blackboard,
+        lost_limit: int,
+        period_s: float,
+    ) -> None:
+        self._arm = arm
+        self._homing = homing
+        self._operator = operator
+        self._watch = watch
+        self._blackboard = blackboard
+        self._lost_limit = lost_limit
+        self._patience = round(_CLOSING_S / period_s)
+        self._cycles = 0
+        self._told = 0
+        self._hard = False
+        """Whether an emergency came: what still moves is stopped as quickly as the drives can."""
+
+    def lead(self, good: bool, lost: int) -> bool:
+        """Do the cycle's part; return whether all is done.
+
+        Args:
+            good: the drives have answered.
+            lost: cycles in a row in which they have not.
+        """
+        arm = self._arm
+        self._cycles += 1
+        if self._ramps_down(good):
+            return False
+        if lost >= self._lost_limit:
+            arm.lead(DriveGoal.QUICK_STOPPED)
+            return lost >= self._lost_limit + _FAREWELL_CYCLES
+        if self._cycles > self._patience:
+            return True
+        if not good:
+            return False
+        if self._homing.still_ending(good):
+            self._cycles = 0
+            return False
+        return self._stop() and self._take_torque()
+
+    def _ramps_down(self, good: bool) -> bool:
+        """Meet a press, or a measurement beyond its limit; return whether the drives ramp down by themselves."""
+        arm = self._arm
+        if not self._hard and arm.first_with_torque() >= 0:
+            found = self._watch.look(arm.state) if good and arm.first_not_enabled() < 0 else None
+            if self._operator.emergency_stop or found is not None:
+                self._hard = True
+                self._cycles = 0
+                self._homing.abandon()
+                arm.hold_target()
+                if found is None:
+                    self._blackboard.event(Code.PRESSED)
+                else:
+                    self._blackboard.event(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        if not self._hard or arm.first_moving() < 0 or self._cycles > self._patience:
+            return False
+        arm.lead(DriveGoal.QUICK_STOPPED)
+        if good:
+            arm.follow()
+        return True
+
+    def _stop(self) -> bool:
+        """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""
+        arm, motions = self._arm, self._arm.motions
+        if motions.active.phase is Phase.MOVE:
+            motions.stop(arm.state)
+        if arm.gripper is not None:
+            arm.gripper.stop()
+        if arm.all_still or arm.first_not_enabled() >= 0:
+            return True
+        self._cycles = 0
+        if arm.command() is Verdict.STOPPED:
+            motions.rest()
+        return False
+
+    def _take_torque(self) -> bool:
+        # In a fault the drives ramp down by themselves: their torque goes when they stand.
+        arm = self._arm
+        ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
+        arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
+        arm.follow()
+        self._told = 0 if ramping else self._told + 1
+        return self._told > _TOLD_CYCLES and arm.first_with_torque() < 0
