@@ -1,7 +1,10 @@
-"""Random sessions on the in-process bus, judged by the bytes that went over it.
+"""Random sessions, judged by the bytes that went over the bus.
 
 `python benchmarks/sessions.py --sessions 10000 --seed 1` plays the sessions of seeds 1 to 10000 on all CPUs, prints
 what came of them and exits with 1 on a failure. A failing seed is played again by `--seed N --sessions 1`.
+
+`python benchmarks/sessions.py --bus virtual --minutes 3 --seed 1` plays one on a real platform: its processes, its
+control socket, and the frames that reached its segment, captured there and judged afterwards.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.sessions.play import Outcome, play
+from tests.sessions.wire_play import play_on_the_wire
 
 
 def table(title: str, counts: Counter[str]) -> None:
@@ -33,7 +37,7 @@ def show(outcome: Outcome, wall_s: float) -> None:
     table("commands taken     ", outcome.taken)
     table("commands refused   ", outcome.refused)
     table("happenings         ", outcome.happenings)
-    table("cycles in states   ", outcome.states)
+    table("seen in states     ", outcome.states)
     print(f"largest step        {outcome.step:.4f} of what is allowed")
     print(f"largest acceleration {outcome.acceleration:.4f} of what is allowed")
     print(f"failures            {len(outcome.failures)}")
@@ -53,9 +57,23 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the first session; the others follow")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--stop", type=int, default=10, help="end after so many failures")
+    parser.add_argument("--bus", choices=("inprocess", "virtual"), default="inprocess")
+    parser.add_argument("--minutes", type=float, default=3.0, help="of the session on the bus virtual")
+    parser.add_argument("--period", type=int, default=2000, help="its cycle, us")
+    parser.add_argument("--keep", type=Path, help="file in which its frames are kept")
     given = parser.parse_args()
+    began = time.monotonic()
+    if given.bus == "virtual":
+        total = play_on_the_wire(given.seed, 60.0 * given.minutes, given.period, given.keep)
+    else:
+        total = play_inprocess(given)
+    show(total, time.monotonic() - began)
+    return 1 if total.failures else 0
+
+
+def play_inprocess(given: argparse.Namespace) -> Outcome:
     total = Outcome()
-    began = shown = time.monotonic()
+    shown = time.monotonic()
     seeds = range(given.seed, given.seed + given.sessions)
     # Ctrl-C ends it with what is known by then.
     with suppress(KeyboardInterrupt), multiprocessing.Pool(given.processes, initializer=_ignore_interrupts) as pool:
@@ -66,8 +84,7 @@ def main() -> int:
                 print(f"... {total.sessions} sessions, {len(total.failures)} failures", file=sys.stderr, flush=True)
             if len(total.failures) >= given.stop:
                 break
-    show(total, time.monotonic() - began)
-    return 1 if total.failures else 0
+    return total
 
 
 if __name__ == "__main__":

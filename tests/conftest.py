@@ -1,4 +1,5 @@
-"""What holds for every test: properties are tried with the same values in every run, and none has a time limit.
+"""What holds for every test: properties are tried with the same values in every run, none has a time limit, and none
+reads or writes the zero offsets of the arm at this host.
 
 A test that fails once in a hundred runs names a mistake to whoever happens to run it. To search on with values of
 chance: `HYPOTHESIS_PROFILE=search make test`.
@@ -8,7 +9,9 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterator
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 _UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -19,3 +22,11 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Begun in the background by a shell, which has its children ignore Ctrl-C, and so all that the tests start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def state_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Where zero offsets are kept for as long as the tests run, also by the processes that they start."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RTCP_STATE_DIR", str(tmp_path_factory.mktemp("state")))
+        yield

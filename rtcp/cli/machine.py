@@ -13,6 +13,7 @@ from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
 
 HOMING_S = 200.0
+GRIPPER_S = 200.0
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Its configured name, as joint2, or its number from 1.")]
 
@@ -79,12 +80,18 @@ def _output(
 
 
 def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> None:
-    """Open or close the gripper."""
+    """Open or close the gripper; one with a drive of its own has then come to rest. Ctrl-C stops it."""
     opened = {"open": True, "close": False}.get(value.lower())
     if opened is None:
         raise CommandError(f"{value!r} is nothing that a gripper does: open or close")
-    ask("gripper", "gripper", {"open": opened})
-    report(f"the gripper is told to {value.lower()}")
+    with stopping(client := connect("gripper")):
+        result = client.call("gripper", {"open": opened}, timeout_s=GRIPPER_S)
+    if "position" not in result:
+        report(f"the gripper is told to {value.lower()}")
+    elif result["holds"]:
+        report(f"the gripper rests at {result['position']:.4f} rad: it holds something")
+    else:
+        report(f"the gripper is {'open' if opened else 'closed'}: it rests at {result['position']:.4f} rad")
 
 
 def _zero(

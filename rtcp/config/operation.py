@@ -94,8 +94,16 @@ class InputConfig:
 
     number: Annotated[int, Ge(1), Le(16)]
     active: Literal["high", "low"] = "high"
-    """The level that means what the input is named after; `low` for a normally closed emergency stop."""
+    """The level that means what the input is named after."""
     debounce_ms: Annotated[float, Ge(0), Le(1000)] = 5.0
+
+
+@dataclass(frozen=True)
+class EmergencyStopConfig(InputConfig):
+    """The emergency stop's input: nobody guesses its level, for the wrong one could not be seen before it is needed."""
+
+    active: Literal["high", "low"] = field()
+    """`low` for a normally closed contact, where a cut wire stops the arm too."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +129,7 @@ class InputsConfig:
     """Active: the stick is the arm's; else it is the wheelchair's and the arm holds still."""
     enabling_switch: InputConfig | None = None
     """Active: motion is allowed. Letting go stops; pressing again moves nothing until a new command."""
-    emergency_stop: InputConfig | None = None
+    emergency_stop: EmergencyStopConfig | None = None
     """Active: pressed."""
 
 

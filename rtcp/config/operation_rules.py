@@ -13,13 +13,14 @@ from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.geometry import Kinematics
 from rtcp.config.model import DeviceDescription
 from rtcp.config.operation import CartesianConfig, JogConfig, JoystickConfig
-from rtcp.config.rules import entries, number, text
+from rtcp.config.rules import axes, entries, number, text
 
 STICK = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 """Keys of the stick's terminals."""
 _INPUTS = ("arm_toggle", "enabling_switch", "emergency_stop")
 _OUTPUTS = ("state_lamp", "motion_lamp", "heartbeat")
 _AXES = "xyz"
+_ALL_JOINTS = "joints"
 
 Point = tuple[float, float, float]
 
@@ -78,6 +79,7 @@ def box_findings(data: object, part: Kinematics | None) -> list[Finding]:
         if name is not None and first.setdefault(name, i) != i:
             found = f'found the text "{name}", the name that cartesian.keep_out[{first[name]}] has'
             findings.append((("cartesian", "keep_out", i, "name"), f"{found}; each needs its own"))
+    findings += _names_of_limits(data)
     return findings + (_nothing_left(boxes) if not findings else [])
 
 
@@ -86,6 +88,27 @@ def shoulder_and_reach(part: Kinematics) -> tuple[Point, float]:
     row = part.dh[0]
     shoulder = (row.a, 0.0 - math.sin(row.alpha) * row.d, math.cos(row.alpha) * row.d)
     return shoulder, sum(math.hypot(row.a, row.d) for row in part.dh[1:]) + math.hypot(*part.tool.position)
+
+
+def _names_of_limits(data: object) -> Iterator[Finding]:
+    """Names that would make the key of a limit, as joint2.max or user.max.z, mean two things."""
+    taken = {"box": "cartesian.box", _ALL_JOINTS: "all joints"}
+    for where, joint in axes(data):
+        name = text(joint, "name")
+        if name == _ALL_JOINTS:
+            yield ((*where, "name"), f'found the text "{name}", which in the key of a limit means all joints')
+        elif name is not None:
+            taken.setdefault(name, dotted(where))
+    for i, entry in entries(data, "cartesian", "keep_out"):
+        name = text(entry, "name")
+        key = ("cartesian", "keep_out", i, "name")
+        if name in taken:
+            yield (key, f'found the text "{name}", which in the key of a limit means {taken[name]}')
+        elif name is not None and "." in name:
+            yield (
+                key,
+                f'found the text "{name}", allowed is one without a dot: in the key of a limit dots part its words',
+            )
 
 
 def _placed(where: KeyPath, low: Point, high: Point, part: Kinematics, *, keep_out: bool) -> Iterator[Finding]:

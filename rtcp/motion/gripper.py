@@ -14,8 +14,9 @@ class GripperMotion:
     """Set-points of a gripper's joint: jerk-limited, one `update` a cycle.
 
     While it moves, a torque at the joint's limit against the motion for 5 cycles means that it holds something: the
-    set-point stays, a little inside of what is held, and with it the torque. Nothing else ever ends in force: the
-    drive's following error would be a fault.
+    set-point stays, a little inside of what is held. A drive pushes ever harder towards a set-point that it cannot
+    reach: for as long as the torque is beyond the limit the set-point yields, under the joint's acceleration. Nothing
+    else ever ends in force: the drive's following error would be a fault.
 
     Attributes: `position` (rad, the set-point), `gripped` (it was stopped by what it holds).
     """
@@ -29,6 +30,8 @@ class GripperMotion:
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
         self._step = joint.velocity * period_s
         self._firm_torque = joint.torque
+        self._yielding = joint.acceleration * period_s * period_s
+        self._direction = 0.0
         self._low, self._high = joint.position.min, joint.position.max
         self._goals = {False: open_position, True: closed_position}
         self._firm = 0
@@ -65,7 +68,12 @@ class GripperMotion:
 
     def stop(self) -> None:
         """Come to rest under its limits."""
-        self._generator.stop(self._state)
+        state = self._state
+        if any(state.velocity) or any(state.acceleration):
+            self._generator.stop(state)
+        else:
+            # On a way that has not begun: the generator's stop does nothing at rest.
+            self._generator.hold()
 
     def update(self, torque: float) -> float:
         """Return the set-point of the next cycle, rad; `torque`: measured, Nm."""
@@ -78,7 +86,10 @@ class GripperMotion:
             here = state.position[0]
             self.latch(here)
             self.gripped = True
+            self._direction = 1.0 if before > 0.0 else -1.0
             return here
+        if self.gripped and torque * self._direction > self._firm_torque:
+            state.position[0] -= self._direction * self._yielding
         target = self._generator.update(state, self._period_s)
         position = self._next(state.position[0], target.position[0])
         velocity = target.velocity[0]

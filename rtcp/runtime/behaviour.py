@@ -126,7 +126,7 @@ class Behaviour:
         self._steps[self.state](good)
         operator.show(self.all_enabled, self.state is State.MOVING)
         gripper = self._arm.gripper
-        if gripper is not None and gripper.came_to_rest():
+        if gripper is not None and gripper.came_to_rest() and self.all_enabled:
             motion = gripper.motion
             self._blackboard.event(Code.GRIPPER_AT, len(self._arm.drives), motion.position, float(motion.gripped))
 
@@ -240,7 +240,9 @@ class Behaviour:
         found = self._watch.look(arm.state)
         if gripper is not None:
             found = found or gripper.look()
-            if gripper.motion.moving and not (self._operator.permitted and self._leased(gripper.lease)):
+            operator = self._operator
+            led = self._leased(gripper.lease) if gripper.lease else operator.arm_has_stick
+            if gripper.motion.moving and not (operator.permitted and led):
                 gripper.stop()
         if found is None:
             return False

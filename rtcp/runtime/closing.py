@@ -5,7 +5,7 @@ from __future__ import annotations
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.state import Phase
-from rtcp.motion.watch import Watch
+from rtcp.motion.watch import Found, Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
@@ -26,7 +26,7 @@ class Closing:
         arm: the joints.
         homing: one that is under way is brought to its end.
         operator: knows whether the emergency stop is pressed.
-        watch: of the joints.
+        watch: of the joints; the gripper has its own.
         blackboard: where it is told that an emergency was met.
         lost_limit: so many cycles in a row without frames give the bus up.
         period_s: the cycle, s.
@@ -81,7 +81,7 @@ class Closing:
         """Meet a press, or a measurement beyond its limit; return whether the drives ramp down by themselves."""
         arm = self._arm
         if not self._hard and arm.first_with_torque() >= 0:
-            found = self._watch.look(arm.state) if good and arm.first_not_enabled() < 0 else None
+            found = self._found() if good and arm.first_not_enabled() < 0 else None
             if self._operator.emergency_stop or found is not None:
                 self._hard = True
                 self._cycles = 0
@@ -97,6 +97,12 @@ class Closing:
         if good:
             arm.follow()
         return True
+
+    def _found(self) -> Found | None:
+        """Look at what is measured of the joints and the gripper."""
+        gripper = self._arm.gripper
+        found = self._watch.look(self._arm.state)
+        return found or (None if gripper is None else gripper.look())
 
     def _stop(self) -> bool:
         """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""

@@ -6,6 +6,7 @@ import asyncio
 import time
 from typing import Any
 
+from rtcp.config.model import Joint
 from rtcp.motion.modes import DriveMode
 from rtcp.runtime.carrier import MOVING, POLL_S, Carrier, CommandFailed
 from rtcp.runtime.codes import Code, MotionMode
@@ -21,7 +22,8 @@ _RESETTING = frozenset({State.RESETTING})
 _HALTING = MOVING | {State.HOMING}
 _RESETTABLE = (State.FAULT, State.EMERGENCY_STOP, State.RESETTING)
 _SERVICE_S = 5.0
-_GRIPPER_S = 10.0
+_GRIPPER_S = 5.0
+_THERE_RAD = 1e-3
 
 
 class Commander:
@@ -96,7 +98,11 @@ class Commander:
     async def gripper(self, client: str, opened: bool) -> dict[str, Any]:
         """Open or close the gripper.
 
-        One on an output has then been told; one with a drive, which moves only under the lease, has come to rest.
+        One on an output has then been told; one with a drive, which moves only under the lease, has come to rest: at
+        `position`, rad, and `holds` says whether something keeps it from where it is open or closed.
+
+        Raises:
+            CommandFailed: refused; a fault came first; it was stopped on its way.
         """
         carrier, gripper = self._carrier, self._config.gripper
         async with carrier.lease(client) as lease:
@@ -104,9 +110,18 @@ class Commander:
             await carrier.give(lease, Command.GRIPPER, [opened])
             if gripper is None or gripper.joint is None:
                 return {}
-            way = gripper.joint.position.max - gripper.joint.position.min
-            rest = await carrier.happened(Code.GRIPPER_AT, event, _GRIPPER_S + 4 * way / gripper.joint.velocity)
-        return {"position": rest.value, "holds": rest.limit == 1.0}
+            # An earlier way may have come to its end before the command was taken.
+            begun = await carrier.happened(Code.GRIPPER, event, _GRIPPER_S)
+            rest = await carrier.happened(Code.GRIPPER_AT, begun.number, _longest_s(gripper.joint))
+        holds = rest.limit == 1.0
+        goal = gripper.open_position if opened else gripper.closed_position
+        if goal is not None and not holds and abs(rest.value - goal) > _THERE_RAD:
+            raise CommandFailed(
+                "refused",
+                f"{gripper.joint.name} was stopped at {rest.value:.4f} rad, on its way to where it is "
+                f"{'open' if opened else 'closed'}, {goal:g} rad",
+            )
+        return {"position": rest.value, "holds": holds}
 
     async def shut_down(self) -> None:
         """Tell the loop to stop, disable and end; its process's end is the answer."""
@@ -142,3 +157,11 @@ class Commander:
                     raise CommandFailed("timeout", "the loop's service thread did not answer within 5 s")
                 await asyncio.sleep(POLL_S)
         return answer
+
+
+def _longest_s(joint: Joint) -> float:
+    """Return how long a gripper may take, s: amply what its whole range takes under its limits."""
+    way = joint.position.max - joint.position.min
+    return _GRIPPER_S + 4 * (
+        way / joint.velocity + joint.velocity / joint.acceleration + joint.acceleration / joint.jerk
+    )

@@ -271,6 +271,10 @@ def main() -> int:
 
 async def _run(directory: Path, ready: Callable[[], None]) -> None:
     await Gateway(directory).serve(ready)
+    # asyncio closes the pipe that it learns of signals by before it takes its handlers back: one in between would be a
+    # traceback in the log.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
 
 
 if __name__ == "__main__":

@@ -71,10 +71,12 @@ class DrivenGripper:
         if not (self.enabled and self.motion.grip(close)):
             return False
         self.lease = lease
+        # Where it already is where it shall be, it comes to rest before the cycle has ended.
+        self._moved = True
         return True
 
     def came_to_rest(self) -> bool:
-        """Whether its set-point moved in the last cycle and stands now."""
+        """Whether its set-point moved, or was told to, since the last call and stands now; called once a cycle."""
         before, self._moved = self._moved, self.motion.moving
         return before and not self._moved
 

@@ -160,8 +160,9 @@ def _empty(names: list[str], joints: Mapping[str, list[float]], boxes: Mapping[s
 
 def _example(config: ArmConfig) -> str:
     keys = ", ".join(_JOINT_KEYS)
-    boxes = ["box", *(one.name for one in config.cartesian.keep_out)]
-    return f"{config.joints[0].name}.KEY or {ALL}.KEY (KEY: {keys}) and {boxes[-1]}.min.x (boxes: {', '.join(boxes)})"
+    joints = f"{config.joints[0].name}.KEY or {ALL}.KEY (KEY: {keys})"
+    boxes = [*_lists(config, Values.configured(config))[1]]
+    return f"{joints} and {boxes[-1]}.min.x (boxes: {', '.join(boxes)})" if boxes else joints
 
 
 def _corners(six: list[float]) -> Corners:

@@ -24,9 +24,9 @@ from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
 from rtcp.runtime.session import Processes, end, forget_processes, identify, is_ours
 
-_SEGMENT_S = 15.0
+_SEGMENT_S = 60.0
 _LOOP_S = 60.0
-_GATEWAY_S = 15.0
+_GATEWAY_S = 60.0
 _STOP_S = 20.0
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Report = Callable[[str], None]

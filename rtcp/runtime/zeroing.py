@@ -9,7 +9,7 @@ from rtcp.config.errors import ConfigError
 from rtcp.runtime.carrier import Carrier, CommandFailed
 from rtcp.runtime.codes import Code
 from rtcp.runtime.machine import Command, State
-from rtcp.runtime.zero import read_zeros, store_zero
+from rtcp.runtime.zero import read_zeros, store_zero, zero_file
 
 _HOMING = frozenset({State.HOMING})
 _HOMING_S = 180.0
@@ -29,6 +29,13 @@ class Zeroing:
     async def zero(self, client: str, joint: str, at: float) -> dict[str, Any]:
         """Let the joint stand at `at` (rad) now, in the loop and in the file of offsets, while no drive has torque."""
         axis = self._axis(joint)
+        if axis == len(self._config.joints):
+            # A cycle record has the arm's joints alone: where the gripper stands is not in it.
+            raise CommandFailed(
+                "refused",
+                f"{joint}: the zero of the gripper's joint is not set by a command; its offset stands in "
+                f"{zero_file(self._config.name)}",
+            )
         async with self._carrier.lease(client) as lease:
             try:
                 offsets = read_zeros(self._config) or (0.0,) * len(self._config.axes)

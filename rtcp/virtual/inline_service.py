@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.assembly import drives_of
+from rtcp.runtime.assembly import position_of
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.service import Service
 from rtcp.virtual.inprocess import InProcessBus
@@ -21,8 +21,8 @@ class InlineService(Service):
     """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
 
     def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:
-        positions = [slot + 1 for slot, _ in drives_of(config)]
-        names = [joint.name for joint in config.joints]
+        positions = [position_of(config, axis) for axis in config.axes]
+        names = [axis.name for axis in config.axes]
         super().__init__(cast(Any, bus), blackboard, positions, names, config.bus.op_timeout_s, 0, 1)
         self._segment = bus
         self._board = blackboard

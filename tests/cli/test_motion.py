@@ -101,6 +101,24 @@ def test_the_gripper_is_told_to_open_or_close(
     assert platform.asked("gripper") == [{"open": opened}]
 
 
+@pytest.mark.parametrize(
+    ("word", "answer", "said"),
+    [
+        ("open", {}, "the gripper is told to open"),
+        ("close", {"position": 0.0, "holds": False}, "the gripper is closed: it rests at 0.0000 rad"),
+        ("open", {"position": 1.4, "holds": False}, "the gripper is open: it rests at 1.4000 rad"),
+        ("close", {"position": 0.48656, "holds": True}, "the gripper rests at 0.4866 rad: it holds something"),
+    ],
+    ids=["on an output", "closed", "open", "holding"],
+)
+def test_it_is_said_where_a_gripper_with_a_drive_has_come_to_rest(
+    platform: Any, rtcp: Callable[..., Any], word: str, answer: dict[str, Any], said: str
+) -> None:
+    platform.answers["gripper"] = answer
+    ended = rtcp("gripper", word)
+    assert (ended.code, ended.out) == (0, f"{said}\n")
+
+
 def test_what_a_gripper_cannot_do_is_refused(platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("gripper", "half")
     assert (ended.code, platform.requests) == (2, [])

@@ -18,7 +18,15 @@ from kinematics.forward import frames
 from rtcp.config import ConfigError, default_config, load, load_segment, segment_path
 from rtcp.config.arm_model import kinematics_part
 from rtcp.config.model import ArmConfig
-from rtcp.config.operation import Box, CartesianConfig, InputConfig, JogConfig, KeepOut, WatchConfig
+from rtcp.config.operation import (
+    Box,
+    CartesianConfig,
+    EmergencyStopConfig,
+    InputConfig,
+    JogConfig,
+    KeepOut,
+    WatchConfig,
+)
 from rtcp.config.operation_rules import shoulder_and_reach
 from rtcp.config.schema import with_motion
 from rtcp.virtual.models import create
@@ -137,6 +145,27 @@ MISTAKES = {
         ("  torque: 1.5 ", "  torque: 0.5 "),
         "watch.torque: found 0.5, allowed is a number from 1 to 10",
     ),
+    "a keep-out box with the name of the box that the tool stays in": (
+        ("name: user", "name: box"),
+        'cartesian.keep_out[0].name: found the text "box", which in the key of a limit means cartesian.box',
+    ),
+    "a keep-out box with the name of all joints": (
+        ("name: user", "name: joints"),
+        'cartesian.keep_out[0].name: found the text "joints", which in the key of a limit means all joints',
+    ),
+    "a keep-out box with the name of a joint": (
+        ("name: chair", "name: joint2"),
+        'cartesian.keep_out[1].name: found the text "joint2", which in the key of a limit means joints[1]',
+    ),
+    "a keep-out box with a dot in its name": (
+        ("name: user", "name: user.min"),
+        'cartesian.keep_out[0].name: found the text "user.min", allowed is one without a dot: in the key of a limit '
+        "dots part its words",
+    ),
+    "a joint with the name of all of them": (
+        ("name: joint3", "name: joints"),
+        'joints[2].name: found the text "joints", which in the key of a limit means all joints',
+    ),
     "two directions on one input": (
         ("left: 3", "left: 2"),
         "inputs.joystick.left: found 2, the input of inputs.joystick.backward; each needs its own",
@@ -156,6 +185,10 @@ MISTAKES = {
     "an input without a number": (
         (TOGGLE, "arm_toggle: {active: high}"),
         "inputs.arm_toggle: the key number is missing; it must be an integer from 1 to 16",
+    ),
+    "an emergency stop whose level nobody has said": (
+        ("{number: 10, active: low", "{number: 10"),
+        "inputs.emergency_stop: the key active is missing; it must be one of high, low",
     ),
     "a level that is none": (
         ("{number: 10, active: low", "{number: 10, active: closed"),
@@ -279,7 +312,7 @@ def test_the_parts_are_read_into_their_dataclasses(directory: Path) -> None:
     assert arm.jog == JogConfig(frame="tool")
     assert arm.watch == WatchConfig(cycles=7)
     assert arm.inputs.enabling_switch == InputConfig(11)
-    assert arm.inputs.emergency_stop == InputConfig(10, "low")
+    assert arm.inputs.emergency_stop == EmergencyStopConfig(10, "low")
 
 
 def test_the_geometry_is_the_one_of_the_kinematics_part() -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.operation import InputConfig, InputsConfig, JoystickConfig
+from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig
 from rtcp.devices.stick import Stick
 
 CYCLE = 0.0005
@@ -102,7 +102,9 @@ def test_lines_that_never_come_to_rest_do_not_keep_the_last_direction():
 
 
 def test_other_inputs_with_a_meaning_and_other_bytes_do_not_disturb_it():
-    stick = stick_of(arm_toggle=InputConfig(7), emergency_stop=InputConfig(8, "low"), enabling_switch=InputConfig(12))
+    stick = stick_of(
+        arm_toggle=InputConfig(7), emergency_stop=EmergencyStopConfig(8, "low"), enabling_switch=InputConfig(12)
+    )
     held(stick, 0xFF00 | 0xC0 | 62, 1)
     assert stick.valid
     assert shown(stick) == (1, 0, 0)

@@ -3,12 +3,12 @@ from __future__ import annotations
 import pytest
 
 from rtcp.config.model import GripperConfig
-from rtcp.config.operation import InputConfig, InputsConfig, OutputsConfig
+from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, OutputsConfig
 from rtcp.devices.terminals import Inputs, Outputs, Switch
 
 CYCLE = 0.0005
 ALL = InputsConfig(
-    arm_toggle=InputConfig(9), enabling_switch=InputConfig(11), emergency_stop=InputConfig(10, active="low")
+    arm_toggle=InputConfig(9), enabling_switch=InputConfig(11), emergency_stop=EmergencyStopConfig(10, active="low")
 )
 
 

@@ -18,6 +18,8 @@ from typing import Any
 import pytest
 
 from rtcp.config.find import default_config
+from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.paths import control_socket
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
@@ -75,10 +77,15 @@ class Platform:
             stderr=subprocess.PIPE,
         )
 
+    def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
+        """Ask over the control socket, as `rtcp` does, without the half second that its start takes."""
+        with ControlClient("the tests", control_socket(self.directory)) as client:
+            found: dict[str, Any] = client.call(verb, arguments, timeout_s=60.0)
+            return found
+
     def status(self) -> dict[str, Any]:
-        """Return `rtcp status --json`."""
-        found: dict[str, Any] = json.loads(self.rtcp("status", "--json").stdout)
-        return found
+        """Return what `rtcp status --json` prints."""
+        return self.call("status")
 
     def until(self, met: Callable[[dict[str, Any]], bool], what: str, patience_s: float = 20.0) -> dict[str, Any]:
         """Ask for the status until `met`; the patience only keeps a broken platform from hanging the tests."""
@@ -110,7 +117,7 @@ class Platform:
 
     @contextlib.contextmanager
     def capture(self, path: Path) -> Iterator[None]:
-        """Write the frames that reach the segment meanwhile to a file."""
+        """Write the frames that reach and leave the segment meanwhile to a file; assert that none was lost."""
         segment = str(self.pids()["segment"])
         sniffer = subprocess.Popen(
             [sys.executable, str(WIRE), segment, "capture", str(path)], stdout=subprocess.PIPE, text=True
@@ -121,7 +128,8 @@ class Platform:
             yield
         finally:
             sniffer.send_signal(signal.SIGTERM)
-            assert sniffer.wait() == 0
+            lost, _ = sniffer.communicate()
+            assert (sniffer.returncode, lost) == (0, "0\n")
 
     def al_states(self) -> list[int]:
         """Return the AL status of every slave, read with frames of the tests' own."""
@@ -194,8 +202,9 @@ def shared() -> Iterator[Platform]:
 def enabled(shared: Platform) -> Iterator[Platform]:
     """The shared platform, in CSP, enabled; disabled afterwards."""
     if shared.status()["state"] == "fault":
-        shared.rtcp("reset")
-    shared.rtcp("mode", "csp")
-    shared.rtcp("enable")
+        shared.call("reset")
+    shared.call("mode", name="csp")
+    shared.call("enable")
     yield shared
-    shared.rtcp("disable", check=None)
+    with contextlib.suppress(ControlError):
+        shared.call("disable")

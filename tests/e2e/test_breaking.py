@@ -149,7 +149,11 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(platform: Platfor
 
     def positions() -> list[int]:
         return [
-            int(platform.rtcp("sdo", "read", str(slave), "0x6064", "--type", "int32").stdout.split()[0])
+            int.from_bytes(
+                bytes.fromhex(platform.call("sdo_read", slave=slave, index=0x6064, subindex=0)["hex"]),
+                "little",
+                signed=True,
+            )
             for slave in range(2, 8)
         ]
 

@@ -25,12 +25,12 @@ NUMBERS = [f"{q:g}" for q in BENT]
 @pytest.fixture
 def bent(enabled: Platform) -> Iterator[Platform]:
     """The shared platform, enabled, the arm bent away from all limits, taking moves; as it was afterwards."""
-    enabled.rtcp("mode", "joint")
-    enabled.rtcp("move", *NUMBERS)
+    enabled.call("motion", name="joint")
+    enabled.call("move", q=BENT, speed=None)
     yield enabled
     enabled.until(lambda found: found["state"] in ("holding", "stopped_by_limit"), "rest")
-    enabled.rtcp("reset")
-    enabled.rtcp("mode", "joint")
+    enabled.call("reset")
+    enabled.call("motion", name="joint")
 
 
 @pytest.fixture
@@ -199,7 +199,8 @@ def test_limits_are_narrowed_shown_and_kept_to(bent: Platform) -> None:
         done = bent.rtcp("limits", "set", "joint1.max", "-0.5", check=3)
         assert "joint1" in done.stderr
         assert "nothing was changed" in done.stderr
-        bent.rtcp("limits", "set", "joint1.max", "9", check=3)
+        done = bent.rtcp("limits", "set", "joint1.max", "9", check=2)
+        assert "joint1.max: found 9, allowed is -3.1 to 3.1" in done.stderr
     finally:
         bent.rtcp("limits", "set", "joint1.max", "3.1")
 

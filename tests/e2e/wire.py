@@ -1,11 +1,12 @@
 """A look at the wire that shares nothing with the platform: its own frames, its own decoder.
 
-Usage: python wire.py SEGMENT_PID al | init POSITION | capture FILE
+Usage: python wire.py SEGMENT_PID al | init POSITION | safeop POSITION | capture FILE
 The layout of the process image is that of the facts: an IO box (2 bytes out), then six drives (15 bytes out each).
 """
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
 import os
@@ -27,6 +28,18 @@ DRIVE = struct.Struct("<Hiiib")
 BOX_OUT = 2
 DRIVES = 6
 COUNTS_PER_RAD = 10_000
+AL_STATES = {"init": 1, "safeop": 4}
+ETH_P_ALL = 3
+"""What a socket must be bound to for packet(7) to show it what leaves, too."""
+LEAVES = 0x8000
+"""Flag in a capture, beside the length, of a frame that leaves the segment."""
+SO_TIMESTAMPNS = 35
+SO_RCVBUFFORCE = 33
+SOL_PACKET, PACKET_STATISTICS = 263, 6
+BUFFER = 16 << 20
+TIMESPEC = struct.Struct("@qq")
+HEAD = struct.Struct("<QH")
+"""Of a frame in a capture: its time, ns, and its length."""
 
 
 def enter(pid: int) -> None:
@@ -76,32 +89,47 @@ def al_states(interface: str) -> list[int]:
         return [int.from_bytes(ask(port, APRD, -position, 0x0130, 2)[0], "little") for position in range(count)]
 
 
-def to_init(interface: str, position: int) -> None:
-    """Send the slave at `position` (from 0) to INIT, as if it had lost its way."""
+def to_state(interface: str, position: int, state: int) -> None:
+    """Send the slave at `position` (from 0) to a lower AL state, as if it had lost its way."""
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
         port.bind((interface, ETHERTYPE))
-        port.send(frame(APWR, 0xDD, -position, 0x0120, b"\x01\x00"))
+        port.send(frame(APWR, 0xDD, -position, 0x0120, struct.pack("<H", state)))
 
 
 def capture(interface: str, path: str) -> None:
-    """Write every frame that reaches the segment to a file, with its time, until SIGTERM."""
+    """Write every frame that reaches or leaves the segment to a file, with its time, until SIGTERM; then what was lost.
+
+    Times are the kernel's, as CLOCK_MONOTONIC: a host that is busy delays the writing, not the stamp.
+    """
     ended: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, at: ended.append(number))
     with (
-        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port,
+        socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL)) as port,
         open(path, "wb") as file,
     ):
-        port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 16 << 20)
-        port.bind((interface, ETHERTYPE))
+        for option in (socket.SO_RCVBUF, SO_RCVBUFFORCE):
+            with contextlib.suppress(PermissionError):
+                port.setsockopt(socket.SOL_SOCKET, option, BUFFER)
+        port.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        port.bind((interface, ETH_P_ALL))
         port.settimeout(0.1)
         print("ready", flush=True)
         while not ended:
             try:
-                got, where = port.recvfrom(1600)
+                got, extra, _, where = port.recvmsg(1600, socket.CMSG_SPACE(TIMESPEC.size))
             except TimeoutError:
                 continue
-            if where[2] != socket.PACKET_OUTGOING:
-                file.write(struct.pack("<QH", time.monotonic_ns(), len(got)) + got)
+            except OSError:
+                break  # the segment has taken its interface along
+            if got[12:14] != ETHERTYPE.to_bytes(2, "big"):
+                continue
+            s, ns = TIMESPEC.unpack_from(extra[0][2])
+            when = s * 1_000_000_000 + ns - time.time_ns() + time.monotonic_ns()
+            leaves = LEAVES if where[2] == socket.PACKET_OUTGOING else 0
+            file.write(HEAD.pack(when, len(got) | leaves) + got)
+        # tpacket_stats of packet(7): frames seen, frames for which there was no room.
+        _, lost = struct.unpack("@II", port.getsockopt(SOL_PACKET, PACKET_STATISTICS, 8))
+        print(lost, flush=True)
 
 
 @dataclass(frozen=True)
@@ -115,28 +143,32 @@ class Targets:
     mode: int
 
 
-def frames(path: Path) -> Iterator[tuple[int, bytes]]:
-    """Yield time (ns) and bytes of captured frames."""
-    data = path.read_bytes()
-    at = 0
-    while at + 10 <= len(data):
-        when, length = struct.unpack_from("<QH", data, at)
-        yield when, data[at + 10 : at + 10 + length]
-        at += 10 + length
+def frames(path: Path) -> Iterator[tuple[int, bool, bytes]]:
+    """Yield time (ns), whether it leaves the segment, and bytes of captured frames."""
+    with path.open("rb") as file:
+        while len(head := file.read(HEAD.size)) == HEAD.size:
+            when, word = HEAD.unpack(head)
+            yield when, bool(word & LEAVES), file.read(word & ~LEAVES)
+
+
+def datagrams(frame: bytes) -> Iterator[tuple[int, int, bytes, int]]:
+    """Yield command, index, data and working counter of every datagram in a frame."""
+    at, more = 16, True
+    while more:
+        command, index, _, _, word, _ = struct.unpack_from("<BBHHHH", frame, at)
+        length, more = word & 0x07FF, bool(word & 0x8000)
+        data = frame[at + 10 : at + 10 + length]
+        yield command, index, data, int.from_bytes(frame[at + 10 + length : at + 12 + length], "little")
+        at += 12 + length
 
 
 def outputs(path: Path) -> Iterator[tuple[int, list[Targets]]]:
-    """Yield time (ns) and the targets of all drives of every process data frame."""
-    for when, got in frames(path):
-        at = 16
-        more = True
-        while more:
-            command, _, _, _, word, _ = struct.unpack_from("<BBHHHH", got, at)
-            length, more = word & 0x07FF, bool(word & 0x8000)
-            if command == LRW:
-                image = got[at + 10 : at + 10 + length]
-                yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
-            at += 12 + length
+    """Yield time (ns) and the targets of all drives of every process data frame that reached the segment."""
+    for when, leaves, got in frames(path):
+        if not leaves:
+            for command, _, image, _ in datagrams(got):
+                if command == LRW:
+                    yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
 
 
 def main() -> None:
@@ -144,8 +176,8 @@ def main() -> None:
     enter(int(sys.argv[1]))
     if sys.argv[2] == "al":
         print(json.dumps(al_states("ecat0")))
-    elif sys.argv[2] == "init":
-        to_init("ecat0", int(sys.argv[3]))
+    elif sys.argv[2] in AL_STATES:
+        to_state("ecat0", int(sys.argv[3]), AL_STATES[sys.argv[2]])
     else:
         capture("ecat0-seg", sys.argv[3])
 

@@ -74,6 +74,36 @@ def test_what_it_holds_ends_the_motion_at_once(motion, close, push):
     assert set(run(motion, 1.0, push)) == {here}
 
 
+@pytest.mark.parametrize(("close", "side"), [(True, -1.0), (False, 1.0)])
+def test_what_it_holds_with_more_than_its_torque_it_yields_to_until_it_does_not(motion, close, side):
+    motion.grip(close)
+    run(motion, 0.3)
+    run(motion, 5 * DT, 3.0 * side)
+    held = motion.position
+    path = [held, *run(motion, 0.1, 2.1 * side)]
+    step = JOINT.acceleration * DT * DT
+    assert [(a - b) * side for a, b in itertools.pairwise(path)] == pytest.approx([step] * (len(path) - 1))
+    assert set(run(motion, 0.1, 1.9 * side)) == {path[-1]}
+    # A push from the other side is no force of its own.
+    assert set(run(motion, 0.1, -5.0 * side)) == {path[-1]}
+    assert motion.gripped
+
+
+def test_it_yields_no_further_than_its_range(motion):
+    motion.grip(False)
+    run(motion, 0.3)
+    run(motion, 5 * DT, 3.0)
+    motion._state.position[0] = JOINT.position.min
+    assert set(run(motion, 0.1, 3.0)) == {JOINT.position.min}
+
+
+def test_a_stop_before_its_first_step_is_a_stop(motion):
+    motion.grip(True)
+    motion.stop()
+    assert not motion.moving
+    assert set(run(motion, 0.5)) == {0.5}
+
+
 def test_to_be_told_again_changes_nothing(motion):
     other = GripperMotion(JOINT, OPEN, CLOSED, DT)
     other.latch(0.5)

@@ -13,7 +13,7 @@ from kinematics.forward import forward
 from rtcp.config import default_config, load
 from rtcp.motion.state import Reason
 from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.codes import Code, JogFrame, MotionMode
+from rtcp.runtime.codes import Code, JogFrame, MotionMode, Refusal
 from rtcp.runtime.machine import Command, State
 from rtcp.runtime.paths import control_socket
 from tests.runtime.played_loop import JOINTS, Loop
@@ -33,7 +33,7 @@ def wait_until(holds: Callable[[], bool], patience_s: float = 5.0) -> None:
 @pytest.fixture
 def loop(gateway_client: ControlClient, gateway_loop: Loop) -> Loop:
     gateway_loop.state = State.HOLDING
-    gateway_loop.stand_at(BENT)
+    gateway_loop.q = list(BENT)
     wait_until(lambda: gateway_client.call("status")["joints"]["target"] == BENT)
     return gateway_loop
 
@@ -55,9 +55,9 @@ def forced(loop: Loop) -> list[tuple[int, int]]:
 
 def written(loop: Loop) -> list[tuple[int, int]]:
     return [
-        (request["subindex"], int.from_bytes(bytes.fromhex(request["hex"]), "little"))
-        for request in loop.requests
-        if request["do"] == "sdo_write" and request["index"] == 0x2000
+        (subindex, int.from_bytes(bytes.fromhex(value), "little"))
+        for index, subindex, value in loop.written
+        if index == 0x2000
     ]
 
 
@@ -84,7 +84,7 @@ def test_a_pose_is_reached_by_the_nearest_solution(client: ControlClient, loop: 
 def test_a_line_is_written_as_a_plan_and_its_speed_is_that_of_the_tool(
     client: ControlClient, loop: Loop, line: bool, motion: MotionMode
 ) -> None:
-    loop.set_motion(motion)
+    loop.motion = motion
     wait_until(lambda: client.call("status")["motion"] == motion.name.lower())
     goal = tool_at(BENT)
     goal[1] += 0.1
@@ -204,7 +204,7 @@ def test_a_jogger_that_falls_silent_loses_its_lease(
 def test_a_jog_of_joints_is_a_velocity_in_the_mode_velocity(
     client: ControlClient, loop: Loop, motion: MotionMode, command: Command
 ) -> None:
-    loop.set_motion(motion)
+    loop.motion = motion
     wait_until(lambda: client.call("status")["motion"] == motion.name.lower())
     client.call("jog", {"v": [0.1] * JOINTS, "frame": "joints"})
     assert [found[0] for found in loop.commands] == [command]
@@ -229,7 +229,7 @@ def test_limits_are_changed_all_at_once_and_shown(client: ControlClient, loop: L
 
 def test_limits_that_the_loop_refuses_are_not_in_force(client: ControlClient, loop: Loop) -> None:
     before = client.call("limits")["limits"]
-    loop.refusal = (26, 1, 0.3, 0.1)
+    loop.refusals[Command.LIMITS] = (Refusal.LIMITS_OUTSIDE, 1, 0.3, 0.1)
     with pytest.raises(ControlError, match="nothing was changed"):
         client.call("limits", {"set": {"joint2.max": 0.1}})
     assert client.call("limits")["limits"] == before

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import nan
 
 import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.motion.watch import FOLLOWING_ERROR, SPEED
 from rtcp.runtime.gripper import DrivenGripper, gripper_of
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
@@ -179,6 +181,35 @@ def test_outside_its_range_it_is_not_to_be_enabled(position: float, outside: boo
     bench = Bench(position=position)
     assert bench.gripper.outside is outside
     assert bench.gripper.drive.target_position == min(max(bench.gripper.drive.position, -0.1), 1.5)
+
+
+@pytest.mark.parametrize("wrong", [0.16, -0.16, nan])
+def test_how_far_it_is_from_its_set_point_counts_but_for_what_it_holds(wrong: float) -> None:
+    gripper = gripper_of(DRIVEN)
+    assert gripper is not None
+    gripper.motion.latch(0.5)
+    gripper.drive.position = 0.5 + wrong
+    gripper.motion.gripped = True
+    assert [gripper.look() for _ in range(100)] == [None] * 100
+    gripper.motion.gripped = False
+    *before, found = [gripper.look() for _ in range(DRIVEN.watch.cycles)]
+    assert before == [None] * (DRIVEN.watch.cycles - 1)
+    assert found is not None
+    assert (found.kind, found.axis, found.limit) == (FOLLOWING_ERROR, 6, DRIVEN.watch.following_error)
+
+
+@pytest.mark.parametrize("wrong", [1.51, -1.51, nan])
+def test_a_speed_beyond_its_limit_counts_whatever_it_holds(wrong: float) -> None:
+    gripper = gripper_of(DRIVEN)
+    assert gripper is not None
+    gripper.motion.gripped = True
+    gripper.drive.velocity = wrong
+    *before, found = [gripper.look() for _ in range(DRIVEN.watch.cycles)]
+    assert before == [None] * (DRIVEN.watch.cycles - 1)
+    assert found is not None
+    assert (found.kind, found.axis, found.limit) == (SPEED, 6, 1.5 * FINGER.velocity)
+    gripper.drive.velocity = 1.49
+    assert gripper.look() is None
 
 
 def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:

@@ -17,6 +17,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.limit_orders import LimitOrders
 from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Answer, Observer
+from rtcp.runtime.sentences import Sentences
 
 from .test_behaviour import CONFIG, COUNTS, PERIOD_S, Bench, move_numbers
 
@@ -170,3 +171,76 @@ def test_boxes_that_the_arm_stands_in_are_refused(board: tuple[Blackboard, Obser
         plan = rows(new)
         assert orders.take(1, [board[1].write_plan(plan), len(plan)]) == expected
     assert arm.limits.box == new.box
+
+
+@pytest.mark.parametrize("name", ["user", "chair"])
+def test_a_keep_out_box_that_the_arm_stands_in_is_refused_by_its_name(
+    board: tuple[Blackboard, Observer], name: str
+) -> None:
+    config = load(default_config())
+    which = [box.name for box in config.cartesian.keep_out].index(name)
+    arm = Arm(config, [])
+    widest = arm.limits.widest
+    arm.state.position[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
+    arm.guards.latch(arm.state)
+    # The box alone grows over the tool, to beyond the other side of the arm's base and no further than it.
+    tool = arm.guards.poses[6].position
+    boxes = list(widest.keep_out)
+    low, high = boxes[which][:3], boxes[which][3:]
+    grown = [min(a, b - 0.05) for a, b in zip(low, tool, strict=True)]
+    grown += [max(a, b + 0.05) for a, b in zip(high, tool, strict=True)]
+    boxes[which] = tuple(grown)  # type: ignore[assignment]
+    plan = rows(replace(widest, keep_out=tuple(boxes)))
+    answer = LimitOrders(arm, board[0]).take(1, [board[1].write_plan(plan), len(plan)])
+    assert (answer[0], answer[1], answer[3]) == (Refusal.LIMITS_OUTSIDE, -1, float(which))
+    assert Sentences(config).refusal(*answer) == (
+        f"the tool, the wrist or the elbow would pass the new bounds of the keep-out box {name} "
+        f"(cartesian.keep_out[{which}] in {config.source.name}): nothing was changed"
+    )
+    assert arm.limits.keep_out == widest.keep_out
+
+
+@pytest.fixture
+def loaded(bench: Bench) -> Bench:
+    """Somebody leans on the first joint: its drive holds 5 Nm."""
+    bench.hold()
+    bench.models[0].mechanics.external_torque = 5.0
+    bench.run(0.5)
+    assert abs(bench.arm.state.torque[0]) == pytest.approx(5.0, abs=WIDEST.torque[0] * 0.05)
+    return bench
+
+
+def test_less_torque_than_a_joint_holds_is_refused_and_nothing_changes(loaded: Bench) -> None:
+    held = abs(loaded.arm.state.torque[0])
+    answer = give(loaded, of_first("torque", 2.0))
+    assert (answer.refusal, answer.axis) == (Refusal.LIMITS_WEAK, 0)
+    assert loaded.refused(answer) == (
+        f"joint1 holds {held:.6g} Nm, more than the new limit of 2 Nm: it would sag, nothing was changed"
+    )
+    assert in_force(loaded) == WIDEST
+    assert Code.LIMITS not in loaded.codes
+
+
+def test_less_torque_that_is_still_more_than_a_joint_holds_is_taken(loaded: Bench) -> None:
+    new = of_first("torque", 10.0)
+    assert give(loaded, new).refusal == Refusal.NONE
+    assert in_force(loaded) == new
+
+
+def test_a_torque_that_is_not_lowered_is_no_matter_whatever_is_held(loaded: Bench) -> None:
+    assert give(loaded, of_first("torque", 10.0)).refusal == Refusal.NONE
+    loaded.models[0].mechanics.external_torque = 12.0
+    loaded.run(0.3)
+    assert abs(loaded.arm.state.torque[0]) > 10.0
+    assert give(loaded, replace(of_first("torque", 10.0), velocity=(0.2, 0.2))).refusal == Refusal.NONE
+
+
+def test_without_torque_any_torque_limit_is_taken(loaded: Bench, board: tuple[Blackboard, Observer]) -> None:
+    loaded.do(Command.DISABLE)
+    loaded.until(State.READY)
+    # Whatever a drive without torque shows.
+    loaded.arm.state.torque[0] = 5.0
+    new = of_first("torque", 2.0)
+    plan = rows(new)
+    assert LimitOrders(loaded.arm, board[0]).take(1, [board[1].write_plan(plan), len(plan)]) == (Refusal.NONE,)
+    assert in_force(loaded) == new

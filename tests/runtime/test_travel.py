@@ -13,7 +13,7 @@ from kinematics.forward import forward
 from rtcp.config.motion_points import Stop
 from rtcp.motion.limits import Limits
 from rtcp.runtime.codes import Code, MotionMode, Refusal
-from rtcp.runtime.machine import Command, State
+from rtcp.runtime.machine import Command
 from rtcp.runtime.planner import Planner
 from tests.runtime.played import Played, played
 
@@ -208,17 +208,8 @@ def test_what_the_loop_refuses_is_told_in_its_sentence(arm: Played) -> None:
 
 def test_a_motion_that_ends_early_is_told_with_its_reason(arm: Played) -> None:
     goal = [0.5, *BENT[1:]]
-    publish = arm.loop._publish
-
-    def stopped() -> None:
-        if arm.loop.state is State.MOVING:
-            arm.loop.q = list(BENT)
-            arm.loop.state = State.HOLDING
-            arm.loop.board.event(Code.NOT_PERMITTED)
-            arm.loop.board.event(Code.STOPPED)
-        publish()
-
-    arm.loop._publish = stopped  # type: ignore[method-assign]
+    arm.loop.ends[Command.MOVE] = BENT
+    arm.loop.event_at_the_end = (Code.NOT_PERMITTED,)
     failed = arm.refused("move", q=goal)
     assert failed.kind == "fault"
     assert "the enabling switch was let go" in str(failed)

@@ -9,8 +9,10 @@ import pytest
 
 from rtcp.runtime.codes import Refusal
 from rtcp.runtime.machine import Command
-from rtcp.runtime.zero import read_zeros, zero_file
+from rtcp.runtime.zero import read_zeros, state_directory, zero_file
 from tests.runtime.played import Played, played
+
+from .test_gripper import DRIVEN
 
 Q = [0.25, 0.2, 1.0, 0.0, 0.4, 0.0]
 
@@ -54,9 +56,27 @@ def test_what_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm: Played
     assert offsets in ([], [0.25, 0.0])
 
 
+def test_the_zero_of_a_grippers_joint_is_refused_and_where_it_stands_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    with played(tmp_path, Q, config=DRIVEN) as arm:
+        failed = arm.refused("zero", joint="finger")
+        assert failed.kind == "refused"
+        assert str(failed) == (
+            "finger: the zero of the gripper's joint is not set by a command; its offset stands in "
+            f"{tmp_path}/state/assistive-arm.zero.yaml"
+        )
+        assert arm.loop.commands == []
+
+
 @pytest.mark.parametrize("verb", ["zero", "home"])
 def test_a_joint_that_is_none_is_named_with_those_that_there_are(arm: Played, verb: str) -> None:
     failed = arm.refused(verb, joint="joint7")
     assert failed.kind == "invalid"
     assert "found 'joint7', allowed is one of joint1, joint2" in str(failed)
     assert arm.loop.commands == []
+
+
+def test_no_test_keeps_offsets_where_the_arm_at_this_host_has_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
+    assert state_directory().is_relative_to(tmp_path_factory.getbasetemp())

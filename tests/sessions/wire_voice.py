@@ -1,0 +1,167 @@
+"""What a random session says on the control socket, and what it is answered: counted, and kept with its time."""
+
+from __future__ import annotations
+
+import json
+import math
+import socket
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rtcp.runtime.client import ControlClient, ControlError
+
+NAME = "a random session"
+PATIENCE_S = 30.0
+DEFECTS = ("internal", "lost", "not running", "timeout")
+"""Kinds of answers that no request may have, whatever it asks."""
+
+
+class Line:
+    """A connection on which something is asked and not waited for; it takes numbers that JSON does not know, too."""
+
+    def __init__(self, path: Path) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.connect(str(path))
+        self._received = b""
+
+    def begin(self, verb: str, arguments: Mapping[str, Any]) -> None:
+        """Ask."""
+        request = {"id": 1, "do": verb, "args": dict(arguments), "client": NAME}
+        self._socket.sendall(json.dumps(request).encode() + b"\n")
+
+    def answer(self, patience_s: float) -> dict[str, Any] | None:
+        """Return the answer, or None where it has not come in time."""
+        end = time.monotonic() + patience_s
+        while True:
+            *lines, self._received = self._received.split(b"\n")
+            for reply in map(json.loads, lines):
+                if "progress" not in reply:
+                    return dict(reply)
+            self._socket.settimeout(max(end - time.monotonic(), 1e-3))
+            try:
+                got = self._socket.recv(65536)
+            except TimeoutError:
+                return None
+            if not got:
+                return {"ok": False, "error": {"kind": "lost", "message": "the connection was closed"}}
+            self._received += got
+
+    def close(self) -> None:
+        """Go away, whatever was asked."""
+        self._socket.close()
+
+
+class Voice:
+    """Asks, and keeps what was asked: `deeds` are (ns of CLOCK_MONOTONIC, sentence)."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._client = ControlClient(NAME, path)
+        self._line: Line | None = None
+        self._verb = ""
+        self.deeds: list[tuple[int, str]] = []
+        self.taken: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
+        self.happenings: Counter[str] = Counter()
+        self.defects: list[tuple[int, str]] = []
+
+    def ask(self, verb: str, **arguments: Any) -> dict[str, Any] | None:
+        """Ask and wait; return the result, or None where it was refused."""
+        begun = time.monotonic_ns()
+        kind, message, result = "", "", None
+        if _is_json(arguments):
+            try:
+                result = self._client.call(verb, arguments, timeout_s=PATIENCE_S)
+            except ControlError as error:
+                kind, message = error.kind, error.message
+                if kind == "lost":
+                    self.hang_up()
+        else:
+            line = Line(self._path)
+            line.begin(verb, arguments)
+            reply = line.answer(PATIENCE_S)
+            line.close()
+            kind, message, result = _read(reply)
+        self._keep(begun, verb, arguments, kind, message)
+        return result
+
+    def status(self) -> dict[str, Any]:
+        """Return the status, which is no deed."""
+        return self._client.call("status", timeout_s=PATIENCE_S)
+
+    def begin(self, verb: str, **arguments: Any) -> None:
+        """Ask for what takes long on a connection of its own, and do not wait."""
+        self.drop()
+        self._line, self._verb = Line(self._path), verb
+        self._line.begin(verb, arguments)
+        self.deeds.append((time.monotonic_ns(), f"{verb} {_short(arguments)} begins"))
+
+    def busy(self, patience_s: float) -> bool:
+        """Whether what was begun has not been answered within this time."""
+        if self._line is None:
+            return False
+        reply = self._line.answer(patience_s)
+        if reply is None:
+            return True
+        kind, message, _ = _read(reply)
+        self._keep(time.monotonic_ns(), self._verb, {}, kind, message)
+        self._line.close()
+        self._line = None
+        return False
+
+    def drop(self) -> None:
+        """Close the connection of what was begun; its lease goes with it."""
+        if self._line is not None:
+            if self.busy(1e-3):
+                self.happen("connection closed", f"in the middle of {self._verb}")
+                self._line.close()
+            self._line = None
+
+    def hang_up(self) -> None:
+        """Close the connection on which is asked, with its lease, and open another."""
+        self._client.close()
+        self._client = ControlClient(NAME, self._path)
+
+    def happen(self, name: str, what: str = "") -> None:
+        """Note what happens."""
+        self.happenings[name] += 1
+        self.deeds.append((time.monotonic_ns(), f"* {name} {what}"))
+
+    def close(self) -> None:
+        """Close both connections."""
+        self.drop()
+        self._client.close()
+
+    def _keep(self, when: int, verb: str, arguments: Mapping[str, Any], kind: str, message: str) -> None:
+        (self.refused if kind else self.taken)[verb] += 1
+        self.deeds.append((when, f"{verb} {_short(arguments)} -> {kind or 'taken'} {message[:120]}"))
+        if kind in DEFECTS:
+            self.defects.append((when, f"{verb} {_short(arguments)}: {kind}: {message}"))
+
+
+def _is_json(value: Any) -> bool:
+    if isinstance(value, dict):
+        return all(map(_is_json, value.values()))
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_json, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def _read(reply: dict[str, Any] | None) -> tuple[str, str, dict[str, Any] | None]:
+    if reply is None:
+        return "timeout", "no answer", None
+    if reply.get("ok"):
+        return "", "", dict(reply["result"])
+    return str(reply["error"]["kind"]), str(reply["error"]["message"]), None
+
+
+def _short(value: Any) -> str:
+    """The arguments, numbers cut to what one can read."""
+    if isinstance(value, dict):
+        return " ".join(f"{key}={_short(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return "[" + " ".join(map(_short, value)) + "]"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
