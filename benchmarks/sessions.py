@@ -64,6 +64,8 @@ def main() -> int:
     given = parser.parse_args()
     began = time.monotonic()
     if given.bus == "virtual":
+        # However it ends, no platform stays behind.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         total = play_on_the_wire(given.seed, 60.0 * given.minutes, given.period, given.keep)
     else:
         total = play_inprocess(given)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -59,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: the command line without the program's name; that of the process when None.
     """
+    _open_what_is_closed()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without UTF-8 loses a letter, not the answer
@@ -78,7 +80,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         return _flushed(interruption_code(error))
     except OSError as error:
-        complain(f"{error.strerror or error}{f': {error.filename}' if error.filename else ''}")
+        where = (
+            f": {error.filename}" if error.filename else " (standard output?)" if error.errno == errno.ENOSPC else ""
+        )
+        complain(f"{error.strerror or error}{where}")
         return _flushed(ExitCode.INTERNAL)
     except Exception as error:
         if os.environ.get("RTCP_TRACEBACK"):
@@ -88,6 +93,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(f"internal error: {type(error).__name__}: {error} (RTCP_TRACEBACK=1 shows where)")
         return _flushed(ExitCode.INTERNAL)
     return _flushed(ExitCode.DONE)
+
+
+def _open_what_is_closed() -> None:
+    """Give a command that was started without standard output, as by `>&-`, one that leads nowhere."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
 
 
 def _flushed(code: int) -> int:

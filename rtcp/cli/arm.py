@@ -12,6 +12,7 @@ import typer
 from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report, show
+from rtcp.config.plain_number import plain_number
 
 if TYPE_CHECKING:
     from kinematics.model import ArmModel
@@ -167,7 +168,7 @@ def _numbers(values: Sequence[str], names: Sequence[str]) -> list[float]:
         unit = "m" if name in POSE[:3] else "rad"
         written = value if unit == "m" else angle(value)
         try:
-            number = float(written)  # type: ignore[arg-type]
+            number = plain_number(written)
         except ValueError:
             wrong.append(f"{name}: {value!r} is not a number ({unit})")
             continue

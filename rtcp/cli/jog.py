@@ -17,6 +17,7 @@ from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, positive, refuse_options
 from rtcp.cli.outcome import CommandError
 from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
+from rtcp.config.plain_number import plain_number
 from rtcp.runtime.client import ControlClient
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
@@ -126,7 +127,7 @@ def _axis(axis: str) -> tuple[int, bool]:
 def _speed(speed: str, turns: bool) -> float:
     unit = "rad/s" if turns else "m/s"
     try:
-        found = float(speed)
+        found = plain_number(speed)
     except ValueError:
         raise CommandError(f"{speed!r} is not a number ({unit})") from None
     if not math.isfinite(found) or found == 0:

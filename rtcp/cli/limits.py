@@ -12,6 +12,7 @@ from rtcp.cli.connection import ask
 from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.outcome import CommandError
 from rtcp.cli.output import emit_json, report, show
+from rtcp.config.plain_number import plain_number
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
 COLUMNS = (
@@ -66,7 +67,7 @@ def _changes(pairs: Sequence[str]) -> dict[str, float]:
     wrong = []
     for key, value in zip(pairs[::2], pairs[1::2], strict=True):
         try:
-            number = float(value)
+            number = plain_number(value)
         except ValueError:
             wrong.append(f"{key}: {value!r} is not a number")
             continue

@@ -8,6 +8,7 @@ import re
 from collections.abc import Sequence
 
 from rtcp.cli.outcome import CommandError
+from rtcp.config.plain_number import plain_number
 
 NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
 """Lets `-0.5` through to the arguments; `refuse_options` then finds the misspelt options among them."""
@@ -42,7 +43,7 @@ def joint_values(values: Sequence[str]) -> list[float]:
     numbers, wrong = [], []
     for joint, value in enumerate(values, 1):
         try:
-            number = float(value)
+            number = plain_number(value)
         except ValueError:
             wrong.append(f"joint {joint}: {value!r} is not a number (rad)")
             continue
@@ -68,7 +69,7 @@ def pose_values(values: Sequence[str]) -> list[float]:
     for name, value in zip(POSE, values, strict=True):
         unit = "rad" if name.startswith("r") else "m"
         try:
-            number = float(angle(value) if unit == "rad" else value)  # type: ignore[arg-type]
+            number = plain_number(angle(value) if unit == "rad" else value)
         except ValueError:
             wrong.append(f"{name}: {value!r} is not a number ({unit})")
             continue

@@ -7,6 +7,7 @@ import re
 import struct
 
 from rtcp.cli.outcome import CommandError
+from rtcp.config.plain_number import plain_number
 
 INTEGER_TYPES = {
     f"{sign}int{bits}": (bits // 8, sign == "") for bits in (8, 16, 32, 64) for sign in ("u", "")
@@ -117,7 +118,7 @@ def guesses(data: bytes) -> str:
 
 def _encode_float(text: str, type_name: str) -> bytes:
     try:
-        number = float(text)
+        number = plain_number(text)
         packed = FLOAT_TYPES[type_name].pack(number)
     except ValueError as error:
         raise CommandError(f"{text!r} is not a number ({type_name})") from error
@@ -131,6 +132,8 @@ def _encode_float(text: str, type_name: str) -> bytes:
 def _integer(text: str, what: str) -> int:
     """Return a whole number written in decimal or, after 0x, in hex."""
     try:
+        if "_" in text or not text.isascii():
+            raise ValueError
         return int(text, 16) if text.lower().lstrip("+-").startswith("0x") else int(text)
     except ValueError as error:
         raise CommandError(f"{text!r} is not a whole number ({what})") from error

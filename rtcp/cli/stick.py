@@ -80,8 +80,8 @@ def _stick(
 
 def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
     if words[0] == "byte":
-        if len(words) != 2 or not words[1].isdecimal() or not 0 <= int(words[1]) <= 255:
-            raise CommandError(f"byte {' '.join(words[1:])} is not allowed: one number from 0 to 255")
+        if len(words) != 2 or not (words[1].isascii() and words[1].isdecimal()) or not 0 <= int(words[1]) <= 255:
+            raise CommandError(f"{' '.join(words)} is not allowed: one number from 0 to 255")
         return [], int(words[1])
     if list(words) == ["release"]:
         return [], None

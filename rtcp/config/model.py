@@ -110,9 +110,9 @@ class Joint:
     name: Name
     slave: Name
     position: Range
-    velocity: Positive
-    acceleration: Positive
-    jerk: Positive
+    velocity: Annotated[float, Ge(0.001)]
+    acceleration: Annotated[float, Ge(0.001)]
+    jerk: Annotated[float, Ge(0.001)]
     torque: Positive
     csv_gain: NotNegative = 10.0
     """Position gain of the loop closed in CSV, 1/s."""

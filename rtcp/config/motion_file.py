@@ -29,6 +29,7 @@ from rtcp.config.checking import Checker
 from rtcp.config.document import Document, Finding, read, text_of
 from rtcp.config.errors import ConfigError
 from rtcp.config.motion_points import Point, Stop
+from rtcp.config.plain_number import plain_number
 
 MOST = 4096
 """Points or poses that a motion has at most."""
@@ -121,7 +122,7 @@ def _read_csv(path: Path) -> MotionFile:
     with_speed = header == [*_POSE, "speed"]
     if joints == 0 and not with_speed and header != list(_POSE):
         wanted = "t,q1,..,q6 (and v1,..,v6 and a1,..,a6) or x,y,z,rx,ry,rz (and speed)"
-        raise ConfigError([f'{path}:{first}: found the header "{head[:80]}", allowed is {wanted}'])
+        raise ConfigError([f"{path}:{first}: found the header {_shown(head)}, allowed is {wanted}"])
     if len(lines) - 1 > MOST:
         raise ConfigError([f"{path}: the file has {len(lines) - 1} rows, at most {MOST} are allowed"])
     if len(lines) == 1:
@@ -145,6 +146,11 @@ def _read_csv(path: Path) -> MotionFile:
     return MotionFile(path=tuple(Stop(tuple(row[:6]), None, row[6] if with_speed else None) for row in rows))
 
 
+def _shown(text: str) -> str:
+    """Return some of a text in quotes, with nothing in it that a terminal would obey."""
+    return '"' + "".join(letter if letter.isprintable() else "?" for letter in text[:80]) + '"'
+
+
 def _joints(header: Sequence[str]) -> int:
     """Return of how many joints a header names the columns; 0 where it is no trajectory's."""
     for joints in range(1, 7):
@@ -164,9 +170,9 @@ def _numbers(line: str, header: Sequence[str], where: str, problems: list[str]) 
     row: list[float] = []
     for name, cell in zip(header, cells, strict=True):
         try:
-            number = float(cell)
+            number = plain_number(cell)
         except ValueError:
-            problems.append(f'{where}: {name}: found the text "{cell[:60]}", allowed is a number')
+            problems.append(f"{where}: {name}: found the text {_shown(cell)}, allowed is a number")
             return None
         if not isfinite(number):
             problems.append(f"{where}: {name}: found {cell}, allowed is a finite number")

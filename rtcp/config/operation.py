@@ -84,7 +84,7 @@ class WatchConfig:
     """Times a joint's velocity limit."""
     torque: Annotated[float, Ge(1), Le(10)] = 1.5
     """Times a joint's torque limit."""
-    following_error: Positive = 0.15
+    following_error: Annotated[float, Gt(0), Le(1)] = 0.15
     """rad, of the joint from where it was commanded."""
 
 

@@ -27,10 +27,16 @@ class Switch:
         self._candidate = before
         self._stable = self._restless = 0
 
+    @property
+    def settled(self) -> bool:
+        """Whether its level has lasted for the debounce, or there is no such input."""
+        return not self._bit or self._stable >= self._debounce
+
     def forget(self) -> None:
         """Count as not active until a level that says otherwise has lasted."""
         self.active = self._candidate = False
-        self._stable = self._restless = 0
+        self._stable = -1
+        self._restless = 0
 
     def read(self, levels: int) -> None:
         """Take the levels of all inputs of a cycle."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from math import isfinite
+from math import inf, isfinite
 
 from kinematics.forward import frames
 from kinematics.pose import Pose
@@ -92,10 +92,14 @@ class SetPointGuard:
 
     def zone_at(self, q: Sequence[float]) -> int | None:
         """Return the number of the box (`zones`) whose bounds the arm would pass at `q` (rad), or None."""
-        if self.zones is None or self._model is None:
-            return None
-        distance, which = self.zones.distance(frames(self._model, q))
+        distance, which = self.nearest_box(q)
         return which if distance < 0.0 else None
+
+    def nearest_box(self, q: Sequence[float]) -> tuple[float, int]:
+        """Return how far the arm at `q` (rad) is from the bounds of the nearest box, m, below 0: beyond; and which."""
+        if self.zones is None or self._model is None:
+            return inf, 0
+        return self.zones.distance(frames(self._model, q))
 
     def probe(self, state: MotionState, position: Sequence[float], velocity: Sequence[float]) -> bool:
         """Return whether a target would pass as it is."""

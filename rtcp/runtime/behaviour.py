@@ -348,6 +348,9 @@ class Behaviour:
             if gripper is not None:
                 gripper.watch.reset()
             self._blackboard.event(Code.ENABLED)
+            distance, box = arm.guards.nearest_box(arm.state.actual)
+            if distance < 0.0:
+                self._blackboard.event(Code.STANDS_IN, box, distance)
             self.on(Event.ENABLED)
             if self.wanted_mode is not DriveMode.CSP:
                 self.change_mode(self.wanted_mode)
@@ -478,7 +481,8 @@ class Behaviour:
             # What still moves is let come to rest first: its torque goes with the reset.
             arm.lead(DriveGoal.RESET if arm.first_moving() < 0 else DriveGoal.QUICK_STOPPED)
             arm.follow()
-            if arm.first_not_resting() < 0:
+            # Whether the button is still pressed shows only now that the box is heard again.
+            if arm.first_not_resting() < 0 and self._operator.button_known:
                 self.fault = Code.NONE
                 self._blackboard.event(Code.RESET)
                 self.on(Event.RESET_DONE)

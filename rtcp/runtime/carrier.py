@@ -187,6 +187,11 @@ class Carrier:
         """Return what an event says."""
         return self._sentences.event(event.code, event.axis, event.value, event.limit)
 
+    def last_sentence(self) -> str:
+        """Return what the last event says: the picture's message may be some polls behind the state."""
+        events = self.observer.events_since(0)
+        return self.sentence(events[-1]) if events else self.picture.message
+
     async def _why_ended(self, number: int) -> str:
         event = self.ended_since(number)
         return f"stopped by a limit: {self.sentence(event)}" if event else "stopped by a limit: see `rtcp status`"

@@ -121,6 +121,7 @@ class Refusal(IntEnum):
     """The gripper's drive is not enabled."""
     PLAN_LEAD = 38
     """No way leads from where the arm is to the plan's first point."""
+    JOINT_SPEED = 45
     LIMITS_WEAK = 44
     """The joint holds more than its new torque limit; axis, value held, limit, Nm."""
     PLAN_MOVING = 43
@@ -175,6 +176,8 @@ class Code(IntEnum):
     STICK_MODE = 37
     HOMING_RUNNING = 39
     """The drive does not come to rest after a homing that was stopped or has failed; value: its speed, rad/s."""
+    STANDS_IN = 41
+    """Enabled beyond the bounds of a box; axis: the box, value: its distance, m, less than 0."""
     GRIPPER_AT = 40
     """A gripper with a drive came to rest; value: position, rad, limit: 1 where it holds something."""
     CAME_OUT = 38

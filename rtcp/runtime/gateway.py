@@ -231,12 +231,19 @@ async def _let_go(reader: asyncio.StreamReader) -> None:
 
 def _parse(given: bytes) -> dict[str, Any]:
     try:
-        request = json.loads(given)
+        request = json.loads(given, parse_constant=_no_constant)
     except (ValueError, RecursionError) as error:
         raise CommandFailed("invalid", f"the request is no JSON: {error}") from None
     if not isinstance(request, dict):
         raise CommandFailed("invalid", f"the request must be an object, not {type(request).__name__}")
+    if type(number := request.get("id")) not in (int, str, type(None)):
+        raise CommandFailed("invalid", f"id: found {type(number).__name__}, allowed is an integer or a text")
     return request
+
+
+def _no_constant(found: str) -> float:
+    """NaN and Infinity, which Python takes for JSON, are none."""
+    raise ValueError(f"{found} is no number")
 
 
 def _refusal(number: Any, kind: str, sentence: str) -> dict[str, Any]:

@@ -183,7 +183,7 @@ class MotionOrders:
         return self._hindered(MotionMode.VELOCITY) or self._speeds(lease, numbers)
 
     def _speeds(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if wrong := self._within(numbers, self._arm.limits.velocity, Refusal.JOG_SPEED):
+        if wrong := self._within(numbers, self._arm.limits.velocity, Refusal.JOINT_SPEED):
             return wrong
         velocity = self._arm.motions.velocity
         if not self._goes_on(velocity):

@@ -77,8 +77,8 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             f"it is to count for {number(m.value)} s: allowed is more than 0 and at most {number(m.limit)} s"
         ),
         Refusal.LIMITS_OUTSIDE: lambda m: (
-            f"{names.joint(m.axis)} stands or would come to rest at {number(m.value)} rad, outside the new limit "
-            f"{number(m.limit)} rad: nothing was changed"
+            f"{names.joint(m.axis)} stands or would come to rest at {m.value:.9g} rad, outside the new limit "
+            f"{m.limit:.9g} rad: nothing was changed"
             if m.axis >= 0
             else f"the tool, the wrist or the elbow would pass the new bounds of {names.box(int(m.limit))}: "
             "nothing was changed"
@@ -105,7 +105,12 @@ def motion_refusals(names: Naming) -> dict[Refusal, Say]:
             f"{names.joint(m.axis)}: offset {number(m.value)} rad is not allowed: {number(m.limit)} rad either way"
         ),
         Refusal.JOG_SPEED: lambda m: (
-            f"speed {number(m.value)} of direction {m.axis + 1} is not allowed: at most {number(m.limit)} either way"
+            f"{_DIRECTIONS[m.axis]}: {number(m.value)} {'m/s' if m.axis < 3 else 'rad/s'} is not allowed: at most "
+            f"{number(m.limit)} either way (cartesian.{'speed' if m.axis < 3 else 'angular_speed'} in {file})"
+        ),
+        Refusal.JOINT_SPEED: lambda m: (
+            f"{names.joint(m.axis)}: {number(m.value)} rad/s is not allowed: at most {number(m.limit)} either way "
+            f"({names.key(m.axis)}.velocity in {file}, or `rtcp limits`)"
         ),
         Refusal.STREAM_DROPPED: lambda m: f"the target came {number(m.value)} s late or out of order: it was dropped",
         Refusal.ZONE: lambda m: f"at that target the arm would pass the bounds of {names.box(m.axis)}",
@@ -122,6 +127,7 @@ def _singularity(m: Matter) -> str:
     )
 
 
+_DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 _RESET = "; the arm holds, `rtcp reset` goes on"
 
 
@@ -160,6 +166,10 @@ def motion_events(names: Naming) -> dict[int, Say]:
         Code.MOTION: lambda m: f"the arm takes commands of mode {motion_name(m.axis)}",
         Code.LIMITS: lambda _: "the limits were changed",
         Code.RELEASED: lambda _: "reset: the arm holds and takes commands again",
+        Code.STANDS_IN: lambda m: (
+            f"the arm stands {number(-m.value)} m beyond the bounds of {names.box(m.axis)}: only what leads "
+            "out is taken, jogging does"
+        ),
         Code.GRIPPER: lambda m: f"the gripper is told to {'open' if m.value else 'close'}",
         Code.ZERO: lambda m: f"{names.joint(m.axis)}: its zero is now at {number(m.value)} rad of the drive",
         Code.GRIPPER_AT: lambda m: (
@@ -185,6 +195,9 @@ def motion_events(names: Naming) -> dict[int, Say]:
         ended(Reason.PLAN): lambda m: f"the plan is damaged in row {m.axis}: {number(m.value)}{_RESET}",
         ended(Reason.KEEP_OUT): lambda m: (
             f"the arm stopped before {names.box(m.axis)}, {number(m.value)} m from it{_RESET}"
+            if m.value >= 0.0
+            else f"the arm is {number(-m.value)} m beyond the bounds of {names.box(m.axis)}, and the motion did not "
+            f"lead out{_RESET}; jogging leads out"
         ),
         ended(Reason.JUMP): lambda m: (
             f"{names.joint(m.axis)}: the motion would have jumped by {number(m.value)} rad in a cycle, at most "

@@ -56,6 +56,11 @@ class Operator:
         self.permitted = inputs.enabling_switch.active
         self.arm_has_stick = inputs.arm_toggle.active
 
+    @property
+    def button_known(self) -> bool:
+        """Whether the emergency stop's input has been heard for long enough since it was forgotten."""
+        return self._box is None or self._inputs.emergency_stop.settled
+
     def forget_press(self) -> None:
         """Let the emergency stop count as released until the box is heard to say otherwise."""
         self._inputs.emergency_stop.forget()

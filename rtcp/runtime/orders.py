@@ -215,6 +215,8 @@ class Orders:
     def _gripper(self, lease: int, numbers: Sequence[float]) -> Verdict:
         if numbers[0] not in (0.0, 1.0):
             return Refusal.OUTPUT_VALUE, -1, numbers[0]
+        if self._operator.emergency_stop:
+            return (Refusal.PRESSED,)
         gripper = self._arm.gripper
         if gripper is not None:
             if not self._operator.permitted:

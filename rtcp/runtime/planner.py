@@ -20,6 +20,8 @@ from rtcp.motion.zones import Zones
 from rtcp.runtime.carrier import CommandFailed
 
 POSE_NUMBERS = 6
+_MOST_M, _MOST_RAD = 100.0, 100.0
+"""Further away is no arm; of larger angles the turns that are left over would be noise of the number."""
 
 
 class Planner:
@@ -106,3 +108,8 @@ def _require_pose(pose: Sequence[float], what: str) -> None:
     for name, number in zip(("x", "y", "z", "rx", "ry", "rz"), pose, strict=True):
         if not math.isfinite(number):
             raise CommandFailed("invalid", f"{what}: {name}: found {number}, allowed is a finite number")
+        most, unit = (_MOST_RAD, "rad") if name.startswith("r") else (_MOST_M, "m")
+        if abs(number) > most:
+            raise CommandFailed(
+                "invalid", f"{what}: {name}: found {number:g} {unit}, allowed is {-most:g} to {most:g} {unit}"
+            )

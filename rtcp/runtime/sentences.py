@@ -126,7 +126,13 @@ class Sentences:
     def _not_in_this_state(self, matter: Matter) -> str:
         command, state = Command(int(matter.value)), State(matter.axis)
         allowed = ", ".join(sorted(TABLE[other].words for other in ALLOWED[command]))
-        way_out = "; `rtcp reset` first" if Command.RESET in TABLE[state].takes else ""
+        way_out = ""
+        if Command.RESET in TABLE[state].takes:
+            way_out = "; `rtcp reset` first"
+        elif state is State.READY and State.HOLDING in ALLOWED[command]:
+            way_out = "; `rtcp enable` first"
+        elif Command.DISABLE in TABLE[state].takes and ALLOWED[command] == {State.READY} and command != Command.ENABLE:
+            way_out = "; `rtcp disable` first"
         return f"{command.name.lower()} is not possible while {TABLE[state].words}; it is while: {allowed}{way_out}"
 
     def _position_limit(self, matter: Matter) -> str:

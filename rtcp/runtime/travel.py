@@ -160,7 +160,7 @@ class Travel:
         count = len(self._config.joints)
         target = self._carrier.joints("target")[:count]
         if max(abs(a - b) for a, b in zip(target, q, strict=True)) > same_rad:
-            raise CommandFailed("fault", f"the move ended before it arrived: {self._carrier.picture.message}")
+            raise CommandFailed("fault", f"the move ended before it arrived: {self._carrier.last_sentence()}")
         until = time.monotonic() + _SETTLE_S
         while True:
             position = self._carrier.joints("position")[:count]

@@ -85,7 +85,7 @@ MISTAKES = {
     ),
     "a limit that is missing": (
         driven(", jerk: 40.0", ""),
-        "gripper.joint: the key jerk is missing; it must be a number greater than 0",
+        "gripper.joint: the key jerk is missing; it must be a number of at least 0.001",
     ),
 }
 

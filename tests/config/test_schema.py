@@ -88,11 +88,11 @@ IN_THE_ARM = {
     ),
     "an infinite number": (
         ("velocity: 0.5", "velocity: .inf"),
-        "joints[0].velocity: found inf, allowed is a number greater than 0",
+        "joints[0].velocity: found inf, allowed is a number of at least 0.001",
     ),
     "a number too large for any computer": (
         ("velocity: 0.5", "velocity: 1e999"),
-        "joints[0].velocity: found inf, allowed is a number greater than 0",
+        "joints[0].velocity: found inf, allowed is a number of at least 0.001",
     ),
     "a number for a name": (
         ("name: joint1", "name: 1"),
@@ -130,7 +130,7 @@ IN_THE_ARM = {
     ),
     "a missing key": (
         ("    jerk: 20.0\n", ""),
-        "joints[0]: the key jerk is missing; it must be a number greater than 0",
+        "joints[0]: the key jerk is missing; it must be a number of at least 0.001",
     ),
     "a mapping that is a list": (
         ("{min: -3.1, max: 3.1}", "[-3.1, 3.1]"),
@@ -316,7 +316,7 @@ def test_a_mistake_in_a_device_file_is_named(
 
 def test_one_mistake_gives_one_sentence_with_file_and_line(directory: Path, problems_after: Spoil) -> None:
     line = (directory / ARM).read_text().split("velocity: 0.5")[0].count("\n") + 1
-    wanted = f"{ARM}:{line}: joints[0].velocity: found -0.5, allowed is a number greater than 0"
+    wanted = f"{ARM}:{line}: joints[0].velocity: found -0.5, allowed is a number of at least 0.001"
     assert problems_after(ARM, ("velocity: 0.5", "velocity: -0.5")) == [wanted]
 
 

@@ -149,7 +149,14 @@ def test_a_command_that_does_not_fit_the_state_is_told_with_those_it_fits(
     assert head == f"{command.name.lower()} is not possible while {TABLE_OF_WORDS[state]}"
     fits, _, hint = fits.partition("; ")
     assert fits.split(", ") == sorted(TABLE_OF_WORDS[s] for c, s, taken in PAIRS if taken and c is command)
-    assert hint == ("`rtcp reset` first" if (Command.RESET, state, True) in PAIRS else "")
+    if (Command.RESET, state, True) in PAIRS:
+        assert hint == "`rtcp reset` first"
+    elif state is State.READY and (command, State.HOLDING, True) in PAIRS:
+        assert hint == "`rtcp enable` first"
+    elif command is Command.ZERO and (Command.DISABLE, state, True) in PAIRS:
+        assert hint == "`rtcp disable` first"
+    else:
+        assert hint == ""
 
 
 # Starting, enabling, moving and the like end by themselves: only states that last are looked at.

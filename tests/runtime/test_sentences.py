@@ -46,7 +46,7 @@ def test_a_position_outside_a_narrowed_range_is_told_with_the_limit_in_force() -
 
 def test_a_command_in_the_wrong_state_is_told_with_the_right_ones() -> None:
     said = SENTENCES.refusal(Refusal.NOT_IN_THIS_STATE, State.READY, Command.MOVE, 0.0)
-    assert said == "move is not possible while ready; it is while: holding, moving"
+    assert said == "move is not possible while ready; it is while: holding, moving; `rtcp enable` first"
 
 
 def test_every_command_is_taken_in_some_state_and_the_end_in_all() -> None:

@@ -213,3 +213,14 @@ def test_a_motion_that_ends_early_is_told_with_its_reason(arm: Played) -> None:
     failed = arm.refused("move", q=goal)
     assert failed.kind == "fault"
     assert "the enabling switch was let go" in str(failed)
+
+
+def test_a_motion_that_is_halted_is_told_so_however_old_the_pictures_message_is(
+    arm: Played, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arm.picture, "follow", list)
+    arm.picture.message = "the move has arrived"
+    arm.loop.ends[Command.MOVE] = BENT
+    arm.loop.event_at_the_end = (Code.STOPPED,)
+    failed = arm.refused("move", q=[0.5, *BENT[1:]])
+    assert str(failed) == "the move ended before it arrived: the arm has stopped and holds"
