@@ -73,3 +73,17 @@ def test_status_loads_nothing_that_starts_slowly() -> None:
     heavy = ("numpy", "pydantic", "pysoem", "ruckig", "yaml", "pyroute2", "asyncio")
     program = f"import sys, rtcp.cli.app; print(*[name for name in {heavy!r} if name in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", program], text=True).split() == []
+
+
+def test_a_command_without_standard_output_says_nothing_and_succeeds() -> None:
+    asked = [sys.executable, "-m", "rtcp.cli", "arm", "fk", *"000000"]
+    ended = subprocess.run(["sh", "-c", '"$@" >&-', "sh", *asked], stderr=subprocess.PIPE, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+
+
+@pytest.mark.parametrize("written", ["0_1", "\u0661", "1__0"])
+def test_what_only_python_takes_for_a_number_is_none(rtcp: Callable[..., Any], written: str) -> None:
+    for command in (("move", written, *"00000"), ("jog", "x", written), ("limits", "set", "joint1.max", written)):
+        ended = rtcp(*command)
+        assert ended.code == 2
+        assert "is not a number" in ended.trouble

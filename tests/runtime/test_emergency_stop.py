@@ -107,11 +107,19 @@ def test_still_pressed_when_the_parked_box_is_heard_again_it_is_an_emergency_sto
     bench.run(1.0)
     bench.data.carries = False
     bench.run(0.1)
+    at = len(bench.log)
     bench.do(Command.RESET)
     bench.data.carries = True
     bench.run(0.5)
+    assert bench.state is State.EMERGENCY_STOP
+    assert State.READY not in {cycle.state for cycle in bench.log[at:]}
     assert bench.refused(bench.order(Command.ENABLE))
     assert bench.arm.first_with_torque() == -1
+
+
+def test_the_gripper_is_not_switched_while_it_is_pressed(bench: Bench) -> None:
+    bench.start().press()
+    assert "the emergency stop is pressed" in bench.refused(bench.order(Command.GRIPPER, [0.0]))
 
 
 def test_released_it_moves_nothing_until_reset_and_enable(bench: Bench) -> None:
