@@ -80,9 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as error:
         return _flushed(interruption_code(error))
     except OSError as error:
-        where = (
-            f": {error.filename}" if error.filename else " (standard output)" if error.errno == errno.ENOSPC else ""
-        )
+        where = f": {error.filename}" if error.filename else " (standard output)" if error.errno == errno.ENOSPC else ""
         complain(f"{error.strerror or error}{where}")
         return _flushed(ExitCode.INTERNAL)
     except Exception as error:

@@ -13,7 +13,8 @@ from kinematics.pose import Pose
 from rtcp.motion.limits import Corners
 from rtcp.motion.zones import INNER_BOX, Gap, Zones, inside, outside
 
-_MOST_SAMPLES = 48
+_MOST_SAMPLES = 16
+"""A way that needs more, beside a box at full speed, counts as touching it: a cycle has no time for all of them."""
 _ROUNDING_M = 1e-12
 _INSIDE_SAMPLES = 8
 

@@ -7,7 +7,7 @@ are scaled together, so that the tool keeps its direction; where they cannot fol
 what was reached. Nothing winds up.
 
 Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
-stretched elbow is bent by its joints (`_bend`).
+stretched elbow is bent by its joints (`jog_elbow`).
 """
 
 from __future__ import annotations
@@ -20,28 +20,21 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose, Rotation, applied, times
 from rtcp.config.model import ArmConfig
 from rtcp.motion.envelope import SetPointGuard
-from rtcp.motion.jog_bounds import JogBounds, stopping
-from rtcp.motion.jog_inverse import ELBOW, SHOULDER, WRIST, JogInverse
+from rtcp.motion.jog_bounds import JogBounds
+from rtcp.motion.jog_elbow import bend
+from rtcp.motion.jog_inverse import ELBOW, JogInverse
 from rtcp.motion.jog_ramp import JogRamp
+from rtcp.motion.jog_speeds import FULL, JogSpeeds
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 FOR_EVER = 1 << 62
-_FULL = 0.98
-"""Part of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
 _BRAKING = 0.7
 """Part of the Cartesian acceleration with which the tool slows before a box."""
 _BACK_1_S = 100.0
 """How fast the tool returns to its line, 1/s."""
 _OFF_LINE_M = 2e-4
 """Further away from it the line begins anew."""
-_INWARD_M_S = 1e-3
-"""An elbow that is stretched bends where the tool is wanted to come inwards faster than this."""
-_STRAIGHT_RAD = 1e-9
-_BENDING = 0.4
-"""Part of the joints' speeds with which it bends."""
-_LOST = 1e-3
-_LAST_RAD = 1e-6
 _AT_REST = 2e-3
 """m/s, rad/s: what is slower is not taken for a motion that is wanted."""
 
@@ -75,8 +68,7 @@ class JogMode:
         self._target = Target(6)
         self._asked = [0.0] * 6
         self._wanted = [0.0] * 6
-        self._twist = [0.0] * 6
-        self._speeds = [0.0] * 6
+        self._joints = JogSpeeds(limits)
         self._in_tool = False
         self._until_ns = FOR_EVER
         self._line: Pose | None = None
@@ -139,7 +131,7 @@ class JogMode:
             return target
         if state.now_ns > self._until_ns and self.phase is Phase.MOVE:
             self.stop(state)
-        inverse, bounds, ramp = self._inverse, self._bounds, self._ramp
+        inverse, bounds, ramp, joints = self._inverse, self._bounds, self._ramp, self._joints
         jumped = self._fresh or position != self._last
         poses = self._guards.poses
         if jumped or not self._posed:
@@ -154,13 +146,13 @@ class JogMode:
         wanted = self._turned(poses[6])
         ramp.step(wanted, dt)
         bounds.look(poses, position, jumped)
-        twist, speeds = self._twist, self._speeds
+        twist, speeds = joints.twist, joints.speeds
         twist[:] = ramp.velocity
         self._fit(poses, wanted)
         if inverse.locked[ELBOW]:
-            self._bend(poses, position, wanted)
+            bend(inverse, poses, position, wanted, speeds, self._limits, self._wrist)
         self._back(poses[6])
-        if self._follow(state, dt):
+        if joints.follow(state, dt):
             self._advance(dt, poses[6])
             ramp.held(twist)
         else:
@@ -173,7 +165,7 @@ class JogMode:
         return self._answer(position, dt)
 
     def _answer(self, position: Sequence[float], dt: float) -> Target:
-        target, speeds = self._target, self._speeds
+        target, speeds = self._target, self._joints.speeds
         target.position = self._last = [q + v * dt for q, v in zip(position, speeds, strict=True)]
         target.velocity = speeds
         return target
@@ -189,39 +181,21 @@ class JogMode:
         wanted[3], wanted[4], wanted[5] = applied(tool.rotation, (d, e, f))
         return wanted
 
-    def _make_speeds(self) -> float:
-        """Write the joint speeds for the twist; return the part of them that the joints can do."""
-        a, b, c, d, e, f = self._twist
-        speeds, fastest = self._speeds, self._limits.velocity
-        part = 1.0
-        for i, (g, h, k, m, n, o) in enumerate(self._inverse.rows):
-            speeds[i] = v = a * g + b * h + c * k + d * m + e * n + f * o
-            most = _FULL * fastest[i]
-            if v * part > most or v * part < -most:
-                part = most / (v if v > 0.0 else -v)
-        return part
-
-    def _scale(self, part: float) -> None:
-        if part < 1.0:
-            twist, speeds = self._twist, self._speeds
-            for i in range(6):
-                twist[i] *= part
-                speeds[i] *= part
-
     def _fit(self, poses: Sequence[Pose], wanted: Sequence[float]) -> None:
         """Bring the twist, and the joint speeds with it, within all bounds."""
-        twist, bounds = self._twist, self._bounds
-        self._scale(self._make_speeds())
-        if bounds.passed(poses, twist, self._speeds):
+        joints, bounds, rows = self._joints, self._bounds, self._inverse.rows
+        twist = joints.twist
+        joints.make(rows)
+        if bounds.passed(poses, twist, joints.speeds):
             a, b, c, d, e, f = twist
             moves = any(wanted[:3]) or a * a + b * b + c * c > _AT_REST * _AT_REST
             turns = any(wanted[3:]) or d * d + e * e + f * f > _AT_REST * _AT_REST
             if not bounds.slide(poses, twist, moves, turns):
                 twist[:] = self._zero
-            self._scale(self._make_speeds())
-        self._scale(bounds.halt(twist))
+            joints.make(rows)
+        joints.scale(bounds.halt(twist))
         if bounds.near:
-            self._scale(bounds.stoppable(poses, self._speeds))
+            joints.scale(bounds.stoppable(poses, joints.speeds))
 
     def _back(self, tool: Pose) -> None:
         """Add to the joint speeds what brings the tool back to its line."""
@@ -238,82 +212,15 @@ class JogMode:
         if dx * dx + dy * dy + dz * dz + tx * tx + ty * ty + tz * tz > _OFF_LINE_M * _OFF_LINE_M:
             self._line = None
             return
-        speeds, fastest = self._speeds, self._limits.velocity
+        speeds, fastest = self._joints.speeds, self._limits.velocity
         for at, (row0, row1, row2, row3, row4, row5) in enumerate(self._inverse.rows):
             v = speeds[at] + _BACK_1_S * (row0 * dx + row1 * dy + row2 * dz + row3 * tx + row4 * ty + row5 * tz)
             most = fastest[at]
             speeds[at] = most if v > most else -most if v < -most else v
 
-    def _follow(self, state: MotionState, dt: float) -> bool:
-        """Bring the joint speeds, and the twist with them, within what the accelerations allow.
-
-        Returns:
-            Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
-                goes towards its speed as fast as it may; so it does, too, where its limits leave no more.
-        """
-        speeds, last, limits = self._speeds, state.velocity, self._limits
-        acceleration = limits.acceleration
-        step = _FULL * dt
-        together = True
-        for i in range(6):
-            change, most = speeds[i] - last[i], step * acceleration[i]
-            if change > most or change < -most:
-                together = self._scaled_together(last, step)
-                break
-        q, low, high, fastest = state.position, limits.low, limits.high, limits.velocity
-        for i in range(6):
-            v, rate, most = speeds[i], acceleration[i], fastest[i]
-            if v > most or v < -most:
-                least = abs(last[i]) - step * rate
-                most = max(most, least)
-                speeds[i] = v = most if v > most else -most if v < -most else v
-                together = False
-            room = high[i] - q[i] if v > 0.0 else q[i] - low[i]
-            if v * v > 1.8 * rate * room:
-                most = stopping(room - _LAST_RAD, rate, dt)
-                least = abs(last[i]) - step * rate if v * last[i] > 0.0 else 0.0
-                most = max(most, least)
-                if v > most or v < -most:
-                    speeds[i] = most if v > 0.0 else -most
-                    together = False
-        return together
-
-    def _scaled_together(self, last: Sequence[float], step: float) -> bool:
-        speeds, acceleration = self._speeds, self._limits.acceleration
-        low, high = 0.0, 1e9
-        for i in range(6):
-            v, w, most = speeds[i], last[i], step * acceleration[i]
-            if v > 1e-12:
-                least, greatest = (w - most) / v, (w + most) / v
-            elif v < -1e-12:
-                least, greatest = (w + most) / v, (w - most) / v
-            elif -most <= w <= most:
-                continue
-            else:
-                high = -1.0
-                break
-            low, high = max(low, least), min(high, greatest)
-        if low > high:
-            self._clip(last, step)
-            return False
-        # Above 1 it brakes as fast as the joints can.
-        factor = low if low > 1.0 else high if high < 1.0 else 1.0
-        twist = self._twist
-        for i in range(6):
-            speeds[i] *= factor
-            twist[i] *= factor
-        return True
-
-    def _clip(self, last: Sequence[float], step: float) -> None:
-        speeds, acceleration = self._speeds, self._limits.acceleration
-        for i in range(6):
-            most = step * acceleration[i]
-            v, w = speeds[i], last[i]
-            speeds[i] = w + most if v > w + most else w - most if v < w - most else v
-
     def _advance(self, dt: float, tool: Pose) -> None:
         """Let the line go on with what the tool does in this cycle."""
-        twist = self._twist
+        twist = self._joints.twist
         if self._inverse.lost or self._bounds.axis >= 0 or not any(twist):
             self._line = None
             return
@@ -323,54 +230,11 @@ class JogMode:
             rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
         self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
 
-    def _bend(self, poses: Sequence[Pose], position: Sequence[float], wanted: Sequence[float]) -> None:
-        """Bend a stretched (or open a folded) elbow, where the tool is to go that way.
-
-        The joints then move as they can without moving the tool, to first order: joint 2 takes back what joint 3 does
-        to the wrist centre, and the hand keeps its direction. To second order the tool goes the only way that it can.
-        """
-        inverse, speeds, limits = self._inverse, self._speeds, self._limits
-        row = inverse.lost[1 if inverse.locked[SHOULDER] else 0]
-        x, y, z = row[:3]
-        (px, py, pz), (wx, wy, wz) = poses[1].position, poses[4].position
-        outward = sum(one * other for one, other in zip(row, wanted, strict=True))
-        if (x * (wx - px) + y * (wy - py) + z * (wz - pz) < 0.0) is inverse.stretched:
-            outward = -outward
-        if outward > -_INWARD_M_S:
-            return
-        way = inverse.bend
-        if -_STRAIGHT_RAD < way < _STRAIGHT_RAD:
-            way = 1.0 if limits.high[2] - position[2] >= position[2] - limits.low[2] else -1.0
-        elif not inverse.stretched:
-            way = -way
-        third = 1.0 if way > 0.0 else -1.0
-        _, (a, b, c), (d, e, f) = inverse.arm
-        second = -third * (a * d + b * e + c * f) / (a * a + b * b + c * c)
-        _, _, x2, _, _, y2, _, _, z2 = poses[1].rotation
-        _, _, x3, _, _, y3, _, _, z3 = poses[2].rotation
-        x, y, z = -second * x2 - third * x3, -second * y2 - third * y3, -second * z2 - third * z3
-        ox, oy, oz = inverse.to_centre
-        # The twist that turns the hand about the wrist centre.
-        hand = (-y * oz + z * oy, -z * ox + x * oz, -x * oy + y * ox, x, y, z)
-        wrist = [sum(one * other for one, other in zip(inverse.rows[i], hand, strict=True)) for i in (3, 4, 5)]
-        if inverse.locked[WRIST]:
-            lost = sum(one * other for one, other in zip(inverse.lost[-1], hand, strict=True))
-            if abs(lost) > _LOST:
-                return
-        elif inverse.distance[WRIST] < self._wrist and wrist[1] * inverse.wrist_sign < 0.0:
-            return
-        rate = 1.0
-        for i, v in enumerate((0.0, second, third, *wrist)):
-            if abs(v) * rate > _BENDING * limits.velocity[i]:
-                rate = _BENDING * limits.velocity[i] / abs(v)
-        for i, v in enumerate((0.0, second, third, *wrist)):
-            speeds[i] += rate * v
-
     def _brake(self, state: MotionState, dt: float) -> Target:
         """Each joint brakes as fast as it may: there is no inverse."""
-        speeds = self._speeds
+        speeds = self._joints.speeds
         speeds[:] = self._zero
-        self._clip(state.velocity, _FULL * dt)
+        self._joints.clip(state.velocity, FULL * dt)
         self._line = None
         self._fresh = True
         self._posed = False
