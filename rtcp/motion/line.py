@@ -7,22 +7,27 @@ from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError
 
-from kinematics.forward import forward
+from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import has_parallel_arm, loop_distances
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Vector
+from kinematics.spherical import has_spherical_wrist
 from rtcp.motion.generator import JointGenerator
 from rtcp.motion.rows import Refused, Wrong, damaged_line, read_row
 from rtcp.motion.slerp import quaternion, rotation, turn_between, turned_by
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
+    from rtcp.config.operation import SingularityLimits
     from rtcp.motion.limits import Limits
 
 AT_START_M, AT_START_RAD = 1e-3, 2e-3
 """So near to where the tool is commanded the first piece begins; what is left fades out."""
 _STILL_RAD_S = 1e-6
 _EXACT = 1e-9
+_BETWEEN_SAMPLES = 0.95
+"""Of the distance that is kept from a singularity: a plan was looked at every 2 mm, and may be nearer in between."""
 _FADED = 0.25
 """What was left at the start fades out over so much of the first piece."""
 
@@ -34,10 +39,16 @@ class LineMode:
         model: the arm.
         limits: of the joints; read in every cycle.
         period_s: the cycle, s.
+        singularity: how near to one the arm may come; None: the plan was looked at, that is enough.
     """
 
-    def __init__(self, model: ArmModel, limits: Limits, period_s: float) -> None:
+    def __init__(
+        self, model: ArmModel, limits: Limits, period_s: float, singularity: SingularityLimits | None = None
+    ) -> None:
         n = len(limits.velocity)
+        # Other geometries are looked at beforehand only.
+        known = singularity is not None and has_spherical_wrist(model) and has_parallel_arm(model)
+        self._nearest = (singularity.shoulder, singularity.elbow, singularity.wrist) if singularity and known else None
         self._model = model
         self._inverse = InverseKinematics(model)
         self._limits = limits
@@ -204,6 +215,10 @@ class LineMode:
             velocity[i] = v = (position[i] - before[i]) * over
             if not -limits[i] * 1.000001 <= v <= limits[i] * 1.000001:
                 return self._give_up(state, dt, Reason.JUMP, i, v, limits[i])
+        if self._nearest is not None:
+            for which, distance in enumerate(loop_distances(self._model, frames(self._model, position))):
+                if distance < _BETWEEN_SAMPLES * self._nearest[which]:
+                    return self._give_up(state, dt, Reason.SINGULARITY, which, distance, self._nearest[which])
         self._near = position if not self._rest_counts else list(q)
         target.position, target.velocity = position, velocity
         self.elapsed_s = self._done_s + output.time

@@ -35,7 +35,7 @@ class Motions:
         self.stream = StreamMode(limits, period_s)
         self.velocity = VelocityMode(limits, period_s)
         self.torque = TorqueMode(config.joints, limits, period_s, config.arm)
-        self.line = None if config.arm is None else LineMode(config.arm, limits, period_s)
+        self.line = None if config.arm is None else LineMode(config.arm, limits, period_s, config.cartesian.singularity)
         self.jog = None if config.arm is None else JogMode(config, config.arm, limits, guards, period_s)
         self.active: Mode = self.generator
         self.mode = MotionMode[config.motion.upper()]

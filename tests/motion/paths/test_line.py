@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from kinematics import Pose, forward
+from kinematics.jacobian import singularity_distances
 from rtcp.motion.line import LineMode
 from rtcp.motion.planning import Stop, plan_lines
 from rtcp.motion.rows import COLUMNS, KIND, Wrong
@@ -203,6 +204,24 @@ def test_a_line_that_stretches_the_arm_stops_before_a_joint_is_too_fast(
     drive.until_rest(mode)
     assert mode.reason is Reason.JUMP
     assert abs(mode.value) > mode.limit
+
+
+def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it(
+    arm: Any, drive: Any, bounds: Any, rows: Any, moved: Any
+) -> None:
+    plan, count = rows([moved(dy=0.2)])
+    plan[8], plan[14], plan[15], plan[16] = 1.5, 0.03, 0.1, 1.0
+    # Far enough from the stretched elbow that no joint is too fast there.
+    near = replace(arm.cartesian.singularity, elbow=0.6)
+    mode = LineMode(arm.arm, bounds, PERIOD, near)
+    drive.at(Q)
+    assert mode.start(drive.state, plan, count) is None
+    drive.until_rest(mode)
+    assert (mode.reason, mode.axis, mode.limit) == (Reason.SINGULARITY, 1, 0.6)
+    assert 0.94 * 0.6 < mode.value < 0.95 * 0.6
+    found = singularity_distances(arm.arm, drive.state.position).elbow
+    assert found is not None
+    assert 0.5 < found < mode.value
 
 
 def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(
