@@ -26,6 +26,7 @@ AT_START_M, AT_START_RAD = 1e-3, 2e-3
 """So near to where the tool is commanded the first piece begins; what is left fades out."""
 _STILL_RAD_S = 1e-6
 _EXACT = 1e-9
+_LOOK_S = 0.004
 _BETWEEN_SAMPLES = 0.95
 """Of the distance that is kept from a singularity: a plan was looked at every 2 mm, and may be nearer in between."""
 _FADED = 0.25
@@ -49,6 +50,8 @@ class LineMode:
         # Other geometries are looked at beforehand only.
         known = singularity is not None and has_spherical_wrist(model) and has_parallel_arm(model)
         self._nearest = (singularity.shoulder, singularity.elbow, singularity.wrist) if singularity and known else None
+        self._every = max(round(_LOOK_S / period_s), 1)
+        self._wait = 0
         self._model = model
         self._inverse = InverseKinematics(model)
         self._limits = limits
@@ -215,7 +218,7 @@ class LineMode:
             velocity[i] = v = (position[i] - before[i]) * over
             if not -limits[i] * 1.000001 <= v <= limits[i] * 1.000001:
                 return self._give_up(state, dt, Reason.JUMP, i, v, limits[i])
-        if self._nearest is not None:
+        if self._nearest is not None and self._due():
             for which, distance in enumerate(loop_distances(self._model, frames(self._model, position))):
                 if distance < _BETWEEN_SAMPLES * self._nearest[which]:
                     return self._give_up(state, dt, Reason.SINGULARITY, which, distance, self._nearest[which])
@@ -229,6 +232,14 @@ class LineMode:
         else:
             output.pass_to_input(self._active)
         return target
+
+    def _due(self) -> bool:
+        """Whether some ms have passed since the singularities were looked at: the tool has moved 1 mm at most."""
+        self._wait -= 1
+        if self._wait > 0:
+            return False
+        self._wait = self._every
+        return True
 
     def _give_up(self, state: MotionState, dt: float, reason: Reason, axis: int, value: float, limit: float) -> Target:
         self.phase, self.reason, self.axis, self.value, self.limit = Phase.STOP, reason, axis, value, limit
