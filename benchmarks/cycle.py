@@ -13,6 +13,7 @@ import os
 import platform
 import re
 import shutil
+import signal
 import statistics
 import subprocess
 import sys
@@ -313,6 +314,8 @@ def main() -> int:
     )
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
     given = parser.parse_args()
+    # So that a platform that was started is ended too.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     console = Console()
     machine = (
         f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, Python {platform.python_version()}"

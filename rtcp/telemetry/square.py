@@ -212,9 +212,10 @@ def _in_space(axes: Any, driven: Driven) -> None:
     middle, half = corners.mean(axis=0), 0.7 * SIDE_M
     for axis, name in enumerate("xyz"):
         getattr(axes, f"set_{name}lim")(middle[axis] - half, middle[axis] + half)
-        getattr(axes, f"set_{name}label")(f"{name}, m")
+        getattr(axes, f"set_{name}label")(f"{name}, m", labelpad=12)
+        axes.tick_params(axis=name, labelsize=8)
         getattr(axes, f"{name}axis").set_major_locator(_few_ticks())
-    axes.set_box_aspect((1, 1, 1), zoom=0.82)
+    axes.set_box_aspect((1, 1, 1), zoom=0.8)
     axes.legend(fontsize=8, loc="upper left")
 
 

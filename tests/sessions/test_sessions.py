@@ -25,7 +25,7 @@ from tests.sessions.driver import (
 )
 from tests.sessions.play import MOTIONS, Outcome, play
 
-SESSIONS = 200
+SESSIONS = 100
 BATCH = 20
 
 
