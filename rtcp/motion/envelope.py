@@ -101,6 +101,11 @@ class SetPointGuard:
             return inf, 0
         return self.zones.distance(frames(self._model, q))
 
+    def _gap_to(self, box: int, ahead: float) -> float:
+        """Return how near to `box` the stop would come, m; below 0 only where the arm itself is beyond its bounds."""
+        here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
+        return here if here < 0.0 and nearest == box else max(ahead, 0.0)
+
     def probe(self, state: MotionState, position: Sequence[float], velocity: Sequence[float]) -> bool:
         """Return whether a target would pass as it is."""
         return not self._bound(state, position) and self._touches(state, position) is None
@@ -149,7 +154,7 @@ class SetPointGuard:
             wanted = position
         found = self._touches(state, wanted)
         if found is not None:
-            return self._stop(state, Reason.KEEP_OUT, found[0], found[1], 0.0)
+            return self._stop(state, Reason.KEEP_OUT, found[0], self._gap_to(*found), 0.0)
         self._poses, self._room = self._poses_then, self._room_then
         here, speeds, rates, most = state.position, target.velocity, self._limits.acceleration, self._limits.velocity
         velocity, acceleration = state.velocity, state.acceleration

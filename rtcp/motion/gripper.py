@@ -48,6 +48,11 @@ class GripperMotion:
         """Whether it is on its way."""
         return self._generator.phase is not Phase.HOLD
 
+    @property
+    def stops(self) -> bool:
+        """Whether it comes to rest on its way."""
+        return self._generator.phase is Phase.STOP
+
     def latch(self, position: float) -> None:
         """Rest at `position`, rad, or at the end of the range that it is beyond: without torque it is where it is."""
         state = self._state
@@ -61,10 +66,12 @@ class GripperMotion:
         """Go to where it is closed, or open, from whatever it does; return False where no way is found."""
         if close is self._closing and self._generator.phase is Phase.MOVE:
             return True
+        if not self._generator.move_to(self._state, [self._goals[close]], self._speed):
+            return False
         self._closing = close
         self._firm = 0
         self.gripped = False
-        return self._generator.move_to(self._state, [self._goals[close]], self._speed)
+        return True
 
     def stop(self) -> None:
         """Come to rest under its limits."""

@@ -50,6 +50,11 @@ class Joystick:
         self._paddle = 0
         self._gripped = 0
 
+    @property
+    def holds_grip(self) -> bool:
+        """Whether the stick is held where it opens or closes the gripper."""
+        return self._gripped != 0
+
     def wait_for_neutral(self) -> None:
         """Count only after the stick has been neutral."""
         self._neutral_seen = False

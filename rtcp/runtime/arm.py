@@ -12,6 +12,7 @@ from rtcp.motion.guard import Guard
 from rtcp.motion.limits import Limits
 from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
 from rtcp.motion.state import MotionState, Phase
+from rtcp.motion.watch import Found, Watch
 from rtcp.runtime.gripper import DrivenGripper
 from rtcp.runtime.motions import Motions
 
@@ -94,6 +95,12 @@ class Arm:
         for drive in self.all_drives:
             drive.advance(goal)
 
+    def stop(self) -> None:
+        """Let all that moves come to rest, the gripper too."""
+        self.motions.stop(self.state)
+        if self.gripper is not None:
+            self.gripper.stop()
+
     def hold_target(self) -> None:
         """Hold at the set-point that was made last, at rest from now on."""
         self.motions.rest()
@@ -127,6 +134,11 @@ class Arm:
         if self.gripper is not None:
             self.gripper.command()
         return verdict
+
+    def beyond(self, watch: Watch) -> Found | None:
+        """Look at what is measured of joints and gripper; return what is beyond its limit for too long, or None."""
+        found = watch.look(self.state)
+        return self.gripper.look() if found is None and self.gripper is not None else found
 
     def first_not_enabled(self) -> int:
         """Return the first joint whose drive is not enabled, or -1."""

@@ -15,7 +15,7 @@ from rtcp.motion.watch import Watch
 from rtcp.realtime.discipline import Discipline
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.closing import Closing
+from rtcp.runtime.closing import TOLD_CYCLES, Closing
 from rtcp.runtime.emergency_stop import EmergencyStop
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.machine import TABLE, WITH_TORQUE, Code, Event, State
@@ -25,8 +25,6 @@ from rtcp.runtime.service import Service
 _RESET_S = 3.0
 _MODE_S = 1.0
 _CLOCK_S = 1.0
-_TOLD_CYCLES = 5
-"""What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
 _ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
 """Reasons that are no limit: the arm has stopped and takes commands."""
 _PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
@@ -166,9 +164,7 @@ class Behaviour:
     def stop_motion(self) -> None:
         """Let the active mode come to rest."""
         self._operator.wait_for_neutral()
-        self._arm.motions.stop(self._arm.state)
-        if self._arm.gripper is not None:
-            self._arm.gripper.stop()
+        self._arm.stop()
         self._limited = False
         self.on(Event.STOP)
 
@@ -236,19 +232,25 @@ class Behaviour:
 
     def _watch_stops(self) -> bool:
         """Look at what is measured; return whether it ended in the emergency stop."""
-        arm, gripper = self._arm, self._arm.gripper
-        found = self._watch.look(arm.state)
-        if gripper is not None:
-            found = found or gripper.look()
-            operator = self._operator
-            led = self._leased(gripper.lease) if gripper.lease else operator.arm_has_stick
-            if gripper.motion.moving and not (operator.permitted and led):
-                gripper.stop()
+        found = self._arm.beyond(self._watch)
         if found is None:
             return False
         # Codes follow the kinds: speed, torque, following error.
         self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
         return True
+
+    def _lead_gripper(self) -> None:
+        """Let a gripper come to rest that nobody leads any more, and say why."""
+        gripper, operator = self._arm.gripper, self._operator
+        if gripper is None or not gripper.motion.moving or gripper.motion.stops:
+            return
+        if not operator.permitted:
+            self._blackboard.event(Code.NOT_PERMITTED)
+        elif gripper.lease and not self._leased(gripper.lease):
+            self._blackboard.event(Code.LEASE_ENDED)
+        elif gripper.lease or operator.holds_grip:
+            return
+        gripper.stop()
 
     def _track(self, good: bool) -> bool:
         """Move on by one cycle while enabled; return False when the state has changed by it."""
@@ -264,6 +266,7 @@ class Behaviour:
             return False
         if self._watch_stops():
             return False
+        self._lead_gripper()
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         verdict = arm.command()
         if verdict is Verdict.PASS and arm.motions.active.reason is Reason.NONE:
@@ -296,6 +299,8 @@ class Behaviour:
         self._limited = limited
         if limited:
             self.limit = reason
+            if self._arm.gripper is not None:
+                self._arm.gripper.stop()
         if self.state in (State.MOVING, State.HOLDING, State.STOPPING):
             self.on(Event.GUARD)
 
@@ -407,44 +412,49 @@ class Behaviour:
     def _stopped_by_limit(self, good: bool) -> None:
         self._track(good)
 
-    def _homing(self, good: bool) -> None:
+    def _lead_homing(self, good: bool) -> bool:
+        """Do a homing's part of the cycle, watched as any motion; return False where it broke, or no frame came."""
         arm, homing = self._arm, self.homing
         if self._bus_fails(good) or not good:
-            return
+            return False
         left = arm.first_not_enabled()
         if left >= 0:
             self._fail_drive(Code.DRIVE_LEFT_ENABLED, left)
-            return
+            return False
         if not (self._operator.permitted and self._leased(self.lease)):
             homing.stop()
         homing.step()
         if self._watch_stops():
-            return
-        if arm.guards.zone_at(arm.state.actual) is not None and not homing.leaves:
-            # Before its home a drive does not know where it is: what can be told from its old zero is kept to.
-            self._blackboard.event(Code.ENDED + Reason.KEEP_OUT, arm.guards.zone_at(arm.state.actual) or 0)
-            homing.stop()
-        elif homing.stuck:
+            return False
+        self._lead_gripper()
+        outside = arm.first_outside()
+        if homing.stuck:
             self._fail_mode(homing.axis)
         elif homing.running:
             self._fail(Code.HOMING_RUNNING, homing.axis, arm.drives[homing.axis].velocity)
-        elif arm.first_outside() >= 0:
+        elif outside >= 0:
             # While it searches, and where it begins to count anew: also a stop after the index was found does.
-            axis = arm.first_outside()
-            self._fail(Code.LEFT_RANGE, axis, arm.all_drives[axis].position)
-        elif homing.ended:
+            self._fail(Code.LEFT_RANGE, outside, arm.all_drives[outside].position)
+        else:
+            # Before its home a drive does not know where it is: what can be told from its old zero is kept to.
+            if not homing.leaves and (box := arm.guards.zone_at(arm.state.actual)) is not None:
+                self._blackboard.event(Code.HOMING_ZONE, box)
+                homing.stop()
+            return True
+        return False
+
+    def _homing(self, good: bool) -> None:
+        homing = self.homing
+        if self._lead_homing(good) and homing.ended:
             self._blackboard.event(*homing.outcome)
             self.on(Event.HOMED if homing.homed else Event.STOPPED)
 
-    def _homing_ends(self, good: bool) -> bool:
-        if not self.homing.still_ending(good):
-            return False
-        self._since = self.cycle
-        return True
-
     def _disabling(self, good: bool) -> None:
         arm = self._arm
-        if self._homing_ends(good):
+        if self.homing.under_way:
+            self.homing.stop()
+            self._since = self.cycle
+            self._lead_homing(good)
             return
         if not arm.all_still:
             # The time for disabling begins when the arm stands.
@@ -458,7 +468,7 @@ class Behaviour:
         arm.follow()
         self._told += 1
         axis = arm.first_with_torque()
-        if axis < 0 and self._told > _TOLD_CYCLES:
+        if axis < 0 and self._told > TOLD_CYCLES:
             self._blackboard.event(Code.DISABLED)
             self.on(Event.DISABLED)
         elif axis >= 0 and self._waited > self._enable_cycles:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.state import Phase
-from rtcp.motion.watch import Found, Watch
+from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
@@ -13,7 +13,7 @@ from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.operator import Operator
 
 _CLOSING_S = 2.0
-_TOLD_CYCLES = 5
+TOLD_CYCLES = 5
 """What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
 _FAREWELL_CYCLES = 20
 """Frames with quick stop for slaves that still listen when the bus is given up."""
@@ -72,8 +72,13 @@ class Closing:
             return True
         if not good:
             return False
-        if self._homing.still_ending(good):
+        if self._homing.under_way and arm.first_not_enabled() < 0:
+            self._homing.stop()
+            self._homing.step()
             self._cycles = 0
+            if self._homing.running:
+                axis = self._homing.axis
+                self._meet(Code.HOMING_RUNNING, axis, arm.drives[axis].velocity)
             return False
         return self._stop() and self._take_torque()
 
@@ -81,16 +86,11 @@ class Closing:
         """Meet a press, or a measurement beyond its limit; return whether the drives ramp down by themselves."""
         arm = self._arm
         if not self._hard and arm.first_with_torque() >= 0:
-            found = self._found() if good and arm.first_not_enabled() < 0 else None
-            if self._operator.emergency_stop or found is not None:
-                self._hard = True
-                self._cycles = 0
-                self._homing.abandon()
-                arm.hold_target()
-                if found is None:
-                    self._blackboard.event(Code.PRESSED)
-                else:
-                    self._blackboard.event(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+            found = arm.beyond(self._watch) if good and arm.first_not_enabled() < 0 else None
+            if found is not None:
+                self._meet(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+            elif self._operator.emergency_stop:
+                self._meet(Code.PRESSED)
         if not self._hard or arm.first_moving() < 0 or self._cycles > self._patience:
             return False
         arm.lead(DriveGoal.QUICK_STOPPED)
@@ -98,11 +98,13 @@ class Closing:
             arm.follow()
         return True
 
-    def _found(self) -> Found | None:
-        """Look at what is measured of the joints and the gripper."""
-        gripper = self._arm.gripper
-        found = self._watch.look(self._arm.state)
-        return found or (None if gripper is None else gripper.look())
+    def _meet(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        """Let the drives ramp down by themselves from now on, and say why."""
+        self._hard = True
+        self._cycles = 0
+        self._homing.abandon()
+        self._arm.hold_target()
+        self._blackboard.event(code, axis, value, limit)
 
     def _stop(self) -> bool:
         """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""
@@ -125,4 +127,4 @@ class Closing:
         arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
         arm.follow()
         self._told = 0 if ramping else self._told + 1
-        return self._told > _TOLD_CYCLES and arm.first_with_torque() < 0
+        return self._told > TOLD_CYCLES and arm.first_with_torque() < 0

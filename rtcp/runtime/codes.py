@@ -176,6 +176,8 @@ class Code(IntEnum):
     STICK_MODE = 37
     HOMING_RUNNING = 39
     """The drive does not come to rest after a homing that was stopped or has failed; value: its speed, rad/s."""
+    HOMING_ZONE = 42
+    """A homing was stopped where the arm would be in a box by the drive's old zero; axis: the box."""
     STANDS_IN = 41
     """Enabled beyond the bounds of a box; axis: the box, value: its distance, m, less than 0."""
     GRIPPER_AT = 40

@@ -49,14 +49,10 @@ class HomingArm:
         if arm.gripper is not None:
             arm.gripper.command()
 
-    def still_ending(self, good: bool) -> bool:
-        """Bring a homing to its end before the torque goes; return whether it is still under way."""
-        if self._homing.phase is HomingPhase.IDLE or self._homing.ended or self._arm.first_not_enabled() >= 0:
-            return False
-        self._homing.stop()
-        if good:
-            self.step()
-        return not self._homing.ended
+    @property
+    def under_way(self) -> bool:
+        """Whether it has begun and is not over."""
+        return self._homing.phase is not HomingPhase.IDLE and not self._homing.ended
 
     @property
     def stuck(self) -> bool:

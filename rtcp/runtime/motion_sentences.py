@@ -166,6 +166,7 @@ def motion_events(names: Naming) -> dict[int, Say]:
         Code.MOTION: lambda m: f"the arm takes commands of mode {motion_name(m.axis)}",
         Code.LIMITS: lambda _: "the limits were changed",
         Code.RELEASED: lambda _: "reset: the arm holds and takes commands again",
+        Code.HOMING_ZONE: lambda m: f"the homing was stopped: by its old zero the arm is in {names.box(m.axis)}",
         Code.STANDS_IN: lambda m: (
             f"the arm stands {number(-m.value)} m beyond the bounds of {names.box(m.axis)}: only what leads "
             "out is taken, jogging does"

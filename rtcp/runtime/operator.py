@@ -57,6 +57,11 @@ class Operator:
         self.arm_has_stick = inputs.arm_toggle.active
 
     @property
+    def holds_grip(self) -> bool:
+        """Whether the stick is held where it opens or closes the gripper."""
+        return self.arm_has_stick and self._joystick.holds_grip
+
+    @property
     def button_known(self) -> bool:
         """Whether the emergency stop's input has been heard for long enough since it was forgotten."""
         return self._box is None or self._inputs.emergency_stop.settled

@@ -135,9 +135,7 @@ class Orders:
             behaviour.on(Event.DISABLE)
             self._blackboard.event(Code.TORQUE_OFF)
         elif behaviour.state not in (State.READY, State.DISABLING, State.EMERGENCY_STOP):
-            self._arm.motions.stop(self._arm.state)
-            if self._arm.gripper is not None:
-                self._arm.gripper.stop()
+            self._arm.stop()
             behaviour.on(Event.DISABLE)
         return DONE
 

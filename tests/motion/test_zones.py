@@ -138,6 +138,20 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     assert 0.0 <= here < 0.004
 
 
+@pytest.mark.parametrize("gap", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("dt", [0.0005, 0.002])
+def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside(dt: float, gap: float) -> None:
+    q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
+    tool = points(q)[0]
+    box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
+    towards = [-1.0 if tool[0] > 0 else 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    judge = Judge(with_boxes(WIDE, box), q, dt)
+    while not judge.guard.stopping:
+        driven(judge, towards, 1)
+    assert points(judge.state.position)[0][1] > box[4]
+    assert judge.guard.value >= 0.0
+
+
 def test_a_stop_before_the_tools_own_box_names_it() -> None:
     tool = points(Q)[0]
     judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)

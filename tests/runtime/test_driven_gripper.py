@@ -292,10 +292,15 @@ def by_stick(with_hand: Callable[..., Hand]) -> Hand:
 
 
 def test_the_stick_closes_it_without_a_lease(by_stick: Hand) -> None:
-    by_stick.simulation.run(1.0)
-    by_stick.inputs(put=NEUTRAL)
     by_stick.rest()
     assert by_stick.position == pytest.approx(CLOSED, abs=2e-3)
+
+
+@pytest.mark.parametrize("code", [NEUTRAL, 0, 1, PADDLE_UP], ids=["released", "no code", "another", "paddle"])
+def test_it_stops_when_the_stick_that_closes_it_is_let_go_or_shows_no_code(by_stick: Hand, code: int) -> None:
+    by_stick.inputs(clear=0x3F, put=code)
+    by_stick.rest()
+    stopped_on_its_way(by_stick)
 
 
 def test_it_stops_when_the_stick_that_closes_it_is_given_to_the_chair(by_stick: Hand) -> None:

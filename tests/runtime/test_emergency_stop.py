@@ -14,7 +14,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Observer
 
-from .test_behaviour import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, SPEED, Bench, move_numbers
+from .test_behaviour import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, QUICK_STOP, SPEED, Bench, move_numbers
 
 WITH_TORQUE = [State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.HOMING, State.STOPPED_BY_LIMIT]
 PRESSED_SAYS = (
@@ -258,6 +258,38 @@ def test_disabling_ends_a_homing_before_the_torque_goes(bench: Bench) -> None:
     bench.do(Command.DISABLE)
     bench.until(State.READY)
     assert bench.arm.first_with_torque() == -1
+
+
+def test_frames_that_stay_away_while_a_homing_is_ended_by_disabling_are_a_fault(bench: Bench) -> None:
+    bench.bring_to(State.HOMING)
+    bench.run(0.1)
+    bench.do(Command.DISABLE)
+    bench.data.carries = False
+    bench.run(1.0)
+    assert bench.state is State.FAULT
+    assert bench.codes[-1] == Code.BUS_LOST
+
+
+def test_the_button_counts_while_a_homing_is_ended_by_disabling(bench: Bench) -> None:
+    bench.bring_to(State.HOMING)
+    bench.run(0.1)
+    bench.do(Command.DISABLE)
+    bench.press()
+    assert bench.state is State.EMERGENCY_STOP
+
+
+@pytest.mark.parametrize("command", [Command.DISABLE, Command.SHUTDOWN])
+def test_a_joint_that_turns_on_after_its_homing_is_stopped_hard_whatever_ended_it(
+    bench: Bench, command: Command
+) -> None:
+    bench.bring_to(State.HOMING)
+    bench.run(0.1)
+    turned = bench.models[0].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 1e5, 0.015, 117.0
+    bench.do(command)
+    bench.run(3.2)
+    assert Code.HOMING_RUNNING in bench.codes
+    assert bench.log[-1].drives[0].controlword == QUICK_STOP
 
 
 def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(bench: Bench) -> None:
