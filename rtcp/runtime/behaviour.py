@@ -65,7 +65,9 @@ class Behaviour:
         self._lost_limit = config.bus.lost_cycles
         self._closes = Closing(arm, self.homing, operator, self._watch, blackboard, self._lost_limit, period_s)
         self._enable_cycles = round(config.enable_timeout_s / period_s)
-        self._reset_cycles = round(_RESET_S / period_s)
+        button = config.inputs.emergency_stop
+        settling_s = 0.0 if button is None else button.debounce_ms * 1e-3
+        self._reset_cycles = round((_RESET_S + settling_s) / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
         self._clock_cycles = round(_CLOCK_S / period_s)
         self._unlocked = 0

@@ -169,7 +169,7 @@ class Carrier:
         """Wait for an event after the one of the number `since`; return it.
 
         Raises:
-            CommandFailed: a fault came first, or it took too long.
+            CommandFailed: a fault came first, or the torque went, or it took too long.
         """
         until = time.monotonic() + patience_s
         while True:
@@ -179,6 +179,8 @@ class Carrier:
                     return event
                 if event.code in FAULTS:
                     raise CommandFailed("fault", self.sentence(event))
+                if event.code == Code.DISABLED:
+                    raise CommandFailed("refused", "it was ended by another command: the drives are disabled")
             if time.monotonic() > until:
                 raise CommandFailed("timeout", f"it took longer than {patience_s:.1f} s")
             await asyncio.sleep(POLL_S)

@@ -116,10 +116,11 @@ class Commander:
         holds = rest.limit == 1.0
         goal = gripper.open_position if opened else gripper.closed_position
         if goal is not None and not holds and abs(rest.value - goal) > _THERE_RAD:
+            ended = carrier.ended_since(begun.number)
             raise CommandFailed(
                 "refused",
                 f"{gripper.joint.name} was stopped at {rest.value:.4f} rad, on its way to where it is "
-                f"{'open' if opened else 'closed'}, {goal:g} rad",
+                f"{'open' if opened else 'closed'}, {goal:g} rad" + (f": {carrier.sentence(ended)}" if ended else ""),
             )
         return {"position": rest.value, "holds": holds}
 

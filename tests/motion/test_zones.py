@@ -13,6 +13,9 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from kinematics.forward import frames
+from kinematics.model import ArmModel
+from kinematics.pose import Pose
+from rtcp.motion.braking import touched
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import Reason
@@ -137,6 +140,36 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     assert judge.guard.axis == 0
     here = -depth(points(judge.state.position)[0], box)
     assert 0.0 <= here < 0.004
+
+
+def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[Sequence[float]] = []
+
+    def counted(model: ArmModel, q: Sequence[float]) -> tuple[Pose, ...]:
+        looked.append(q)
+        return frames(model, q)
+
+    monkeypatch.setattr("rtcp.motion.braking.frames", counted)
+    chance, most, dt = Random(1), 0, 0.0005
+    for _ in range(3000):
+        q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
+        tool, axis = points(q)[0], chance.randrange(3)
+        low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
+        high[axis] = tool[axis] - 10 ** chance.uniform(-4, -1)
+        low[axis] = high[axis] - 0.3
+        limits = Limits(with_boxes(WIDE, low + high))
+        mean = [chance.choice((-1, 1)) * v for v in limits.velocity]
+        after = [at + w * dt for at, w in zip(q, mean, strict=True)]
+        looked.clear()
+        touched(
+            Zones(ARM.arm, limits),  # type: ignore[arg-type]
+            frames(ARM.arm, q),  # type: ignore[arg-type]
+            frames(ARM.arm, after),  # type: ignore[arg-type]
+            after, mean, limits.acceleration, dt,
+        )  # fmt: skip
+        most = max(most, len(looked))
+    # A cycle has no time for more; seldom it would take three times as many, and then the stop counts as touching.
+    assert most == 16
 
 
 def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
