@@ -23,7 +23,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("wheel")
     source = directory / "source"
     source.mkdir()
-    for name in ("rtcp", "kinematics", "config"):
+    for name in ("rtcp", "kinematics", "config", "systemd"):
         shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(REPOSITORY / name, source)
@@ -64,6 +64,7 @@ def test_a_wheel_holds_packages_configuration_and_licence(wheel: Path) -> None:
         names = set(archive.namelist())
     shipped = {path.relative_to(REPOSITORY / "config") for path in (REPOSITORY / "config").rglob("*.yaml")}
     assert {f"rtcp/config/default/{path}" for path in shipped} <= names
+    assert {f"rtcp/cli/systemd/{path.name}" for path in (REPOSITORY / "systemd").iterdir()} <= names
     assert {"rtcp/py.typed", "kinematics/py.typed"} <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
@@ -87,6 +88,12 @@ print(len(arm.slaves), len(load_segment(segment_path(arm)).slaves))
 
 def test_the_command_of_an_installed_wheel_starts(installed: Path) -> None:
     subprocess.run([installed.parent / "rtcp", "--help"], check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
+
+
+def test_an_installed_wheel_brings_the_service_along(installed: Path, tmp_path: Path) -> None:
+    command = [installed.parent / "rtcp", "service", "install", "--root", tmp_path, "--program", "/usr/bin/env"]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
+    assert "ExecStart=/usr/bin/env start" in (tmp_path / "etc/systemd/system/rtcp@.service").read_text()
 
 
 def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) -> None:

@@ -73,10 +73,12 @@ def release(made: Realtime) -> None:
 def _pin(made: Realtime, cpu: int | None) -> None:
     allowed = available_cpus()
     chosen = choose_cpu(cpu)
-    if chosen not in allowed:
+    try:
+        # Also a CPU that is isolated: no process has it among its CPUs before it asks.
+        os.sched_setaffinity(0, {chosen})
+    except (OSError, ValueError, OverflowError):
         made.notes.append(f"cycle.cpu is {chosen}, which this process may not use (allowed: {allowed}): not pinned")
         return
-    os.sched_setaffinity(0, {chosen})
     made.cpu = chosen
 
 

@@ -21,6 +21,7 @@ from typing import Any
 from rtcp.runtime.arguments import Arguments
 from rtcp.runtime.carrier import CommandFailed, Progress
 from rtcp.runtime.held import Caller
+from rtcp.runtime.journal import log_format
 from rtcp.runtime.observer import BlackboardError, Observer
 from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.runtime.picture import Picture
@@ -261,7 +262,9 @@ def main() -> int:
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--ready-fd", type=int, required=True)
     given = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    to_stderr = logging.StreamHandler(sys.stderr)
+    to_stderr.setFormatter(log_format())
+    logging.basicConfig(level=logging.INFO, handlers=[to_stderr])
 
     def ready() -> None:
         with contextlib.suppress(OSError):

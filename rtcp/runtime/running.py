@@ -21,6 +21,8 @@ from typing import Any, Literal
 from rtcp.config.model import ArmConfig
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.journal import open_log
+from rtcp.runtime.notifier import Notifier
 from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
 from rtcp.runtime.session import Processes, end, forget_processes, identify, is_ours
 
@@ -56,7 +58,7 @@ class Running:
 
     def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
         reading, writing = os.pipe()
-        with open(self.directory / f"{name}.log", "wb") as log, undisturbed():
+        with open_log(self.directory / f"{name}.log") as log, undisturbed():
             # A signal between start and registration would leave a process that nobody knows of.
             child = subprocess.Popen(
                 [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
@@ -112,7 +114,8 @@ class Running:
                 os.sched_setaffinity(pid, others)
 
     def _last_words(self, name: str, child: subprocess.Popen[bytes]) -> str:
-        log = (self.directory / f"{name}.log").read_text(errors="replace").strip().splitlines()
+        path = self.directory / f"{name}.log"  # absent where the journal has it
+        log = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
         ended = child.poll()
         fate = "did not become ready in time" if ended is None else f"ended with code {ended}"
         said = f": {log[-1]}" if log else ""
@@ -128,15 +131,20 @@ class Running:
         """
         stopped: list[int] = []
         before = {number: signal.signal(number, lambda got, frame: stopped.append(got)) for number in _SIGNALS}
+        notifier = Notifier.of_environment(blackboard_file(self.directory))
         try:
+            notifier.ready()
             while not stopped and is_ours(self.processes.loop):
+                notifier.look()
                 time.sleep(0.1)
+            notifier.stopping("stopping" if stopped else "the loop has ended")
             if not stopped and self._ended_orderly():
                 self._reap(10.0)
                 return 0
             self.stop()
             return 0 if stopped else 5
         finally:
+            notifier.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
 
