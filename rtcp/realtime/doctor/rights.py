@@ -17,7 +17,7 @@ _NEEDED_BYTES = 512 << 20
 _CAPABLE = (
     "rtcp service install   # as a service it has its rights; else, for an ordinary user:",
     "install -m 755 $(readlink -f $(command -v python3)) /usr/local/bin/rtcp-python",
-    "setcap cap_net_admin,cap_net_raw,cap_sys_nice,cap_ipc_lock+ep /usr/local/bin/rtcp-python   # make the venv with it",
+    "setcap cap_net_admin,cap_net_raw,cap_sys_nice,cap_ipc_lock+ep /usr/local/bin/rtcp-python  # make the venv with it",
 )
 
 
