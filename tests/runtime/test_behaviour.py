@@ -32,6 +32,8 @@ from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 PERIOD_S = 0.001
 COUNTS = 10000
 ENABLE_TIMEOUT_S = 0.2
+DEBOUNCE_S = 0.005
+"""Of the emergency stop's input, which a reset waits for as well."""
 LOST_CYCLES = 40
 CSP, CSV, CST = 8, 9, 10
 EMERGENCIES = {Code.PRESSED, Code.OVER_SPEED, Code.OVER_TORQUE, Code.FOLLOWING_ERROR}
@@ -780,7 +782,7 @@ def test_the_arm_holds_its_place_through_every_change_of_mode(bench: Bench, posi
         (drive_that_does_not_enable, ENABLE_TIMEOUT_S),
         (drive_that_keeps_its_mode, 1.0),
         (clock_runs_away, 1.0),
-        (slave_that_does_not_come_back, 3.0),
+        (slave_that_does_not_come_back, 3.0 + DEBOUNCE_S),
     ],
 )
 def test_a_fault_of_patience_comes_when_it_is_over_and_not_before(
