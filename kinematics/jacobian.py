@@ -114,31 +114,12 @@ def singularity_distances(model: ArmModel, q: Sequence[float]) -> SingularityDis
     smallest = smallest_singular_value(scaled_rows(_rows(poses), 1.0 / length))
     if not has_spherical_wrist(model):
         return SingularityDistances(None, None, None, smallest)
-    shoulder = elbow = None
-    if has_parallel_arm(model):
-        shoulder, elbow = _arm_distances(poses)
-    return SingularityDistances(shoulder, elbow, _wrist_distance(model, poses), smallest)
-
-
-def has_parallel_arm(model: ArmModel) -> bool:
-    """Return whether axis 2 is parallel to axis 3 and not to axis 1: shoulder and elbow have a distance each."""
-    return fabs(model.constants[2][0]) < _PARALLEL < fabs(model.constants[1][0])
-
-
-def loop_distances(model: ArmModel, poses: Sequence[Pose]) -> tuple[float, float, float]:
-    """Return the distances of shoulder (m), elbow and wrist (rad) as `singularity_distances` has them, in some us.
-
-    Args:
-        model: with a spherical wrist and, as `has_parallel_arm` says, axis 2 parallel to axis 3.
-        poses: its `frames`.
-    """
-    shoulder, elbow = _arm_distances(poses)
-    return shoulder, elbow, _wrist_distance(model, poses)
-
-
-def _wrist_distance(model: ArmModel, poses: Sequence[Pose]) -> float:
     volume = _dot(_axis(poses[3]), _cross(_axis(poses[4]), _axis(poses[5])))
-    return asin(min(1.0, fabs(volume / (model.constants[4][0] * model.constants[5][0]))))
+    wrist = asin(min(1.0, fabs(volume / (model.constants[4][0] * model.constants[5][0]))))
+    shoulder = elbow = None
+    if fabs(model.constants[2][0]) < _PARALLEL < fabs(model.constants[1][0]):
+        shoulder, elbow = _arm_distances(poses)
+    return SingularityDistances(shoulder, elbow, wrist, smallest)
 
 
 def _rows(poses: Sequence[Pose]) -> Rows:

@@ -18,7 +18,7 @@ from ruckig import (
     Trajectory,
 )
 
-from rtcp.motion.room import allowed_acceleration
+from rtcp.motion.room import allowed_accelerations
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 LONGEST_S = 600.0
@@ -130,10 +130,7 @@ class JointGenerator:
         given.current_velocity = state.velocity
         bounds = self._acceleration_limit
         given.max_acceleration = bounds
-        given.current_acceleration = [
-            allowed_acceleration(now, state.velocity[i], self._velocity_limit[i], bounds[i], self._jerk_limit[i])
-            for i, now in enumerate(state.acceleration)
-        ]
+        given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
         given.target_acceleration = self._zero
 
     def update(self, state: MotionState, dt: float) -> Target:

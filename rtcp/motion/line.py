@@ -9,10 +9,9 @@ from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ru
 
 from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
-from kinematics.jacobian import has_parallel_arm, loop_distances
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Vector
-from kinematics.spherical import has_spherical_wrist
+from rtcp.motion.distance import Singularities
 from rtcp.motion.generator import JointGenerator
 from rtcp.motion.rows import Refused, Wrong, damaged_line, read_row
 from rtcp.motion.slerp import quaternion, rotation, turn_between, turned_by
@@ -47,9 +46,8 @@ class LineMode:
         self, model: ArmModel, limits: Limits, period_s: float, singularity: SingularityLimits | None = None
     ) -> None:
         n = len(limits.velocity)
-        # Other geometries are looked at beforehand only.
-        known = singularity is not None and has_spherical_wrist(model) and has_parallel_arm(model)
-        self._nearest = (singularity.shoulder, singularity.elbow, singularity.wrist) if singularity and known else None
+        self._singularities = Singularities(model)
+        self._nearest = None if singularity is None else (singularity.shoulder, singularity.elbow, singularity.wrist)
         self._every = max(round(_LOOK_S / period_s), 1)
         self._wait = 0
         self._model = model
@@ -219,7 +217,7 @@ class LineMode:
             if not -limits[i] * 1.000001 <= v <= limits[i] * 1.000001:
                 return self._give_up(state, dt, Reason.JUMP, i, v, limits[i])
         if self._nearest is not None and self._due():
-            for which, distance in enumerate(loop_distances(self._model, frames(self._model, position))):
+            for which, distance in enumerate(self._singularities.distances(frames(self._model, position))):
                 if distance < _BETWEEN_SAMPLES * self._nearest[which]:
                     return self._give_up(state, dt, Reason.SINGULARITY, which, distance, self._nearest[which])
         self._near = position if not self._rest_counts else list(q)

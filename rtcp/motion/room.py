@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import sqrt
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rtcp.motion.state import MotionState
 
 _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
@@ -21,6 +26,16 @@ def allowed_acceleration(acceleration: float, speed: float, fastest: float, most
         bound = rising if rising < most else most
     bound *= _INSIDE
     return bound if acceleration > bound else -bound if acceleration < -bound else acceleration
+
+
+def allowed_accelerations(
+    state: MotionState, fastest: Sequence[float], most: Sequence[float], jerk: Sequence[float]
+) -> list[float]:
+    """Return `allowed_acceleration` of every joint of a state; bounds of shape (n,)."""
+    return [
+        allowed_acceleration(now, state.velocity[i], fastest[i], most[i], jerk[i])
+        for i, now in enumerate(state.acceleration)
+    ]
 
 
 def stoppable_speed(room: float, acceleration: float, jerk: float) -> float:

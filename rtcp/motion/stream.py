@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
 from rtcp.motion.generator import JointGenerator
-from rtcp.motion.room import allowed_acceleration, stoppable_speed
+from rtcp.motion.room import allowed_accelerations, stoppable_speed
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
@@ -211,16 +211,7 @@ class StreamMode:
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
         if not self._tracks or state.position != self._last:
             way.current_position, way.current_velocity = state.position, state.velocity
-            way.current_acceleration = [
-                allowed_acceleration(
-                    state.acceleration[i],
-                    state.velocity[i],
-                    limits.velocity[i],
-                    limits.acceleration[i],
-                    limits.jerk[i],
-                )
-                for i in self._joints
-            ]
+            way.current_acceleration = allowed_accelerations(state, limits.velocity, limits.acceleration, limits.jerk)
         self._tracks = True
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
 
-from rtcp.motion.room import allowed_acceleration
+from rtcp.motion.room import allowed_accelerations
 from rtcp.motion.state import MotionState, Phase, Reason, Target
 
 if TYPE_CHECKING:
@@ -40,7 +40,6 @@ class VelocityMode:
         self._zero = [0.0] * n
         self._joints = range(n)
         self._wanted = [0.0] * n
-        self._goals: list[float] = []
         self._said: list[float] = []
         self._until_ns = 0
         self._last: list[float] = []
@@ -88,11 +87,10 @@ class VelocityMode:
                 self.reason, self.value = Reason.COMMAND_ENDED, 0.0
             self.stop(state)
         way, output = self._way, self._output
-        self._goals, goals = self._said, self._goals
-        self._set_goals(state, goals)
+        goals = self._goals(state)
         # What the guards changed, or what is asked for anew, begins at the state; else the ramp goes on.
         moved = state.position != self._last
-        if moved or goals != self._goals:
+        if moved or goals != self._said:
             self._plan(state, goals, moved)
         self._said = goals
         result = self._step()
@@ -119,9 +117,9 @@ class VelocityMode:
         except (RuckigError, ValueError):
             return Result.Error
 
-    def _set_goals(self, state: MotionState, goals: list[float]) -> None:
-        """Write what each joint goes to: four numbers each, of which the first says whether it is a position."""
-        goals.clear()
+    def _goals(self, state: MotionState) -> list[float]:
+        """Return what each joint goes to: four numbers each, of which the first says whether it is a position."""
+        goals: list[float] = []
         limits = self._limits
         for i, wanted in enumerate(self._wanted):
             acceleration, jerk, now = limits.acceleration[i], limits.jerk[i], state.velocity[i]
@@ -135,6 +133,7 @@ class VelocityMode:
                 goals += (1.0, edge, faster, jerk) if faster > _SLOWEST_RAD_S else (0.0, 0.0, acceleration, jerk)
             else:
                 goals += (0.0, wanted, acceleration, jerk)
+        return goals
 
     def _plan(self, state: MotionState, goals: list[float], moved: bool) -> None:
         """Give ruckig the goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
@@ -149,13 +148,4 @@ class VelocityMode:
         way.current_position, way.current_velocity = state.position, state.velocity
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
         if moved:
-            way.current_acceleration = [
-                allowed_acceleration(
-                    state.acceleration[i],
-                    state.velocity[i],
-                    limits.velocity[i],
-                    limits.acceleration[i],
-                    limits.jerk[i],
-                )
-                for i in self._joints
-            ]
+            way.current_acceleration = allowed_accelerations(state, limits.velocity, limits.acceleration, limits.jerk)

@@ -12,7 +12,8 @@ from rtcp.motion.guard import Guard
 from rtcp.motion.limits import Limits
 from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
 from rtcp.motion.state import MotionState, Phase
-from rtcp.motion.watch import Found, Watch
+from rtcp.motion.watch import Watch
+from rtcp.runtime.codes import Code
 from rtcp.runtime.gripper import DrivenGripper
 from rtcp.runtime.motions import Motions
 
@@ -135,10 +136,13 @@ class Arm:
             self.gripper.command()
         return verdict
 
-    def beyond(self, watch: Watch) -> Found | None:
+    def beyond(self, watch: Watch) -> tuple[Code, int, float, float] | None:
         """Look at what is measured of joints and gripper; return what is beyond its limit for too long, or None."""
         found = watch.look(self.state)
-        return self.gripper.look() if found is None and self.gripper is not None else found
+        if found is None and self.gripper is not None:
+            found = self.gripper.look()
+        # Codes follow the kinds: speed, torque, following error.
+        return None if found is None else (Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
 
     def first_not_enabled(self) -> int:
         """Return the first joint whose drive is not enabled, or -1."""

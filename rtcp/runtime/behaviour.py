@@ -237,8 +237,7 @@ class Behaviour:
         found = self._arm.beyond(self._watch)
         if found is None:
             return False
-        # Codes follow the kinds: speed, torque, following error.
-        self._stop_in_emergency(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+        self._stop_in_emergency(*found)
         return True
 
     def _lead_gripper(self) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
-from rtcp.motion.state import Phase
 from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
@@ -88,7 +87,7 @@ class Closing:
         if not self._hard and arm.first_with_torque() >= 0:
             found = arm.beyond(self._watch) if good and arm.first_not_enabled() < 0 else None
             if found is not None:
-                self._meet(Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+                self._meet(*found)
             elif self._operator.emergency_stop:
                 self._meet(Code.PRESSED)
         if not self._hard or arm.first_moving() < 0 or self._cycles > self._patience:
@@ -108,16 +107,13 @@ class Closing:
 
     def _stop(self) -> bool:
         """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""
-        arm, motions = self._arm, self._arm.motions
-        if motions.active.phase is Phase.MOVE:
-            motions.stop(arm.state)
-        if arm.gripper is not None:
-            arm.gripper.stop()
+        arm = self._arm
+        arm.stop()
         if arm.all_still or arm.first_not_enabled() >= 0:
             return True
         self._cycles = 0
         if arm.command() is Verdict.STOPPED:
-            motions.rest()
+            arm.motions.rest()
         return False
 
     def _take_torque(self) -> bool:

@@ -89,6 +89,9 @@ class Judge:
 
 ARM = load(default_config())
 """The arm as delivered, boxes and all."""
+assert ARM.arm is not None
+MODEL = ARM.arm
+"""Its geometry."""
 _RANGE = replace(ARM.joints[1].position, min=-0.3, max=0.2)
 _SHORT = replace(ARM.joints[1], acceleration=0.7, velocity=1.5, position=_RANGE)
 JOINTS_ONLY = replace(ARM, joints=(ARM.joints[0], _SHORT), arm=None)

@@ -15,10 +15,8 @@ from kinematics.forward import frames
 from kinematics.model import ArmModel
 from rtcp.motion.distance import Singularities
 
-from .judge import ARM
+from .judge import MODEL
 
-MODEL = ARM.arm
-assert MODEL is not None
 ANGLES = st.lists(st.floats(-pi, pi), min_size=6, max_size=6)
 
 

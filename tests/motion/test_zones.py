@@ -21,7 +21,7 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.state import Reason
 from rtcp.motion.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 
-from .judge import ARM, Judge, with_boxes
+from .judge import ARM, MODEL, Judge, with_boxes
 from .reference import Point, depth, points
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
@@ -50,7 +50,7 @@ def driven(judge: Judge, direction: Sequence[float], cycles: int, clamps: bool =
 
 @given(q=JOINTS)
 def test_the_points_that_are_watched_are_where_the_table_of_the_facts_puts_them(q: Sequence[float]) -> None:
-    poses = frames(ARM.arm, q)  # type: ignore[arg-type]
+    poses = frames(MODEL, q)
     for found, expected in zip((TOOL, WRIST, ELBOW), points(q), strict=True):
         assert poses[found].position == pytest.approx(expected, abs=1e-12)
 
@@ -162,9 +162,9 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
         after = [at + w * dt for at, w in zip(q, mean, strict=True)]
         looked.clear()
         touched(
-            Zones(ARM.arm, limits),  # type: ignore[arg-type]
-            frames(ARM.arm, q),  # type: ignore[arg-type]
-            frames(ARM.arm, after),  # type: ignore[arg-type]
+            Zones(MODEL, limits),
+            frames(MODEL, q),
+            frames(MODEL, after),
             after, mean, limits.acceleration, dt,
         )  # fmt: skip
         most = max(most, len(looked))
@@ -222,7 +222,7 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
     judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
     driven(judge, [0.5] * 6, 200)
     assert len(counted) <= 1
-    assert judge.guard.poses == frames(ARM.arm, judge.state.position)  # type: ignore[arg-type]
+    assert judge.guard.poses == frames(MODEL, judge.state.position)
 
 
 def test_to_probe_beside_a_box_changes_nothing() -> None:
@@ -233,7 +233,7 @@ def test_to_probe_beside_a_box_changes_nothing() -> None:
     assert guard.probe(judge.state, step, [0.0] * 6)
     assert guard.poses is poses
     assert judge.ask(step, clamps=False) is Verdict.PASS
-    assert guard.poses == frames(ARM.arm, step)  # type: ignore[arg-type]
+    assert guard.poses == frames(MODEL, step)
 
 
 # -- distances ------------------------------------------------------------------------------------------------------
@@ -256,8 +256,8 @@ def test_outside_is_the_distance_to_the_nearest_point_of_the_box_and_inside_the_
 @settings(max_examples=50)
 def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     limits = Limits(ARM)
-    zones = Zones(ARM.arm, limits)  # type: ignore[arg-type]
-    poses = frames(ARM.arm, q)  # type: ignore[arg-type]
+    zones = Zones(MODEL, limits)
+    poses = frames(MODEL, q)
     found = zones.clearances(poses, inf)
     assert [one.distance for one in found] == sorted(one.distance for one in found)
     assert len(found) == 6 + 3 * len(limits.keep_out)
@@ -274,7 +274,7 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
 @given(q=JOINTS, direction=DIRECTION)
 @settings(max_examples=60)
 def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[float], direction: list[float]) -> None:
-    zones = Zones(ARM.arm, Limits(ARM))  # type: ignore[arg-type]
+    zones = Zones(MODEL, Limits(ARM))
     step = 1e-4
     moved = [angle + step * part for angle, part in zip(q, direction, strict=True)]
     bound = sum(step * abs(part) * reach for part, reach in zip(direction, zones.reach, strict=True))

@@ -1,4 +1,4 @@
-"""A gateway's process in front of a played loop."""
+"""A blackboard; a gateway's process in front of a played loop."""
 
 from __future__ import annotations
 
@@ -14,10 +14,25 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.client import ControlClient
 from rtcp.runtime.paths import blackboard_file, control_socket
 from rtcp.runtime.session import Session
 from tests.runtime.played_loop import Loop
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
+    yield made
+    made.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def board(path: Path) -> Iterator[Blackboard]:
+    made = Blackboard(path, 6, 500_000)
+    yield made
+    made.close()
 
 
 @pytest.fixture(scope="module")

@@ -18,20 +18,6 @@ FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
-    yield made
-    made.unlink(missing_ok=True)
-
-
-@pytest.fixture
-def board(path: Path) -> Iterator[Blackboard]:
-    made = Blackboard(path, JOINTS, 500_000)
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
     made = Observer(path)
     yield made

@@ -21,20 +21,6 @@ AT_ONCE = 1e-6
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    made = Path(f"/dev/shm/rtcp-test-notifier-{os.getpid()}")
-    yield made
-    made.unlink(missing_ok=True)
-
-
-@pytest.fixture
-def board(path: Path) -> Iterator[Blackboard]:
-    made = Blackboard(path, JOINTS, 500_000)
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def manager(tmp_path: Path) -> Iterator[socket.socket]:
     """The manager's end."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as made:
