@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from rtcp.cli import sdo_value
+from rtcp.cli import sdo_value, segment
 from rtcp.cli.bus_access import bus_access, position_of
 from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
-from rtcp.cli.options import BusName, ConfigFile, ObjectIndex, Poll, SlaveName
+from rtcp.cli.options import BusName, ConfigFile, ObjectIndex, SlaveName
 from rtcp.cli.outcome import CommandError
 from rtcp.cli.output import emit, emit_json, report, show
 
@@ -20,7 +19,7 @@ SDO_WRITE_OPTIONS = ("--type", "--bus", "--config", "--help", "-h")
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
     app.command("scan")(_scan)
-    app.command("segment")(_segment)
+    segment.register(app)
     sdo = typer.Typer(help="Read and write objects of a slave.", no_args_is_help=True)
     sdo.command("read")(_sdo_read)
     sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)(_sdo_write)
@@ -78,20 +77,3 @@ def _sdo_write(
         position = position_of(slave, access)
         access.sdo_write(position, index, subindex, data)
     report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
-
-
-def _segment(
-    config: Annotated[Path, typer.Option("--config", metavar="FILE", help="The slaves in the order of the cable.")],
-    interface: Annotated[
-        str | None,
-        typer.Option(
-            "--interface", metavar="NAME", help="Leave the master's end here under this name; else in a namespace."
-        ),
-    ] = None,
-    poll: Poll = False,
-    cpu: Annotated[int | None, typer.Option("--cpu", metavar="N", help="CPU of the segment.")] = None,
-) -> None:
-    """Run a segment of software slaves for any EtherCAT master, until stopped."""
-    from rtcp.cli.segment import run_segment
-
-    run_segment(config, interface, poll, cpu)

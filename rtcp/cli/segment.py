@@ -1,51 +1,191 @@
-"""How `rtcp segment` runs: the segment in this process, and how to point a master at it."""
+"""`rtcp segment`: run software slaves for any EtherCAT master, and make faults on those that run."""
 
 from __future__ import annotations
 
-import os
-import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
+
+from rtcp.cli.options import Poll
 from rtcp.cli.outcome import CommandError, ExitCode
-from rtcp.cli.output import report
-from rtcp.virtual.network import NetworkError
-from rtcp.virtual.server import run
+from rtcp.cli.output import emit, emit_json, report
+from rtcp.runtime.paths import listens, runtime_directory, segment_control
+
+if TYPE_CHECKING:
+    from rtcp.virtual.faults.client import SegmentClient
+
+ControlPath = Annotated[
+    Path | None,
+    typer.Option(
+        "--segment", metavar="PATH", help="Control socket of the segment; else the one in the runtime directory."
+    ),
+]
 
 
-def run_segment(config: Path, interface: str | None, poll: bool, cpu: int | None) -> None:
-    """Run the slaves that `config` lists until SIGINT, SIGTERM or SIGHUP.
+def register(app: typer.Typer) -> None:
+    """Add this group's commands."""
+    segment = typer.Typer(invoke_without_command=True)
+    segment.callback()(_segment)
+    segment.command("fault")(_fault)
+    segment.command("mend")(_mend)
+    segment.command("faults")(_faults)
+    segment.command("kinds")(_kinds)
+    app.add_typer(segment, name="segment")
 
-    Args:
-        config: the file of the segment.
-        interface: name of the master's end in the caller's network; None: in a namespace of the segment's own.
-        poll: never sleep.
-        cpu: CPU to run on, any when None.
+
+def _segment(
+    context: typer.Context,
+    config: Annotated[
+        Path | None, typer.Option("--config", metavar="FILE", help="The slaves in the order of the cable.")
+    ] = None,
+    interface: Annotated[
+        str | None,
+        typer.Option(
+            "--interface", metavar="NAME", help="Leave the master's end here under this name; else in a namespace."
+        ),
+    ] = None,
+    poll: Poll = False,
+    cpu: Annotated[int | None, typer.Option("--cpu", metavar="N", help="CPU of the segment.")] = None,
+    script: Annotated[
+        Path | None, typer.Option("--faults", metavar="SCRIPT", help="Faults with their times, s from the start.")
+    ] = None,
+) -> None:
+    """Run a segment of software slaves for any EtherCAT master, until stopped; or make faults on one that runs."""
+    given = {"--config": config, "--interface": interface, "--poll": poll or None, "--cpu": cpu, "--faults": script}
+    if context.invoked_subcommand is not None:
+        if wrong := [option for option, value in given.items() if value is not None]:
+            raise CommandError(f"{wrong[0]} is an option of a segment that starts, not of {context.invoked_subcommand}")
+        return
+    if config is None:
+        raise CommandError("--config FILE is missing: the slaves in the order of the cable (or: fault, mend, faults)")
+    from rtcp.cli.segment_run import run_segment
+
+    run_segment(config, interface, poll, cpu, script)
+
+
+def _fault(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Kind of the fault: `rtcp segment kinds` lists them.")],
+    pairs: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE..", help="As after=3, code=0x1A.")] = None,
+    lasts: Annotated[
+        float | None, typer.Option("--lasts", metavar="S", help="How long, s; else until it is mended.")
+    ] = None,
+    segment: ControlPath = None,
+) -> None:
+    """Make a fault on the segment that runs."""
+    from rtcp.cli.segment_view import named, sentence_of
+    from rtcp.config.faults import ONCE, parse
+
+    mapping = _mapping(name, pairs or [], lasts)
+    planned, findings = parse(mapping)
+    if planned is None:
+        raise CommandError("\n".join(map(sentence_of, findings)))
+    if planned.at:
+        raise CommandError("at: a fault that is asked for begins at once; only a script has times")
+    with _client(segment) as client:
+        number = client.fault(planned.as_mapping())
+        active = any(each["id"] == number for each in client.faults())
+    said = f"fault {number}: {named(planned.as_mapping())}"
+    if isinstance(planned.fault, ONCE) or not active:
+        report(f"{said}: it has happened")
+        return
+    until = "until it is mended" if planned.lasts is None else f"for {planned.lasts:g} s"
+    if getattr(planned.fault, "burst", None) is not None:
+        until = "until its burst has passed"
+    where = "" if segment is None else f" --segment {segment}"
+    report(f"{said}, {until}; to mend it: rtcp segment mend {number}{where}")
+
+
+def _mend(
+    number: Annotated[int | None, typer.Argument(metavar="ID", help="The fault's number; else all faults.")] = None,
+    segment: ControlPath = None,
+) -> None:
+    """Mend a fault, or all of them."""
+    with _client(segment) as client:
+        mended = client.mend(number)
+    report(f"mended: {', '.join(f'fault {each}' for each in mended)}" if mended else "no fault is active")
+
+
+def _faults(
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON array.")] = False, segment: ControlPath = None
+) -> None:
+    """Show the faults that are active, since when, and what they have done to frames."""
+    with _client(segment) as client:
+        active = client.faults()
+    if as_json:
+        emit_json(active)
+        return
+    from rtcp.cli.segment_view import line_of
+
+    emit("\n".join(map(line_of, active)) or "no fault is active")
+
+
+def _kinds() -> None:
+    """List the kinds of faults, their keys and what is allowed for them."""
+    from rtcp.cli.segment_view import kinds
+
+    for kind in kinds():
+        emit(f"{kind.name}: {kind.says}")
+        for key, allowed in kind.keys.items():
+            emit(f"    {key:9} {allowed}")
+    emit("Each but those that happen once takes --lasts S. In a script: a list `faults:` with fault, at, lasts, keys.")
+
+
+def _mapping(name: str, pairs: Sequence[str], lasts: float | None) -> dict[str, Any]:
+    """Return the mapping that a command line names."""
+    mapping: dict[str, Any] = {"fault": name}
+    for pair in pairs:
+        key, separator, value = pair.partition("=")
+        if not separator or not key or not value:
+            raise CommandError(f"{pair!r} is no KEY=VALUE, as after=3 or code=0x1A")
+        if key in mapping:
+            raise CommandError(f"{key} stands twice")
+        mapping[key] = _value(value)
+    if lasts is not None:
+        if "lasts" in mapping:
+            raise CommandError("lasts stands twice")
+        mapping["lasts"] = lasts
+    return mapping
+
+
+def _value(written: str) -> int | float | str:
+    """Return a number, decimal or as 0x1A, or the text itself."""
+    if "_" in written or not written.isascii():
+        return written
+    for read in (int, lambda text: int(text, 16) if text[:2].lower() == "0x" else float(text)):
+        try:
+            return read(written)
+        except ValueError:
+            continue
+    return written
+
+
+@contextmanager
+def _client(path: Path | None) -> Iterator[SegmentClient]:
+    """Speak to the segment at `path`, or to the one that runs.
 
     Raises:
-        CommandError: when the interfaces cannot be made, or a model or an option is unknown.
-        ConfigError: with every mistake of the file.
+        CommandError: there is none, or several, or it refuses.
     """
-    users_before = _user_namespace()
-
-    def ready(facts: dict[str, int | str | bool]) -> None:
-        # The segment has taken SIGTERM for its end by now; a terminal that closes is to end it in the same order.
-        signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))
-        count, name, pid = facts["slaves"], facts["interface"], facts["pid"]
-        report(f"segment of {count} {'slave' if count == 1 else 'slaves'} (process {pid})")
-        if not facts["namespace"]:
-            report(f"the master's end is {name}: `rtcp start --bus {name}`, or any other EtherCAT master on {name}")
-        else:
-            users = "" if _user_namespace() == users_before else " -U --preserve-credentials"
-            report(f"the master's end is {name} in the network namespace of process {pid}; a master gets there by")
-            report(f"  nsenter -t {pid}{users} -n COMMAND {name}")
-        report("Ctrl-C ends it")
+    from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
 
     try:
-        run(config, interface, poll, cpu, ready)
-    except (NetworkError, ValueError) as error:
-        raise CommandError(str(error), ExitCode.USAGE) from error
-    report("ended")
+        with SegmentClient(path or _running()) as client:
+            yield client
+    except SegmentAway as error:
+        raise CommandError(str(error), ExitCode.NOT_RUNNING) from error
+    except SegmentRefused as error:
+        raise CommandError(str(error), ExitCode.REFUSED) from error
 
 
-def _user_namespace() -> str:
-    return os.readlink("/proc/self/ns/user")
+def _running() -> Path:
+    directory = runtime_directory()
+    usual = segment_control(directory)
+    found = [path for path in (usual, *sorted(directory.glob("segment-*.sock"))) if listens(path)]
+    if not found:
+        raise CommandError(f"no virtual segment is running: nothing listens at {usual}", ExitCode.NOT_RUNNING)
+    if len(found) > 1:
+        raise CommandError(f"several segments are running: choose by --segment {' or '.join(map(str, found))}")
+    return found[0]

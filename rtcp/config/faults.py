@@ -10,6 +10,7 @@ As `model`, this module imports nothing heavy. Positions count from 1, as on the
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar, Literal
@@ -298,8 +299,7 @@ def parse(mapping: object) -> tuple[Planned | None, list[Finding]]:
         if isinstance(name, str):
             text = unknown_key(name, list(FAULTS)).replace("this key is", "this fault is")
         return None, [(("fault",), text), *findings]
-    checker: Checker[Any] = Checker(FAULTS[name])
-    fault, wrong = checker.check(own)
+    fault, wrong = _checker(name).check(own)
     findings += wrong
     if fault is not None:
         if isinstance(fault, _BY_RATE) and (fault.rate is None) == (fault.burst is None):
@@ -311,8 +311,16 @@ def parse(mapping: object) -> tuple[Planned | None, list[Finding]]:
     return Planned(fault, float(times.get("at", 0.0)), times.get("lasts")), []
 
 
-def load_script(path: Path) -> tuple[Planned, ...]:
+@cache
+def _checker(name: str) -> Checker[Any]:
+    """Return the checker of a kind: made once, a segment that runs reads its commands between frames."""
+    return Checker(FAULTS[name])
+
+
+def load_script(path: Path, slaves: int = 255) -> tuple[Planned, ...]:
     """Read a script of faults: a mapping with the key `faults`, a list of faults with `at`; return them in their order.
+
+    `slaves` is how many the segment has.
 
     Raises:
         ConfigError: with one sentence for every mistake.
@@ -332,6 +340,15 @@ def load_script(path: Path) -> tuple[Planned, ...]:
         findings += [(("faults", i, *where), text) for where, text in wrong]
         if made is not None:
             planned.append(made)
+            findings += [(("faults", i, *where), text) for where, text in _beyond(made.fault, slaves)]
     if findings:
         raise ConfigError(document.sentences(findings))
     return tuple(sorted(planned, key=lambda each: each.at))
+
+
+def _beyond(fault: Fault, slaves: int) -> list[Finding]:
+    """Return the mistake of a fault whose place the cable does not have."""
+    for key, last in (("slave", slaves), ("after", slaves - 1)):
+        if (place := getattr(fault, key, 0)) > last:
+            return [((key,), f"found {place}, the segment has {slaves} slaves: allowed is at most {last}")]
+    return []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import socket
 import stat
 import tempfile
 from pathlib import Path
@@ -55,6 +56,30 @@ def prepare(directory: Path) -> None:
 def control_socket(directory: Path) -> Path:
     """Return the path of the control socket."""
     return directory / "control.sock"
+
+
+def segment_control(directory: Path) -> Path:
+    """Return the path of the virtual segment's control socket."""
+    return directory / "segment.sock"
+
+
+def free_segment_control(directory: Path) -> Path:
+    """Return that path, or one with the number of this process in it where a living segment has it."""
+    usual = segment_control(directory)
+    return directory / f"segment-{os.getpid()}.sock" if listens(usual) else usual
+
+
+def listens(path: Path) -> bool:
+    """Whether a process listens at a Unix socket, whatever it says there."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
+            return False
+        except OSError:
+            pass  # a full queue, another kind of socket, another user's: somebody has it
+    return True
 
 
 def processes_file(directory: Path) -> Path:

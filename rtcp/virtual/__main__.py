@@ -22,6 +22,8 @@ def main() -> int:
     parser.add_argument("--interface", help="leave the master's end of the cable in this network under this name")
     parser.add_argument("--poll", action="store_true", help="poll for frames: faster, for a CPU of its own")
     parser.add_argument("--cpu", type=int, help="run on this CPU")
+    parser.add_argument("--control", type=Path, help="listen here, at a Unix socket, for faults that are asked for")
+    parser.add_argument("--faults", type=Path, help="script of faults with their times")
     parser.add_argument("--ready-fd", type=int, default=1, help="where to write one line of JSON when ready")
     arguments = parser.parse_args()
 
@@ -29,7 +31,8 @@ def main() -> int:
         os.write(arguments.ready_fd, json.dumps(message).encode() + b"\n")
 
     try:
-        run(arguments.config, arguments.interface, arguments.poll, arguments.cpu, ready)
+        run(arguments.config, arguments.interface, arguments.poll, arguments.cpu, ready, arguments.control,
+            arguments.faults)  # fmt: skip
     except (ConfigError, NetworkError, ValueError) as error:
         print(error, file=sys.stderr)
         return USAGE_ERROR

@@ -21,6 +21,7 @@ from rtcp.virtual.statemachine import (
 )
 from rtcp.virtual.synchronisation import SyncMonitor
 from rtcp.virtual.syncmanager import SyncManager
+from rtcp.virtual.trouble import Trouble
 
 OP_TIMEOUT = 1_000_000_000
 """How long, in ns, a slave asked for OP waits in SAFE-OP for its first outputs and SYNC0 before it refuses."""
@@ -36,10 +37,11 @@ class Application:
     Instants are ns of the host's monotonic clock.
     """
 
-    def __init__(self, esc: Esc, device: Device, t: int) -> None:
+    def __init__(self, esc: Esc, device: Device, trouble: Trouble, t: int) -> None:
         self.esc = esc
         self.device = device
         self._parts = Parts(esc, device)
+        self._trouble = trouble
         self._mailbox: MailboxService | None = None
         self._rx = self._tx = PdoImage(())
         self._latched = b""
@@ -67,13 +69,13 @@ class Application:
         if esc.sync_managers_written:
             esc.sync_managers_written = False
             self._recheck()
-        if esc.al_control_written:
+        if esc.al_control_written and not self._trouble.hangs:
             esc.al_control_written = False
             self._control(esc.get(Register.AL_CONTROL, 2), t)
         if esc.mailbox_touched:
             esc.mailbox_touched = False
             if self._mailbox is not None:
-                self._mailbox.serve(self.state)
+                self._mailbox.serve(self.state, t)
 
     def outputs_written(self, manager: SyncManager, t: int) -> None:
         """A buffer of outputs was completed by a frame that arrived at `t`."""
@@ -96,7 +98,8 @@ class Application:
             self._error = False
             self._lock_process_data(self.state < State.SAFE_OP)
         self._op_wanted_at = None
-        code = judge(self.state, wanted, self._parts)
+        refusal = self._trouble.refusal(wanted) if wanted > self.state else 0
+        code = refusal or judge(self.state, wanted, self._parts)
         if code:
             self._refuse(code)
             return
@@ -124,7 +127,8 @@ class Application:
         if before < State.PRE_OP <= wanted:
             self._lock(False, MAILBOX_OUT, MAILBOX_IN)
             managers = self.esc.sync_managers
-            self._mailbox = MailboxService(self.device, managers[MAILBOX_OUT], managers[MAILBOX_IN])
+            out, in_ = managers[MAILBOX_OUT], managers[MAILBOX_IN]
+            self._mailbox = MailboxService(self.device, out, in_, self._trouble)
         if before < State.SAFE_OP <= wanted:
             self._start_process_data()
 
@@ -146,14 +150,14 @@ class Application:
             self.esc.sync_managers[index].lock(locked)
         self.esc.on_layout()
 
-    def _report(self, code: AlStatusCode) -> None:
+    def _report(self, code: int) -> None:
         self.esc.set_al_status(self.state | (ERROR_FLAG if self._error else 0), code)
 
-    def _refuse(self, code: AlStatusCode) -> None:
+    def _refuse(self, code: int) -> None:
         self._error = True
         self._report(code)
 
-    def _fall(self, state: State, code: AlStatusCode) -> None:
+    def fall(self, state: State, code: int) -> None:
         """Leave the state on an error of one's own; the working counter shows it, for the outputs are closed."""
         self._op_wanted_at = None
         self._enter(state)
@@ -165,13 +169,13 @@ class Application:
         for checks, fallback in HELD[self.state]:
             code = first_failure(checks, self._parts)
             if code:
-                self._fall(fallback, code)
+                self.fall(fallback, code)
                 return
 
     def _try_op(self, t: int) -> None:
         """Go to OP as soon as outputs and SYNC0 are there; give up after a while."""
         asked = self._op_wanted_at
-        if asked is None:
+        if asked is None or self._trouble.hangs:
             return
         have_outputs = self._received or not self._rx.byte_length
         have_sync = self.sync.running or not self.sync.active
@@ -199,9 +203,9 @@ class Application:
             count = esc.memory[Register.WATCHDOG_COUNTERS]
             esc.memory[Register.WATCHDOG_COUNTERS] = min(count + 1, 0xFF)
             if self.state == State.OP:
-                self._fall(State.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
+                self.fall(State.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
         if self.state == State.OP and self.sync.active and not self.sync.running:
-            self._fall(State.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
+            self.fall(State.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
         if self._op_wanted_at is not None:
             self._try_op(t)
 
@@ -209,7 +213,7 @@ class Application:
         """SYNC0 has come: take over the outputs. `on_time` tells that this process was not late in noticing it."""
         self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
         if self.state == State.OP and self.sync.pulse(on_time):
-            self._fall(State.SAFE_OP, AlStatusCode.SYNC_ERROR)
+            self.fall(State.SAFE_OP, AlStatusCode.SYNC_ERROR)
 
     def latch(self) -> None:
         """Take over the outputs without SYNC0: the frame that brought them has passed."""
@@ -235,5 +239,5 @@ class Application:
         if self.state >= State.SAFE_OP:
             self._tx.pack(self.esc.sync_managers[INPUTS].buffer)
         mailbox = self._mailbox
-        if mailbox is not None and mailbox.pending():
-            mailbox.serve(self.state)
+        if mailbox is not None and mailbox.pending(t):
+            mailbox.serve(self.state, t)

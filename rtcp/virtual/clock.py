@@ -54,6 +54,18 @@ class Clock:
         passed = system - self.offset - self._local
         return self._t + passed - int((passed * self._rate + self._fraction) / (1.0 + self._rate))
 
+    def jump(self, ns: int) -> None:
+        """Show `ns` more from now on."""
+        self._local += ns
+
+    def change_drift(self, ppm: float, t: int) -> None:
+        """Run fast by `ppm` millionths more than before, from `t` on."""
+        passed = t - self._t
+        moved = passed * self._rate + self._fraction
+        self._t, self._local, self._fraction = t, self._local + passed + int(moved), moved - int(moved)
+        self._natural += ppm * 1e-6
+        self._rate += ppm * 1e-6
+
     def reset_control(self) -> None:
         """Forget what drift compensation has learnt (a write to 0x0930 does it)."""
         self._rate = self._natural
@@ -96,10 +108,11 @@ class SyncGenerator:
     lay in the past or the offset was rewritten while running, no pulse comes any more.
     """
 
-    __slots__ = ("_clock", "cycle", "due", "next", "pulses", "running")
+    __slots__ = ("_clock", "_suspended", "cycle", "due", "next", "pulses", "running")
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
+        self._suspended = False
         self.cycle = 0
         """Period in ns; 0: a single pulse."""
         self.next = 0
@@ -131,10 +144,23 @@ class SyncGenerator:
 
     def schedule(self, t: int) -> None:
         """Find the instant of the next pulse anew; the pulse is lost where the system time has passed it."""
-        if not self.running:
+        if not self.running or self._suspended:
             return
         due = self._clock.instant(self.next)
         self.due = due if due >= t else None
+
+    def suspend(self) -> None:
+        """Let no pulse come, whatever is activated, until `resume`."""
+        self._suspended = True
+        self.due = None
+
+    def resume(self, t: int) -> None:
+        """Let pulses come again from `t` on, in the grid in which they would have come all the time."""
+        self._suspended = False
+        late = self._clock.system(t) - self.next
+        if self.cycle and late >= 0:
+            self.next += (late // self.cycle + 1) * self.cycle
+        self.schedule(t)
 
     def fire(self) -> None:
         """The next pulse has come: count it and find the one after it."""

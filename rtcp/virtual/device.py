@@ -44,6 +44,12 @@ class Device(Protocol):
     """Emergency messages that wait to be sent; the slave's mailbox takes them from the left."""
     supports_dc: bool
 
+    def power_off(self) -> None:
+        """The supply goes: no torque, outputs off, nothing is driven; `step` lets only the mechanics go on."""
+
+    def power_on(self) -> None:
+        """The supply comes back: all is as at power-on, only what is mechanical and what is stored has stayed."""
+
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass: read the RxPDO objects, move, write the TxPDO objects."""
 

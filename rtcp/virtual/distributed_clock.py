@@ -22,7 +22,7 @@ class DistributedClockUnit:
         self._memory = memory
         self.clock = clock
         self.sync0 = SyncGenerator(clock)
-        self._turnaround = turnaround
+        self.turnaround = turnaround
 
     @property
     def cyclic(self) -> bool:
@@ -43,7 +43,7 @@ class DistributedClockUnit:
         """A write to 0x0900 passed at `t`: latch the receive times of the ports and of the processing unit."""
         local = self.clock.local(t)
         self._put(Register.DC_RECEIVE_TIME, local, 4)
-        returned = 0 if self._turnaround is None else local + self._turnaround
+        returned = 0 if self.turnaround is None else local + self.turnaround
         self._put(Register.DC_RECEIVE_TIME + 4, returned, 4)
         self._put(Register.DC_RECEIVE_TIME_UNIT, local, 8)
 

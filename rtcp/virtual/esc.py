@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rtcp.virtual.clock import Clock
 from rtcp.virtual.distributed_clock import DistributedClockUnit
@@ -31,9 +31,11 @@ from rtcp.virtual.syncmanager import SyncManager
 MEMORY_SIZE = REGISTER_SPACE + RAM_SIZE
 ALIAS_ENABLE = 0x01
 """Bit of 0x0103 that lets the alias serve as station address."""
-PORT_0_LINK = 0x0210
-PORT_1_LINK = 0x0820
-PORT_1_CLOSED = 0x0400
+LINK = 0x0010
+"""Bit of the DL status for a physical link at port 0; that of port n is n places further up."""
+LOOP_CLOSED = 0x0100
+COMMUNICATION = 0x0200
+"""Bits of the DL status for port 0: the frame turns round there, or goes on; those of port n are 2n further up."""
 PORTS_2_3_CLOSED = 0x5000
 PDI_RUNS = 0x0001
 WATCHDOG_OK = 0x0002
@@ -45,15 +47,24 @@ def _nothing() -> None:
     return
 
 
+def _dl_status(links: Sequence[bool]) -> int:
+    status = PDI_RUNS | WATCHDOG_OK | PORTS_2_3_CLOSED
+    for port, linked in enumerate(links):
+        status |= LINK << port | COMMUNICATION << 2 * port if linked else LOOP_CLOSED << 2 * port
+    return status
+
+
 class Esc:
     """The memory of one slave controller, read and written by address.
 
     `turnaround` is the time in ns that a frame takes from this slave to the end of the chain and back; None for the
     last slave. `clock` is None for a slave without distributed clocks. Instants `t` are those of the frame's arrival at
-    this slave, in ns of the host's monotonic clock.
+    this slave, in ns of the host's monotonic clock. `links` tells of ports 0 and 1 whether they have a link.
     """
 
-    def __init__(self, eeprom: bytes, clock: Clock | None, turnaround: int | None) -> None:
+    def __init__(
+        self, eeprom: bytes, clock: Clock | None, turnaround: int | None, links: tuple[bool, bool]
+    ) -> None:  # fmt: skip
         self.memory = bytearray(MEMORY_SIZE)
         self.writable = bytearray(REGISTER_SPACE)
         features = FEATURE_SEPARATE_FCS
@@ -68,7 +79,7 @@ class Esc:
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
         self.put(Register.FEATURES, features, 2)
-        self.put(Register.DL_STATUS, self._dl_status(last=turnaround is None), 2)
+        self.put(Register.DL_STATUS, _dl_status(links), 2)
         self.eeprom = EepromInterface(self.memory, self.writable, eeprom)
         self.sync_managers = tuple(SyncManager(n, self.memory, self.writable) for n in range(SM_COUNT))
         self.watchdog_ns = 0
@@ -92,10 +103,25 @@ class Esc:
         self.on_outputs: Callable[[SyncManager, int], None] = lambda manager, t: None
         """Called with the sync manager and the instant when a buffer of outputs is complete."""
 
-    @staticmethod
-    def _dl_status(*, last: bool) -> int:
-        port_1 = PORT_1_CLOSED if last else PORT_1_LINK
-        return PDI_RUNS | WATCHDOG_OK | PORT_0_LINK | port_1 | PORTS_2_3_CLOSED
+    def detach(self) -> None:
+        """Call nobody any more: the supply has gone, another takes this one's place."""
+        self.on_layout = self.on_address = self.on_attention = self.on_event = _nothing
+        self.on_outputs = lambda manager, t: None
+
+    def set_links(self, *links: bool) -> None:
+        """Show which of the ports 0 and 1 have a link now; one that has lost it counts that."""
+        before, after = self.get(Register.DL_STATUS, 2), _dl_status(links)
+        if before == after:
+            return
+        self.put(Register.DL_STATUS, after, 2)
+        for port in range(len(links)):
+            if before & ~after & LINK << port:
+                self.count(Register.LOST_LINKS + port)
+        self.raise_event(EcatEvent.DL_STATUS)
+
+    def count(self, register: int) -> None:
+        """Count an error in a register of one byte, which stops at its end."""
+        self.memory[register] = min(self.memory[register] + 1, 0xFF)
 
     def get(self, register: int, size: int) -> int:
         """An unsigned register of `size` bytes."""
@@ -154,6 +180,8 @@ class Esc:
         data = bytes(self.memory[address:end])
         if address < Register.AL_STATUS + 2 and end > Register.AL_STATUS:
             self._clear_event(EcatEvent.AL_STATUS)
+        if address < Register.DL_STATUS + 2 and end > Register.DL_STATUS:
+            self._clear_event(EcatEvent.DL_STATUS)
         return data
 
     def write(self, address: int, data: bytes, t: int) -> bool:

@@ -129,6 +129,8 @@ class Plan:
     """From the image of inputs into the frame, after all outputs were taken out."""
     counter: int = 0
     """What the copies add to the working counter."""
+    shares: list[tuple[Esc, int]] = field(default_factory=list)
+    """What each slave has in `counter`."""
     written: list[tuple[Esc, SyncManager]] = field(default_factory=list)
     """Buffers that the copies complete."""
     others: list[Esc] = field(default_factory=list)
@@ -211,5 +213,7 @@ def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[
     plan.outputs += outputs
     plan.inputs += inputs
     plan.written += written
-    plan.counter += bool(inputs) + bool(outputs) * (2 if command == Command.LRW else 1)
+    share = bool(inputs) + bool(outputs) * (2 if command == Command.LRW else 1)
+    plan.counter += share
+    plan.shares.append((esc, share))
     return True

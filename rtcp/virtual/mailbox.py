@@ -10,6 +10,7 @@ from rtcp.virtual.coe import ABORT, CoeService, SdoServer, emergency_message
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.objects import ObjectDictionary
 from rtcp.virtual.sdo_info import SdoInformation
+from rtcp.virtual.trouble import Trouble
 
 _HEADER = struct.Struct("<HHBB")
 _ERROR_REPLY = struct.Struct("<HH")
@@ -54,7 +55,12 @@ class Mailbox:
     """The mailbox service of a slave: what the master writes to SM0, and what it finds in SM1."""
 
     def __init__(
-        self, objects: ObjectDictionary, emergencies: deque[Emergency], receive_size: int, send_size: int
+        self,
+        objects: ObjectDictionary,
+        emergencies: deque[Emergency],
+        receive_size: int,
+        send_size: int,
+        trouble: Trouble | None = None,
     ) -> None:
         """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes.
 
@@ -66,14 +72,15 @@ class Mailbox:
                 raise ValueError(f"the {name} mailbox has {size} bytes, allowed are {MINIMUM_SIZE} and more")
         self._emergencies = emergencies
         self._receive_size = receive_size
-        self._sdo = SdoServer(objects, send_size)
+        self._trouble = Trouble() if trouble is None else trouble
+        self._sdo = SdoServer(objects, send_size, self._trouble)
         self._information = SdoInformation(objects, send_size)
-        self._waiting: deque[tuple[MailboxType, int, bytes]] = deque()
+        self._waiting: deque[tuple[MailboxType, int, bytes, int]] = deque()
         self._master_counter = 0
         self._own_counter = 0
 
-    def receive(self, data: bytes, state: int) -> None:
-        """Take what the master wrote to SM0 (the whole buffer); `state` is the AL state, for the access rights.
+    def receive(self, data: bytes, state: int, t: int = 0) -> None:
+        """Take what the master wrote to SM0 (the whole buffer) by instant `t`; `state` decides on access rights.
 
         Malformed messages are answered with a mailbox error; a message with the counter of the one before is the
         master's repetition of it and not answered twice.
@@ -96,23 +103,26 @@ class Mailbox:
         elif channel & 0x3F:
             self._refuse(address, MailboxError.INVALID_CHANNEL)
         else:
-            self._coe(address, bytes(data[_HEADER.size : _HEADER.size + length]), state)
+            self._coe(address, bytes(data[_HEADER.size : _HEADER.size + length]), state, t)
 
-    def pending(self) -> bool:
-        """Return whether a message waits to be put in SM1."""
-        return bool(self._waiting or self._emergencies)
+    def pending(self, t: int = 0) -> bool:
+        """Return whether a message waits to be put in SM1 at instant `t`."""
+        if self._waiting:
+            return self._waiting[0][3] <= t
+        return bool(self._emergencies)
 
-    def next_message(self) -> bytes | None:
+    def next_message(self, t: int = 0) -> bytes | None:
         """Return the next message for SM1, with its mailbox header, at most `send_size` bytes; None when none waits.
 
-        Emergencies go before answers. What follows the message in SM1's buffer has no meaning.
+        Emergencies go before answers, but wait behind one that comes late. What follows the message in SM1's buffer has
+        no meaning.
         """
+        if not self.pending(t):
+            return None
         if self._emergencies:
             kind, address, content = MailboxType.COE, 0, emergency_message(self._emergencies.popleft())
-        elif self._waiting:
-            kind, address, content = self._waiting.popleft()
         else:
-            return None
+            kind, address, content, _ = self._waiting.popleft()
         self._own_counter = self._own_counter % 7 + 1
         return _HEADER.pack(len(content), address, 0, self._own_counter << 4 | kind) + content
 
@@ -125,16 +135,16 @@ class Mailbox:
         self._own_counter = 0
 
     def _refuse(self, address: int, error: MailboxError) -> None:
-        self._waiting.append((MailboxType.ERROR, address, _error(error)))
+        self._waiting.append((MailboxType.ERROR, address, _error(error), 0))
 
-    def _coe(self, address: int, content: bytes, state: int) -> None:
+    def _coe(self, address: int, content: bytes, state: int, t: int) -> None:
         """Serve a CoE message; its header holds a number of 9 bits and above it the service (ETG.1000.6, 5.6.1)."""
         if len(content) < 2:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
             return
         service = content[1] >> 4
         if service == CoeService.SDO_REQUEST:
-            self._sdo_request(address, content, state)
+            self._sdo_request(address, content, state, t)
         elif service == CoeService.SDO_INFORMATION:
             self._sdo_information(address, content)
         elif service in _SERVICES:
@@ -142,7 +152,7 @@ class Mailbox:
         else:
             self._refuse(address, MailboxError.INVALID_HEADER)
 
-    def _sdo_request(self, address: int, content: bytes, state: int) -> None:
+    def _sdo_request(self, address: int, content: bytes, state: int, t: int) -> None:
         if len(content) < SdoServer.MINIMUM_REQUEST:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
             return
@@ -150,14 +160,14 @@ class Mailbox:
         if answer is not None:
             # An abort is a request of the server's to the client (ETG.1000.6, 5.6.2.7): masters tell it by that.
             service = CoeService.SDO_REQUEST if answer[0] == ABORT else CoeService.SDO_RESPONSE
-            self._waiting.append((MailboxType.COE, address, service.header + answer))
+            self._waiting.append((MailboxType.COE, address, service.header + answer, t + self._trouble.sdo_delay()))
 
     def _sdo_information(self, address: int, content: bytes) -> None:
         if len(content) < SdoInformation.MINIMUM_REQUEST:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
             return
         for answer in self._information.answer(content[2:]):
-            self._waiting.append((MailboxType.COE, address, CoeService.SDO_INFORMATION.header + answer))
+            self._waiting.append((MailboxType.COE, address, CoeService.SDO_INFORMATION.header + answer, 0))
 
 
 def _error(error: MailboxError) -> bytes:

@@ -7,39 +7,40 @@ from collections import deque
 from rtcp.virtual.device import Device
 from rtcp.virtual.mailbox import Mailbox
 from rtcp.virtual.syncmanager import SyncManager
+from rtcp.virtual.trouble import Trouble
 
 
 class MailboxService:
     """Carries messages between sync managers and `Mailbox`, and repeats the last one when the master lost it."""
 
-    def __init__(self, device: Device, out: SyncManager, in_: SyncManager) -> None:
+    def __init__(self, device: Device, out: SyncManager, in_: SyncManager, trouble: Trouble) -> None:
         """`out` is SM0, which the master writes, `in_` is SM1, which it reads; both configured by now."""
         self._out = out
         self._in = in_
         device.emergencies.clear()
-        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length)
+        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length, trouble)
         self._outbox: deque[bytes] = deque()
         self._present: bytes | None = None
         self._last: bytes | None = None
 
-    def serve(self, state: int) -> None:
-        """Take what the master wrote, in AL state `state`, and put the next message where it reads."""
+    def serve(self, state: int, t: int) -> None:
+        """Take what the master wrote, in AL state `state` at instant `t`, and put the next message where it reads."""
         if self._out.full:
-            self._mailbox.receive(self._out.take(), state)
+            self._mailbox.receive(self._out.take(), state, t)
         reader = self._in
         if not reader.full and self._present is not None:
             self._last, self._present = self._present, None
         if reader.repeat_wanted:
             self._repeat()
         if not reader.full:
-            message = self._outbox.popleft() if self._outbox else self._mailbox.next_message()
+            message = self._outbox.popleft() if self._outbox else self._mailbox.next_message(t)
             if message is not None:
                 self._present = message
                 reader.put(message)
 
-    def pending(self) -> bool:
-        """Whether a message waits and SM1 has room for it."""
-        return self._mailbox.pending() and not self._in.full
+    def pending(self, t: int) -> bool:
+        """Whether a message waits at instant `t` and SM1 has room for it."""
+        return self._mailbox.pending(t) and not self._in.full
 
     def stop(self) -> None:
         """The slave goes to INIT: forget everything."""

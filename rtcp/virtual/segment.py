@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from rtcp.virtual.chain import Chain
+from rtcp.virtual.registers import Register
 from rtcp.virtual.slave import Slave
-from rtcp.virtual.wire import Wire
+from rtcp.virtual.wire import Miscount, Wire
 
 IDLE_TICK = 1_000_000
 """Longest time in ns between two looks at watchdogs and devices."""
@@ -14,6 +16,8 @@ TOGETHER = 2_000
 """SYNC0 pulses that lie within this many ns are handled at once."""
 REPLAYED_PULSES = 20
 """SYNC0 pulses made up for after the process was stopped; older ones pass unseen."""
+BREATH = 50_000
+"""SYNC0 that comes faster than it can be followed is looked at again after so many ns: frames come first."""
 
 
 class Segment:
@@ -26,12 +30,20 @@ class Segment:
 
     def __init__(self, slaves: Sequence[Slave], t: int) -> None:
         self.slaves = tuple(slaves)
-        self._wire = Wire(slaves)
+        self.chain = Chain(self.slaves)
+        self.miscounts: list[Miscount] = []
+        self.damages: list[tuple[int, Callable[[], bool]]] = []
+        """Cables that damage a frame when the second says so; the cable's number is that of the slave before it."""
         self._attention: list[Slave] = []
         self._waiting: deque[Slave] = deque()
         self._next_tick = t + IDLE_TICK
         self.next_event = t + IDLE_TICK
         """Instant of the next call of `tick` that is needed."""
+        self.rewire()
+
+    def rewire(self) -> None:
+        """Lead frames to the slaves that they reach by now."""
+        self._wire = Wire(self.slaves[: self.chain.reach], self.miscounts)
         for slave in self.slaves:
             slave.esc.on_attention = self._attention_of(slave)
 
@@ -43,8 +55,27 @@ class Segment:
         return call
 
     def process(self, frame: bytearray, size: int, t: int) -> bool:
-        """Answer a frame in place, see `Wire.process`."""
+        """Answer a frame in place, see `Wire.process`; False: nothing comes back of it."""
+        if self.damages or not self._wire.slaves:
+            return self._process_in_trouble(frame, size, t)
         return self._wire.process(frame, size, t)
+
+    def _process_in_trouble(self, frame: bytearray, size: int, t: int) -> bool:
+        """Answer a frame that may not come back, or not come far."""
+        reach = self.chain.reach
+        far = min((cable for cable, strikes in tuple(self.damages) if cable < reach and strikes()), default=reach)
+        if far == reach:
+            return bool(reach) and self._wire.process(frame, size, t)
+        whole, self._wire = self._wire, Wire(self.slaves[:far], self.miscounts, passing=True)
+        self._wire.process(frame, size, t)
+        self.settle(t)
+        self._wire = whole
+        first = self.slaves[far].esc
+        first.count(Register.RX_ERRORS)
+        first.count(Register.RX_ERRORS + 1)
+        for slave in self.slaves[far + 1 : reach]:
+            slave.esc.count(Register.FORWARDED_RX_ERRORS)
+        return False
 
     def settle(self, t: int) -> None:
         """Do what the frames since the last call, the last of which arrived at `t`, asked of the slaves."""
@@ -61,7 +92,7 @@ class Segment:
                 for esc, manager in plan.written:
                     esc.on_outputs(manager, t)
             self._wire.done.clear()
-            for slave in self.slaves:
+            for slave in self._wire.slaves:
                 if not slave.application.by_sync0:
                     slave.application.latch()
                     self._queue(slave, t)
@@ -69,8 +100,12 @@ class Segment:
             asking, self._attention = self._attention, []
             for slave in asking:
                 slave.application.attend(t)
-            self._next_tick = min(self._next_tick, t)
-            self.next_event = self._next_tick
+            self.look_at(t)
+
+    def look_at(self, t: int) -> None:
+        """See to it that a `tick` comes at `t`: something has changed that it has to follow."""
+        self._next_tick = min(self._next_tick, t)
+        self.next_event = min(self.next_event, self._next_tick)
 
     def tick(self, now: int) -> None:
         """Handle every SYNC0 up to `now`, and once a millisecond watchdogs and the devices that no SYNC0 steps."""
@@ -102,12 +137,15 @@ class Segment:
         cycle = sync0.cycle
         if sync0.due is not None and cycle and now - sync0.due > REPLAYED_PULSES * cycle:
             sync0.skip_to(now - REPLAYED_PULSES * cycle)
-        while (due := sync0.due) is not None and due <= now + TOGETHER:
+        for _ in range(REPLAYED_PULSES + 2):
+            due = sync0.due
+            if due is None or due > now + TOGETHER:
+                return due
             sync0.fire()
             if slave.application.by_sync0:
                 slave.application.pulse(now - due < cycle)
                 self._queue(slave, due)
-        return sync0.due
+        return now + BREATH
 
     def _queue(self, slave: Slave, t: int) -> None:
         if slave.queued_until is None:

@@ -9,13 +9,19 @@ import select
 import signal
 import socket
 import struct
+import sys
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 
+from rtcp.config.faults import Planned, load_script
 from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.virtual.faults.book import Book
+from rtcp.virtual.faults.control import Control, control_socket
+from rtcp.virtual.faults.frames import FOR_EVER
+from rtcp.virtual.faults.truth import Truth
 from rtcp.virtual.frame import ETHERTYPE
 from rtcp.virtual.models import create
 from rtcp.virtual.network import NetworkError, private_pair, public_pair
@@ -45,7 +51,8 @@ throttled by the kernel for 50 ms in every second (sched_rt_runtime_us)."""
 LONGEST_REST = 250_000
 SILENCE = 20_000_000
 """Without frames for this many ns polling stops until the next one comes."""
-FOR_EVER = 1 << 63
+LOOK = 1_000_000
+"""The control socket is looked at no more often than once in so many ns."""
 
 Ready = Callable[[dict[str, int | str | bool]], None]
 
@@ -88,23 +95,31 @@ class StopRequest:
 
 
 class Server:
-    """Answers frames on one interface."""
+    """Answers frames on one interface, but for what the faults of its `book` do to them."""
 
-    def __init__(self, segment: Segment, interface: str) -> None:
+    def __init__(self, segment: Segment, interface: str, truth: Truth, script: Sequence[Planned] = ()) -> None:
         self.segment = segment
+        self._truth = truth
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         self._socket.bind((interface, ETHERTYPE))
+        self.book = Book(segment, self._send, time.monotonic_ns(), script, _complain)
 
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
 
-    def serve(self, stop: StopRequest, poll: bool) -> None:
+    def _send(self, frame: bytes | memoryview) -> None:
+        # A full queue of the interface loses the frame, as a cable would.
+        with suppress(BlockingIOError):
+            self._socket.send(frame)
+
+    def serve(self, stop: StopRequest, poll: bool, control: Control | None = None) -> None:
         """Answer frames until `stop` came; with `poll` sleep no longer than it takes not to be throttled."""
-        segment = self.segment
+        segment, book, truth = self.segment, self.book, self._truth
+        frames = book.frames
         frame = bytearray(BUFFER)
         view = memoryview(frame)
         receive, send = self._socket.recvmsg_into, self._socket.send
@@ -112,6 +127,7 @@ class Server:
         monotonic, wait = time.monotonic_ns, select.select
         arrived = 0
         awake_from = 0 if poll else FOR_EVER
+        look_at = FOR_EVER if control is None else 0
         while not stop.came:
             try:
                 size, stamps, _, _ = receive([view], ANCILLARY)
@@ -119,9 +135,10 @@ class Server:
                 size = 0
             if size:
                 before, arrived = arrived, _arrival(stamps)
-                if segment.process(frame, size, arrived):
+                if frames.active:
+                    self._answer_disturbed(frame, size, arrived)
+                elif segment.process(frame, size, arrived):
                     if monotonic() - arrived < STALE:
-                        # A full queue of the interface loses the frame, as a cable would.
                         with suppress(BlockingIOError):
                             send(view[:size])
                     segment.settle(arrived)
@@ -129,15 +146,34 @@ class Server:
                     awake_from = monotonic() + min((arrived - before) // REST_SHARE, LONGEST_REST)
                 continue
             now = monotonic()
-            left = segment.next_event - now
-            if left <= 0:
+            if book.due <= now:
+                book.tick(now)
+            due = segment.next_event
+            if due <= now:
                 segment.tick(now)
+                # At least once in segment.IDLE_TICK, and never before a frame that waits.
+                if control is not None and look_at <= now:
+                    look_at = now + LOOK
+                    control.look()
             elif segment.busy:
                 segment.step_one()
+                if truth.watching:
+                    truth.look(now)
             elif now < awake_from:
-                wait(descriptors, (), (), min(left, awake_from - now) * 1e-9)
+                wait(descriptors, (), (), max(0, min(due, book.due, awake_from) - now) * 1e-9)
             elif now - arrived > SILENCE:
-                wait(descriptors, (), (), left * 1e-9)
+                wait(descriptors, (), (), max(0, min(due, book.due) - now) * 1e-9)
+
+    def _answer_disturbed(self, frame: bytearray, size: int, arrived: int) -> None:
+        """Answer a frame while a fault does something to those that pass."""
+        if self.book.frames.arrives() and self.segment.process(frame, size, arrived):
+            if time.monotonic_ns() - arrived < STALE:
+                self.book.answers(bytes(frame[:size]), arrived)
+            self.segment.settle(arrived)
+
+
+def _complain(sentence: str) -> None:
+    print(sentence, file=sys.stderr, flush=True)
 
 
 def _stamp(data: bytes) -> tuple[int, int]:
@@ -176,26 +212,36 @@ def _prefer() -> None:
     gc.disable()
 
 
-def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, ready: Ready) -> None:
+def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, ready: Ready,
+        control_path: Path | None = None, script_path: Path | None = None) -> None:  # fmt: skip
     """Run a segment until SIGTERM or SIGINT.
 
     `interface` names the master's end in the caller's network; None: everything in a namespace of the segment's own.
     `poll` hardly sleeps while frames come, best with a `cpu` of its own. `ready` is called once with "pid",
-    "interface", "namespace" and "slaves" when frames are answered.
+    "interface", "namespace" and "slaves" when frames are answered. At `control_path` faults can be asked for; those of
+    the script begin by themselves.
 
     Raises:
         ConfigError, ValueError, NetworkError: with sentences for the user.
     """
     config = load_segment(config_path)
+    script = () if script_path is None else load_script(script_path, len(config.slaves))
     if cpu is not None:
         _run_on(cpu)
     segment = make_segment(config, time.monotonic_ns())
     stop = StopRequest()
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
-    pair = private_pair() if interface is None else public_pair(interface)
-    with pair as (master_end, segment_end):
-        server = Server(segment, segment_end)
+    with ExitStack() as kept:
+        listener = None if control_path is None else kept.enter_context(control_socket(control_path))
+        pair = private_pair() if interface is None else public_pair(interface)
+        master_end, segment_end = kept.enter_context(pair)
+        truth = Truth(segment, [slave.model for slave in config.slaves])
+        server = Server(segment, segment_end, truth, script)
+        kept.callback(server.close)
+        control = None if listener is None else Control(listener, server.book, truth)
+        if control is not None:
+            kept.callback(control.close)
         _prefer()
         ready({
             "pid": os.getpid(),
@@ -204,8 +250,6 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
             "slaves": len(segment.slaves),
         })  # fmt: skip
         try:
-            server.serve(stop, poll)
+            server.serve(stop, poll, control)
         except OSError as error:
             raise NetworkError(f"the cable at {master_end} is gone ({error.strerror}): was it removed?") from error
-        finally:
-            server.close()

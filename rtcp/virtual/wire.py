@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from rtcp.virtual.esc import Esc
 from rtcp.virtual.frame import (
     COUNTER,
     DATAGRAM_HEADER,
@@ -20,6 +21,8 @@ from rtcp.virtual.registers import Register
 from rtcp.virtual.slave import Slave
 from rtcp.virtual.syncmanager import SyncManager
 
+MOST_KNOWN = 256
+"""What is worked out for an address is kept for so many of them: what a master may send knows no end."""
 _AUTO = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
 _STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
 _BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
@@ -31,12 +34,18 @@ _READS = frozenset((Command.APRD, Command.APRW, Command.FPRD, Command.FPRW, Comm
 _WRITES = frozenset((Command.APWR, Command.APRW, Command.FPWR, Command.FPRW, Command.BWR, Command.BRW))
 _READ_WRITES = frozenset((Command.APRW, Command.FPRW, Command.BRW))
 
+Miscount = tuple[Slave, Callable[[], bool]]
+"""A slave that does not count itself in the working counter of a logical datagram when the second says so."""
+
 
 class Wire:
     """Answers frames in place. What frames ask of clocks and firmware is noted for `Segment.settle`."""
 
-    def __init__(self, slaves: Sequence[Slave]) -> None:
+    def __init__(self, slaves: Sequence[Slave], miscounts: Sequence[Miscount] = (), passing: bool = False) -> None:
+        """Lead to `slaves`; `miscounts` may change later. A `passing` wire serves one frame beside the lasting one."""
         self.slaves = tuple(slaves)
+        self._miscounts = miscounts
+        self._passing = passing
         self._escs = tuple(slave.esc for slave in slaves)
         self._plans: dict[tuple[int, int, int], Plan] = {}
         self._places: dict[SyncManager, int] = {}
@@ -49,10 +58,13 @@ class Wire:
         """Clocks to steer: the slaves, the time they got (32 bits), the frame's arrival at the first slave."""
         self.done: list[Plan] = []
         """Logical datagrams that completed buffers of outputs, or may have done so."""
+        if passing:
+            return
         for esc in self._escs:
             esc.on_layout = self._plans.clear
             esc.on_address = self._forget_addresses
             esc.on_event = self._collect_events
+        self._collect_events()
 
     def _forget_addresses(self) -> None:
         self._stations.clear()
@@ -115,14 +127,31 @@ class Wire:
         if plan.written or plan.others:
             self.done.append(plan)
         count = plan.counter
+        miscounts = self._miscounts
         if plan.others:
             content = frame[data : data + length]
             for esc in plan.others:
-                count += transfer(esc, command, address, content, t)
+                share = transfer(esc, command, address, content, t)
+                count += share - self._kept_back(esc, share) if miscounts else share
             frame[data : data + length] = content
+        if miscounts:
+            count -= sum(self._kept_back(esc, share) for esc, share in plan.shares)
         return count
 
+    def _kept_back(self, esc: Esc, share: int) -> int:
+        """What a slave does not add to the working counter of its share, on a fault."""
+        if share:
+            for slave, strikes in self._miscounts:
+                if slave.esc is esc and strikes():
+                    return share
+        return 0
+
     def _make_plan(self, command: int, address: int, length: int) -> Plan:
+        if self._passing:
+            # The images belong to the lasting wire.
+            return Plan(others=list(self._escs))
+        if len(self._plans) >= MOST_KNOWN:
+            self._plans.clear()
         if not self._plans:
             self._lay_out_images()
         plan = compile_plan(self._escs, self._places, command, address, length)
@@ -183,6 +212,8 @@ class Wire:
             found = self._stations.get(address)
             if found is None:
                 found = tuple(slave for slave in self.slaves if slave.esc.answers_to(address))
+                if len(self._stations) >= MOST_KNOWN:
+                    self._stations.clear()
                 self._stations[address] = found
             return found
         return ()
@@ -232,5 +263,7 @@ class Wire:
             elif slave.clock is not None or not steering:
                 writers.append(slave)
         groups.append((writers, None))
+        if len(self._orders) >= MOST_KNOWN:
+            self._orders.clear()
         self._orders[key] = groups
         return groups

@@ -49,6 +49,13 @@ class TinyDevice:
         self.steps += 1
         self.in_.value = (int(self.out.value) + 1) & 0xFFFF
 
+    def power_off(self) -> None:
+        self.valid.append(False)
+        self.out.value = 0
+
+    def power_on(self) -> None:
+        self.in_.value = 0
+
     def set_outputs_valid(self, valid: bool) -> None:
         self.valid.append(valid)
         if not valid:

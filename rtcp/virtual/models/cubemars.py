@@ -8,6 +8,7 @@ from math import ceil
 from rtcp.virtual.device import Emergency, Identity
 from rtcp.virtual.models.axis import Axis
 from rtcp.virtual.models.cia402 import STATE_BITS, State, StateMachine, Status
+from rtcp.virtual.models.defaults import Defaults
 from rtcp.virtual.models.drive_objects import UNIT, build_objects
 from rtcp.virtual.models.feedback import ErrorLog, Feedback
 from rtcp.virtual.models.mechanics import SIZES, Mechanics
@@ -66,10 +67,6 @@ class CubemarsDrive:
             VENDOR_ID, PRODUCT_CODE, REVISION, int(value("serial")), f"Cubemars {actuator.name}",
             "Servo drives", f"Cubemars-{actuator.name}",
         )  # fmt: skip
-        self.objects = objects = build_objects(self.identity, actuator)
-        self._feedback = Feedback(objects, actuator.rated_torque)
-        self._errors = ErrorLog(objects)
-        self.emergencies: deque[Emergency] = self._errors.emergencies
         self.mechanics = Mechanics(
             actuator.rotor_inertia + value("load_inertia", actuator.load_inertia),
             value("friction", actuator.coulomb),
@@ -82,6 +79,26 @@ class CubemarsDrive:
         self.condition = Condition(actuator, value("temperature"), value("bus_voltage"))
         self.axis = Axis(self.mechanics)
         self._actuator = actuator
+        self._lasting: list[int] = []
+        """Faults whose cause lasts, made from outside."""
+        self.objects = objects = build_objects(self.identity, actuator)
+        self._feedback = Feedback(objects, actuator.rated_torque)
+        self._errors = ErrorLog(objects)
+        self.emergencies: deque[Emergency] = self._errors.emergencies
+        self._bind()
+        define_pdo_objects(objects, {0x1600: RX_PDO}, {0x1A00: TX_PDO}, [0x1600], [0x1A00], fixed=False)
+        self._defaults = Defaults(objects)
+        self.power_on()
+
+    def power_on(self) -> None:
+        """The supply comes back: all is as at power-on. The joint stands where it stands; its encoder is absolute."""
+        objects = self.objects
+        self._defaults.restore()
+        self.emergencies.clear()
+        self.condition.overload = 0.0
+        self.axis.offset = self.axis.torque_limit = 0.0
+        self.axis.synchronise()
+        self._supplied = True
         self._machine = StateMachine()
         self._stop = Stop(self.axis)
         self._profile = Profile(objects)
@@ -106,8 +123,6 @@ class CubemarsDrive:
         self._following_time = 0.0
         self._torque_counts = -1
         self._bits = 0
-        self._bind()
-        define_pdo_objects(objects, {0x1600: RX_PDO}, {0x1A00: TX_PDO}, [0x1600], [0x1A00], fixed=False)
         self._report_condition()
         self._feedback.publish(self._bits, self.axis, 0.0)
 
@@ -138,6 +153,12 @@ class CubemarsDrive:
         """Whether the power stage is on and the brake open."""
         return self._motion is not None
 
+    def power_off(self) -> None:
+        """The supply goes: no torque, the brake closes."""
+        self._supplied = False
+        self._outputs_valid = False
+        self._switch_off(State.NOT_READY_TO_SWITCH_ON)
+
     def set_outputs_valid(self, valid: bool) -> None:
         """Tell that process data outputs have become valid (OP) or must be ignored; then the controlword counts as 0.
 
@@ -158,9 +179,22 @@ class CubemarsDrive:
             raise ValueError(f"error code 0x{code:X} is none: allowed are 0x1000 to 0xFFFF (CiA 402-2)")
         self._fail(code)
 
+    def begin_fault(self, code: int) -> None:
+        """Let the fault `code` happen now, and its cause last until `end_fault`: no fault reset succeeds."""
+        self._lasting.append(code)
+        if self._supplied and self._machine.state is not State.NOT_READY_TO_SWITCH_ON:
+            self._fail(code)
+
+    def end_fault(self, code: int) -> None:
+        """Let the cause of a fault be gone: from now on a fault reset succeeds."""
+        self._lasting.remove(code)
+
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass: obey the RxPDO objects, move, write the TxPDO objects."""
         if dt <= 0.0:
+            return
+        if not self._supplied:
+            self._stand(dt)
             return
         controlword = self._controlword.value if self._outputs_valid else 0
         if self._busy or controlword != self._last_controlword:
@@ -204,6 +238,12 @@ class CubemarsDrive:
             bits = 0
         self._feedback.publish(self._bits | bits, axis, following)
 
+    def _stand(self, dt: float) -> None:
+        """Without supply only the mechanics go on."""
+        count = ceil(dt / _LONGEST)
+        for _ in range(count):
+            self.axis.rest(dt / count)
+
     def _protect(self, dt: float) -> None:
         mechanics = self.mechanics
         fastest = self._max_speed.value * UNIT
@@ -245,6 +285,8 @@ class CubemarsDrive:
             self._self_test -= dt
             if self._self_test <= 0.0:
                 self._enter(State.SWITCH_ON_DISABLED)
+                if self._lasting:
+                    self._fail(self._lasting[-1])
         elif before is State.FAULT_REACTION_ACTIVE:
             if self._motion is None or self._stop.done:
                 self._switch_off(State.FAULT)
@@ -351,6 +393,9 @@ class CubemarsDrive:
     def _reset(self) -> None:
         """Transition 15, refused for as long as what caused the fault lasts (CiA 402-2, transition 15)."""
         mechanics = self.mechanics
+        if self._lasting:
+            self._errors.add(self._lasting[-1])
+            return
         if self.condition.fault() or abs(mechanics.position) > ENCODER_RANGE:
             return
         if abs(mechanics.velocity) > self._max_speed.value * UNIT:

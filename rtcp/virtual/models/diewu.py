@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from rtcp.virtual.device import Emergency, Identity
+from rtcp.virtual.models.defaults import Defaults
 from rtcp.virtual.models.number import number
 from rtcp.virtual.models.options import IO_BOX_OPTIONS, read_options
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, Value
@@ -40,11 +41,12 @@ class DiewuIoBox:
             VENDOR_ID, PRODUCT_CODE, REVISION, serial, "DIEWU 16DI16DO", "Digital IO", "DIEWU-16DI16DO"
         )
         self.counter_rate = chosen["counter_rate"] or 0.0
-        self.emergencies: deque[Emergency] = deque()
         self._inputs = int(chosen["inputs"] or 0)
+        self._turned = 0.0
+        self._broken: list[BrokenTerminals] = []
+        self.emergencies: deque[Emergency] = deque()
         self.objects = objects = _build_objects(self.identity, self._inputs)
         self._outputs_valid = False
-        self._turned = 0.0
         self._input_entry = number(objects, 0x6000, 1)
         self._counter_entry = number(objects, 0x6010, 1)
         self._output_entry = number(objects, 0x7000, 1)
@@ -62,6 +64,12 @@ class DiewuIoBox:
             [0x1A00],
             fixed=True,
         )
+        self._defaults = Defaults(objects)
+
+    def power_on(self) -> None:
+        """The supply comes back: all is as at power-on."""
+        self._defaults.restore()
+        self._held_s = 0.0
 
     @property
     def inputs(self) -> int:
@@ -90,6 +98,18 @@ class DiewuIoBox:
         """Turn the AB encoder by so many edges, negative for backwards; whole ones are counted by the next step."""
         self._turned += edges
 
+    def break_terminals(self, broken: BrokenTerminals) -> None:
+        """Let input terminals show something else than the world, whatever is forced over the bus, until `mend`."""
+        self._broken.append(broken)
+
+    def mend_terminals(self, broken: BrokenTerminals) -> None:
+        """Let them show the world again."""
+        self._broken.remove(broken)
+
+    def power_off(self) -> None:
+        """The supply goes: the outputs are off."""
+        self.set_outputs_valid(False)
+
     def set_outputs_valid(self, valid: bool) -> None:
         """Tell that the outputs in the process data count (OP) or must be 0 (the safe state)."""
         self._outputs_valid = valid
@@ -104,7 +124,10 @@ class DiewuIoBox:
                 # Nobody has said it again: a stick that stays deflected for ever is the known accident.
                 self._mask_entry.value = 0
         mask = self._mask_entry.value
-        self._input_entry.value = self._inputs & ~mask | self._levels_entry.value & mask
+        levels = self._inputs & ~mask | self._levels_entry.value & mask
+        for broken in self._broken:
+            levels = broken.shown(levels, dt)
+        self._input_entry.value = levels
         turned = self._turned + self.counter_rate * dt
         if turned:
             whole = int(turned)
@@ -116,6 +139,25 @@ class DiewuIoBox:
 
     def _preset(self, _: Entry, value: Value) -> None:
         self._counter_entry.value = int(value)
+
+
+class BrokenTerminals:
+    """Input terminals, the bits of `mask`, that show `levels`; with a `half_period` (s) they turn over after each."""
+
+    def __init__(self, mask: int, levels: int, half_period: float = 0.0) -> None:
+        self._mask = mask
+        self._levels = levels & mask
+        self._half_period = half_period
+        self._passed = 0.0
+
+    def shown(self, levels: int, dt: float) -> int:
+        """Let `dt` seconds pass and return what the inputs show while `levels` are true."""
+        own = self._levels
+        if self._half_period:
+            self._passed += dt
+            if self._passed // self._half_period % 2:
+                own ^= self._mask
+        return levels & ~self._mask | own
 
 
 def _build_objects(identity: Identity, inputs: int) -> ObjectDictionary:

@@ -14,6 +14,7 @@ OVER_VOLTAGE = 0x3210
 UNDER_VOLTAGE = 0x3220
 OVER_TEMPERATURE = 0x4310
 COMMUNICATION = 0x8130
+ENCODER = 0x7305
 OVER_SPEED = 0x8400
 FOLLOWING_ERROR = 0x8611
 POSITION_RANGE = 0x8612
@@ -36,6 +37,7 @@ FAULTS = MappingProxyType({
     # EtherCAT has no life guarding of CANopen's; its watchdog is the sync manager's, and this code says the same:
     # the master's cyclic sign of life is missing. 0x7510 would be a fault of a serial interface inside the drive.
     COMMUNICATION: Fault("life guard: outputs became invalid while the drive was enabled", 0x11),
+    ENCODER: Fault("encoder: the position is unknown, no ramp can be kept", 0x21, at_once=True),
     OVER_SPEED: Fault("over-speed", 0x21),
     FOLLOWING_ERROR: Fault("following error", 0x21),
     POSITION_RANGE: Fault("position outside the range of the encoder", 0x21),

@@ -351,10 +351,10 @@ def test_the_fault_reaction_is_the_one_chosen(drive: Maker, option: int, expecte
     bench[0x605E] = option
     bench[0x60FF] = 10000
     bench.run(0.5)
-    bench.drive.inject_fault(0x7305)
+    bench.drive.inject_fault(0x7121)
     took = bench.until(lambda: abs(bench.velocity) < 0.005, 1.0)
     assert took == pytest.approx(expected, abs=0.06)
-    bench.expect_fault(0x7305, 0x20)
+    bench.expect_fault(0x7121, 0x20)
 
 
 def test_a_code_that_is_no_error_cannot_be_injected(drive: Maker) -> None:

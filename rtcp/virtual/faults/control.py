@@ -1,0 +1,204 @@
+"""The control socket of a segment: faults begun and mended, and questions, by other processes while it runs.
+
+A Unix socket of packets, one JSON object each: `{"do": "fault", "fault": {...}}` is answered by `{"ok": true, "result":
+...}` or by `{"ok": false, "error": "a sentence"}`. Frames come first: nothing here waits for a client.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import stat
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from rtcp.config.checking import shown, unknown_key
+from rtcp.config.document import dotted
+from rtcp.config.faults import FAULTS, parse
+from rtcp.runtime.paths import listens
+from rtcp.virtual.faults.book import Book
+from rtcp.virtual.faults.slaves import FaultRefused
+from rtcp.virtual.faults.truth import Truth
+
+LONGEST_REQUEST = 1024
+MOST_KEYS = 10
+"""What is read between two frames is short: no sentence takes long to find."""
+MOST_CLIENTS = 16
+"""When another comes, the one that has been silent longest has to go."""
+BACKLOG = 16
+
+
+@contextmanager
+def control_socket(path: Path) -> Iterator[socket.socket]:
+    """Listen at `path`, for this user alone; the file is removed at the end. One that nobody listens at is replaced.
+
+    Raises:
+        ValueError: the path is in use, of something else, or cannot be made; the message is a sentence.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
+        listener.setblocking(False)
+        _make_room(path)
+        before = os.umask(0o177)
+        try:
+            listener.bind(str(path))
+            listener.listen(BACKLOG)
+        except OSError as error:
+            raise ValueError(f"the control socket {path} cannot be made: {error.strerror or error}") from error
+        finally:
+            os.umask(before)
+        try:
+            yield listener
+        finally:
+            with suppress(OSError):
+                path.unlink()
+
+
+def _make_room(path: Path) -> None:
+    try:
+        if not stat.S_ISSOCK(path.lstat().st_mode):
+            raise ValueError(f"the control socket {path} cannot be made: there is a file that is no socket")
+        if listens(path):
+            raise ValueError(f"the control socket {path} is in use by a segment that runs: choose another path")
+        path.unlink()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise ValueError(f"the control socket {path} cannot be made: {error.strerror or error}") from error
+
+
+class Control:
+    """Answers one request a look, so that a client that floods takes no more of the time than one that asks."""
+
+    def __init__(self, listener: socket.socket, book: Book, truth: Truth) -> None:
+        self._listener = listener
+        self._book = book
+        self._truth = truth
+        self._clients: dict[int, socket.socket] = {}
+        self._epoll = select.epoll()
+        self._epoll.register(listener, select.EPOLLIN)
+        self._verbs: MappingProxyType[str, Callable[[dict[str, Any], int], Any]] = MappingProxyType({
+            "fault": self._fault, "mend": self._mend, "faults": self._faults, "truth": self._tell_truth,
+            "clear_peaks": self._clear_peaks,
+        })  # fmt: skip
+        for name in FAULTS:
+            # What a kind allows is worked out when it is first named, which takes longer than a frame may wait.
+            parse({"fault": name})
+
+    def close(self) -> None:
+        """Let all clients go."""
+        self._epoll.close()
+        for client in self._clients.values():
+            client.close()
+
+    def look(self) -> None:
+        """Take a new client, or answer one request, where there is one."""
+        for descriptor, _ in self._epoll.poll(0, 1):
+            client = self._clients.get(descriptor)
+            if client is None:
+                self._accept()
+            else:
+                self._serve(client)
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:
+            return  # it has gone already
+        client.setblocking(False)
+        if len(self._clients) >= MOST_CLIENTS:
+            self._dismiss(next(iter(self._clients.values())))
+        self._clients[client.fileno()] = client
+        self._epoll.register(client, select.EPOLLIN)
+
+    def _serve(self, client: socket.socket) -> None:
+        try:
+            packet = client.recv(LONGEST_REQUEST + 1)
+        except BlockingIOError:
+            return
+        except OSError:
+            packet = b""
+        if not packet or not self._send(client, self._answer(packet)):
+            self._dismiss(client)
+            return
+        # The one that has been silent longest stands first.
+        self._clients[client.fileno()] = self._clients.pop(client.fileno())
+
+    def _dismiss(self, client: socket.socket) -> None:
+        del self._clients[client.fileno()]
+        self._epoll.unregister(client)
+        client.close()
+
+    @staticmethod
+    def _send(client: socket.socket, answer: dict[str, Any]) -> bool:
+        """Send an answer; False to a client that does not fetch its answers, or has gone."""
+        try:
+            client.send(json.dumps(answer).encode(), socket.MSG_NOSIGNAL)
+        except OSError:
+            return False
+        return True
+
+    def _answer(self, packet: bytes) -> dict[str, Any]:
+        try:
+            request = _request(packet)
+            verb = request.pop("do", None)
+            if not isinstance(verb, str) or verb not in self._verbs:
+                raise FaultRefused(f"do: found {shown(verb)}, allowed is one of {', '.join(self._verbs)}")
+            return {"ok": True, "result": self._verbs[verb](request, time.monotonic_ns())}
+        except FaultRefused as refusal:
+            return {"ok": False, "error": str(refusal)}
+
+    def _fault(self, request: dict[str, Any], now: int) -> dict[str, int]:
+        _only(request, "fault")
+        mapping = request.get("fault")
+        if isinstance(mapping, dict) and len(mapping) > MOST_KEYS:
+            raise FaultRefused(f"a fault has at most {MOST_KEYS} keys, found {len(mapping)}")
+        planned, findings = parse(mapping)
+        if planned is None:
+            raise FaultRefused("; ".join(f"{dotted(where)}{': ' if where else ''}{text}" for where, text in findings))
+        if planned.at:
+            raise FaultRefused("at: a fault that is asked for begins at once; only a script has times")
+        return {"id": self._book.begin(planned, now)}
+
+    def _mend(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
+        _only(request, "id")
+        number = request.get("id")
+        if number is not None and type(number) is not int:
+            raise FaultRefused(f"id: found {shown(number)}, allowed is the number of a fault, or none for all")
+        return {"mended": self._book.mend(number, now)}
+
+    def _faults(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
+        _only(request)
+        return self._book.listing(now)
+
+    def _tell_truth(self, request: dict[str, Any], now: int) -> dict[str, Any]:
+        _only(request)
+        return self._truth.answer(now)
+
+    def _clear_peaks(self, request: dict[str, Any], now: int) -> dict[str, Any]:
+        _only(request)
+        self._truth.clear_peaks()
+        return {}
+
+
+def _request(packet: bytes) -> dict[str, Any]:
+    if len(packet) > LONGEST_REQUEST:
+        raise FaultRefused(f"a request has at most {LONGEST_REQUEST} bytes")
+    try:
+        request = json.loads(packet)
+    except (ValueError, RecursionError) as error:
+        raise FaultRefused("a request is one JSON object in UTF-8, and this is none") from error
+    if not isinstance(request, dict):
+        raise FaultRefused(f"found {shown(request)}, allowed is an object with the key do")
+    return request
+
+
+def _only(request: dict[str, Any], *known: str) -> None:
+    for key in request:
+        if key not in known:
+            raise FaultRefused(f"{key}: {unknown_key(key, ['do', *known])}")

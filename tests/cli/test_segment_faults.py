@@ -1,0 +1,185 @@
+"""`rtcp segment fault`, `mend`, `faults` and `kinds` on a real segment that `rtcp segment` runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.cli.segment_view import kinds
+from rtcp.config.faults import FAULTS, load_script
+
+PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
+Rtcp = Callable[..., Any]
+Segment = tuple["subprocess.Popen[str]", list[str]]
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Path:
+    path = tmp_path / "segment.yaml"
+    path.write_text("slaves:\n  - model: diewu-io\n  - model: cubemars-orh70\n")
+    return path
+
+
+@pytest.fixture
+def begin(rtcp_process: Callable[..., Any], config: Path) -> Callable[..., Segment]:
+    """Start `rtcp segment`; return its process and what it said."""
+
+    def start(*options: str, **more: Any) -> Segment:
+        process = rtcp_process("segment", "--config", str(config), *options, **more)
+        said = []
+        while not said or said[-1] != "Ctrl-C ends it\n":
+            said.append(process.stdout.readline())
+            assert said[-1], process.stderr.read()
+        return process, said
+
+    return start
+
+
+def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
+    rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
+) -> None:
+    process, said = begin()
+    assert f"faults are made by `rtcp segment fault NAME`: control socket {directory / 'segment.sock'}\n" in said
+
+    made = rtcp("segment", "fault", "cable", "after=1")
+    assert (made.code, made.err) == (0, "")
+    assert made.out == "fault 1: cable after=1, until it is mended; to mend it: rtcp segment mend 1\n"
+    assert rtcp("segment", "fault", "sdo_abort", "slave=2", "code=0x06090030", "--lasts", "60").out == (
+        "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to mend it: rtcp segment mend 2\n"
+    )
+    assert "until its burst has passed" in rtcp("segment", "fault", "loss", "burst=5").out
+    assert rtcp("segment", "fault", "clock_jump", "slave=2", "us=-50.5").out == (
+        "fault 4: clock_jump slave=2 us=-50.5: it has happened\n"
+    )
+
+    listed = json.loads(rtcp("segment", "faults", "--json").out)
+    assert [(each["id"], each["fault"]["fault"]) for each in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
+    lines = rtcp("segment", "faults").out.splitlines()
+    assert re.fullmatch(r"fault 1: cable after=1, for \d+\.\d s, until it is mended", lines[0])
+    assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s to come", lines[1])
+    assert lines[2].endswith("0 lost before, 0 lost behind")
+
+    assert rtcp("segment", "mend", "1").out == "mended: fault 1\n"
+    assert rtcp("segment", "mend").out == "mended: fault 2, fault 3\n"
+    assert rtcp("segment", "mend").out == rtcp("segment", "faults").out == "no fault is active\n"
+
+    refused = rtcp("segment", "fault", "drive", "slave=1", "error=encoder")
+    assert refused.code == 3
+    assert "is no drive" in refused.trouble
+    again = rtcp("segment", "mend", "1")
+    assert (again.code, again.trouble) == (3, "rtcp: fault 1 is not active any more")
+
+    process.terminate()
+    assert (process.communicate(), process.returncode) == (("ended\n", ""), 0)
+    assert not (directory / "segment.sock").exists()
+
+
+def test_a_second_segment_has_a_socket_of_its_own_and_has_to_be_chosen(
+    rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
+) -> None:
+    begin()
+    second, said = begin()
+    own = directory / f"segment-{second.pid}.sock"
+    assert f"faults are made by `rtcp segment fault NAME --segment {own}`: control socket {own}\n" in said
+
+    unclear = rtcp("segment", "faults")
+    assert unclear.code == 2
+    assert f"--segment {directory / 'segment.sock'} or {own}" in unclear.trouble
+    made = rtcp("segment", "fault", "cable", "after=1", "--segment", str(own))
+    assert made.out.endswith(f"to mend it: rtcp segment mend 1 --segment {own}\n")
+    assert len(json.loads(rtcp("segment", "faults", "--json", "--segment", str(own)).out)) == 1
+    assert json.loads(rtcp("segment", "faults", "--json", "--segment", str(directory / "segment.sock")).out) == []
+
+
+def test_where_the_runtime_directory_cannot_be_made_the_socket_is_elsewhere(
+    rtcp: Rtcp, begin: Callable[..., Segment], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path / "file" / "run"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    process, _ = begin()
+    own = tmp_path / f"rtcp-segment-{process.pid}.sock"
+    assert rtcp("segment", "faults", "--segment", str(own)).out == "no fault is active\n"
+
+
+@pytest.mark.parametrize("command", [("fault", "cable", "after=1"), ("mend",), ("mend", "3"), ("faults",)])
+def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: Path, command: tuple[str, ...]) -> None:
+    ended = rtcp("segment", *command)
+    assert ended.code == 4
+    assert ended.trouble == f"rtcp: no virtual segment is running: nothing listens at {directory / 'segment.sock'}"
+    ended = rtcp("segment", *command, "--segment", str(directory / "x.sock"))
+    assert ended.code == 4
+    assert f"no segment answers at {directory / 'x.sock'}" in ended.trouble
+
+
+@pytest.mark.parametrize(
+    ("command", "sentence"),
+    [
+        (("fault", "cabel", "after=1"), "fault: this fault is not known here; did you mean cable?"),
+        (("fault", "cable"), "the key after is missing; it must be an integer from 0 to 254"),
+        (("fault", "cable", "after"), "'after' is no KEY=VALUE, as after=3 or code=0x1A"),
+        (("fault", "cable", "=3"), "'=3' is no KEY=VALUE"),
+        (("fault", "cable", "after=1.5"), "after: found 1.5, allowed is an integer from 0 to 254"),
+        (("fault", "cable", "after=1_0"), 'after: found the text "1_0", allowed is an integer'),
+        (("fault", "cable", "after=0xFFFF"), "after: found 65535, allowed is an integer"),
+        (("fault", "cable", "after=1", "after=2"), "after stands twice"),
+        (("fault", "cable", "after=1", "lasts=2", "--lasts", "2"), "lasts stands twice"),
+        (("fault", "cable", "after=1", "--lasts", "-1"), "lasts: found -1.0, allowed is a number from 0.001"),
+        (("fault", "cable", "after=1", "--lasts", "nan"), "lasts: found nan"),
+        (("fault", "cable", "after=1", "at=3"), "at: a fault that is asked for begins at once"),
+        (("fault", "cable", "after=1", "fault=power"), "fault stands twice"),
+        (("fault", "loss"), "give either rate"),
+        (("fault", "loss", "rate=nan"), "rate: "),
+        (("fault", "loss", "rate=inf"), "rate: "),
+        (("fault", "clock_jump", "slave=1", "us=3", "--lasts", "1"), "clock_jump happens once and is over"),
+        (("--config", "x.yaml", "faults"), "--config is an option of a segment that starts, not of faults"),
+        ((), "--config FILE is missing"),
+        (("mend", "x"), "unable to parse string as an integer"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_a_sentence_and_exit_code_2(rtcp: Rtcp, command: tuple[str, ...], sentence: str) -> None:
+    ended = rtcp("segment", *command)
+    assert (ended.code, ended.out) == (2, "")
+    assert sentence in ended.trouble
+    assert "Traceback" not in ended.err
+
+
+def test_a_script_is_read_before_the_segment_starts(rtcp: Rtcp, config: Path, tmp_path: Path) -> None:
+    script = tmp_path / "script.yaml"
+    script.write_text("faults:\n  - fault: power\n    slave: 3\n    at: 2\n")
+    ended = rtcp("segment", "--config", str(config), "--faults", str(script))
+    assert (ended.code, ended.out) == (2, "")
+    assert f"{script}:3: faults[0].slave: found 3, the segment has 2 slaves" in ended.trouble
+
+
+# -- the kinds ------------------------------------------------------------------------------------------------------
+
+
+def test_the_kinds_are_listed_with_their_keys_and_what_is_allowed(rtcp: Rtcp) -> None:
+    lines = rtcp("segment", "kinds").out.splitlines()
+    assert [line.partition(":")[0] for line in lines if line[:1].islower()] == list(FAULTS)
+    assert "    ms        a number greater than 0 and at most 1000 (2 if left out)" in lines
+    assert "    code      an integer from 1 to 65535 (0x0001 if left out)" in lines
+
+
+def test_the_page_lists_the_kinds_as_the_code_has_them() -> None:
+    rows = [
+        f"| `{kind.name}` | {'; '.join(f'`{key}`: {allowed}' for key, allowed in kind.keys.items())} | {kind.says} |"
+        for kind in kinds()
+    ]
+    found = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
+    assert [row for row in rows if row not in found] == []
+
+
+def test_the_script_of_the_page_is_one(tmp_path: Path) -> None:
+    written = re.search(r"```yaml\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    assert written is not None
+    script = tmp_path / "script.yaml"
+    script.write_text(written[1])
+    assert len(load_script(script)) >= 3

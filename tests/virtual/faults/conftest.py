@@ -1,0 +1,106 @@
+"""A segment in a process of its own with its control socket, and raw frames over its cable."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from rtcp.virtual.faults.client import SegmentClient
+
+ROOT = Path(__file__).parents[3]
+CHILD = Path(__file__).with_name("raw_child.py")
+
+
+class Running(NamedTuple):
+    """A segment that runs: its process and its control socket."""
+
+    process: subprocess.Popen[str]
+    control: Path
+
+    def client(self) -> SegmentClient:
+        return SegmentClient(self.control)
+
+
+class Traffic(NamedTuple):
+    """When frames were sent, and what came when; ns."""
+
+    sent: list[int]
+    came: list[tuple[int, bytes]]
+
+
+Exchange = Callable[..., Traffic]
+BeginSegment = Callable[..., "subprocess.Popen[str]"]
+
+
+def start(config: Path, *options: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rtcp.virtual", "--config", str(config), *options],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def three_slaves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a segment: an IO box and two drives."""
+    path = tmp_path_factory.mktemp("segment") / "segment.yaml"
+    models = ("diewu-io", "cubemars-orh70", "cubemars-orh40")
+    path.write_text("slaves:\n" + "".join(f"  - {{model: {model}}}\n" for model in models), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def begin_segment(three_slaves: Path) -> Iterator[BeginSegment]:
+    """Start a segment of these slaves, or of those of another file, with some options."""
+    started: list[subprocess.Popen[str]] = []
+
+    def begin(*options: str, config: Path = three_slaves) -> subprocess.Popen[str]:
+        started.append(start(config, *options))
+        return started[-1]
+
+    yield begin
+    for process in started:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
+    """One segment for all tests of a file; what one of them breaks it mends."""
+    control = tmp_path_factory.mktemp("control") / "segment.sock"
+    process = start(three_slaves, "--control", str(control))
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        yield Running(process, control)
+        process.terminate()
+        assert (process.communicate()[1], process.returncode) == ("", 0)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def exchange(segment: Running) -> Iterator[Exchange]:
+    """Send frames one after the other, wait for `patience_s` after the last; return what came."""
+    with subprocess.Popen(
+        [sys.executable, str(CHILD), str(segment.process.pid), "ecat0"],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    ) as child:  # fmt: skip
+        assert child.stdin is not None
+        assert child.stdout is not None
+
+        def send(frames: Sequence[bytes], gap_s: float = 0.001, patience_s: float = 0.05) -> Traffic:
+            asked = {"frames": [frame.hex() for frame in frames], "gap_s": gap_s, "patience_s": patience_s}
+            child.stdin.write(json.dumps(asked) + "\n")
+            child.stdin.flush()
+            told = json.loads(child.stdout.readline())
+            return Traffic(told["sent"], [(at, bytes.fromhex(frame)) for at, frame in told["came"]])
+
+        yield send
+        child.stdin.close()

@@ -1,0 +1,58 @@
+"""Sends frames to a segment as they are and tells what comes, in a process of its own.
+
+    python raw_child.py PID INTERFACE
+
+joins the namespaces of process PID; answers each line of JSON, `{"frames": [hex], "gap_s": s, "patience_s": s}`, with
+one: `{"sent": [ns], "came": [[ns, hex]]}` (CLOCK_MONOTONIC).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import select
+import socket
+import sys
+import time
+
+EVERYTHING = 0x0003
+OUTGOING = 4
+
+
+def join(pid: str) -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    for kind in ("user", "net"):
+        if os.stat(f"/proc/{pid}/ns/{kind}").st_ino == os.stat(f"/proc/self/ns/{kind}").st_ino:
+            continue
+        with open(f"/proc/{pid}/ns/{kind}", "rb") as namespace:
+            if libc.setns(namespace.fileno(), 0):
+                raise OSError(ctypes.get_errno(), f"cannot join the {kind} namespace")
+
+
+def collect(raw: socket.socket, until: int, came: list[tuple[int, str]]) -> None:
+    while (left := until - time.monotonic_ns()) > 0:
+        if select.select([raw], [], [], left * 1e-9)[0]:
+            frame, address = raw.recvfrom(2048)
+            if address[2] != OUTGOING:
+                came.append((time.monotonic_ns(), frame.hex()))
+
+
+def main() -> None:
+    join(sys.argv[1])
+    with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(EVERYTHING)) as raw:
+        raw.bind((sys.argv[2], EVERYTHING))
+        for line in sys.stdin:
+            asked = json.loads(line)
+            came: list[tuple[int, str]] = []
+            sent = []
+            for frame in asked["frames"]:
+                sent.append(time.monotonic_ns())
+                raw.send(bytes.fromhex(frame))
+                collect(raw, time.monotonic_ns() + round(asked["gap_s"] * 1e9), came)
+            collect(raw, time.monotonic_ns() + round(asked["patience_s"] * 1e9), came)
+            print(json.dumps({"sent": sent, "came": came}), flush=True)
+
+
+if __name__ == "__main__":
+    main()

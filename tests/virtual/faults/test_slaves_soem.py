@@ -1,0 +1,56 @@
+"""Faults under a real master over a real cable."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[3]
+CHILD = Path(__file__).with_name("soem_recovery_child.py")
+
+
+def test_a_real_master_sees_each_fault_and_brings_all_back_after_a_broken_cable_and_a_loss_of_supply(
+    tmp_path: Path,
+) -> None:
+    config, control = tmp_path / "segment.yaml", tmp_path / "control"
+    slaves = "".join(f"  - {{model: {model}}}\n" for model in ["diewu-io", *["cubemars-orh70"] * 6])
+    config.write_text("slaves:\n" + slaves, encoding="utf-8")
+    segment = subprocess.Popen(
+        [sys.executable, "-m", "rtcp.virtual", "--config", str(config), "--control", str(control)],
+        stdout=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+    try:
+        assert segment.stdout is not None
+        ready = json.loads(segment.stdout.readline())
+        done = subprocess.run(
+            [sys.executable, str(CHILD), str(ready["pid"]), ready["interface"], str(control)],
+            stdout=subprocess.PIPE, text=True, check=True, cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )  # fmt: skip
+    finally:
+        segment.kill()
+        segment.communicate()
+    found = json.loads(done.stdout)
+    assert (found["slaves"], found["op"]) == (7, 8)
+    # A frame that this machine delays beyond the master's patience (-1) is no wrong counter.
+    assert {*found["broken"]} <= {9, -1}
+    assert 9 in found["broken"]
+    assert found["links"] == [3, 3, 1]
+    assert found["watched"] == [True] * 3 + [False] * 4
+    assert found["lost_links"] == [0, 0, 0x0100, 0x0001, 0, 0, 0]
+    assert found["behind"] == [[8, 0], [0x14, 0x1B], [0x14, 0x1B]]
+    assert found["mended"][0] == 8
+    assert {*found["mended"][1]} <= {21, -1}
+    assert {*found["dark"], *found["back"]} <= {18, -1}
+    assert found["recovered"] > 0
+    assert found["reconfigured"] > 0
+    assert found["again"][0] == 8
+    assert {*found["again"][1]} <= {21, -1}
+    assert {*found["not_counted"]} <= {18, -1}
+    assert found["damaged"].count(-1) >= 5
+    assert found["errors"] == [0, 0, 0, 0, 5, 5 * 256, 5 * 256]
+    assert found["abort"] == 0x08000022
+    assert {*found["fallen"]} <= {19, -1}
+    assert found["al"] == [[8, 0], [0x14, 0x1234], [8, 0]]
