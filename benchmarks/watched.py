@@ -1,0 +1,141 @@
+"""What onlookers cost the cycle: `python benchmarks/watched.py [--seconds N] [--rounds N] [--json FILE]`.
+
+In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and nobody looking; and
+with the watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`. Both
+with the timer alone (`spin_us: 0`), whose wake-up p99 is what onlookers could delay, and both moving in joint mode.
+Medians over the rounds; the ratio is that of the medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import platform
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from datetime import date
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from cycle import Round, figures, platform_round, spread
+
+from rtcp.config.find import find_config
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.paths import blackboard_file, runtime_directory
+
+WATCH_MS = {"alone": 1000, "watched": 10}
+TURN_S = 0.01
+
+
+def configured(directory: Path, watch_ms: int, spin_us: int) -> Path:
+    """Copy the default configuration with these two numbers; return the arm's file."""
+    copied = directory / f"watch-{watch_ms}-{spin_us}"
+    shutil.copytree(find_config(None).parent, copied)
+    arm = copied / find_config(None).name
+    text = re.sub(r"spin_us: \d+", f"spin_us: {spin_us}", arm.read_text())
+    arm.write_text(re.sub(r"(\n *lost_cycles:)", rf"\n  watch_ms: {watch_ms}\1", re.sub(r"\n *watch_ms:.*", "", text)))
+    return arm
+
+
+def read_everything() -> None:
+    """Copy every record from the blackboard, for ever: what a recorder does."""
+    observer = Observer(blackboard_file(runtime_directory()))
+    at = observer.head
+    while True:
+        records, missed = observer.since(at)
+        at += len(records) + missed
+        time.sleep(TURN_S)
+
+
+@contextlib.contextmanager
+def onlookers() -> Iterator[None]:
+    """Let a reader and `rtcp status --watch` look on, once there is something to be seen."""
+    script = (
+        "import sys, time; sys.path.insert(0, sys.argv[1]); import watched; from pathlib import Path\n"
+        "while not watched.blackboard_file(watched.runtime_directory()).exists(): time.sleep(0.1)\n"
+        "time.sleep(1.0); watched.read_everything()"
+    )
+    watch = f"while :; do {sys.executable} -m rtcp.cli status --watch; sleep 0.2; done"
+    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    commands = ([sys.executable, "-c", script, str(Path(__file__).parent)], ["sh", "-c", watch])
+    started = [subprocess.Popen(command, start_new_session=True, **quiet) for command in commands]  # type: ignore[call-overload]
+    try:
+        yield
+    finally:
+        for child in started:
+            os.killpg(child.pid, signal.SIGKILL)
+            child.wait()
+
+
+def measure(directory: Path, kind: str, spin_us: int, seconds: float) -> Round:
+    """Run one round."""
+    config = configured(directory, WATCH_MS[kind], spin_us)
+    try:
+        with contextlib.ExitStack() as around:
+            if kind == "watched":
+                around.enter_context(onlookers())
+            return platform_round(500, seconds, poll=False, active="joint", config=config)
+    finally:
+        shutil.rmtree(config.parent)
+
+
+def main() -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=8.0, help="length of one measurement")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    machine = (
+        f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, Python {platform.python_version()}"
+    )
+    console = Console()
+    console.print(f"{machine}, {date.today().isoformat()}")
+    found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
+    with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
+        os.environ["RTCP_RUNTIME_DIR"] = directory
+        runs: dict[tuple[str, int], list[Round]] = {(kind, spin): [] for spin in (0, 40) for kind in WATCH_MS}
+        for _ in range(given.rounds):
+            for (kind, spin), rounds in runs.items():
+                rounds.append(measure(Path(directory), kind, spin, given.seconds))
+    table = Table(title=f"500 us cycle, {given.rounds} rounds of {given.seconds:g} s, joint motion; us")
+    for heading in ("", "p50", "p99", "p99.9", "max", "p99 over the rounds"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for spin in (0, 40):
+        for what in ("wakeup", "exchange", "compute"):
+            for kind in WATCH_MS:
+                samples = [getattr(run, what) for run in runs[kind, spin]]
+                numbers = figures(samples)
+                found[f"{what}, {kind}, spin_us {spin}"] = numbers
+                table.add_row(
+                    f"{what}, spin_us {spin}, {kind}",
+                    *(f"{numbers[key]:.1f}" for key in ("p50", "p99", "p99.9", "max")),
+                    spread(samples, "p99"),
+                )
+    console.print(table)
+    ratio = (
+        figures([run.wakeup for run in runs["watched", 0]])["p99"]
+        / figures([run.wakeup for run in runs["alone", 0]])["p99"]
+    )
+    found["ratio"] = ratio
+    console.print(f"wake-up p99 with the timer alone, watched / alone: {ratio:.2f}")
+    if given.json:
+        given.json.write_text(json.dumps(found, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
