@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 import rtcp
-from rtcp.cli import arm, bus, demo, doctor, jog, limits, machine, motion, service, start, status, stick
+from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, machine, motion, service, soak, start, status, stick
 from rtcp.cli.outcome import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.errors import ConfigError
@@ -50,7 +50,7 @@ def _print_help(context: typer.Context) -> None:
         emit(text.rstrip())
 
 
-for _group in (start, status, machine, motion, jog, limits, stick, arm, bus, demo, service, doctor):
+for _group in (start, status, machine, motion, jog, limits, stick, arm, bus, demo, service, doctor, soak, faults):
     _group.register(app)
 
 

@@ -3,19 +3,39 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from rtcp.runtime.client import ControlClient
+from rtcp.cli.output import complain
+from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.paths import runtime_directory
+from rtcp.runtime.session import is_ours, read_processes
+
+_PATIENCE_S = 10.0
+"""For a gateway that somebody else is starting."""
 
 
 def connect(command: str) -> ControlClient:
     """Connect under the command's name, which others are told when they are refused.
 
+    A loop that lives and has lost its gateway is given a new one first, and that is told on standard error.
+
     Raises:
         ControlError: as `ControlClient` does, `not running` above all.
     """
-    return ControlClient(f"rtcp {command} (pid {os.getpid()})")
+    name = f"rtcp {command} (pid {os.getpid()})"
+    directory = runtime_directory()
+    until = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            return ControlClient(name)
+        except ControlError as error:
+            if error.kind != "not running" or time.monotonic() > until or not _is_our_loop(directory):
+                raise
+            _replace_gateway(directory, error)
+        time.sleep(0.05)
 
 
 def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> dict[str, Any]:
@@ -26,3 +46,22 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
     """
     with connect(command) as client:
         return client.call(verb, arguments)
+
+
+def _is_our_loop(directory: Path) -> bool:
+    """Whether a loop lives, of this user: another's could not use a gateway of ours."""
+    return is_ours(read_processes(directory).loop) and directory.stat().st_uid == os.geteuid()
+
+
+def _replace_gateway(directory: Path, error: ControlError) -> None:
+    from rtcp.runtime.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
+    from rtcp.runtime.running import StartError
+
+    try:
+        if process := replace_gateway(directory):
+            complain(f"the gateway had ended and was started anew (process {process}); nothing was enabled by that")
+    except StartError as refused:
+        if refused.kind != "refused":
+            raise ControlError("not running", f"{error.message}; {refused}") from refused
+    except (OSError, TypeError):
+        raise error from None  # what the loop was started with cannot be read: no platform of this version

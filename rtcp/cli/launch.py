@@ -63,7 +63,7 @@ def serve(options: StartOptions, report: Callable[[str], None], announce: Callab
         running = launch(options, report)
         try:
             announce()
-            return running.wait()
+            return running.wait(report)
         except KeyboardInterrupt:  # a signal that came before `wait` had taken them over
             running.stop()
             return ExitCode.DONE

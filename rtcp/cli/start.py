@@ -59,7 +59,7 @@ def _stop() -> None:
     from rtcp.runtime.running import StartError
 
     try:
-        launcher.stop()
+        launcher.stop(report)
     except StartError as error:
         raise CommandError(str(error), code_of(error.kind)) from error
     report("stopped")

@@ -66,6 +66,15 @@ def _watch(client: ControlClient, as_json: bool) -> None:
             live.update(picture(status), refresh=True)
 
 
+def _again(client: ControlClient) -> ControlClient:
+    """Connect again where only the gateway has ended."""
+    client.close()
+    try:
+        return connect("status")
+    except ControlError as error:
+        raise CommandError("the platform has ended", ExitCode.NOT_RUNNING) from error
+
+
 def _pictures(client: ControlClient, interval_s: float) -> Iterator[dict[str, Any]]:
     """Yield the status on an even grid; a platform that ends while it is watched is `not running`."""
     due = time.monotonic()
@@ -73,9 +82,10 @@ def _pictures(client: ControlClient, interval_s: float) -> Iterator[dict[str, An
         try:
             status = client.call("status")
         except ControlError as error:
-            if error.kind == "lost":
-                raise CommandError("the platform has ended", ExitCode.NOT_RUNNING) from error
-            raise
+            if error.kind != "lost":
+                raise
+            client = _again(client)
+            continue
         yield status
         due = max(due + interval_s, time.monotonic())
         time.sleep(max(0.0, due - time.monotonic()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import Any
 
 from rich import box
@@ -34,11 +35,15 @@ DIGITAL_BITS = 16
 
 ABSENT = "-"
 
+MESSAGES = 5
+"""So many of the last sentences are shown."""
+
 
 def picture(status: Mapping[str, Any]) -> RenderableType:
     """Return the whole picture of one answer to `status`; a field that is missing is drawn as a dash."""
     gap = Text()
-    return Group(_headline(status), _joints(status), gap, _slaves(status), gap, _times(status), gap, _facts(status))
+    tables = (_slaves(status), gap, _times(status), gap, _facts(status), *_messages(status))
+    return Group(_headline(status), _joints(status), gap, *tables)
 
 
 def _headline(status: Mapping[str, Any]) -> Panel:
@@ -57,6 +62,26 @@ def _headline(status: Mapping[str, Any]) -> Panel:
     if message:
         line.append("\n" + message, "red" if state.lower() in ("fault", "emergency stop") else "")
     return Panel(line, box=box.ROUNDED, title="rtcp", title_align="left")
+
+
+def _messages(status: Mapping[str, Any]) -> list[RenderableType]:
+    """What was said last, each sentence with its local time."""
+    told = [_mapping(one) for one in _sequence(status.get("events"))][-MESSAGES:]
+    if not told:
+        return []
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for one in told:
+        table.add_row(Text(_clock(one.get("time")), "dim"), Text(str(one.get("sentence", ABSENT))))
+    return [Text(), table]
+
+
+def _clock(value: object) -> str:
+    try:
+        return datetime.fromisoformat(str(value)).astimezone().strftime("%H:%M:%S.%f")[:-3]
+    except ValueError:
+        return ABSENT
 
 
 def _joints(status: Mapping[str, Any]) -> Table:
@@ -78,11 +103,14 @@ def _slaves(status: Mapping[str, Any]) -> Table:
     """Slaves in two columns, down the first and then the second, as the cable runs."""
     slaves = [_mapping(slave) for slave in _sequence(status.get("slaves"))]
     rows = (len(slaves) + 1) // 2
+    troubled = any(_trouble(slave) for slave in slaves)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, expand=True, padding=(0, 1))
     for _ in range(2 if len(slaves) > 1 else 1):
         table.add_column("#", justify="right")
         table.add_column("slave", ratio=1)
         table.add_column("state")
+        if troubled:
+            table.add_column("lost/err/links")
     for row in range(rows):
         cells: list[RenderableType] = []
         for slave in slaves[row::rows]:
@@ -92,8 +120,17 @@ def _slaves(status: Mapping[str, Any]) -> Table:
                 str(slave.get("name", ABSENT)),
                 Text(found, "green" if found.upper() == "OP" else "red"),
             ]
+            if troubled:
+                cells.append(Text(_trouble(slave), "yellow"))
         table.add_row(*cells)
     return table
+
+
+def _trouble(slave: Mapping[str, Any]) -> str:
+    """How often a slave left OP, damaged frames that came in over its cables, lost links; empty where all are 0."""
+    errors = _mapping(slave.get("errors"))
+    counts = [slave.get("lost", 0), errors.get("rx", 0), errors.get("links", 0)]
+    return "/".join(map(str, counts)) if any(counts) else ""
 
 
 def _times(status: Mapping[str, Any]) -> Table:

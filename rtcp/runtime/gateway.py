@@ -19,13 +19,24 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.runtime.arguments import Arguments
+from rtcp.runtime.blackbox import BlackBox
+from rtcp.runtime.blackbox_file import faults_directory
 from rtcp.runtime.carrier import CommandFailed, Progress
 from rtcp.runtime.held import Caller
 from rtcp.runtime.journal import log_format
 from rtcp.runtime.observer import BlackboardError, Observer
 from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import end, forget_processes, read_processes, read_session, wait_gone
+from rtcp.runtime.session import (
+    SessionError,
+    end,
+    forget_processes,
+    is_ours,
+    read_json,
+    read_processes,
+    read_session,
+    wait_gone,
+)
 from rtcp.runtime.verbs import Verb, Verbs
 
 _FOLLOW_S = 0.02
@@ -47,9 +58,10 @@ class Gateway:
         self._directory = directory
         session = read_session(directory / "session.pickle")
         self._observer = Observer(blackboard_file(directory))
-        started = json.loads((directory / "started.json").read_text())
+        started = read_json(directory / "started.json", dict)
         self._picture = Picture(self._observer, session, started)
         self._arm = Verbs(self._observer, self._picture, session.config, session.bus, directory)
+        self._box = BlackBox(self._observer, session, faults_directory(), self._picture.note)
         self._connections = 0
         self._ended = asyncio.Event()
         self._stopping = False
@@ -87,26 +99,32 @@ class Gateway:
             await self._arm.stick.let_go()
         self._following.cancel()
         path.unlink(missing_ok=True)
+        await asyncio.to_thread(self._box.finish)
 
     def _watch_loop(self, loop: asyncio.AbstractEventLoop) -> None:
         try:
             descriptor = os.pidfd_open(self._observer.loop_pid)
         except OSError:
-            self._picture.loop_lives = False
+            self._loop_has_ended()
             return
 
         def gone() -> None:
             loop.remove_reader(descriptor)
             os.close(descriptor)
-            self._picture.loop_lives = False
+            self._loop_has_ended()
             log.error("the loop (process %d) has ended", self._observer.loop_pid)
 
         loop.add_reader(descriptor, gone)
+
+    def _loop_has_ended(self) -> None:
+        self._picture.loop_lives = False
+        self._box.loop_has_ended()
 
     async def _follow(self) -> None:
         while True:
             for sentence in self._picture.follow():
                 log.info("%s", sentence)
+            self._box.look()
             await asyncio.sleep(_FOLLOW_S)
 
     # -- clients ------------------------------------------------------------------------------------------------
@@ -184,7 +202,10 @@ class Gateway:
         return self._picture.status(read_processes(self._directory))
 
     async def _scan(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
-        slaves = json.loads((self._directory / "scan.json").read_text())
+        try:
+            slaves = read_json(self._directory / "scan.json", list)
+        except SessionError as error:
+            raise CommandFailed("internal", str(error)) from error
         states = self._picture.status(read_processes(self._directory))["slaves"]
         for slave, now in zip(slaves, states, strict=False):
             slave["state"] = now["state"]
@@ -192,6 +213,10 @@ class Gateway:
 
     async def _stop(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         processes = read_processes(self._directory)
+        if processes.loop and not is_ours(processes.loop):
+            # It has died before it was told to, and whoever saw that was quicker here than its end.
+            self._loop_has_ended()
+        self._box.end_is_wanted()
         stopping_mark(self._directory).touch(mode=0o600)
         if self._picture.loop_lives:
             with contextlib.suppress(BlackboardError):
@@ -202,6 +227,7 @@ class Gateway:
         await asyncio.to_thread(end, processes.segment, 3.0)
         if self._following is not None:
             self._following.cancel()
+        await asyncio.to_thread(self._box.finish)
         blackboard_file(self._directory).unlink(missing_ok=True)
         forget_processes(self._directory)
         self._stopping = True
@@ -273,7 +299,7 @@ def main() -> int:
 
     try:
         asyncio.run(_run(given.directory, ready))
-    except (BlackboardError, OSError, TypeError) as error:
+    except (BlackboardError, SessionError, OSError, TypeError) as error:
         sys.stderr.write(f"gateway: {error}\n")
         return 1
     return 0

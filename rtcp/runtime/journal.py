@@ -25,11 +25,11 @@ def stderr_is_journal() -> bool:
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open what a process is to write its log to: the file, or the journal where standard error is that."""
+    """Open what a process is to add its log to: the file, or the journal where standard error is that."""
     if stderr_is_journal():
         path.unlink(missing_ok=True)
         return os.fdopen(os.dup(_STDERR), "wb")
-    return open(path, "wb")
+    return open(path, "ab")
 
 
 def log_format() -> logging.Formatter:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -20,10 +19,21 @@ from rtcp.config.segment import load_segment
 from rtcp.config.virtual import VIRTUAL, widen
 from rtcp.fieldbus.bus import BusError
 from rtcp.fieldbus.link import check_name
+from rtcp.runtime.blackbox import BlackBox
+from rtcp.runtime.blackbox_file import faults_directory
 from rtcp.runtime.client import LONGEST_SOCKET_PATH, ControlError
-from rtcp.runtime.paths import RuntimeDirectoryError, control_socket, prepare, runtime_directory, stopping_mark
+from rtcp.runtime.lock import Busy, alone
+from rtcp.runtime.observer import BlackboardError, Observer
+from rtcp.runtime.paths import (
+    RuntimeDirectoryError,
+    blackboard_file,
+    control_socket,
+    prepare,
+    runtime_directory,
+    stopping_mark,
+)
 from rtcp.runtime.running import Report, Running, StartError, ask_gateway, clear, undisturbed
-from rtcp.runtime.session import Processes, Session, is_ours, read_processes, read_session
+from rtcp.runtime.session import Processes, Session, SessionError, is_ours, read_processes, read_session
 from rtcp.runtime.zero import read_zeros
 
 CheckSegment = Callable[[Path], object]
@@ -44,15 +54,11 @@ class StartOptions:
 @contextlib.contextmanager
 def _alone(directory: Path) -> Iterator[None]:
     """Hold the directory's lock: two starts at once would each find nothing running."""
-    descriptor = os.open(directory / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise StartError("another `rtcp start` or `rtcp stop` is under way", "refused") from None
-        yield
-    finally:
-        os.close(descriptor)
+        with alone(directory):
+            yield
+    except Busy:
+        raise StartError("another `rtcp start` or `rtcp stop` is under way", "refused") from None
 
 
 def start(options: StartOptions, report: Report, check_segment: CheckSegment = load_segment) -> Running:
@@ -81,6 +87,7 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
     except RuntimeDirectoryError as error:
         raise StartError(str(error), "usage") from None
     with _alone(directory):
+        _record_unseen_end(directory, report)
         stopping_mark(directory).unlink(missing_ok=True)
         if adopted := _adopt(directory, options, report):
             return adopted
@@ -103,12 +110,51 @@ def _adopt(directory: Path, options: StartOptions, report: Report) -> Running | 
                 "one; for other options `rtcp stop` first",
                 "refused",
             )
-        running = Running(directory, read_session(directory / "session.pickle").config, found)
         report(f"the loop (process {found.loop}) is running without a gateway: starting one")
-        running.start_gateway()
-        return running
+        return _with_gateway(directory, found)
     clear(directory, found)
     return None
+
+
+def _record_unseen_end(directory: Path, report: Report) -> None:
+    """Have the black box record a loop that died while there was no gateway, before what it left is cleared away."""
+    found = read_processes(directory)
+    if not found.loop or any(is_ours(pid) for pid in (found.loop, found.gateway)) or stopping_mark(directory).exists():
+        return
+    try:
+        session, observer = read_session(directory / "session.pickle"), Observer(blackboard_file(directory))
+    except (BlackboardError, SessionError):
+        return  # nothing is left of it, or it was of another version
+    try:
+        if observer.loop_pid == found.loop:
+            box = BlackBox(observer, session, faults_directory(), report)
+            box.loop_had_ended()
+            box.finish()
+    finally:
+        observer.close()
+
+
+def _with_gateway(directory: Path, found: Processes) -> Running:
+    try:
+        config = read_session(directory / "session.pickle").config
+    except SessionError as error:
+        raise StartError(f"{error}: `rtcp stop`, then start anew", "fault") from error
+    running = Running(directory, config, found)
+    running.start_gateway()
+    return running
+
+
+def replace_gateway(directory: Path) -> int:
+    """Give a living loop that has lost its gateway a new one; return its process, 0 where there was nothing to do.
+
+    Raises:
+        StartError: while a start or stop is under way (`refused`), or where it does not become ready.
+    """
+    with _alone(directory):
+        found = read_processes(directory)
+        if not is_ours(found.loop) or is_ours(found.gateway) or stopping_mark(directory).exists():
+            return 0
+        return _with_gateway(directory, found).processes.gateway
 
 
 def _configured(options: StartOptions) -> ArmConfig:
@@ -147,6 +193,8 @@ def _start_all(
 ) -> Running:  # fmt: skip
     bus = config.bus.interface
     running = Running(directory, config, Processes())
+    for log in directory.glob("*.log"):
+        log.unlink()  # of an earlier start; a gateway that is replaced goes on with its own
     try:
         interface, segment = bus, 0
         if bus == VIRTUAL:
@@ -163,8 +211,8 @@ def _start_all(
     return running
 
 
-def stop() -> None:
-    """Stop the platform of this runtime directory.
+def stop(report: Report) -> None:
+    """Stop the platform of this runtime directory; `report` is told what is worth it.
 
     Raises:
         ControlError: `not running` where nothing runs.
@@ -175,5 +223,7 @@ def stop() -> None:
     if not any(is_ours(pid) for pid in (found.loop, found.gateway, found.segment)):
         raise ControlError("not running", f"no platform is running (runtime directory {directory})")
     with _alone(directory):
+        _record_unseen_end(directory, report)
+        found = read_processes(directory)  # a gateway may have been replaced meanwhile
         ask_gateway(directory)
         clear(directory, found)

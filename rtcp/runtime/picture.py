@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -15,12 +16,14 @@ from rtcp.runtime.machine import Code, State
 from rtcp.runtime.motion_sentences import STICK_MODES, motion_name
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.robot_status import robot_status
-from rtcp.runtime.sentences import FAULTS, Sentences
+from rtcp.runtime.sentences import Sentences
 from rtcp.runtime.session import Processes, Session, is_ours
 
 MODE_NAMES = {8: "csp", 9: "csv", 10: "cst"}
 AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
 _MESSAGES = 50
+_TOLD = 10
+"""The last so many of them are told."""
 _STALE_S = 1.0
 
 
@@ -29,6 +32,10 @@ def al_name(status: int) -> str:
     if status == 0:
         return "no answer"
     return AL_NAMES.get(status & 0x0F, f"0x{status:02X}") + (" + ERROR" if status & 0x10 else "")
+
+
+def _iso(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9).astimezone().isoformat(timespec="milliseconds")
 
 
 class Picture:
@@ -73,6 +80,10 @@ class Picture:
             self._count(records)
         return self._listen()
 
+    def note(self, sentence: str) -> None:
+        """Add a sentence of the gateway's own to the messages."""
+        self.messages.append((time.time_ns(), sentence))
+
     def _count(self, records: npt.NDArray[np.void]) -> None:
         now = time.monotonic()
         if int(records[-1]["enables"]) != self._enables:
@@ -92,7 +103,7 @@ class Picture:
             self._event = event.number
             sentence = self._sentences.event(event.code, event.axis, event.value, event.limit)
             said.append((event.time_ns, sentence))
-            if event.code in FAULTS:
+            if event.code in self._sentences.faults:
                 self.fault = self.fault or sentence
                 self.last_fault = sentence
                 self.faults += 1
@@ -153,9 +164,17 @@ class Picture:
                 "name": slave.name,
                 "state": al_name(al) if self.loop_lives else "unknown",
                 "al_status_code": code,
+                "lost": health.lost,
+                "recovered": health.recovered,
+                "errors": {"rx": health.rx, "forwarded": health.forwarded, "links": health.links},
             }
-            for i, (slave, (al, code)) in enumerate(
-                zip(config.slaves, self._observer.slaves(len(config.slaves)), strict=True)
+            for i, (slave, (al, code), health) in enumerate(
+                zip(
+                    config.slaves,
+                    self._observer.slaves(len(config.slaves)),
+                    self._observer.health(len(config.slaves)),
+                    strict=True,
+                )
             )
         ]
         return {
@@ -202,5 +221,6 @@ class Picture:
                 "gateway": processes.gateway,
                 "segment": processes.segment if is_ours(processes.segment) else 0,
             },
-            "messages": [sentence for _, sentence in list(self.messages)[-10:]],
+            "messages": [sentence for _, sentence in list(self.messages)[-_TOLD:]],
+            "events": [{"time": _iso(at), "sentence": sentence} for at, sentence in list(self.messages)[-_TOLD:]],
         }

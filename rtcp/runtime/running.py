@@ -22,9 +22,10 @@ from rtcp.config.model import ArmConfig
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.journal import open_log
+from rtcp.runtime.keeper import GatewayKeeper
 from rtcp.runtime.notifier import Notifier
-from rtcp.runtime.paths import blackboard_file, control_socket, processes_file, stopping_mark
-from rtcp.runtime.session import Processes, end, forget_processes, identify, is_ours
+from rtcp.runtime.paths import blackboard_file, control_socket, free_segment_control, processes_file, stopping_mark
+from rtcp.runtime.session import NONE, Processes, end, forget_processes, identify, is_ours, read_processes
 
 _SEGMENT_S = 60.0
 _LOOP_S = 60.0
@@ -77,6 +78,7 @@ class Running:
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line."""
         more = ["--poll"] if poll else []
+        more += ["--control", str(free_segment_control(self.directory))]
         child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
         self._keep_off(child.pid)
         for line in _lines(reading, _SEGMENT_S, child):
@@ -98,13 +100,23 @@ class Running:
                 return
         raise StartError(self._last_words("loop", child))
 
-    def start_gateway(self) -> None:
-        """Start the gateway; return when the control socket listens."""
+    def begin_gateway(self) -> int:
+        """Start the gateway and return the pipe on which it says when the control socket listens."""
         child, reading = self._spawn("gateway", "rtcp.runtime.gateway", "--directory", str(self.directory))
         self._keep_off(child.pid)
+        return reading
+
+    def start_gateway(self) -> None:
+        """Start the gateway; return when the control socket listens."""
+        reading = self.begin_gateway()
+        child = self._children[-1]
         for _ in _lines(reading, _GATEWAY_S, child):
             return
         raise StartError(self._last_words("gateway", child))
+
+    def exit_code(self, pid: int) -> int | None:
+        """Return how a child of this process has ended; None where it has not, or is no child."""
+        return next((child.poll() for child in self._children if child.pid == pid), None)
 
     def _keep_off(self, pid: int) -> None:
         """Keep a process off the cycle's CPU where there is another."""
@@ -123,8 +135,8 @@ class Running:
 
     # -- running and stopping -----------------------------------------------------------------------------------
 
-    def wait(self) -> int:
-        """Wait until the platform is stopped or its loop ends; return the exit code.
+    def wait(self, report: Report) -> int:
+        """Wait until the platform is stopped or its loop ends; return the exit code. Its gateway is kept there.
 
         SIGINT, SIGTERM and SIGHUP stop it in an orderly way (0), and so does `rtcp stop` (0); a loop that ends by
         itself is a fault (5), whereupon the rest is stopped too.
@@ -132,10 +144,12 @@ class Running:
         stopped: list[int] = []
         before = {number: signal.signal(number, lambda got, frame: stopped.append(got)) for number in _SIGNALS}
         notifier = Notifier.of_environment(blackboard_file(self.directory))
+        keeper = GatewayKeeper(self, report)
         try:
             notifier.ready()
             while not stopped and is_ours(self.processes.loop):
                 notifier.look()
+                keeper.look()
                 time.sleep(0.1)
             notifier.stopping("stopping" if stopped else "the loop has ended")
             if not stopped and self._ended_orderly():
@@ -145,6 +159,7 @@ class Running:
             return 0 if stopped else 5
         finally:
             notifier.close()
+            keeper.close()
             for number, handler in before.items():
                 signal.signal(number, handler)
 
@@ -169,7 +184,10 @@ class Running:
 
 def clear(directory: Path, found: Processes) -> None:
     """End what is left of a platform and remove its files."""
-    for pid in (found.loop, found.gateway, found.segment):
+    now = read_processes(directory)
+    # A gateway that has been replaced since.
+    newer = now.gateway if now.loop == found.loop else NONE
+    for pid in (found.loop, found.gateway, newer, found.segment):
         end(pid, 5.0)
     forget_processes(directory)
     for path in (control_socket(directory), blackboard_file(directory)):

@@ -107,6 +107,14 @@ def test_a_later_bearer_of_the_loops_pid_is_neither_taken_for_it_nor_signalled(
     assert loop.poll() is None
 
 
+def test_a_loop_of_which_nobody_knows_how_it_was_started_is_given_no_gateway(
+    rtcp: Callable[..., Any], loop: subprocess.Popen[bytes]
+) -> None:
+    ended = rtcp("status")
+    assert (ended.code, ended.out) == (4, "")
+    assert f"the loop (process {loop.pid}) runs without a gateway: `rtcp start` gives it one" in ended.trouble
+
+
 def test_the_pids_stand_in_their_file_as_plain_numbers_by_name(
     loop: subprocess.Popen[bytes], directory: Path
 ) -> None:  # fmt: skip

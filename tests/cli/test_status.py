@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
+import socket
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -102,3 +104,33 @@ def test_the_robot_status_and_the_states_are_told_in_words(platform: Any, rtcp: 
 
 def test_a_status_without_a_robot_has_no_line_for_it(platform: Any, rtcp: Callable[..., Any]) -> None:
     assert not any(line.startswith(("robot", "stick")) for line in rtcp("status").out.splitlines())
+
+
+def test_the_last_messages_are_shown_with_their_local_time(
+    platform: Any, rtcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TZ", "UTC-2")
+    time.tzset()
+    try:
+        platform.status["events"] = [
+            {"time": f"2026-11-21T14:37:2{n}.873+00:00", "sentence": f"message [{n}]"} for n in range(7)
+        ] + [{"time": "yesterday", "sentence": "without a time"}]
+        shown = rtcp("status").out.splitlines()
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+    assert shown[-5:-1] == [f"16:37:2{n}.873  message [{n}]" for n in (3, 4, 5, 6)]
+    assert shown[-1].split() == ["-", "without", "a", "time"]
+
+
+def test_a_watch_goes_on_when_only_the_gateway_was_replaced(
+    platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    watching = rtcp_process("status", "--json", "--watch")
+    assert watching.stdout.readline()
+    for connection in list(platform._connections):
+        connection.shutdown(socket.SHUT_RDWR)
+    for _ in range(5):
+        assert json.loads(watching.stdout.readline()) == platform.status
+    watching.send_signal(signal.SIGINT)
+    assert (watching.communicate()[1], watching.returncode) == ("", 0)

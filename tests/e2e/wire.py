@@ -81,12 +81,12 @@ def ask(port: socket.socket, command: int, address: int, offset: int, length: in
     raise TimeoutError("the segment does not answer")
 
 
-def al_states(interface: str) -> list[int]:
-    """Return the AL status words of all slaves, by position."""
+def al_words(interface: str, register: int) -> list[int]:
+    """Return the AL status words (0x0130) or AL status codes (0x0134) of all slaves, by position."""
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
         port.bind((interface, ETHERTYPE))
         _, count = ask(port, BRD, 0, 0x0130, 2)
-        return [int.from_bytes(ask(port, APRD, -position, 0x0130, 2)[0], "little") for position in range(count)]
+        return [int.from_bytes(ask(port, APRD, -position, register, 2)[0], "little") for position in range(count)]
 
 
 def to_state(interface: str, position: int, state: int) -> None:
@@ -175,7 +175,9 @@ def main() -> None:
     """Do what the command line says."""
     enter(int(sys.argv[1]))
     if sys.argv[2] == "al":
-        print(json.dumps(al_states("ecat0")))
+        print(json.dumps(al_words("ecat0", 0x0130)))
+    elif sys.argv[2] == "codes":
+        print(json.dumps(al_words("ecat0", 0x0134)))
     elif sys.argv[2] in AL_STATES:
         to_state("ecat0", int(sys.argv[3]), AL_STATES[sys.argv[2]])
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
@@ -127,3 +128,13 @@ def test_a_client_whose_request_is_too_long_is_told_so(client: ControlClient) ->
     with pytest.raises(ControlError, match=f"longer than {LINE_LIMIT} bytes") as raised:
         client.call("sdo_write", {**OBJECT, "hex": "00" * 1_000_000})
     assert raised.value.kind == "invalid"
+
+
+def test_the_status_tells_each_message_with_its_instant(client: ControlClient, loop: Loop) -> None:
+    before = datetime.now().astimezone()
+    loop.board.text("a sentence with a time")
+    status = client.call("status")
+    told = [event for event in status["events"] if event["sentence"] == "a sentence with a time"]
+    assert [event["sentence"] for event in status["events"]] == status["messages"]
+    when = datetime.fromisoformat(told[-1]["time"])
+    assert before - timedelta(milliseconds=1) <= when <= datetime.now().astimezone()

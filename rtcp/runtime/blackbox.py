@@ -1,0 +1,300 @@
+"""The black box: at every fault the last seconds of the blackboard's ring go to the disk.
+
+It reads what the loop publishes anyway: the cycle does nothing for it. Waiting and writing happen in a thread of its
+own, so that the gateway goes on answering.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+import rtcp
+from rtcp.runtime.blackbox_file import About, Moment, Recording, RecordingError, listed, write
+from rtcp.runtime.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
+from rtcp.runtime.machine import TABLE, Code, State
+from rtcp.runtime.observer import Event, Observer, Text
+from rtcp.runtime.sentences import Sentences
+from rtcp.runtime.session import Session
+
+BEFORE_S = 10.0
+AFTER_S = 1.0
+SILENT_S = 1.0
+"""A loop that has published nothing for so long hangs."""
+_WATCHDOG = "the drives' watchdog stops them"
+_ENDED = f"ended unexpectedly; {_WATCHDOG}"
+_IN_FAULT = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
+log = logging.getLogger("rtcp.blackbox")
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """What has begun: by an event of the loop, or (number 0) by its silence or end."""
+
+    time_ns: int
+    what: str
+    number: int = 0
+    code: int = 0
+
+
+class BlackBox:
+    """Watches one platform and writes its faults.
+
+    Args:
+        observer: the blackboard; it is read in another thread too.
+        session: what was started.
+        directory: where the files go.
+        tell: is given sentences about what was written or could not be; from any thread.
+    """
+
+    def __init__(self, observer: Observer, session: Session, directory: Path, tell: Callable[[str], None]) -> None:
+        self._observer = observer
+        self._session = session
+        self._directory = directory
+        self._tell = tell
+        self._sentences = Sentences(session.config)
+        self._event = 0
+        self._in_fault = False
+        self._since = 0.0
+        """When the fault that is on was seen."""
+        self._head, self._head_at = observer.head, time.monotonic()
+        self._silent = False
+        self._dead = self._end_wanted = False
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="blackbox")
+        self._over = threading.Event()
+        """Nobody is there to wait for what follows a fault."""
+        for fault in self._begun():
+            self._writer.submit(self._make_up_for, fault)
+
+    # -- when -------------------------------------------------------------------------------------------------------
+
+    def look(self) -> None:
+        """Look for faults that have begun; a few times in each tenth of a second."""
+        if self._over.is_set():
+            return
+        for fault in self._begun():
+            self._writer.submit(self._record, fault)
+        now = time.monotonic()
+        self._listen(now)
+        if self._in_fault and now - self._since > AFTER_S and not self._machine_in_fault():
+            # Not every event of this kind leads to a state that only a reset ends.
+            self._in_fault = False
+
+    def end_is_wanted(self) -> None:
+        """Take it that the loop is told to end: from here on neither its silence nor its end is a fault."""
+        self._end_wanted = True
+
+    def loop_has_ended(self) -> None:
+        """Take it that the loop's process has ended without having been told to."""
+        if self._dead:
+            return
+        self.look()
+        self._dead = True
+        if not self._end_wanted:
+            self._process_fault(time.time_ns(), _ENDED)
+
+    def loop_had_ended(self) -> None:
+        """Take it that the loop's process ended while no gateway was there to see it."""
+        self._dead = True
+        latest = self._observer.latest()
+        if latest is not None:
+            sentence = f"the loop (process {self._observer.loop_pid}) {_ENDED}"
+            last_ns = int(latest["time_ns"][0]) - time.monotonic_ns() + time.time_ns()
+            self._writer.submit(self._make_up_for, _Fault(last_ns, sentence))
+
+    def finish(self) -> None:
+        """Write what is still to be written and return when it is; a second time is harmless."""
+        self.look()
+        self._over.set()
+        self._writer.shutdown()
+
+    def _begun(self) -> list[_Fault]:
+        """Return the faults that events have begun since the last look."""
+        found = []
+        for event in self._observer.events_since(self._event):
+            self._event = event.number
+            if event.code in self._sentences.faults and not self._in_fault:
+                self._in_fault, self._since = True, time.monotonic()
+                found.append(_Fault(event.time_ns, self._words(event), event.number, event.code))
+            elif event.code == Code.RESET:
+                self._in_fault = False
+        return found
+
+    def _listen(self, now: float) -> None:
+        head = self._observer.head
+        if head != self._head:
+            self._head, self._head_at = head, now
+            if self._silent:
+                self._silent = False
+                self._say(f"the loop (process {self._observer.loop_pid}) publishes again")
+        elif now - self._head_at > SILENT_S and not (self._silent or self._dead or self._end_wanted):
+            self._silent = True
+            since_ns = time.time_ns() - round((now - self._head_at) * 1e9)
+            self._process_fault(since_ns, f"has published nothing for {SILENT_S:g} s; {_WATCHDOG}")
+
+    def _machine_in_fault(self) -> bool:
+        latest = self._observer.latest()
+        return latest is not None and State(int(latest["state"][0])) in _IN_FAULT
+
+    def _process_fault(self, time_ns: int, what: str) -> None:
+        sentence = f"the loop (process {self._observer.loop_pid}) {what}"
+        self._say(sentence)
+        if not self._over.is_set():
+            self._writer.submit(self._record, _Fault(time_ns, sentence))
+
+    def _say(self, sentence: str) -> None:
+        log.error("%s", sentence)
+        self._tell(sentence)
+
+    def _words(self, event: Event) -> str:
+        return self._sentences.event(event.code, event.axis, event.value, event.limit)
+
+    # -- what; in the writer's thread -------------------------------------------------------------------------------
+
+    def _make_up_for(self, fault: _Fault) -> None:
+        """Record a fault that began before this gateway did, unless that was done or it has left the ring."""
+        try:
+            done = any(
+                (one.about.began_ns, one.about.event) == (self._session.began_ns, fault.number)
+                and (fault.number or one.about.what == fault.what)
+                for one in listed(self._directory)
+                if one.about is not None
+            )
+        except RecordingError as error:
+            self._say(f"black box: {error}")
+            return
+        ring, _ = self._observer.since(0)
+        if done:
+            return
+        if len(ring) and int(ring["time_ns"][0]) > _monotonic(fault.time_ns):
+            log.info("black box: a fault that no gateway saw has left the ring: %s", fault.what)
+            return
+        self._record(fault)
+
+    def _record(self, fault: _Fault) -> None:
+        try:
+            # At once: a short cycle's ring is soon written over.
+            before, _ = self._observer.since(0)
+            ends_ns = fault.time_ns + round(AFTER_S * 1e9)
+            self._over.wait(0.0 if self._dead else min(max((ends_ns - time.time_ns()) * 1e-9, 0.0), AFTER_S))
+            after, _ = self._observer.since(int(before["number"][-1]) if len(before) else 0)
+            recording = self._recording(fault, before, after, min(ends_ns, time.time_ns()))
+            number, path = write(self._directory, recording)
+        except RecordingError as error:
+            self._say(f"black box: {error}")
+        except Exception as error:
+            # One fault's recording is lost, and said to be; the next is tried again.
+            log.exception("black box")
+            self._say(f"black box: a fault was not recorded, by a defect: {type(error).__name__} {error}")
+        else:
+            sentence = f"black box: this fault is number {number} (`rtcp faults show {number}`)"
+            log.info("%s: %s", sentence, path)
+            self._tell(sentence)
+
+    def _recording(
+        self, fault: _Fault, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
+    ) -> Recording:
+        records = np.concatenate([before, after])
+        at = _place(records, fault) if fault.number else len(before) - 1
+        instants = records["time_ns"]
+        if len(records):
+            kept = np.abs(instants - instants[at] - (AFTER_S - BEFORE_S) * 5e8) <= (BEFORE_S + AFTER_S) * 5e8
+            at -= int(np.count_nonzero(~kept[:at]))
+            records = records[kept]
+        timeline, notes = self._timeline(fault, ends_ns)
+        session = self._session
+        config = session.config
+        joints = tuple(joint.name for joint in config.joints)
+        about = About(
+            number=0,
+            time_ns=fault.time_ns,
+            what=fault.what,
+            before=_state(records, at - 1 if fault.number else at),
+            arm=config.name,
+            bus=session.bus,
+            period_ns=self._observer.period_ns,
+            joints=joints,
+            versions=_versions(),
+            began_ns=session.began_ns,
+            event=fault.number,
+            at=at,
+            notes=(*_lacking(records, at, self._observer.period_ns), *notes),
+            timeline=timeline,
+        )
+        return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
+
+    def _timeline(self, fault: _Fault, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
+        """Return what was said in the recording's time, and what of that is lost."""
+        begins_ns = fault.time_ns - round(BEFORE_S * 1e9)
+        events, texts = self._observer.events_since(0), self._observer.texts_since(0)
+        said = [Moment(event.time_ns, self._words(event)) for event in events]
+        said += [Moment(text.time_ns, text.sentence) for text in texts]
+        said += [Moment(fault.time_ns, fault.what)] if not fault.number else []
+        notes = []
+        oldest: list[tuple[str, int, Event | Text]] = [("events", EVENTS, event) for event in events[:1]]
+        oldest += [("sentences", TEXTS, text) for text in texts[:1]]
+        for name, room, first in oldest:
+            if first.number > 1 and first.time_ns > begins_ns:
+                away_s = (first.time_ns - fault.time_ns) * 1e-9
+                notes.append(f"more than {room} {name} came: those before {away_s:+.1f} s are lost")
+        kept = [moment for moment in said if begins_ns <= moment.time_ns <= ends_ns]
+        return tuple(sorted(kept, key=lambda moment: moment.time_ns)), notes
+
+
+def _place(records: npt.NDArray[np.void], fault: _Fault) -> int:
+    """Return the index of the cycle in which the fault began, -1 without records."""
+    if not len(records):
+        return -1
+    codes = records["fault"].astype(np.int64)
+    begins = np.flatnonzero((codes == fault.code) & (np.concatenate([[0], codes[:-1]]) != fault.code))
+    away = np.abs(records["time_ns"] - _monotonic(fault.time_ns))
+    # An event that is no fault of the machine's state has no such cycle: the clock tells.
+    return int(begins[np.argmin(away[begins])]) if len(begins) else int(np.argmin(away))
+
+
+def _monotonic(realtime_ns: int) -> int:
+    """Return the instant on the clock of the cycle records."""
+    return realtime_ns - time.time_ns() + time.monotonic_ns()
+
+
+def _state(records: npt.NDArray[np.void], at: int) -> str:
+    if not len(records):
+        return "unknown"
+    return TABLE[State(int(records["state"][max(at, 0)]))].words
+
+
+def _lacking(records: npt.NDArray[np.void], at: int, period_ns: int) -> list[str]:
+    """Return in sentences which cycles of the recording's time are not in it."""
+    if not len(records):
+        return ["the ring holds no cycle of it"]
+    notes, instants, numbers = [], records["time_ns"], records["number"].astype(np.int64)
+    held_s = float(instants[at] - instants[0]) * 1e-9
+    if held_s < BEFORE_S - 0.01:
+        full = f"at {period_ns / 1000:g} us the ring holds no more"
+        why = "the platform had just started" if numbers[0] == 1 else full
+        notes.append(f"{held_s:.1f} s before the fault instead of {BEFORE_S:g} s: {why}")
+    after_s = float(instants[-1] - instants[at]) * 1e-9
+    if after_s < AFTER_S - 0.01:
+        notes.append(f"{after_s:.1f} s after the fault instead of {AFTER_S:g} s: then nothing was published any more")
+    if lost := int(numbers[-1] - numbers[0]) + 1 - len(numbers):
+        notes.append(f"{lost} cycles were overwritten before they were read, or torn")
+    return notes
+
+
+def _versions() -> dict[str, str]:
+    return {
+        "rtcp": rtcp.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "kernel": os.uname().release,
+    }

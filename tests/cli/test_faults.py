@@ -1,0 +1,175 @@
+"""`rtcp faults`: the list, one fault, its picture; no platform runs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtcp.runtime.blackbox_file import About, Moment, Recording, faults_directory, write
+from rtcp.runtime.layout import RecordLayout
+from rtcp.runtime.machine import State
+from rtcp.runtime.observer import record_type
+
+JOINTS, PERIOD_NS, CYCLES, AT = 3, 1_000_000, 1200, 800
+WHEN_NS = 1_790_000_000_250_000_000
+WHAT = "joint2: the drive is in fault (statusword 0x0218), [red]; `rtcp reset` goes on"
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    return tmp_path / "state"
+
+
+def recording() -> Recording:
+    """An arm that moves for 0.8 s and faults; after the fault no frame comes for 40 cycles."""
+    whole = np.zeros(CYCLES, dtype=record_type(RecordLayout(JOINTS)))
+    cycles = np.arange(CYCLES)
+    whole["number"] = cycles + 5
+    whole["time_ns"] = (cycles + 7) * PERIOD_NS
+    whole["state"] = np.where(cycles < AT, State.MOVING, State.FAULT)
+    whole["wkc_expected"] = 10
+    whole["wkc"] = np.where((cycles > AT) & (cycles <= AT + 40), -1, 10)
+    whole["lost"] = np.where((cycles > AT) & (cycles <= AT + 40), cycles - AT, 0)
+    whole["missed"] = np.where(cycles < 100, 2, 5)
+    whole["target"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
+    whole["target"][300:, 1] += 0.01
+    whole["position"] = whole["target"] - 0.001
+    whole["velocity"][:AT] = (0.1, 0.2, -0.1)
+    whole["torque"][AT] = (1.0, -2.0, 3.0)
+    names = [name for name in whole.dtype.names or () if name not in ("number_again", "padding")]
+    about = About(
+        number=0, time_ns=WHEN_NS, what=WHAT, before="moving", arm="arm", bus="virtual", period_ns=PERIOD_NS,
+        joints=("base", "elbow", "wrist"), versions={"rtcp": "9.9"}, began_ns=5, event=7, at=AT,
+        notes=("0.8 s before the fault instead of 10 s: the platform had just started",),
+        timeline=(Moment(WHEN_NS - 500_000_000, "a sentence before"), Moment(WHEN_NS, WHAT),
+                  Moment(WHEN_NS + 20_000_000, "slave 3 sent emergency 0x8611")),
+    )  # fmt: skip
+    return Recording(about, {name: whole[name] for name in names})
+
+
+def test_without_a_recording_the_list_says_so(rtcp: Callable[..., Any], state: Path) -> None:
+    ended = rtcp("faults")
+    assert ended.code == 0
+    assert f"no fault has been recorded ({state}/faults)" in ended.out
+    assert json.loads(rtcp("faults", "--json").out) == {"faults": []}
+    assert not state.exists()
+
+
+def test_the_list_has_number_time_first_sentence_state_before_and_duration(rtcp: Callable[..., Any]) -> None:
+    write(faults_directory(), recording())
+    write(faults_directory(), recording())
+    ended = rtcp("faults")
+    shown = " ".join(ended.out.split())
+    when = recording().about.when
+    assert f"2 {when:%Y-%m-%d %H:%M:%S} joint2: the drive is in" in shown
+    assert "moving 1.2 s" in shown
+    assert "1: 0.8 s before the fault instead of 10 s" in shown
+    assert max(len(line) for line in ended.out.splitlines()) <= 80
+    rows = json.loads(rtcp("faults", "--json").out)["faults"]
+    assert [row["number"] for row in rows] == [1, 2]
+    assert (rows[0]["what"], rows[0]["before"], rows[0]["seconds"]) == (WHAT, "moving", 1.199)
+
+
+def test_a_file_that_is_none_is_a_sentence_in_the_list_and_the_others_are_shown(rtcp: Callable[..., Any]) -> None:
+    _, path = write(faults_directory(), recording())
+    path.write_bytes(path.read_bytes()[:3000])
+    write(faults_directory(), recording())
+    ended = rtcp("faults")
+    assert ended.code == 0
+    assert "unreadable" in ended.out
+    assert "is cut off, damaged or no recording" in " ".join(ended.out.split())
+    assert "moving" in ended.out
+    assert "trouble" in json.loads(rtcp("faults", "--json").out)["faults"][0]
+    shown = rtcp("faults", "show", "1")
+    assert (shown.code, shown.out) == (5, "")
+    assert "cut off" in shown.trouble
+
+
+def test_one_fault_is_shown_with_what_happened_the_joints_steps_and_frames(rtcp: Callable[..., Any]) -> None:
+    _, path = write(faults_directory(), recording())
+    ended = rtcp("faults", "show", "1")
+    assert ended.code == 0
+    shown = " ".join(ended.out.split())
+    for told in (
+        "FAULT 1", "arm on virtual", "[red]; `rtcp reset` goes on", "before: moving; rtcp 9.9",
+        "-0.500 a sentence before", "+0.000 state: moving -> fault", "+0.020 slave 3 sent emergency 0x8611",
+        "elbow +0.1690 +0.1700 +0.0000 -2.0000", "1200 cycles, -0.8 s to +0.4 s",
+        "0.0102 rad of a target in one cycle (elbow, 10.2 rad/s, at -0.500 s)", "3 cycles of the grid",
+        "working counter 10 of 10 at the fault; 40 wrong, 40 without an answer",
+        "0.8 s before the fault instead of 10 s",
+    ):  # fmt: skip
+        assert told in shown, told
+    assert max(len(line) for line in ended.out.split("\nrecording:")[0].splitlines()) <= 80
+    picture = path.with_suffix(".png")
+    assert ended.out.endswith(f"recording: {path}\npicture: {picture}\n")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_json_of_a_fault_has_the_same_in_numbers_and_draws_only_when_asked(
+    rtcp: Callable[..., Any], tmp_path: Path
+) -> None:
+    _, path = write(faults_directory(), recording())
+    told = json.loads(rtcp("faults", "show", "1", "--json").out)
+    assert told["largest_step"] == {
+        "joint": "elbow", "rad": pytest.approx(0.0102), "rad_per_s": pytest.approx(10.2), "t_s": -0.5,
+    }  # fmt: skip
+    assert told["wkc"] == {"expected": 10, "actual": 10, "wrong_cycles": 40, "without_answer": 40}
+    assert told["missed"] == 3
+    assert told["joints"]["torque"] == [1.0, -2.0, 3.0]
+    assert [one["t_s"] for one in told["timeline"]] == [-0.5, 0.0, 0.0, 0.02]
+    assert not path.with_suffix(".png").exists()
+    out = tmp_path / "mine.svg"
+    told = json.loads(rtcp("faults", "show", "1", "--json", "--plot", str(out)).out)
+    assert told["picture"] == str(out)
+    assert "<svg" in out.read_text()
+
+
+def test_a_step_across_cycles_that_are_missing_is_none(rtcp: Callable[..., Any]) -> None:
+    made = recording()
+    kept = np.r_[0:290, 310:CYCLES]
+    about = replace(made.about, at=AT - 20)
+    write(faults_directory(), Recording(about, {name: array[kept] for name, array in made.records.items()}))
+    step = json.loads(rtcp("faults", "show", "1", "--json").out)["largest_step"]
+    assert step["rad"] == pytest.approx(2e-4)
+
+
+def test_a_fault_without_a_single_cycle_is_shown(rtcp: Callable[..., Any]) -> None:
+    made = recording()
+    none = {name: array[:0] for name, array in made.records.items()}
+    write(faults_directory(), Recording(replace(made.about, at=-1), none))
+    ended = rtcp("faults", "show", "1")
+    assert ended.code == 0
+    assert "slave 3 sent emergency" in ended.out
+    assert "+0.020" in ended.out
+
+
+def test_a_number_that_does_not_exist_is_answered_with_those_that_do(rtcp: Callable[..., Any]) -> None:
+    assert "none has been recorded" in rtcp("faults", "show", "1").trouble
+    for number in range(1, 7):
+        _, path = write(faults_directory(), recording())
+        if number == 4:
+            path.unlink()
+    ended = rtcp("faults", "show", "9")
+    assert (ended.code, ended.out) == (2, "")
+    assert "there is no fault 9" in ended.trouble
+    assert ended.trouble.endswith("recorded: 1-3, 5-6")
+
+
+def test_a_picture_of_another_kind_is_refused_before_anything_is_read(rtcp: Callable[..., Any]) -> None:
+    ended = rtcp("faults", "show", "1", "--plot", "picture.txt")
+    assert ended.code == 2
+    assert "'.txt' is none of .png, .svg, .pdf" in ended.trouble
+
+
+def test_a_picture_that_cannot_be_written_is_a_sentence(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    write(faults_directory(), recording())
+    ended = rtcp("faults", "show", "1", "--plot", str(tmp_path / "none" / "picture.png"))
+    assert ended.code == 1
+    assert "No such file or directory" in ended.trouble

@@ -1,0 +1,151 @@
+"""Processes that die or hang: who stops the arm, what the black box keeps, how it goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rtcp.runtime.paths import segment_control
+from rtcp.virtual.faults.client import SegmentClient
+from tests.e2e.conftest import Platform, kill, lives
+
+SAFE_OP_ERROR, SYNC_MANAGER_WATCHDOG = 0x14, 0x1B
+STILL_RAD_S = 0.002
+MOVE = ("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+
+
+@pytest.fixture
+def platform(platform: Platform) -> Iterator[Platform]:
+    """One whose recordings are its own."""
+    platform.environment["RTCP_STATE_DIR"] = str(platform.directory / "state")
+    return platform
+
+
+def recorded(platform: Platform) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(platform.rtcp("faults", "--json").stdout)["faults"]
+    return found
+
+
+def until_recorded(platform: Platform, what: str) -> dict[str, Any]:
+    end = time.monotonic() + 20
+    while True:
+        for fault in recorded(platform):
+            if what in fault["what"]:
+                return fault
+        assert time.monotonic() < end, f"{what} was not recorded: {recorded(platform)}\n{platform.logs()}"
+
+
+def drives(platform: Platform) -> list[dict[str, Any]]:
+    with SegmentClient(segment_control(platform.directory)) as segment:
+        return [slave for slave in segment.truth()["slaves"] if "velocity_rad_s" in slave]
+
+
+def started(platform: Platform) -> subprocess.Popen[str]:
+    platform.be_patient(2000)
+    foreground = platform.background("start")
+    end = time.monotonic() + 30
+    while platform.rtcp("status", check=None).returncode != 0:
+        assert time.monotonic() < end, platform.logs()
+    return foreground
+
+
+def test_the_foreground_start_keeps_a_gateway_and_nothing_moves_by_that(platform: Platform) -> None:
+    foreground = started(platform)
+    platform.rtcp("enable")
+    moving = platform.background(*MOVE)
+    platform.until_moving()
+    before = platform.pids()
+    kill(before["gateway"])
+    assert moving.wait() in (4, 5)
+    status = json.loads(platform.rtcp("status", "--json").stdout)
+    while status["state"] != "holding":
+        status = platform.status()
+    after = platform.pids()
+    assert after["loop"] == before["loop"]
+    assert after["gateway"] != before["gateway"]
+    assert {drive["torque_on"] for drive in drives(platform)} == {True}
+    where = [drive["position_rad"] for drive in drives(platform)]
+    time.sleep(0.3)
+    assert [drive["position_rad"] for drive in drives(platform)] == pytest.approx(where, abs=1e-3)
+    # The loop is killed: the drives' watchdog stops them, the rest ends, and what happened is kept.
+    kill(before["loop"])
+    said = foreground.communicate()[0]
+    assert foreground.returncode == 5
+    assert f"the gateway (process {before['gateway']}) has ended by SIGKILL: it is started anew" in said
+    assert f"the gateway (process {after['gateway']}) answers again" in said
+    assert not any(lives(pid) for pid in after.values())
+    (fault,) = recorded(platform)
+    assert f"the loop (process {before['loop']}) ended unexpectedly" in fault["what"]
+    assert fault["before"] == "holding"
+
+
+def test_a_loop_that_hangs_is_stopped_by_the_watchdog_and_moves_again_after_reset_and_enable_alone(
+    platform: Platform,
+) -> None:
+    platform.be_patient(2000)
+    platform.rtcp("start", "--detach")
+    platform.call("enable")
+    moving = platform.background(*MOVE)
+    platform.until_moving()
+    loop = platform.pids()["loop"]
+    assert max(abs(drive["velocity_rad_s"]) for drive in drives(platform)) > 0.1
+    os.kill(loop, signal.SIGSTOP)
+    stopped_ns = time.monotonic_ns()
+    end = time.monotonic() + 20
+    while any(abs(drive["velocity_rad_s"]) > STILL_RAD_S for drive in drives(platform)):
+        assert time.monotonic() < end
+    last_ns = max(drive["moved_ns"] for drive in drives(platform))
+    assert (last_ns - stopped_ns) * 1e-9 < 0.6
+    while platform.al_states()[1:] != [SAFE_OP_ERROR] * 6:
+        assert time.monotonic() < end
+    assert json.loads(platform.wire("codes"))[1:] == [SYNC_MANAGER_WATCHDOG] * 6
+    said = f"the loop (process {loop}) has published nothing for"
+    status = platform.until(lambda found: said in found["message"], "the silence")
+    assert status["state"] == "fault"
+    fault = until_recorded(platform, said)
+    assert fault["before"] == "moving"
+    where = [drive["position_rad"] for drive in drives(platform)]
+    os.kill(loop, signal.SIGCONT)
+    assert moving.wait() != 0
+    platform.until(lambda found: found["state"] == "fault" and said not in found["message"], "the loop's own fault")
+    time.sleep(0.3)
+    assert [drive["position_rad"] for drive in drives(platform)] == pytest.approx(where, abs=2e-3)
+    assert max(drive["moved_ns"] for drive in drives(platform)) == last_ns
+    assert platform.rtcp("enable", check=3).stderr
+    platform.call("reset")
+    assert platform.status()["state"] == "ready"
+    platform.call("enable")
+    platform.rtcp("move", *["0"] * 6)
+
+
+def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_happened_meanwhile(
+    platform: Platform,
+) -> None:
+    platform.be_patient(200)
+    platform.rtcp("start", "--detach")
+    platform.rtcp("enable")
+    before = platform.pids()
+    kill(before["gateway"])
+    os.kill(before["segment"], signal.SIGSTOP)
+    time.sleep(0.5)
+    os.kill(before["segment"], signal.SIGCONT)
+    done = platform.rtcp("status", "--json")
+    after = platform.pids()
+    assert f"the gateway had ended and was started anew (process {after['gateway']})" in done.stderr
+    assert after["loop"] == before["loop"]
+    assert json.loads(done.stdout)["state"] == "fault"
+    assert platform.rtcp("status").stderr == ""
+    # A stop does not lose what has not been written yet.
+    platform.rtcp("stop")
+    assert [fault["before"] for fault in recorded(platform)] == ["holding"]
+    number = str(recorded(platform)[0]["number"])
+    shown = platform.rtcp("faults", "show", number)
+    assert "lost" in shown.stdout or "left OP" in shown.stdout
+    assert "picture: " in shown.stdout

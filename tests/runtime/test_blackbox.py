@@ -1,0 +1,382 @@
+"""The black box: what of a blackboard it writes, and when; the loop's part is played, or it runs in simulated time."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.runtime import blackbox, launcher
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.blackbox import BlackBox
+from rtcp.runtime.blackbox_file import Recording, listed, read
+from rtcp.runtime.codes import Code, Command
+from rtcp.runtime.layout import EVENTS, PER_JOINT, RECORDS, SCALARS
+from rtcp.runtime.machine import State
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.paths import stopping_mark
+from rtcp.runtime.session import Pid, Processes, Session, identify
+from rtcp.virtual.simulation import Simulation
+
+JOINTS = 6
+AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
+BEGAN_NS = 77
+
+
+@pytest.fixture(scope="module")
+def config() -> ArmConfig:
+    return load(default_config())
+
+
+class Played:
+    """A blackboard whose last cycle is now, and a black box that watches it."""
+
+    def __init__(self, path: Path, directory: Path, config: ArmConfig, period_ns: int = 500_000) -> None:
+        self.period_ns = period_ns
+        self.directory = directory
+        self.session = Session(config, "virtual", "ecat0", 0, BEGAN_NS)
+        self.board = Blackboard(path, JOINTS, period_ns)
+        self.observer = Observer(path)
+        self.told: list[str] = []
+
+    def fill(self, cycles: int, *, fault_at: int = 0, code: int = Code.BUS_LOST, ends_ns: int = 0) -> int:
+        """Publish so many cycles, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
+        ends_ns = ends_ns or time.monotonic_ns()
+        for cycle in range(1, cycles + 1):
+            values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
+            values[AT["cycle"]] = cycle
+            values[AT["time_ns"]] = ends_ns - (cycles - cycle) * self.period_ns
+            broken = 0 < fault_at <= cycle
+            values[AT["state"]] = State.FAULT if broken else State.MOVING
+            values[AT["fault"]] = code if broken else 0
+            values[len(SCALARS) - 1] = cycle * 1e-4
+            self.board.publish(values)
+        return ends_ns
+
+    def watched(self) -> BlackBox:
+        return BlackBox(self.observer, self.session, self.directory, self.told.append)
+
+    @property
+    def recordings(self) -> list[Recording]:
+        return [read(one.path) for one in listed(self.directory)]
+
+    def close(self) -> None:
+        self.observer.close()
+        self.board.close()
+
+
+@pytest.fixture
+def play(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[Callable[..., Played]]:
+    made: list[Played] = []
+
+    def make(period_ns: int = 500_000) -> Played:
+        made.append(Played(path, tmp_path / "faults", config, period_ns))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def sentences(recording: Recording) -> list[str]:
+    return [moment.sentence for moment in recording.about.timeline]
+
+
+def test_a_fault_is_written_with_the_ten_seconds_before_it(play: Callable[..., Played], config: ArmConfig) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(24_000, fault_at=23_990)
+    played.board.event(Code.BUS_LOST, value=5)
+    played.board.text("the drive's error code is 0x8611")
+    box.look()
+    box.finish()
+    (recording,) = played.recordings
+    about, records = recording.about, recording.records
+    assert (about.number, about.before, about.arm, about.bus) == (1, "moving", config.name, "virtual")
+    assert about.joints == tuple(joint.name for joint in config.joints)
+    assert "process data lost: 5 cycles" in about.what
+    assert int(records["cycle"][about.at]) == 23_990
+    assert int(records["cycle"][0]) == 23_990 - 20_000
+    assert int(records["cycle"][-1]) == 24_000
+    assert np.array_equal(records["position"][:, 0], records["cycle"] * 1e-4)
+    assert [about.what, "the drive's error code is 0x8611"] == sentences(recording)
+    assert any("number 1 (`rtcp faults show 1`)" in sentence for sentence in played.told)
+
+
+def test_further_fault_events_are_in_the_same_file_until_a_reset(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    box.look()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    first, second = played.recordings
+    assert len(sentences(first)) == 4
+    assert "process data lost" in first.about.what
+    assert "emergency stop" in second.about.what.lower()
+
+
+def test_what_follows_a_fault_is_waited_for(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blackbox, "AFTER_S", 2.0)  # time enough for this test, also on a busy host
+    played = play()
+    box = played.watched()
+    began = played.fill(100, fault_at=100)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    assert played.recordings == []
+    played.fill(1000, fault_at=1, ends_ns=began + 500_000_000)
+    while not played.told:
+        time.sleep(0.01)
+    assert time.monotonic_ns() - began >= 2_000_000_000
+    (recording,) = played.recordings
+    assert len(recording.records["cycle"]) == 1100
+    box.finish()
+
+
+def test_a_short_cycle_has_less_than_ten_seconds_and_the_list_says_so(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play(250_000)
+    taken, since = threading.Event(), played.observer.since
+
+    def told(number: int) -> Any:
+        found = since(number)
+        taken.set()
+        return found
+
+    box = played.watched()
+    played.fill(RECORDS + 1000, fault_at=RECORDS + 1000)
+    played.board.event(Code.BUS_LOST, value=5)
+    monkeypatch.setattr(played.observer, "since", told)
+    box.look()
+    # Read at once: what the ring takes in the second that follows does not push out what was before.
+    assert taken.wait(20)
+    played.fill(2000, fault_at=1)
+    box.finish()
+    (one,) = listed(played.directory)
+    assert one.about is not None
+    assert one.seconds > 8.1
+    assert any(note.startswith("8.2 s before the fault instead of 10 s: at 250 us") for note in one.about.notes)
+
+
+def test_torn_records_are_told_and_not_taken(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(1000, fault_at=900)
+    for number in (10, 11, 500):
+        slot = played.observer._records[number % RECORDS]
+        slot["number_again"] = 0
+    played.board.event(Code.BUS_LOST, value=5)
+    box.finish()
+    (recording,) = played.recordings
+    assert "3 cycles were overwritten before they were read, or torn" in recording.about.notes
+    assert len(recording.records["cycle"]) == 997
+    assert int(recording.records["cycle"][recording.about.at]) == 900
+
+
+def test_events_that_the_ring_no_longer_holds_are_told(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100, fault_at=90)
+    for _ in range(EVENTS):
+        played.board.event(Code.ARRIVED)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.finish()
+    (recording,) = played.recordings
+    assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
+
+
+def test_a_loop_that_has_died_is_a_fault_of_its_own_and_one_that_was_told_to_end_is_none(
+    play: Callable[..., Played],
+) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100)
+    box.loop_has_ended()
+    box.loop_has_ended()
+    box.finish()
+    (recording,) = played.recordings
+    assert "ended unexpectedly" in recording.about.what
+    assert (recording.about.before, recording.about.at, recording.about.event) == ("moving", 99, 0)
+    assert sentences(recording) == [recording.about.what]
+    told_to_end = played.watched()
+    told_to_end.end_is_wanted()
+    told_to_end.loop_has_ended()
+    told_to_end.finish()
+    assert len(played.recordings) == 1
+
+
+def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(100)
+    box = played.watched()
+    until = time.monotonic() + 0.5
+    while time.monotonic() < until:
+        played.fill(1)
+        box.look()
+        time.sleep(0.02)
+    assert played.told == []
+    last = time.monotonic()
+    while not played.told:
+        box.look()
+        time.sleep(0.01)
+    assert time.monotonic() - last >= 0.9
+    played.fill(1)
+    box.look()
+    assert any("publishes again" in sentence for sentence in played.told)
+    box.finish()
+    (recording,) = played.recordings
+    assert "has published nothing for 1 s" in recording.about.what
+    assert int(recording.records["cycle"][recording.about.at]) == 1
+
+
+def test_a_fault_that_no_gateway_saw_is_written_by_the_next_one_and_only_once(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(2000, fault_at=1000)
+    played.board.event(Code.BUS_LOST, value=5)
+    for _ in range(3):
+        played.watched().finish()
+    (recording,) = played.recordings
+    assert int(recording.records["cycle"][recording.about.at]) == 1000
+
+
+def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_only_once(
+    play: Callable[..., Played], tmp_path: Path, config: ArmConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(500)
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
+    monkeypatch.setattr(launcher, "blackboard_file", lambda directory: played.board.path)
+    told: list[str] = []
+    # The processes: this one made the blackboard, so it was the loop; another one of its number lives now.
+    for processes in (Processes(), Processes(loop=identify(os.getpid())), Processes(loop=Pid(os.getpid(), 1))):
+        assert played.recordings == []
+        processes.write(tmp_path)
+        launcher._record_unseen_end(tmp_path, told.append)
+        played.session.write(tmp_path / "session.pickle")
+    launcher._record_unseen_end(tmp_path, told.append)
+    (recording,) = played.recordings
+    assert "ended unexpectedly" in recording.about.what
+    assert (recording.about.before, recording.about.at) == ("moving", 499)
+    stopping_mark(tmp_path).touch()
+    recording_file = listed(played.directory)[0].path
+    recording_file.unlink()
+    launcher._record_unseen_end(tmp_path, told.append)
+    assert played.recordings == []
+
+
+def test_a_fault_that_has_left_the_ring_is_not_made_up(play: Callable[..., Played]) -> None:
+    played = play()
+    played.board.event(Code.BUS_LOST, value=5)
+    time.sleep(0.1)
+    played.fill(100, fault_at=1)
+    played.watched().finish()
+    assert played.recordings == []
+
+
+def test_a_fault_of_another_start_is_not_taken_for_this_ones(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(200, fault_at=100)
+    played.board.event(Code.BUS_LOST, value=5)
+    played.watched().finish()
+    played.session = replace(played.session, began_ns=BEGAN_NS + 1)
+    played.watched().finish()
+    assert len(played.recordings) == 2
+
+
+def test_a_disk_that_refuses_is_a_sentence_and_the_next_fault_is_tried_again(play: Callable[..., Played]) -> None:
+    played = play()
+    played.directory.write_text("no directory")
+    box = played.watched()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+    while not played.told:
+        played.fill(1)
+        box.look()
+        time.sleep(0.01)
+    assert str(played.directory) in played.told[0]
+    assert "no recording can be written" in played.told[0]
+    played.directory.unlink()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert len(played.recordings) == 1
+
+
+def test_a_look_does_not_wait_for_the_disk(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(20_000, fault_at=19_000)
+    written, asked, gate = blackbox.write, threading.Event(), threading.Event()
+
+    def slow(*given: object) -> object:
+        asked.set()
+        assert gate.wait(60)
+        return written(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(blackbox, "write", slow)
+    monkeypatch.setattr(blackbox, "AFTER_S", 0.0)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    assert asked.wait(20)
+    box.look()
+    assert played.told == []
+    gate.set()
+    box.finish()
+    assert len(played.recordings) == 1
+
+
+@pytest.mark.parametrize("break_it", ["drive", "frames"])
+def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_path: Path, break_it: str) -> None:
+    quick = replace(config, cycle=replace(config.cycle, period_us=2000.0))
+    with Simulation(quick, follow_clock=False) as simulation:
+        told: list[str] = []
+        session = Session(quick, "inprocess", "", 0, BEGAN_NS)
+        box = BlackBox(simulation.observer, session, tmp_path, told.append)
+        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
+        simulation.acquire()
+        simulation.order(Command.ENABLE)
+        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.order(Command.MOVE, _move((0.5,) * 6, 0.3))
+        simulation.run(0.8)
+        first = simulation.observer.head
+        if break_it == "drive":
+            simulation.models[2].inject_fault(0x8611)
+        else:
+            simulation.data.lose(200)
+        assert simulation.until(lambda: simulation.state is State.FAULT, 2.0)
+        box.look()
+        simulation.run(0.3)
+        box.finish()
+        (one,) = listed(tmp_path)
+        recording = read(one.path)
+        about, records = recording.about, recording.records
+        assert about.before == "moving"
+        ring, _ = simulation.observer.since(0)
+        whole = ring[np.isin(ring["number"], records["number"])]
+        for name, array in records.items():
+            assert np.array_equal(array, whole[name]), name
+        assert int(records["number"][about.at]) > first
+        assert int(records["state"][about.at]) == State.FAULT
+        assert int(records["state"][about.at - 1]) == State.MOVING
+        assert about.what in sentences(recording)
+        assert told
+
+
+def _move(q: Sequence[float], speed: float) -> list[float]:
+    return [*q, *([0.0] * 5), speed]

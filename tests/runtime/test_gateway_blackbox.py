@@ -1,0 +1,103 @@
+"""The gateway's process and the black box: a fault is not lost by a gateway that ends, and nobody waits for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.runtime.blackbox_file import About, listed
+from rtcp.runtime.client import ControlClient
+from rtcp.runtime.codes import Code
+from rtcp.runtime.paths import blackboard_file, control_socket
+from rtcp.runtime.session import Session
+from tests.runtime.played_loop import Loop
+
+
+class Gateways:
+    """A played loop, and gateways in front of it, one after the other."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory / "session.pickle")
+        (directory / "started.json").write_text("{}")
+        self.loop = Loop(blackboard_file(directory))
+        self._started: list[subprocess.Popen[bytes]] = []
+
+    def start(self) -> subprocess.Popen[bytes]:
+        reading, writing = os.pipe()
+        module = [sys.executable, "-m", "rtcp.runtime.gateway"]
+        process = subprocess.Popen(
+            [*module, "--directory", str(self.directory), "--ready-fd", str(writing)],
+            pass_fds=(writing,),
+            env={**os.environ, "RTCP_STATE_DIR": str(self.directory / "state")},
+        )
+        self._started.append(process)
+        os.close(writing)
+        with open(reading) as pipe:
+            assert pipe.readline()
+        return process
+
+    @property
+    def recorded(self) -> list[About]:
+        return [one.about for one in listed(self.directory / "state" / "faults") if one.about is not None]
+
+    def end(self) -> None:
+        for process in self._started:
+            process.kill()
+            process.wait()
+        self.loop.end()
+        blackboard_file(self.directory).unlink(missing_ok=True)
+
+
+@pytest.fixture
+def gateways() -> Iterator[Gateways]:
+    # Short: a control socket's path has 107 bytes at most.
+    directory = Path(tempfile.mkdtemp(prefix="rtcp-box-", dir="/tmp"))
+    made = Gateways(directory)
+    yield made
+    made.end()
+    shutil.rmtree(directory)
+
+
+def test_a_fault_followed_at_once_by_a_stop_is_written_before_the_blackboard_goes(gateways: Gateways) -> None:
+    gateway = gateways.start()
+    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    with ControlClient("a test", control_socket(gateways.directory)) as client:
+        client.call("stop", timeout_s=60.0)
+        assert [about.what.partition(":")[0] for about in gateways.recorded] == ["process data lost"]
+    assert not blackboard_file(gateways.directory).exists()
+    assert gateway.wait() == 0
+
+
+def test_a_fault_in_whose_second_the_gateway_is_killed_is_written_by_the_next_one(gateways: Gateways) -> None:
+    gateway = gateways.start()
+    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    with ControlClient("a test", control_socket(gateways.directory)) as client:
+        while not any("process data lost" in sentence for sentence in client.call("status")["messages"]):
+            pass
+    gateway.kill()
+    gateway.wait()
+    second = gateways.start()
+    second.terminate()
+    assert second.wait() == 0
+    assert len(gateways.recorded) == 1
+
+
+def test_the_status_is_answered_while_a_fault_is_written_and_names_its_number(gateways: Gateways) -> None:
+    gateways.start()
+    with ControlClient("a test", control_socket(gateways.directory)) as client:
+        gateways.loop.board.event(Code.BUS_LOST, value=3)
+        answers = 0
+        while not any("black box: this fault is number 1" in said for said in client.call("status")["messages"]):
+            answers += 1
+        assert answers > 3
+        assert client.call("status")["message"].startswith("process data lost")

@@ -1,0 +1,98 @@
+"""A platform's gateway is started anew when it has ended; here each one ends at once, since it finds no session."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.runtime import keeper
+from rtcp.runtime.keeper import GatewayKeeper
+from rtcp.runtime.lock import Busy, alone
+from rtcp.runtime.paths import stopping_mark
+from rtcp.runtime.running import Running
+from rtcp.runtime.session import Pid, Processes, identify, is_ours, read_processes
+
+
+class Kept:
+    """A platform of which this process plays the loop, and what its keeper tells."""
+
+    def __init__(self, directory: Path) -> None:
+        self.told: list[str] = []
+        self.running = Running(directory, load(default_config()), Processes(loop=identify(os.getpid())))
+        self.running.processes.gateway = Pid(1 << 22, 1)
+        self.running.processes.write(directory)
+        self.keeper = GatewayKeeper(self.running, self.told.append)
+
+    def look_until(self, met: Callable[[], bool]) -> None:
+        end = time.monotonic() + 60
+        while not met():
+            assert time.monotonic() < end, self.told
+            self.keeper.look()
+            time.sleep(0.01)
+
+    @property
+    def starts(self) -> int:
+        return sum("it is started anew" in sentence for sentence in self.told)
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kept]:
+    monkeypatch.setattr(keeper, "STARTS", 2)
+    made = Kept(tmp_path)
+    yield made
+    made.keeper.close()
+    for child in made.running._children:
+        child.kill()
+        child.wait()
+
+
+def test_a_gateway_that_cannot_live_is_started_only_so_often_and_its_log_keeps_every_end(
+    kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept.look_until(lambda: "left alone" in (kept.told or [""])[-1])
+    for _ in range(3):
+        kept.keeper.look()
+    assert kept.starts == 2
+    assert len(kept.told) == 3
+    assert kept.told[0] == f"the gateway (process {1 << 22}) has ended: it is started anew"
+    assert "has ended with code 1, 2 times within 60 s: it is left alone for a while" in kept.told[2]
+    assert (tmp_path / "gateway.log").read_text().count("No such file") == 2
+    # The minute has passed.
+    monkeypatch.setattr(keeper, "WINDOW_S", 0.0)
+    kept.look_until(lambda: kept.starts == 3)
+
+
+def test_it_is_written_down_whose_gateway_the_new_one_is(kept: Kept, tmp_path: Path) -> None:
+    kept.keeper.look()
+    written = read_processes(tmp_path)
+    assert written.loop == os.getpid()
+    assert written.gateway == kept.running.processes.gateway
+    assert is_ours(written.gateway)
+
+
+def test_whoever_holds_the_lock_is_left_to_it(kept: Kept, tmp_path: Path) -> None:
+    with alone(tmp_path):
+        kept.keeper.look()
+        with pytest.raises(Busy), alone(tmp_path):
+            pass
+    assert kept.told == []
+    kept.keeper.look()
+    assert kept.starts == 1
+
+
+def test_none_is_started_while_the_platform_is_being_stopped(kept: Kept, tmp_path: Path) -> None:
+    stopping_mark(tmp_path).touch()
+    kept.keeper.look()
+    assert kept.told == []
+
+
+def test_a_gateway_that_a_command_has_started_meanwhile_is_taken_over(kept: Kept, tmp_path: Path) -> None:
+    Processes(loop=kept.running.processes.loop, gateway=identify(os.getpid())).write(tmp_path)
+    kept.keeper.look()
+    assert kept.told == []
+    assert kept.running.processes.gateway == os.getpid()
