@@ -9,10 +9,19 @@ from typing import Any
 from pysoem import pysoem
 
 from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, code_meaning, state_name
-from rtcp.fieldbus.bus import BusError, MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, SyncManagerInfo
+from rtcp.fieldbus.bus import (
+    BusError,
+    MailboxInfo,
+    PdoEntryInfo,
+    PdoInfo,
+    SlaveInfo,
+    SyncManagerInfo,
+    slave_label,
+)
 from rtcp.fieldbus.registers import RegisterPort
 from rtcp.fieldbus.sdo import SdoClient
 from rtcp.fieldbus.states import read_al
+from rtcp.fieldbus.steps import Steps, finish
 
 RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
 _DEVICE_NAME = 0x1008
@@ -25,20 +34,31 @@ _EEPROM_CONFIG = 0x0500
 _SYNC_MANAGERS = 0x0800
 _DC_DELAY = 0x0928
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
+_SMALLEST_MAILBOX, _LARGEST_MAILBOX = 16, 1486
+"""Bytes: headers and an SDO (ETG.1000.6, 5.6.2); what one datagram carries."""
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
 """Bits 0 to 5 of SII word 0x1C (ETG.2010, table 4)."""
 _SYNC_MANAGER = struct.Struct("<HHBBBB")
 
 
 def read_mailbox(slave: Any) -> MailboxInfo | None:
-    """Return what the EEPROM of pysoem's `slave` says about its mailbox, None where it has none."""
+    """Return what the EEPROM of pysoem's `slave` says about its mailbox, None where it has none that can be."""
     receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE))
     send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND))
-    if not receive_size:
+    send_size = send_size or receive_size
+    if not _SMALLEST_MAILBOX <= min(receive_size, send_size) <= max(receive_size, send_size) <= _LARGEST_MAILBOX:
         return None
     bits = slave.eeprom_read(_SII_PROTOCOLS)[0]
     protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)
-    return MailboxInfo(receive_start, receive_size, send_start, send_size or receive_size, protocols)
+    return MailboxInfo(receive_start, receive_size, send_start, send_size, protocols)
+
+
+def name_of(slave: Any) -> str:
+    """Return the name that the EEPROM of pysoem's `slave` gives; bytes that are no UTF-8 are taken for Latin-1."""
+    try:
+        return str(slave.name)
+    except UnicodeDecodeError as error:
+        return error.object.decode("latin-1")
 
 
 def read_serial(slave: Any) -> int:
@@ -51,21 +71,29 @@ def eeprom_to_device(port: RegisterPort, station: int) -> None:
     port.write(station, _EEPROM_CONFIG, b"\x01\x00")
 
 
-def read_assignment(sdo: SdoClient, assignment: int) -> tuple[PdoInfo, ...]:
+def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:
     """Return the PDOs that 0x1C12 or 0x1C13 lists and what is mapped into them; names are left empty.
 
     Raises:
         BusError: the slave refuses or does not answer.
     """
     pdos = []
-    for number in range(1, sdo.read_int(assignment, 0) + 1):
-        pdo = sdo.read_int(assignment, number)
+    for number in range(1, (yield from _reading(sdo, assignment, 0, 0xFF)) + 1):
+        pdo = yield from _reading(sdo, assignment, number, 0xFFFF)
         entries = []
-        for i in range(1, sdo.read_int(pdo, 0) + 1):
-            mapped = sdo.read_int(pdo, i)
+        for i in range(1, (yield from _reading(sdo, pdo, 0, 0xFF)) + 1):
+            mapped = yield from sdo.reading_int(pdo, i)
             entries.append(PdoEntryInfo(mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF, ""))
         pdos.append(PdoInfo(pdo, tuple(entries)))
     return tuple(pdos)
+
+
+def _reading(sdo: SdoClient, index: int, subindex: int, most: int) -> Steps[int]:
+    found = yield from sdo.reading_int(index, subindex)
+    if found > most:
+        where = slave_label(sdo.position, sdo.name)
+        raise BusError(f"{where}: 0x{index:04X}:{subindex} reads as 0x{found:X}, at most 0x{most:X} is possible")
+    return found
 
 
 class _Names:
@@ -154,7 +182,7 @@ def describe(
 
     state, error, code = read_al(port, station)
     has_coe = mailbox is not None and mailbox.has_coe
-    name = str(slave.name)
+    name = name_of(slave)
     outputs: tuple[PdoInfo, ...] = ()
     inputs: tuple[PdoInfo, ...] = ()
     if has_coe and state in {AlState.PREOP, AlState.SAFEOP, AlState.OP}:
@@ -163,8 +191,8 @@ def describe(
             name = sdo.read(_DEVICE_NAME, 0).rstrip(b"\0").decode("latin-1")
         try:
             names = _Names(slave)
-            outputs = names.fill(read_assignment(sdo, RX_ASSIGN))
-            inputs = names.fill(read_assignment(sdo, TX_ASSIGN))
+            outputs = names.fill(finish(reading_assignment(sdo, RX_ASSIGN)))
+            inputs = names.fill(finish(reading_assignment(sdo, TX_ASSIGN)))
         except BusError:
             # A slave need not have assignment objects (ETG.1000.6, 5.6.7.4): its PDOs are then fixed in its EEPROM.
             outputs, inputs = (), ()

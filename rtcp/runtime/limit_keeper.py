@@ -199,5 +199,5 @@ def _read(path: Path, loop: int) -> Values | None:
         box = None if values["box"] is None else _corners(values["box"])
         joints = {name: tuple(values[name]) for name in _JOINT_KEYS.values()}
         return Values(**joints, box=box, keep_out=tuple(_corners(one) for one in values["keep_out"]))
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return None

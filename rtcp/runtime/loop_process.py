@@ -28,7 +28,7 @@ from rtcp.runtime.assembly import assemble, discipline_of, position_of
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.paths import blackboard_file
 from rtcp.runtime.service import Service
-from rtcp.runtime.session import Session, read_session
+from rtcp.runtime.session import Session, SessionError, read_session
 
 _DISABLE_CYCLES = 20
 
@@ -64,7 +64,12 @@ def main() -> int:
     parser.add_argument("--ready-fd", type=int, required=True)
     given = parser.parse_args()
     report = Report(given.ready_fd)
-    session = read_session(given.directory / "session.pickle")
+    try:
+        session = read_session(given.directory / "session.pickle")
+    except SessionError as error:
+        report.tell("error", sentences=[str(error)])
+        sys.stderr.write(f"{error}\n")
+        return 2
     # Until the cycle runs, SIGTERM unwinds what was opened; then it asks for a controlled stop.
     signal.signal(signal.SIGTERM, _leave)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -109,6 +114,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         config.bus.op_timeout_s,
         cpu,
         config.cycle.priority,
+        config.bus.watch_ms * 1e-3,
     )
     parts = assemble(config, data, blackboard, service, discipline)
     loop = parts.loop

@@ -32,6 +32,8 @@ from rtcp.runtime.layout import (
     EVENTS_AT,
     EVENTS_HEAD_AT,
     HEADER,
+    HEALTH_AT,
+    HEALTH_SIZE,
     LEASE_DURATION_AT,
     LEASE_HOLDER_AT,
     LEASE_HOLDER_SIZE,
@@ -106,6 +108,20 @@ class Text:
 
 
 @dataclass(frozen=True)
+class Health:
+    """What a slave has been through since the start: how often it left OP and came back, what its ports counted."""
+
+    lost: int
+    recovered: int
+    rx: int
+    """Damaged frames that came in over its own cables."""
+    forwarded: int
+    """Damaged frames that slaves before it had counted."""
+    links: int
+    """Lost links."""
+
+
+@dataclass(frozen=True)
 class Answer:
     """The loop's answer to a command: `refusal` 0 is acceptance."""
 
@@ -134,14 +150,15 @@ class Observer:
         except OSError as error:
             raise BlackboardError(f"blackboard {path} cannot be opened: {error.strerror}") from error
         size = os.fstat(self._descriptor).st_size
-        if size < RECORDS_AT:
+        if size < RECORDS_AT or size % 8:
             os.close(self._descriptor)
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
         self._words = Words(self._map)
         magic, joints, record_size, _, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
-        layout = RecordLayout(joints)
-        if magic != MAGIC or record_size != layout.size or size != layout.file_size:
+        # A number of joints that no record has would be a layout of gigabytes.
+        layout = RecordLayout(joints) if magic == MAGIC and joints <= record_size else None
+        if layout is None or record_size != layout.size or size != layout.file_size:
             self.close()
             raise BlackboardError(f"blackboard {path} is not of this version (magic 0x{magic:X}): start anew")
         self.joints = int(joints)
@@ -218,6 +235,16 @@ class Observer:
         """Return AL status and AL status code of the first `count` slaves."""
         found = [self._words[SLAVES_AT + i * 8] for i in range(count)]
         return [(word & 0xFFFF, word >> 16 & 0xFFFF) for word in found]
+
+    def health(self, count: int) -> list[Health]:
+        """Return what the first `count` slaves have been through."""
+        found = []
+        for at in range(HEALTH_AT, HEALTH_AT + count * HEALTH_SIZE, HEALTH_SIZE):
+            life, errors = self._words[at], self._words[at + 8]
+            found.append(
+                Health(life & 0xFFFF, life >> 16 & 0xFFFF, errors & 0xFFFF_FFFF, errors >> 32, life >> 32)
+            )  # fmt: skip
+        return found
 
     # -- the lease ----------------------------------------------------------------------------------------------
 

@@ -23,6 +23,8 @@ from rtcp.runtime.machine import Code
 from rtcp.runtime.operator import Operator
 from rtcp.runtime.service import Service
 
+_LARGEST_COUNTER = 0x7FFF
+"""What a damaged frame may bring is more than any segment has."""
 _LONGEST_NS = 2_000_000_000
 _AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 
@@ -105,7 +107,7 @@ class Recorder:
             arm.motions.mode,
             operator.stick_mode,
             flags,
-            wkc,
+            min(wkc, _LARGEST_COUNTER),
             self._data.expected_wkc,
             self.missed,
             behaviour.lost,

@@ -7,12 +7,20 @@ import json
 import os
 import pickle
 import signal
+import stat
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import TypeVar
 
 from rtcp.config.model import ArmConfig
 from rtcp.runtime.paths import processes_file, starts_file
+
+T = TypeVar("T")
+
+
+class SessionError(Exception):
+    """A file of the runtime directory is not there, damaged or another user's: a sentence."""
 
 
 class Pid(int):
@@ -57,7 +65,7 @@ def read_processes(directory: Path) -> Processes:
         starts = json.loads(starts_file(directory).read_text())
         names = [field.name for field in fields(Processes)]
         return Processes(*(Pid(int(numbers[name]), int(starts.get(str(numbers[name]), 0))) for name in names))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
         return Processes()
 
 
@@ -136,13 +144,49 @@ class Session:
     """When the start was asked for, CLOCK_MONOTONIC."""
 
     def write(self, path: Path) -> None:
-        """Write the file."""
-        path.write_bytes(pickle.dumps(self))
+        """Write the file, for its user alone: whoever reads it runs what it says."""
+        path.unlink(missing_ok=True)
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        with open(descriptor, "wb") as file:
+            file.write(pickle.dumps(self))
 
 
 def read_session(path: Path) -> Session:
-    """Read what `Session.write` wrote."""
-    found = pickle.loads(path.read_bytes())
-    if not isinstance(found, Session):
-        raise TypeError(f"{path} holds no session")
+    """Read what `Session.write` wrote.
+
+    Raises:
+        SessionError: the file is not there, is damaged, or others may write it.
+    """
+    try:
+        with open(path, "rb") as file:
+            found = os.fstat(file.fileno())
+            if found.st_uid not in (0, os.geteuid()) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+                raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
+            session = pickle.load(file)
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read: {error.strerror}") from error
+    except SessionError:
+        raise
+    except Exception as error:
+        # What a damaged pickle leads to is not told by its documentation.
+        raise SessionError(f"{path} is damaged ({type(error).__name__}: {error})") from error
+    if not isinstance(session, Session):
+        raise SessionError(f"{path} holds no session")
+    return session
+
+
+def read_json(path: Path, kind: type[T]) -> T:
+    """Read a file of the runtime directory that holds a `kind` as JSON.
+
+    Raises:
+        SessionError: the file is not there or is damaged.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except OSError as error:
+        raise SessionError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise SessionError(f"{path} is damaged: {error}") from error
+    if not isinstance(found, kind):
+        raise SessionError(f"{path} is damaged: found {type(found).__name__}, allowed is {kind.__name__}")
     return found

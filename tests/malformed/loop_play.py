@@ -1,0 +1,214 @@
+"""The real loop on mutated process data: statuswords, positions, modes, the stick's byte, counters and clock."""
+
+from __future__ import annotations
+
+import struct
+import time
+import traceback
+from dataclasses import replace
+from random import Random
+
+from rtcp.config import default_config, load
+from rtcp.runtime.machine import Command, State
+from rtcp.virtual.simulation import Frame, Simulation
+from tests.malformed.mutate import EDGES
+from tests.malformed.segment_play import Found, Memory
+
+WIRE = struct.Struct("<HiiiB")
+COUNTS = 10_000.0
+ENABLE_OPERATION = 0x0F
+STATE_MASK, OPERATION_ENABLED = 0x6F, 0x27
+CSP, CSV, CST = 8, 9, 10
+START = (0.0, 0.3, 1.2, 0.0, 0.5, 0.0)
+MARGIN = 0.03
+"""rad; so far outside its range a joint may be enabled, to be brought back."""
+_SHARES = (0.0, 0.002, 0.05, 0.5)
+_STRETCH = 400
+
+
+class Garbler:
+    """Stands before the process data's `receive`: a share of the answers is not what the slaves said."""
+
+    def __init__(self, simulation: Simulation, random: Random) -> None:
+        self.share = 0.0
+        self.mutated = 0
+        self._data = simulation.data
+        self._random = random
+        self._receive = simulation.data.receive
+        simulation.data.receive = self.receive  # type: ignore[method-assign]
+
+    def receive(self) -> int:
+        wkc = self._receive()
+        data, random = self._data, self._random
+        if wkc < 0 or random.random() >= self.share:
+            return wkc
+        self.mutated += 1
+        if random.random() < 0.1:
+            data.dc_time = random.choice((0, -1, -(1 << 63), (1 << 63) - 1, data.dc_time ^ 1 << random.randrange(63)))
+        if random.random() < 0.1:
+            data.wkc = random.choice((0, 1, 20, 22, 63, 0xFFFF))
+            return data.wkc
+        data.inputs = list(data.inputs)
+        for _ in range(random.choice((1, 1, 1, 3, 7))):
+            at = random.randrange(len(data.inputs))
+            data.inputs[at] = self._mutated(data.inputs[at])
+        return wkc
+
+    def _mutated(self, given: bytes) -> bytes:
+        """Other bytes, of the same length: a frame's length is judged before."""
+        random = self._random
+        found = bytearray(given)
+        kind = random.random()
+        if kind < 0.3:
+            found[random.randrange(len(found))] ^= 1 << random.randrange(8)
+        elif kind < 0.5:
+            at = random.randrange(len(found))
+            found[at : at + 4] = random.randbytes(len(found[at : at + 4]))
+        elif kind < 0.7 and len(found) == WIRE.size:
+            status, position, velocity, torque, mode = WIRE.unpack(found)
+            wild = random.choice(
+                (
+                    -(1 << 31),
+                    (1 << 31) - 1,
+                    0,
+                    max(-(1 << 31), min(position + random.randrange(-20_000, 20_000), (1 << 31) - 1)),
+                )
+            )
+            fields = random.choice((
+                (random.choice(EDGES), position, velocity, torque, mode), (status, wild, velocity, torque, mode),
+                (status, position, wild, torque, mode), (status, position, velocity, wild, mode),
+                (status, position, velocity, torque, random.randrange(256)),
+            ))  # fmt: skip
+            found[:] = WIRE.pack(*fields)
+        elif kind < 0.85:
+            found[:] = random.choice((b"\x00", b"\xff", b"\x80", b"\x7f")) * len(found)
+        else:
+            found[:] = random.randbytes(len(found))
+        return bytes(found)
+
+
+class Watch:
+    """Looks at every frame: what a drive that is enabled, and told to be, is told to do.
+
+    Enabled by its own word: what the loop has heard of it may be wrong.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        config = simulation.config
+        slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
+        self._slots = [slots[joint.slave] for joint in config.joints]
+        self._words = [model.objects[0x6041, 0] for model in simulation.models]
+        self._joints = config.joints
+        self._dt = config.cycle.period_us * 1e-6
+        self._before: list[tuple[int, int] | None] = [None] * len(self._joints)
+        self.failures: list[str] = []
+        self.enabled = 0
+        self.largest = 0.0
+        """Largest step, as a share of what the speed limit allows in a cycle."""
+
+    def see(self, frame: Frame) -> None:
+        for axis, (slot, joint) in enumerate(zip(self._slots, self._joints, strict=True)):
+            control, position, velocity, torque, mode = WIRE.unpack(frame.sent[slot])
+            if control != ENABLE_OPERATION or int(self._words[axis].value) & STATE_MASK != OPERATION_ENABLED:
+                self._before[axis] = None
+                continue
+            self.enabled += 1
+            here, told = position / COUNTS, f"at {frame.now_ns * 1e-9:.4f} joint {axis + 1}"
+            if mode == CSP:
+                low, high = joint.position.min - MARGIN, joint.position.max + MARGIN
+                if not low <= here <= high:
+                    self.failures.append(f"{told}: target {here} rad, allowed {low} to {high}")
+                if (before := self._before[axis]) is not None and before[1] == mode:
+                    step = (abs(position - before[0]) - 1) / COUNTS / (joint.velocity * self._dt)
+                    self.largest = max(self.largest, step)
+                    if step > 1.0:
+                        self.failures.append(f"{told}: a step of {step:.1f} times what the speed limit allows")
+            if abs(velocity) > joint.velocity * COUNTS + 1:
+                self.failures.append(f"{told}: {velocity} counts/s, more than its speed limit")
+            if mode == CST and abs(torque) > joint.torque * COUNTS + 1:
+                self.failures.append(f"{told}: {torque} counts of torque, more than its limit")
+            self._before[axis] = (position, mode)
+
+
+def play(count: int, seed: int) -> Found:
+    """Let the loop run until `count` answers were mutated, a third in each drive mode; a failure says what and when."""
+    found = Found("loop behind the master")
+    for at, mode in enumerate(("csp", "csv", "cst")):
+        one = _play(count // 3, seed + at, mode)
+        found.frames += one.frames
+        found.seconds += one.seconds
+        found.starts += one.starts
+        found.kinds += one.kinds
+        found.failures += [f"{mode}, {failure}" for failure in one.failures]
+        found.objects = max(found.objects, one.objects)
+        found.kilobytes = max(found.kilobytes, one.kilobytes)
+    return found
+
+
+def _play(count: int, seed: int, mode: str) -> Found:
+    found = Found(mode)
+    random = Random(seed)
+    config = load(default_config())
+    config = replace(config, mode=mode, cycle=replace(config.cycle, period_us=1000.0))  # type: ignore[arg-type]
+    began = time.monotonic()
+    memory: Memory | None = None
+    with Simulation(config, seed, positions=START) as simulation:
+        garbler, watch = Garbler(simulation, random), Watch(simulation)
+        simulation.on_frame = watch.see
+        simulation.acquire()
+        simulation.until(lambda: simulation.state is State.READY, 5.0)
+        while garbler.mutated < count and len(found.failures) < 10:
+            if memory is None and garbler.mutated >= 0.3 * count:
+                memory = Memory()
+            garbler.share = random.choice(_SHARES)
+            try:
+                _deed(simulation, random)
+                for _ in range(random.randrange(_STRETCH)):
+                    before = simulation.now_ns
+                    simulation.cycle()
+                    if not 0 < simulation.now_ns - before < 3_000_000:
+                        found.failures.append(f"the next cycle came {simulation.now_ns - before} ns later")
+            except Exception:
+                found.failures.append(f"after {garbler.mutated}:\n{traceback.format_exc()}")
+            found.kinds[simulation.state.name] += 1
+            found.failures += watch.failures[: 10 - len(found.failures)]
+            watch.failures.clear()
+        garbler.share = 0.0
+        found.starts += _sane(simulation)
+        if not found.starts:
+            found.failures.append(f"cannot be enabled afterwards: {simulation.state.name}, {simulation.events[-3:]}")
+        found.frames = garbler.mutated
+        found.kinds["cycles with a drive enabled"] = watch.enabled // 6
+    found.seconds = time.monotonic() - began
+    if memory is not None:
+        memory.tell(found)
+    return found
+
+
+def _deed(simulation: Simulation, random: Random) -> None:
+    """Enable, move, jog, halt, come back: whatever fits the state, and now and then what does not."""
+    state = simulation.state
+    if state in (State.FAULT, State.STOPPED_BY_LIMIT, State.EMERGENCY_STOP):
+        simulation.order(Command.RESET)
+    elif state is State.READY:
+        simulation.order(Command.ENABLE)
+    elif random.random() < 0.6:
+        speed = random.choice((0.0, 0.5))
+        simulation.order(Command.MOVE, [*(q + random.uniform(-0.3, 0.3) for q in START), speed])
+    else:
+        simulation.order(random.choice((Command.STOP, Command.DISABLE, Command.ENABLE, Command.RESET)))
+
+
+def _sane(simulation: Simulation) -> bool:
+    """Whether the arm comes back to holding once the answers are right."""
+    simulation.run(0.5)
+    for _ in range(5):
+        if simulation.state not in (State.READY, State.HOLDING, State.MOVING):
+            simulation.order(Command.RESET)
+            simulation.run(1.0)
+        if simulation.state is State.READY:
+            simulation.order(Command.ENABLE)
+            simulation.run(1.0)
+        if simulation.state is State.HOLDING:
+            return True
+    return False

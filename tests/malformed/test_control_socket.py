@@ -1,0 +1,164 @@
+"""The control socket of a real gateway on lines that are nearly right: answered or closed, and nothing happens."""
+
+from __future__ import annotations
+
+import copy
+import json
+import socket
+from collections import Counter
+from collections.abc import Iterator
+from random import Random
+from typing import Any
+
+import pytest
+
+from rtcp.runtime.paths import control_socket
+from tests.e2e.conftest import Platform, lives
+
+LINES = 800
+A_CONNECTION = 60
+Q = [0.1] * 6
+OBJECT = {"slave": 2, "index": 0x6041, "subindex": 0}
+REQUESTS: tuple[dict[str, Any], ...] = tuple(
+    {"id": 7, "do": verb, "client": "a test", "args": args}
+    for verb, args in (
+        ("status", {}), ("scan", {}), ("move", {"q": Q, "speed": 0.2, "each": False}), ("halt", {}), ("disable", {}),
+        ("move_pose", {"pose": Q, "line": True}), ("line", {"poses": [Q, Q], "speed": 0.1}),
+        ("trajectory", {"points": [{"t": 0.0, "q": Q}, {"t": 1.0, "q": Q}], "approach": True}),
+        ("jog", {"v": Q, "frame": "base", "hold_s": 0.1}), ("velocity", {"numbers": Q, "hold_s": 0.1}),
+        ("torque", {"numbers": Q, "stiffness": 0.5, "damping": 0.5, "hold_s": 0.1}), ("stream", {"q": Q, "t": 1.0}),
+        ("sdo_read", OBJECT), ("sdo_write", {**OBJECT, "index": 0x5FFF, "hex": "00"}),
+        ("limits", {"set": {"joint9.max": 1.0}}), ("zero", {"joint": "joint9"}), ("mode", {"name": "csp"}),
+        ("motion", {"name": "joint"}), ("run", {"file": "/none/a.csv"}), ("output", {"number": 17, "value": True}),
+        ("stick", {"pressed": ["away"], "hold_s": 0.1}),
+    )
+)  # fmt: skip
+NASTY: tuple[Any, ...] = (
+    None, True, False, 0, -1, 1.5, 1e308, -1e308, 10**400, 2**63, -(2**63) - 1, "", "x", "x" * 5000, "\ud800",
+    "\udfff\x00\x1b[2J", "../../etc/passwd", "ÿ" * 100, [], {}, [[]], [None] * 6, [1e308] * 6, {"": ""},
+    {"x" * 2000: 1}, [[[[[[[[]]]]]]]], list(range(3000)), "NaN", "1",
+)  # fmt: skip
+RAW = (
+    b"", b"\x00", b"\xff\xfe", b"{", b"}", b"[]", b"null", b'"', b"NaN", b"[" * 20_000, b'{"a":' * 5000,
+    b'{"do":"status","do":"scan","id":1}', b'{"id":1e999,"do":"status"}', b'{"id":NaN,"do":"status"}',
+    b'{"do":"\\ud800","client":"\\udc00","id":"\\ud800"}', b'{"id":1,"do":"move","args":{"q":[NaN,Infinity]}}',
+    b"GET / HTTP/1.1\r", b"\xef\xbb\xbf{}", b'{"id":' + b"9" * 5000 + b"}", b"9" * 60_000, bytes(range(11, 256)),
+)  # fmt: skip
+
+
+def nodes(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
+    """The ways to every value within a request."""
+    if path:
+        yield path
+    inside = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, below in inside:
+        yield from nodes(below, (*path, key))
+
+
+def mutated_line(random: Random) -> bytes:
+    """Return a line without its newline."""
+    if random.random() < 0.1:
+        return random.choice(RAW)
+    request = copy.deepcopy(random.choice(REQUESTS))
+    for _ in range(random.choice((1, 1, 2, 3))):
+        path = random.choice(list(nodes(request)))
+        within: Any = request
+        for key in path[:-1]:
+            within = within[key]
+        if random.random() < 0.2:
+            del within[path[-1]]
+        else:
+            within[path[-1]] = copy.deepcopy(random.choice(NASTY))
+    # What would end the platform or let the arm have torque is not in the list; nothing makes it up by chance.
+    line = bytearray(json.dumps(request).encode())
+    if random.random() < 0.2:
+        for _ in range(random.randrange(1, 4)):
+            line[random.randrange(len(line))] = random.choice(b'\x00\xff{}[]",:0e-\\')
+    if random.random() < 0.05:
+        del line[random.randrange(len(line)) :]
+    return bytes(line).replace(b"\n", b" ")
+
+
+@pytest.fixture(scope="module")
+def started() -> Iterator[Platform]:
+    made = Platform()
+    made.be_patient(2000)
+    made.rtcp("start", "--detach")
+    yield made
+    made.end()
+
+
+class Voice:
+    """A connection that says anything."""
+
+    def __init__(self, platform: Platform) -> None:
+        self._socket = socket.socket(socket.AF_UNIX)
+        self._socket.settimeout(60)
+        self._socket.connect(str(control_socket(platform.directory)))
+        self._file = self._socket.makefile("rb")
+
+    def say(self, data: bytes) -> None:
+        self._socket.sendall(data)
+
+    def hear(self) -> dict[str, Any] | None:
+        """Return the answer, None where the connection was closed."""
+        while line := self._file.readline():
+            answer: dict[str, Any] = json.loads(line)
+            if "ok" in answer:
+                return answer
+        return None
+
+    def hang_up(self) -> None:
+        self._file.close()
+        self._socket.close()
+
+
+def test_every_mutated_line_is_answered_or_ends_its_connection_and_nothing_moves(started: Platform) -> None:
+    random = Random(1)
+    before = started.status()
+    gateway = started.pids()["gateway"]
+    ends: Counter[str] = Counter()
+    voice = Voice(started)
+    silent = [Voice(started) for _ in range(40)]
+    for number in range(LINES):
+        line = mutated_line(random)
+        if number % A_CONNECTION == A_CONNECTION - 1:
+            # Hangs up in the middle of a line.
+            voice.say(line[: len(line) // 2])
+            voice.hang_up()
+            voice = Voice(started)
+        for part in (line[: len(line) // 3], line[len(line) // 3 :], b"\n"):
+            voice.say(part)
+        answer = voice.hear()
+        if answer is None:
+            ends["closed"] += 1
+            voice.hang_up()
+            voice = Voice(started)
+        else:
+            assert answer["ok"] or len(answer["error"]["message"]) > 10, answer
+            ends["done" if answer["ok"] else answer["error"]["kind"]] += 1
+    for one in (voice, *silent):
+        one.hang_up()
+    assert ends["internal"] == 0, started.logs()
+    assert ends["invalid"] > LINES // 3
+    assert ends["done"] > 50
+    after = started.status()
+    assert after["state"] == before["state"] == "ready"
+    assert after["joints"]["position"] == pytest.approx(before["joints"]["position"], abs=1e-3)
+    assert started.pids()["gateway"] == gateway
+    assert lives(gateway)
+    for log in started.directory.glob("*.log"):
+        assert "Traceback" not in log.read_text(), log
+
+
+def test_a_request_that_nobody_waits_for_and_a_flood_of_them_do_not_keep_others_from_theirs(started: Platform) -> None:
+    flood = Voice(started)
+    flood.say(b'{"id":1,"do":"sdo_read","args":{"slave":2,"index":24641,"subindex":0}}\n' * 200)
+    for _ in range(30):
+        one = Voice(started)
+        one.say(b'{"id":1,"do":"status"}\n' * 20)
+        one.hang_up()
+    assert started.status()["state"] == "ready"
+    assert all((flood.hear() or {}).get("ok") for _ in range(200))
+    flood.hang_up()
+    assert "Traceback" not in started.logs()
