@@ -20,6 +20,7 @@ from rtcp.config.operation import (
     OutputsConfig,
     WatchConfig,
 )
+from rtcp.config.stops import StopsConfig
 
 U8 = Annotated[int, Ge(0), Le(0xFF)]
 U16 = Annotated[int, Ge(0), Le(0xFFFF)]
@@ -166,6 +167,8 @@ class BusConfig:
     send_phase: Fraction = 0.5
     """Where between two SYNC0 the frame passes the reference slave, as a fraction of the period."""
     op_timeout_s: Positive = 5.0
+    watch_ms: Annotated[float, Ge(2), Le(1000)] = 10.0
+    """So often the slave watcher, on the thread beside the cycle, asks for the slaves' states."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,7 @@ class ArmConfig:
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
     watch: WatchConfig = field(default_factory=WatchConfig)
+    stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None

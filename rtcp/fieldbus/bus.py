@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.alstatus import AlState, code_meaning, state_name
+from rtcp.fieldbus.alstatus import AlState, code_meaning, code_remedy, state_name
 from rtcp.fieldbus.emergency import Emergency
+
+if TYPE_CHECKING:
+    from rtcp.fieldbus.sdo import SdoClient
+    from rtcp.fieldbus.watcher import Watcher
 
 
 class BusError(Exception):
@@ -132,9 +136,12 @@ class SlaveState:
     """AL status code."""
 
     def words(self) -> str:
-        """Return state and code in words."""
+        """Return state and code in words, with what to do about it where that is known."""
         text = state_name(self.state | (0x10 if self.error else 0))
-        return f"{text} (0x{self.code:04X}: {code_meaning(self.code)})" if self.error else text
+        if not self.error:
+            return text
+        remedy = code_remedy(self.code)
+        return f"{text} (0x{self.code:04X}: {code_meaning(self.code)})" + (f"; {remedy}" if remedy else "")
 
 
 class ProcessData(Protocol):
@@ -202,6 +209,16 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Bring the slaves back to INIT, switch SYNC off, close the bus; may be called at any time, also twice."""
+
+
+class WatchedBus(Bus, Protocol):
+    """A bus on a wire: slaves are lost and brought back while the cycle goes on."""
+
+    def sdo(self, position: int) -> SdoClient:
+        """Return SDO access to a slave, also in steps."""
+
+    def watcher(self, say: Callable[[str], None]) -> Watcher:
+        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
 
 
 def slave_label(position: int, name: str) -> str:

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+import struct
+import time
 from collections.abc import Sequence
 from typing import Any
 
-from rtcp.config.model import SlaveConfig
+from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.bus import BusError, slave_label, station_of
 from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.steps import Steps
 
 DC_ACTIVATE = 0x0981
 """Activation register: bit 0 cyclic operation, bit 1 SYNC0, bit 2 SYNC1."""
-_DC_SYSTEM_TIME, _DC_START = 0x0910, 0x0990
+_DC_RECEIVE_TIMES, _DC_RECEIVE_TIME = 0x0900, 0x0918
+"""Writing the first latches, in every slave that the frame passes, the local time at the second."""
+_DC_SYSTEM_TIME, _DC_OFFSET, _DC_DELAY, _DC_DIFFERENCE = 0x0910, 0x0920, 0x0928, 0x092C
+_DC_SPEED, _DC_SPEED_DEFAULT = 0x0930, b"\x00\x10"
+_DC_CYCLIC_UNIT, _DC_START, _DC_CYCLES = 0x0980, 0x0990, 0x09A0
+_SYNC_DELAY_NS = 100_000_000
+"""From the activation to the first SYNC0 at least."""
+_CLOSE_NS, _SETTLED_NS = 10_000, 2_000
+_SETTLE_S = 1.5
+_UNTIL_2000_NS = 946_684_800 * 1_000_000_000
 _SYNC1 = 0x0400
 
 
@@ -42,7 +54,7 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
                 master.slaves[position - 1].dc_sync(True, period_ns, shift, 0)
             else:
                 master.slaves[position - 1].dc_sync(True, period_ns, shift)
-            if _first_sync_is_ahead(port, station_of(position)):
+            if first_sync_is_ahead(port, station_of(position)):
                 break
         else:
             raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
@@ -52,7 +64,8 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
             raise BusError(f"{label}: `assign_activate` 0x{word:04X} reads back from register 0x0981 as {shown}")
 
 
-def _first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
+def first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
+    """Whether the next SYNC0 of the slave is still to come: one whose time has passed never comes."""
     now = port.read(station, _DC_SYSTEM_TIME, 4)
     start = port.read(station, _DC_START, 4)
     if now is None or start is None:
@@ -60,3 +73,85 @@ def _first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
     # The low 32 bits alone: an ESC may have no more.
     ahead = int.from_bytes(start, "little") - int.from_bytes(now, "little") & 0xFFFFFFFF
     return 0 < ahead < 0x80000000
+
+
+def take_over_time(
+    port: RegisterPort, position: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
+) -> None:
+    """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.6).
+
+    Args:
+        port: the port for registers.
+        position: the slave whose clock is set; SYNC0 is off. It need not have a station address.
+        label: how sentences name it.
+        delay: its propagation delay from the reference clock, as register 0x0928 holds it.
+        others: the other slaves that have a clock, the reference first; the first one that answers is believed.
+        always: set it also where it shows the reference's time already.
+
+    Raises:
+        BusError: it stopped answering.
+    """
+    if not always:
+        shown = port.read_at(position, _DC_DIFFERENCE, 4)
+        if shown is not None and _difference(shown) < _CLOSE_NS:
+            return
+    port.write_all(_DC_RECEIVE_TIMES, bytes(4))
+    own = port.read_at(position, _DC_RECEIVE_TIME, 8)
+    if own is None:
+        raise BusError(f"{label} stopped answering while its clock was set")
+    # Where no other clock lives, the host's time is as good as any (SOEM starts with it): ns since 2000.
+    time_then = time.time_ns() - _UNTIL_2000_NS
+    for other in others:
+        station = station_of(other)
+        theirs = [port.read(station, address, 8) for address in (_DC_RECEIVE_TIME, _DC_OFFSET)]
+        their_delay = port.read(station, _DC_DELAY, 4)
+        if None not in theirs and their_delay is not None:
+            time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
+            time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
+            break
+    offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
+    port.write_at(position, _DC_DELAY, delay)
+    port.write_at(position, _DC_OFFSET, offset.to_bytes(8, "little"))
+
+
+def forget_drift(port: RegisterPort, position: int) -> None:
+    """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
+    port.write_at(position, _DC_SPEED, _DC_SPEED_DEFAULT)
+
+
+def settle_clock(port: RegisterPort, station: int) -> Steps[None]:
+    """Let drift compensation bring a slave's clock to the reference's; after a while go on whatever it shows."""
+    until = time.monotonic() + _SETTLE_S
+    while time.monotonic() < until:
+        shown = port.read(station, _DC_DIFFERENCE, 4)
+        if shown is not None and _difference(shown) < _SETTLED_NS:
+            return
+        yield
+
+
+def _difference(register: bytes) -> int:
+    # Sign and magnitude (ETG.1000.4, table 60).
+    return int.from_bytes(register, "little") & 0x7FFF_FFFF
+
+
+def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int) -> None:
+    """Start SYNC0 of one slave on the grid of the others, as SOEM does it for all (ec_dcsync0).
+
+    Raises:
+        BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
+    """
+    shift = round(device.sync0_shift_us * 1000)
+    port.write(station, DC_ACTIVATE, b"\0")
+    port.write(station, _DC_CYCLIC_UNIT, b"\0")
+    now = port.read(station, _DC_SYSTEM_TIME, 8)
+    if now is None:
+        raise BusError(f"{label} stopped answering while its SYNC0 was started")
+    begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
+    port.write(station, _DC_START, begin.to_bytes(8, "little"))
+    port.write(station, _DC_CYCLES, struct.pack("<II", period_ns, 0))
+    activation = bytes((device.assign_activate >> 8,))
+    port.write(station, DC_ACTIVATE, activation)
+    if not first_sync_is_ahead(port, station):
+        raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
+    if port.read(station, DC_ACTIVATE, 1) != activation:
+        raise BusError(f"{label}: it does not keep `assign_activate` 0x{device.assign_activate:04X} (register 0x0981)")

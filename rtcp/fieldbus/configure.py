@@ -12,8 +12,9 @@ from rtcp.fieldbus.abort import ABSENT
 from rtcp.fieldbus.bus import BusError, SdoAborted, slave_label
 from rtcp.fieldbus.pdo import TYPES
 from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.scan import RX_ASSIGN, TX_ASSIGN, read_assignment
+from rtcp.fieldbus.scan import RX_ASSIGN, TX_ASSIGN, name_of, reading_assignment
 from rtcp.fieldbus.sdo import SdoClient
+from rtcp.fieldbus.steps import Steps
 
 _WATCHDOG_DIVIDER, _WATCHDOG_TIME = 0x0400, 0x0420
 _DIVIDER = 2498
@@ -37,7 +38,7 @@ def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> li
         slave = found[position - 1] if position <= len(found) else None
         config = expected[position - 1] if position <= len(expected) else None
         if config is None and slave is not None:
-            faults.append(f"position {position}: expected nothing, found {_identity(slave.name, slave.man, slave.id)}")
+            faults.append(f"position {position}: expected nothing, found {_found(slave)}")
         if config is None:
             continue
         device = config.device
@@ -45,15 +46,16 @@ def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> li
         if slave is None:
             faults.append(f"position {position} ({config.name}): expected {wanted}, found nothing")
         elif (slave.man, slave.id) != (device.vendor_id, device.product_id):
-            faults.append(
-                f"position {position} ({config.name}): expected {wanted}, "
-                f"found {_identity(slave.name, slave.man, slave.id)}"
-            )
+            faults.append(f"position {position} ({config.name}): expected {wanted}, found {_found(slave)}")
     return faults
 
 
 def _identity(name: str, vendor: int, product: int) -> str:
     return f"{name} (vendor 0x{vendor:08X}, product 0x{product:08X})"
+
+
+def _found(slave: Any) -> str:
+    return _identity(name_of(slave), slave.man, slave.id)
 
 
 def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
@@ -74,8 +76,10 @@ def mapping_text(mapping: Mapping) -> str:
     return f"{bits} bits ({listed or 'no PDO'})"
 
 
-def configure_slave(sdo: SdoClient, port: RegisterPort, station: int, config: SlaveConfig, period_ns: int) -> list[str]:
-    """Set up one slave that is in PRE-OP.
+def configure_slave(
+    sdo: SdoClient, port: RegisterPort, station: int, config: SlaveConfig, period_ns: int
+) -> Steps[list[str]]:
+    """Set up one slave that is in PRE-OP, in steps.
 
     Returns:
         Sentences on what was tolerated.
@@ -87,35 +91,35 @@ def configure_slave(sdo: SdoClient, port: RegisterPort, station: int, config: Sl
     notes: list[str] = []
     for assignment, pdos, key in ((RX_ASSIGN, device.rpdo, "rpdo"), (TX_ASSIGN, device.tpdo, "tpdo")):
         if device.configurable_pdos:
-            write_mapping(sdo, assignment, mapping_of(pdos))
-        compare_mapping(sdo, assignment, mapping_of(pdos), key)
+            yield from write_mapping(sdo, assignment, mapping_of(pdos))
+        yield from compare_mapping(sdo, assignment, mapping_of(pdos), key)
     for startup in device.sdo:
-        notes += write_startup(sdo, startup)
+        notes += yield from write_startup(sdo, startup)
     if device.kind == "cia402":
-        notes += write_interpolation_time(sdo, period_ns)
+        notes += yield from write_interpolation_time(sdo, period_ns)
     set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
     return notes
 
 
-def write_mapping(sdo: SdoClient, assignment: int, mapping: Mapping) -> None:
+def write_mapping(sdo: SdoClient, assignment: int, mapping: Mapping) -> Steps[None]:
     """Write PDO mapping and assignment: counts to 0, entries, counts (ETG.1000.6, 5.6.5.2)."""
-    sdo.write_int(assignment, 0, 0, 1)
+    yield from sdo.writing_int(assignment, 0, 0, 1)
     for pdo, entries in mapping:
-        sdo.write_int(pdo, 0, 0, 1)
+        yield from sdo.writing_int(pdo, 0, 0, 1)
         for i, (index, sub_index, bits) in enumerate(entries, 1):
-            sdo.write_int(pdo, i, index << 16 | sub_index << 8 | bits, 4)
-        sdo.write_int(pdo, 0, len(entries), 1)
+            yield from sdo.writing_int(pdo, i, index << 16 | sub_index << 8 | bits, 4)
+        yield from sdo.writing_int(pdo, 0, len(entries), 1)
     for i, (pdo, _) in enumerate(mapping, 1):
-        sdo.write_int(assignment, i, pdo, 2)
-    sdo.write_int(assignment, 0, len(mapping), 1)
+        yield from sdo.writing_int(assignment, i, pdo, 2)
+    yield from sdo.writing_int(assignment, 0, len(mapping), 1)
 
 
-def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str) -> None:
+def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str) -> Steps[None]:
     """Read the mapping and compare it; raises BusError where it differs (`key`: that of the device's file)."""
     try:
         found = tuple(
             (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries))
-            for pdo in read_assignment(sdo, assignment)
+            for pdo in (yield from reading_assignment(sdo, assignment))
         )
     except SdoAborted as error:
         if error.code not in ABSENT or expected:
@@ -128,7 +132,7 @@ def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str
         )
 
 
-def write_startup(sdo: SdoClient, startup: StartupSdo) -> list[str]:
+def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
     code = "B" if startup.type == "bool" else TYPES[startup.type][1]
     packer = struct.Struct("<" + code)
@@ -136,8 +140,8 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> list[str]:
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
     where = slave_label(sdo.position, sdo.name)
     try:
-        sdo.write(startup.index, startup.sub_index, data)
-        kept = sdo.read(startup.index, startup.sub_index)
+        yield from sdo.writing(startup.index, startup.sub_index, data)
+        kept = yield from sdo.reading(startup.index, startup.sub_index)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
             return [f"{where} has no {what}; it is marked optional and was left out"]
@@ -159,7 +163,7 @@ def interpolation_time(period_ns: int) -> tuple[int, int] | None:
     return (value, exponent) if 0 < value <= 255 else None
 
 
-def write_interpolation_time(sdo: SdoClient, period_ns: int) -> list[str]:
+def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]:
     """Set 0x60C2 to the period where the drive has it; return a note where that was not possible."""
     where = slave_label(sdo.position, sdo.name)
     said = interpolation_time(period_ns)
@@ -167,8 +171,8 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int) -> list[str]:
         return [f"{where}: its interpolation time (0x60C2) cannot say {period_ns / 1000:g} us and was left as it is"]
     try:
         for subindex, byte in ((1, said[0].to_bytes(1, "little")), (2, said[1].to_bytes(1, "little", signed=True))):
-            sdo.write(_INTERPOLATION, subindex, byte)
-            kept = sdo.read(_INTERPOLATION, subindex)
+            yield from sdo.writing(_INTERPOLATION, subindex, byte)
+            kept = yield from sdo.reading(_INTERPOLATION, subindex)
             if kept != byte:
                 raise BusError(
                     f"{where}: 0x60C2:{subindex} (interpolation time) was set to {byte.hex()}, "

@@ -88,6 +88,31 @@ ERROR_CODES: dict[int, str] = {
     0xFF00: "specific to the maker",
 }
 
+# What to do about it, before `rtcp reset`; found as the meanings are.
+REMEDIES: dict[int, str] = {
+    0x2000: "check the motor's cables for a short circuit and the joint for something that blocks it",
+    0x2310: "check the joint for something that blocks or overloads it",
+    0x3000: "check the supply: its voltage and its plugs",
+    0x3210: "check the supply's voltage, and brake more slowly where it rises while the arm brakes",
+    0x3220: "check the supply: its voltage under load and its plugs",
+    0x4000: "let it cool down, and check the load and the surroundings",
+    0x5000: "switch it off and on; where it comes again, the drive is broken",
+    0x5100: "check the supply of its electronics",
+    0x5441: "check the safety circuit: safe torque off is asked for",
+    0x6000: "switch it off and on; where it comes again, ask the maker",
+    0x6320: "compare the `sdo` entries of its device file with its manual",
+    0x7120: "check the motor's cables and the joint for something that blocks it",
+    0x7300: "check the encoder and its cable",
+    0x8100: "check the bus's cables; the master may have been stopped",
+    0x8200: "compare `rpdo` and `tpdo` of its device file with its manual",
+    0x8300: "check the joint for something that blocks or overloads it",
+    0x8400: "check what drove the joint so fast: its load, and its limits of speed",
+    0x8500: "check the joint for something that blocks it, and its limits of speed and acceleration",
+    0x8600: "check the joint for something that blocks it, and its limits of speed and acceleration",
+    0x8700: "frames miss their SYNC0: check the cycle's jitter (`rtcp doctor`)",
+    0x9000: "check what is wired to its inputs",
+}
+
 
 @dataclass(frozen=True)
 class Emergency:
@@ -108,6 +133,7 @@ class Emergency:
         return (
             f"slave {self.position} ({self.name}) sent emergency 0x{self.error_code:04X}: "
             f"{error_meaning(self.error_code)} (error register 0x{self.error_register:02X}, data {self.data.hex(' ')})"
+            f"{_advice(self.error_code)}"
         )
 
 
@@ -117,6 +143,23 @@ def error_meaning(code: int) -> str:
         if known in ERROR_CODES and (known or not code):
             return ERROR_CODES[known]
     return "not in CiA 402"
+
+
+def error_remedy(code: int) -> str:
+    """Return what can be done about an error code; empty where nothing is known."""
+    return next(
+        (REMEDIES[known] for known in (code, code & 0xFFF0, code & 0xFF00, code & 0xF000) if known in REMEDIES), ""
+    )
+
+
+def error_words(code: int) -> str:
+    """Return an error code with its meaning and what to do about it."""
+    return f"0x{code:04X}: {error_meaning(code)}{_advice(code)}"
+
+
+def _advice(code: int) -> str:
+    remedy = error_remedy(code)
+    return f"; {remedy}, then `rtcp reset`" if remedy else ""
 
 
 def parse(message: bytes, position: int, name: str) -> Emergency | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import time
 from enum import IntEnum
 
 from rtcp.fieldbus.bus import BusError, MailboxInfo
@@ -11,7 +10,6 @@ from rtcp.fieldbus.registers import Command, RegisterPort
 
 _SM0_STATUS, _SM1_STATUS, _FULL = 0x0805, 0x080D, 0x08
 _HEADER = struct.Struct("<HHBB")
-_POLL_S = 0.0002
 
 
 class MailboxType(IntEnum):
@@ -35,7 +33,7 @@ _ERRORS = {
 
 
 class Mailbox:
-    """Messages to and from one slave; waiting sleeps, and leaves interpreter and CPU to the cycle."""
+    """Messages to and from one slave. Nothing is waited for but the frames."""
 
     def __init__(self, port: RegisterPort, station: int, info: MailboxInfo) -> None:
         """Take the mailbox of the slave at configured address `station`."""
@@ -48,27 +46,25 @@ class Mailbox:
         """Bytes that a message to the slave may have behind its mailbox header."""
         return self._info.receive_size - _HEADER.size
 
-    def send(self, content: bytes, deadline: float) -> None:
-        """Give the slave a CoE message.
+    def send(self, content: bytes) -> bool:
+        """Give the slave a CoE message; return False while its mailbox is still full.
 
         Args:
             content: CoE header and what follows, `room` bytes at most.
-            deadline: monotonic time (s) until which a full mailbox is waited for.
 
         Raises:
-            BusError: the mailbox stays full, or the slave does not answer.
+            BusError: the slave does not answer.
         """
+        if self._is_full(_SM0_STATUS):
+            return False
         # Counter 0 is not checked by slaves; SOEM counts its own messages 1 to 7, unknown to us (ETG.1000.4, table 29).
         message = _HEADER.pack(len(content), 0, 0, MailboxType.COE) + content
         message = message.ljust(self._info.receive_size, b"\0")
-        while self._is_full(_SM0_STATUS):
-            if time.monotonic() >= deadline:
-                raise BusError("its mailbox stays full")
-            time.sleep(_POLL_S)
         # Once only: whether a lost frame reached the slave is not known.
         start = self._info.receive_start
         if self._port.exchange(Command.FPWR, self._station, start, message, tries=1).wkc != 1:
             raise BusError("it did not take the message")
+        return True
 
     def receive(self) -> bytes | None:
         """Return a CoE message that waits (CoE header first), None where none does.
@@ -88,14 +84,6 @@ class Mailbox:
             code = int.from_bytes(content[2:4], "little")
             raise BusError(f"mailbox error {code}: {_ERRORS.get(code, 'not in the standard')}")
         return content if kind & 0x0F == MailboxType.COE else None
-
-    def wait(self, deadline: float) -> bytes:
-        """Return the next CoE message; raises BusError as `receive`, and where none comes until `deadline`."""
-        while (message := self.receive()) is None:
-            if time.monotonic() >= deadline:
-                raise BusError("no answer in time")
-            time.sleep(_POLL_S)
-        return message
 
     def _is_full(self, register: int) -> bool:
         status = self._port.read(self._station, register, 1)

@@ -32,6 +32,8 @@ class Command(IntEnum):
     """EtherCAT commands used here (ETG.1000.4, table 8)."""
 
     NOP = 0
+    APRD = 1
+    APWR = 2
     FPRD = 4
     FPWR = 5
     BRD = 7
@@ -130,6 +132,15 @@ class RegisterPort:
     def write(self, station: int, address: int, data: bytes) -> bool:
         """Write registers of the slave at configured address `station` (FPWR); return whether it took them."""
         return self.exchange(Command.FPWR, station, address, data).wkc == 1
+
+    def read_at(self, position: int, address: int, length: int) -> bytes | None:
+        """Return registers of the slave at `position` on the cable (APRD), which needs no station address for it."""
+        data, wkc = self.exchange(Command.APRD, 1 - position & 0xFFFF, address, bytes(length))
+        return data if wkc == 1 else None
+
+    def write_at(self, position: int, address: int, data: bytes) -> bool:
+        """Write registers of the slave at `position` on the cable (APWR); return whether it took them."""
+        return self.exchange(Command.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
 
     def read_all(self, address: int, length: int) -> Answer:
         """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import socket
-import threading
-from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from types import TracebackType
 from typing import Any
@@ -18,21 +16,22 @@ from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import BusError, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import DC_ACTIVATE, start_clocks
 from rtcp.fieldbus.configure import configure_slave, identity_faults
-from rtcp.fieldbus.emergency import Emergency, parse
+from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.exchange import SoemProcessData
 from rtcp.fieldbus.fence import Fence
 from rtcp.fieldbus.interface import claim, open_master
 from rtcp.fieldbus.link import PromiscuousMode, check_interface
-from rtcp.fieldbus.mailbox import Mailbox
+from rtcp.fieldbus.mailboxes import Mailboxes
 from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.pdo import layout, layout_faults
 from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.scan import describe, eeprom_to_device, parents, read_mailbox, read_serial
+from rtcp.fieldbus.restore import Restorer, take_set_up
+from rtcp.fieldbus.scan import describe, eeprom_to_device, name_of, parents, read_mailbox, read_serial
 from rtcp.fieldbus.sdo import SdoClient
+from rtcp.fieldbus.steps import finish
+from rtcp.fieldbus.watcher import Watcher
 
-_SM1_STATUS, _MAILBOX_FULL = 0x080D, 0x08
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
-_MESSAGES_A_POLL = 8
 
 
 class SoemBus:
@@ -65,10 +64,10 @@ class SoemBus:
         self._promiscuous: PromiscuousMode | None = None
         self._port: RegisterPort | None = None
         self._fence: Fence | None = None
-        self._sdo_lock = threading.RLock()
         self._names: list[str] = []
-        self._mailboxes: list[MailboxInfo | None] = []
-        self._emergencies: deque[Emergency] = deque(maxlen=256)
+        self._infos: list[MailboxInfo | None] = []
+        self._boxes: Mailboxes | None = None
+        self._restorer: Restorer | None = None
 
     def __enter__(self) -> SoemBus:
         self.open()
@@ -85,6 +84,12 @@ class SoemBus:
         if self._port is None:
             raise BusError(f"the bus on {self.interface} is not open")
         return self._port
+
+    @property
+    def _mailboxes(self) -> Mailboxes:
+        if self._port is None or self._boxes is None:
+            raise BusError(f"the bus on {self.interface} is not open")
+        return self._boxes
 
     def open(self) -> None:
         """Join the namespace, open the interface.
@@ -118,7 +123,7 @@ class SoemBus:
         self._to_preop()
         self._master.config_dc()
         found = [
-            describe(slave, self._sdo(i + 1), self.port, station_of(i + 1), self._mailboxes[i], serials[i])
+            describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], serials[i])
             for i, slave in enumerate(self._master.slaves)
         ]
         before = parents([info.ports for info in found])
@@ -142,7 +147,7 @@ class SoemBus:
         faults = identity_faults(self._master.slaves, slaves)
         if faults:
             raise BusError(*faults)
-        self._names = [config.name for config in slaves]
+        self._names[:] = [config.name for config in slaves]
         if faults := list(self._to_preop()):
             raise BusError(*faults)
         for i, config in enumerate(slaves):
@@ -161,6 +166,8 @@ class SoemBus:
         self.request_state(AlState.SAFEOP)
         if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
             raise BusError(*refused)
+        set_ups = [take_set_up(self.port, position, config.name) for position, config in enumerate(slaves, 1)]
+        self._restorer = Restorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
         return data
 
     def _discover(self) -> None:
@@ -170,8 +177,9 @@ class SoemBus:
         if self._master.config_init() <= 0:
             raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
         found = self._master.slaves
-        self._names = [slave.name for slave in found]
-        self._mailboxes = [read_mailbox(slave) for slave in found]
+        self._names = [name_of(slave) for slave in found]
+        self._infos = [read_mailbox(slave) for slave in found]
+        self._boxes = Mailboxes(self.port, self._names, self._infos)
         for position in range(1, len(found) + 1):
             eeprom_to_device(self.port, station_of(position))
         left = self.port.read_all(DC_ACTIVATE, 1).data
@@ -179,7 +187,7 @@ class SoemBus:
             raise BusError(f"SYNC0 of a slave on {self.interface} is still active and cannot be switched off")
 
     def _to_preop(self) -> tuple[str, ...]:
-        stations = self._stations(i + 1 for i, mailbox in enumerate(self._mailboxes) if mailbox is not None)
+        stations = self._stations(i + 1 for i, mailbox in enumerate(self._infos) if mailbox is not None)
         return self._lead(AlState.PREOP, stations) if stations else ()
 
     def _lead(self, state: AlState, stations: dict[int, str]) -> tuple[str, ...]:
@@ -187,7 +195,7 @@ class SoemBus:
         return states.wait_for_state(self.port, stations, state, self._state_timeout_s)
 
     def _configure_slave(self, i: int, config: SlaveConfig, period_ns: int) -> list[str]:
-        return configure_slave(self._sdo(i + 1), self.port, station_of(i + 1), config, period_ns)
+        return finish(configure_slave(self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), config, period_ns))
 
     def _map(self, slaves: Sequence[SlaveConfig]) -> None:
         try:
@@ -197,9 +205,9 @@ class SoemBus:
             known = (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError)
             met = [fault for fault in error.error_list if isinstance(fault, known)]
             if met:
-                raise BusError(
-                    *(f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
-                ) from error
+                # SOEM may meet the same one hundreds of times.
+                told = (f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
+                raise BusError(*dict.fromkeys(told)) from error
         faults = []
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             label = slave_label(i + 1, config.name)
@@ -247,54 +255,24 @@ class SoemBus:
 
     def emergencies(self) -> tuple[Emergency, ...]:
         """Return the emergency messages that came since the last call; without any it takes one frame."""
-        full = self.port.read_all(_SM1_STATUS, 1).data
-        # While an SDO is under way its answer is in the mailbox; whoever waits for it then meets emergencies too.
-        if any(byte & _MAILBOX_FULL for byte in full) and self._sdo_lock.acquire(blocking=False):
-            try:
-                self._empty_mailboxes()
-            finally:
-                self._sdo_lock.release()
-        result = []
-        while self._emergencies:
-            result.append(self._emergencies.popleft())
-        return tuple(result)
-
-    def _empty_mailboxes(self) -> None:
-        for position, info in enumerate(self._mailboxes, 1):
-            if info is not None:
-                self._empty(Mailbox(self.port, station_of(position), info), position)
-
-    def _empty(self, mailbox: Mailbox, position: int) -> None:
-        try:
-            for _ in range(_MESSAGES_A_POLL):
-                message = mailbox.receive()
-                if message is None:
-                    return
-                self._keep_message(message, position)
-        except BusError as error:
-            raise BusError(
-                f"{slave_label(position, self._names[position - 1])}, reading its mailbox: {error}"
-            ) from error
-
-    def _keep_message(self, message: bytes, position: int) -> None:
-        found = parse(message, position, self._names[position - 1])
-        if found is not None:
-            self._emergencies.append(found)
+        return self._mailboxes.emergencies()
 
     def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
         """Return an object's value; raises SdoAborted (the slave refused) or BusError (no answer)."""
-        return self._sdo(position).read(index, subindex)
+        return self._mailboxes.sdo(position).read(index, subindex)
 
     def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
         """Write an object's value; raises as `sdo_read`."""
-        self._sdo(position).write(index, subindex, data)
+        self._mailboxes.sdo(position).write(index, subindex, data)
 
-    def _sdo(self, position: int) -> SdoClient:
-        if not 1 <= position <= len(self._names):
-            raise BusError(f"there is no slave {position}; the bus has slaves 1 to {len(self._names)}")
-        info = self._mailboxes[position - 1]
-        mailbox = Mailbox(self.port, station_of(position), info) if info is not None and info.has_coe else None
-        return SdoClient(mailbox, position, self._names[position - 1], self._sdo_lock, self._keep_message)
+    def sdo(self, position: int) -> SdoClient:
+        """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
+        return self._mailboxes.sdo(position)
+
+    def watcher(self, say: Callable[[str], None]) -> Watcher:
+        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
+        assert self._restorer is not None, "only a configured bus has something to restore"
+        return Watcher(self.port, self._names, self._restorer, say)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions

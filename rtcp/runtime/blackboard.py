@@ -28,6 +28,8 @@ from rtcp.runtime.layout import (
     EVENTS_AT,
     EVENTS_HEAD_AT,
     HEADER,
+    HEALTH_AT,
+    HEALTH_SIZE,
     LEASE_DURATION_AT,
     LEASE_ID_AT,
     LEASE_RENEWED_AT,
@@ -46,6 +48,8 @@ from rtcp.runtime.layout import (
 )
 from rtcp.runtime.plans import mark_in_use, place
 from rtcp.runtime.words import Words
+
+_U16, _U32 = 0xFFFF, 0xFFFF_FFFF
 
 
 class Blackboard:
@@ -125,6 +129,13 @@ class Blackboard:
         """Note the state of the slave at `position` (from 1)."""
         if 1 <= position <= SLAVES_MAX:
             self._words[SLAVES_AT + (position - 1) * 8] = al_status | al_status_code << 16
+
+    def health(self, position: int, lost: int, recovered: int, rx: int, forwarded: int, links: int) -> None:
+        """Note how often the slave at `position` left OP and came back, and what its ports have counted."""
+        if 1 <= position <= SLAVES_MAX:
+            at = HEALTH_AT + (position - 1) * HEALTH_SIZE
+            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | min(links, _U32) << 32
+            self._words[at + 8] = min(rx, _U32) | min(forwarded, _U32) << 32
 
     def lease(self) -> tuple[int, int, int]:
         """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""

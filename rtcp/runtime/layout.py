@@ -8,6 +8,7 @@
 | 384 | published records; published events; published texts | loop |
 | 512 | request and answer of the service thread | commander; service thread |
 | 1024 | slave states | service thread |
+| 3072 | slave health: lost, recovered, error counters | service thread |
 | 8192 | service text, texts, events, commands, plans, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
@@ -18,7 +19,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-MAGIC = 0x5254_4350_0000_0002
+MAGIC = 0x5254_4350_0000_0003
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -55,6 +56,11 @@ SERVICE_TEXT_SIZE = 8192
 SLAVES_AT = 1024
 """A word a slave: AL status (state, error bit; 0: no answer), AL status code << 16."""
 SLAVES_MAX = 256
+
+HEALTH_AT = SLAVES_AT + SLAVES_MAX * 8
+"""Two words a slave: how often it left OP | how often it came back << 16 | lost links << 32; damaged frames that came
+in over its cables | damaged frames forwarded << 32."""
+HEALTH_SIZE = 16
 
 TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
 TEXT = struct.Struct("<QqH502s")

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
 
 CHILD = Path(__file__).with_name("master_child.py")
+WATCHER = Path(__file__).with_name("watcher_child.py")
 MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh50", "cubemars-orh40")
 
 
@@ -17,26 +20,30 @@ class Segment:
     def __init__(self, file: Path, count: int) -> None:
         file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:count]))
         self.count = count
+        # Short: a Unix socket's path has 107 bytes at most.
+        self.directory = Path(tempfile.mkdtemp(prefix="rtcp-segment-", dir="/tmp"))
+        self.control = self.directory / "segment.sock"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "rtcp.virtual", "--config", str(file)], stdout=subprocess.PIPE, text=True
-        )
+            [sys.executable, "-m", "rtcp.virtual", "--config", str(file), "--control", str(self.control)],
+            stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         assert line, "the segment did not start"
         self.pid = json.loads(line)["pid"]
 
     def master(
-        self, scenario: str, *, receive_fraction: float = 0.3, promiscuous: bool = False, **arguments
+        self, scenario: str, *, receive_fraction: float = 0.3, promiscuous: bool = False, child: Path = CHILD, **more
     ) -> dict:  # fmt: skip
-        """Run a scenario of `master_child`; return its answer, empty where it was killed."""
-        question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": arguments,
+        """Run a scenario of `child`; return its answer, empty where it was killed."""
+        question = {"scenario": scenario, "pid": self.pid, "count": self.count, "arguments": more,
                     "receive_fraction": receive_fraction, "promiscuous": promiscuous}  # fmt: skip
         done = subprocess.run(
-            [sys.executable, str(CHILD), json.dumps(question)],
+            [sys.executable, str(child), json.dumps(question)],
             stdout=subprocess.PIPE,
             text=True,
             check=False,
-            timeout=60,
+            timeout=240,
         )
         return json.loads(done.stdout) if done.stdout else {}
 
@@ -45,6 +52,7 @@ class Segment:
         self.process.wait()
         assert self.process.stdout is not None
         self.process.stdout.close()
+        shutil.rmtree(self.directory, ignore_errors=True)
 
 
 @pytest.fixture

@@ -6,7 +6,8 @@ import pytest
 
 from rtcp.fieldbus.abort import abort_meaning
 from rtcp.fieldbus.alstatus import AlState, code_meaning, refusal, state_name
-from rtcp.fieldbus.emergency import Emergency, error_meaning, parse
+from rtcp.fieldbus.bus import SlaveState
+from rtcp.fieldbus.emergency import ERROR_CODES, REMEDIES, Emergency, error_meaning, error_remedy, error_words, parse
 
 
 @pytest.mark.parametrize(
@@ -65,6 +66,35 @@ def test_error_codes_have_words_those_unknown_the_words_of_their_class(code, wor
     assert words in error_meaning(code)
 
 
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (0x2310, "overloads"), (0x3210, "supply"), (0x3220, "under load"), (0x4310, "cool down"), (0x7305, "encoder"),
+        (0x8400, "so fast"), (0x8611, "blocks it"), (0x8130, "bus's cables"), (0x5441, "safety circuit"),
+    ],
+)  # fmt: skip
+def test_error_codes_that_drives_send_say_what_to_do(code, words):
+    assert words in error_remedy(code)
+    assert error_words(code).endswith(f"; {error_remedy(code)}, then `rtcp reset`")
+
+
+def test_a_code_that_nobody_can_do_anything_about_gives_no_advice():
+    assert error_remedy(0x0000) == error_remedy(0xFF17) == ""
+    assert error_words(0xFF17) == "0xFF17: specific to the maker"
+
+
+def test_every_remedy_belongs_to_a_code_that_has_a_meaning():
+    assert set(REMEDIES) <= set(ERROR_CODES)
+
+
+def test_the_state_of_a_slave_says_its_code_and_what_to_do():
+    found = SlaveState(3, 0x1003, "drive2", AlState.SAFEOP, True, 0x001B)
+    assert found.words() == (
+        "SAFE-OP + ERROR (0x001B: sync manager watchdog); no process data came for longer than `watchdog_ms`"
+    )
+    assert SlaveState(3, 0x1003, "drive2", AlState.OP, False, 0).words() == "OP"
+
+
 def emergency_message(service=1):
     return struct.pack("<HHB5s", service << 12, 0x8611, 0x21, b"\1\2\3\4\5")
 
@@ -73,6 +103,7 @@ def test_an_emergency_message_is_read_out_of_a_mailbox():
     found = parse(emergency_message(), 4, "drive3")
     assert found == Emergency(4, "drive3", 0x8611, 0x21, b"\1\2\3\4\5")
     assert "slave 4 (drive3) sent emergency 0x8611: following error" in found.sentence()
+    assert found.sentence().endswith("limits of speed and acceleration, then `rtcp reset`")
 
 
 @pytest.mark.parametrize("message", [emergency_message(service=3), emergency_message()[:-1], b""])

@@ -1,0 +1,84 @@
+"""The slaves in the watcher's care: what it knows of each, and the table of what it does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
+from rtcp.fieldbus.steps import Steps
+
+SAY_AGAIN_S = 10.0
+"""A slave's trouble is told at once, and then at most so often."""
+
+
+class Action(Enum):
+    """What is done with a slave."""
+
+    NOTHING = "nothing"
+    ACKNOWLEDGE = "acknowledge its error"
+    REQUEST_SAFEOP = "request SAFE-OP"
+    REQUEST_OP = "request OP"
+    RECONFIGURE = "set it up again"
+    MARK_LOST = "mark it lost; when it answers again, recover it"
+
+
+# (state, error) -> what is done; any other state that answers is RECONFIGURE.
+TABLE: dict[tuple[AlState, bool], Action] = {
+    (AlState.OP, False): Action.NOTHING,
+    (AlState.OP, True): Action.ACKNOWLEDGE,
+    (AlState.SAFEOP, True): Action.ACKNOWLEDGE,
+    (AlState.SAFEOP, False): Action.REQUEST_OP,
+    (AlState.NONE, False): Action.MARK_LOST,
+}
+
+
+def action_for(state: AlState, error: bool) -> Action:
+    """Return what is done with a slave that is in `state`."""
+    return TABLE.get((state, error), Action.RECONFIGURE)
+
+
+@dataclass
+class Charge:
+    """One slave in the watcher's care."""
+
+    position: int
+    name: str
+    state: AlState = AlState.OP
+    error: bool = False
+    code: int = 0
+    lost: int = 0
+    """How often it left OP."""
+    recovered: int = 0
+    """How often it was back in OP after that."""
+    left_at: float | None = None
+    was_in_op: bool = True
+    kept: bool = False
+    """Whether it is in PRE-OP because it was sent there, its set-up untouched."""
+    work: Steps[None] | None = None
+    asked: tuple[Action, AlState, bool, float] | None = None
+    """What was asked, in which state it was then, and until when it may take."""
+    failed: int = 0
+    pause_until: float = 0.0
+    probe_at: float = 0.0
+    told_at: float = -SAY_AGAIN_S
+
+    @property
+    def label(self) -> str:
+        """How sentences name it."""
+        return slave_label(self.position, self.name)
+
+    @property
+    def station(self) -> int:
+        """Its configured station address."""
+        return station_of(self.position)
+
+    @property
+    def well(self) -> bool:
+        """Whether it is in OP, without an error."""
+        return self.state is AlState.OP and not self.error
+
+    def words(self) -> str:
+        """Return its state in words."""
+        return SlaveState(self.position, self.station, self.name, self.state, self.error, self.code).words()

@@ -1,0 +1,129 @@
+"""Error counters of the slaves' ports, added up beyond their 8 bits, and the cable that they point at.
+
+Registers 0x0300 to 0x0313 (ETG.1000.4, 6.3): for each port invalid frames and receive errors, errors forwarded, lost
+links. What a port counts as its own came in over that port's cable; slaves behind it count the same frame as forwarded.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.registers import Command, RegisterPort
+
+_COUNTERS, _SIZE = 0x0300, 0x14
+_FORWARDED, _LINKS = 0x08, 0x10
+_PORTS = 4
+_CLEAR_FROM = 128
+"""Counters stop at 255; from here on they are set to 0, which a write of any value does."""
+_SAY_AGAIN_S = 10.0
+_CALM_S = 60.0
+"""Without a new error for so long the next one is a new beginning."""
+
+
+@dataclass
+class PortErrors:
+    """What a slave's ports have counted since the start."""
+
+    rx: int = 0
+    """Damaged frames that came in over a cable of its own."""
+    forwarded: int = 0
+    """Damaged frames that somebody before it has already counted."""
+    links: int = 0
+    """Lost links."""
+
+
+@dataclass
+class _Trouble:
+    """What enters at one cable: since when, how often, when it was told."""
+
+    began: str
+    told_at: float
+    last_at: float
+    near: int = 0
+    """Counted by the slave before the cable."""
+    far: int = 0
+    """Counted by the slave behind it."""
+    told: int = 0
+
+
+class ErrorCounters:
+    """Reads one slave's counters a call, the slaves in turn."""
+
+    def __init__(self, port: RegisterPort, names: Sequence[str], say: Callable[[str], None]) -> None:
+        """Take the slaves in the order of the cable; `say` is given the sentences."""
+        self._port = port
+        self._names = names
+        self._say = say
+        # What was counted before is of no cable that is in use now: plugs were put in.
+        self._last = [port.read(station_of(position), _COUNTERS, _SIZE) for position in range(1, len(names) + 1)]
+        self._turn = 0
+        self._trouble: dict[tuple[str, int], _Trouble] = {}
+        self.of = [PortErrors() for _ in names]
+        """By slave, in the order of the cable."""
+
+    def read_next(self) -> None:
+        """Read the next slave's counters; a slave that does not answer keeps what it had."""
+        index, self._turn = self._turn, (self._turn + 1) % len(self._names)
+        station = station_of(index + 1)
+        found, wkc = self._port.exchange(Command.FPRD, station, _COUNTERS, bytes(_SIZE), tries=1)
+        if wkc != 1:
+            return
+        before, self._last[index] = self._last[index], found
+        if before is not None and found != before:
+            self._add(index, before, found)
+        if max(found) >= _CLEAR_FROM and self._port.write(station, _COUNTERS, bytes(_LINKS - 4)):
+            self._port.write(station, _COUNTERS + _LINKS, bytes(_PORTS))
+            self._last[index] = bytes(_SIZE)
+
+    def _add(self, index: int, before: bytes, found: bytes) -> None:
+        # A counter that shows less than before was set to 0 meanwhile.
+        new = [now - then if now >= then else now for then, now in zip(before, found, strict=True)]
+        errors = self.of[index]
+        errors.forwarded += sum(new[_FORWARDED : _FORWARDED + _PORTS])
+        for port in range(_PORTS):
+            # A damaged frame may count as a receive error of the port, too.
+            damaged, links = max(new[2 * port], new[2 * port + 1]), new[_LINKS + port]
+            errors.rx += damaged
+            errors.links += links
+            # Port 0 looks towards the master, any other away from it.
+            cable = index if port == 0 else index + 1
+            if damaged:
+                self._note("errors", cable, damaged, far=port == 0)
+            if links:
+                self._note("link", cable, links, far=port == 0)
+
+    def _note(self, kind: str, cable: int, count: int, *, far: bool) -> None:
+        now = time.monotonic()
+        trouble = self._trouble.get((kind, cable))
+        if trouble is None or now - trouble.last_at > _CALM_S:
+            trouble = self._trouble[kind, cable] = _Trouble(time.strftime("%H:%M:%S"), now - _SAY_AGAIN_S, now)
+        if far:
+            trouble.far += count
+        else:
+            trouble.near += count
+        trouble.last_at = now
+
+    def tell(self) -> None:
+        """Say what enters where: at once when it begins, then at most every 10 s with the number."""
+        now = time.monotonic()
+        for (kind, cable), trouble in self._trouble.items():
+            # A frame is damaged on its way out or on its way back; a link that is lost is lost for both ends.
+            count = trouble.near + trouble.far if kind == "errors" else max(trouble.near, trouble.far)
+            if count > trouble.told and now - trouble.told_at >= _SAY_AGAIN_S:
+                trouble.told, trouble.told_at = count, now
+                self._say(self._sentence(kind, cable, count, trouble.began))
+
+    def _sentence(self, kind: str, cable: int, count: int, began: str) -> str:
+        before = "the master" if cable == 0 else slave_label(cable, self._names[cable - 1])
+        if cable < len(self._names):
+            between = f"between {before} and {slave_label(cable + 1, self._names[cable])}"
+        else:
+            between = f"behind {before}"
+        if kind == "errors":
+            frames = "1 damaged frame" if count == 1 else f"{count} damaged frames"
+            return f"errors enter {between}: {frames} since {began}; check that cable and its plugs"
+        times = "once" if count == 1 else f"{count} times"
+        return f"the link {between} was lost {times} since {began}; check that cable, its plugs and the supply"

@@ -1,0 +1,200 @@
+"""Setting up again one slave that has lost its set-up while the others go on: address, clock, objects, process data.
+
+What `SoemBus.configure` does through SOEM for all slaves at once, here for one and beside the cycle. What SOEM chose
+(FMMUs, sync managers, delays) is copied after `configure` and written back as it was.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from rtcp.config.model import SlaveConfig
+from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, refusal
+from rtcp.fieldbus.bus import BusError, slave_label, station_of
+from rtcp.fieldbus.clocks import DC_ACTIVATE, forget_drift, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.configure import configure_slave
+from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.scan import eeprom_to_device
+from rtcp.fieldbus.sdo import SdoClient
+from rtcp.fieldbus.states import AL_CONTROL, read_al
+from rtcp.fieldbus.steps import Steps
+
+STATION = 0x0010
+_FMMUS, _FMMUS_SIZE = 0x0600, 0x80
+_SYNC_MANAGERS, _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 0x0800, 8, 8
+_MAILBOXES = 2
+"""Sync managers 0 and 1 are the mailboxes."""
+_FEATURES, _FEATURE_DC, _DELAY = 0x0008, 0x04, 0x0928
+_EEPROM_CONFIG, _EEPROM_CONTROL, _EEPROM_DATA = 0x0500, 0x0502, 0x0508
+_EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
+_SII_VENDOR, _SII_PRODUCT = 0x08, 0x0A
+_EEPROM_S, _STATE_S = 0.5, 3.0
+
+
+class ForeignSlave(BusError):
+    """At the place of a slave another device answers: nothing is written to it."""
+
+
+@dataclass(frozen=True)
+class SetUp:
+    """What a slave's registers hold after `configure`, beside what its object dictionary does."""
+
+    fmmus: bytes
+    sync_managers: tuple[bytes, ...]
+    """Eight bytes each, status and the slave's own byte left out."""
+    delay: bytes | None
+    """Propagation delay from the reference clock; None: it has no clock."""
+
+
+def take_set_up(port: RegisterPort, position: int, name: str) -> SetUp:
+    """Copy a slave's set-up; raises BusError where it does not answer."""
+    station = station_of(position)
+    fmmus = port.read(station, _FMMUS, _FMMUS_SIZE)
+    managers = port.read(station, _SYNC_MANAGERS, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
+    features = port.read(station, _FEATURES, 2)
+    if fmmus is None or managers is None or features is None:
+        raise BusError(f"{slave_label(position, name)} stopped answering while its set-up was read")
+    own = (managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE))
+    return SetUp(
+        fmmus,
+        tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
+        port.read(station, _DELAY, 4) if features[0] & _FEATURE_DC else None,
+    )
+
+
+class Restorer:
+    """Sets up single slaves again, each in steps of a few frames."""
+
+    def __init__(
+        self,
+        port: RegisterPort,
+        slaves: Sequence[SlaveConfig],
+        set_ups: Sequence[SetUp],
+        sdo: Callable[[int], SdoClient],
+        period_ns: int,
+    ) -> None:
+        """Take the configured segment.
+
+        Args:
+            port: the port for registers.
+            slaves: the slaves of the configuration, in the order of the cable.
+            set_ups: their registers after `configure`.
+            sdo: gives SDO access to the slave at a position.
+            period_ns: the cycle.
+        """
+        self._port = port
+        self._slaves = slaves
+        self._set_ups = set_ups
+        self._sdo = sdo
+        self._period_ns = period_ns
+        self._clocks = tuple(i for i, set_up in enumerate(set_ups, 1) if set_up.delay is not None)
+
+    def restore(self, position: int, lost_address: bool) -> Steps[None]:
+        """Set up the slave at `position` and bring it to SAFE-OP.
+
+        Args:
+            position: its position on the cable, from 1.
+            lost_address: it has no station address: it was without supply.
+
+        Raises:
+            ForeignSlave: another device answers there.
+            BusError: it refuses something, or stops answering.
+        """
+        port, station, config = self._port, station_of(position), self._slaves[position - 1]
+        set_up = self._set_ups[position - 1]
+        if lost_address:
+            yield from self._identify(position)
+        if set_up.delay is not None:
+            # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
+            # reference clock by its address, and every other slave follows what it says.
+            port.write_at(position, DC_ACTIVATE, b"\0")
+            others = [other for other in self._clocks if other != position]
+            take_over_time(port, position, self._label(position), set_up.delay, others, always=lost_address)
+        if lost_address:
+            self._write_address(position)
+        if set_up.delay is not None:
+            forget_drift(port, position)
+        yield
+        yield from self._lead(position, AlState.INIT)
+        port.write(station, _SYNC_MANAGERS, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT))
+        port.write(station, _FMMUS, bytes(_FMMUS_SIZE))
+        self._write_sync_managers(position, range(_MAILBOXES))
+        eeprom_to_device(port, station)
+        yield from self._lead(position, AlState.PREOP)
+        yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
+        self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
+        port.write(station, _FMMUS, set_up.fmmus)
+        if config.device.assign_activate:
+            if position != self._clocks[0]:
+                yield from settle_clock(port, station)
+            start_sync(port, station, self._label(position), config.device, self._period_ns)
+        yield
+        yield from self._lead(position, AlState.SAFEOP)
+
+    def _label(self, position: int) -> str:
+        return slave_label(position, self._slaves[position - 1].name)
+
+    def _identify(self, position: int) -> Steps[None]:
+        vendor = yield from self._reading_eeprom(position, _SII_VENDOR)
+        product = yield from self._reading_eeprom(position, _SII_PRODUCT)
+        device = self._slaves[position - 1].device
+        if (vendor, product) != (device.vendor_id, device.product_id):
+            raise ForeignSlave(
+                f"{self._label(position)}: at its place answers another device (vendor 0x{vendor:08X}, product "
+                f"0x{product:08X}), expected {device.name} (vendor 0x{device.vendor_id:08X}, product "
+                f"0x{device.product_id:08X}): it is left alone; put the right one there"
+            )
+
+    def _reading_eeprom(self, position: int, word: int) -> Steps[int]:
+        """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
+        port = self._port
+        # Taken back from the device by force, as it may have it after power-on.
+        port.write_at(position, _EEPROM_CONFIG, b"\x02")
+        port.write_at(position, _EEPROM_CONFIG, b"\x00")
+        port.write_at(position, _EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word))
+        deadline = time.monotonic() + _EEPROM_S
+        while True:
+            data = port.read_at(position, _EEPROM_CONTROL, 2)
+            if data is None:
+                raise BusError(f"{self._label(position)} stopped answering while its EEPROM was read")
+            status = int.from_bytes(data, "little")
+            if not status & _EEPROM_BUSY:
+                break
+            if time.monotonic() >= deadline:
+                raise BusError(f"{self._label(position)}: its EEPROM stays busy")
+            yield
+        found = port.read_at(position, _EEPROM_DATA, 4)
+        if found is None or status & _EEPROM_FAILED:
+            raise BusError(f"{self._label(position)}: its EEPROM cannot be read (status 0x{status:04X})")
+        return int.from_bytes(found, "little")
+
+    def _write_address(self, position: int) -> None:
+        data = station_of(position).to_bytes(2, "little")
+        if not self._port.write_at(position, STATION, data) or self._port.read_at(position, STATION, 2) != data:
+            raise BusError(f"{self._label(position)} does not keep its station address")
+
+    def _write_sync_managers(self, position: int, numbers: range) -> None:
+        for number in numbers:
+            setting = self._set_ups[position - 1].sync_managers[number]
+            if any(setting):
+                address = _SYNC_MANAGERS + number * _SYNC_MANAGER_SIZE
+                self._port.write(station_of(position), address, setting)
+
+    def _lead(self, position: int, state: AlState) -> Steps[None]:
+        """Request `state`, acknowledging what error there is, and wait for it; raises BusError."""
+        port, station = self._port, station_of(position)
+        error = read_al(port, station)[1]
+        port.write(station, AL_CONTROL, (state | (ERROR_BIT if error else 0)).to_bytes(2, "little"))
+        deadline = time.monotonic() + _STATE_S
+        while True:
+            yield
+            found, error, code = read_al(port, station)
+            if found is state and not error:
+                return
+            # An old error may still show until the slave has looked at the request.
+            late = time.monotonic() >= deadline
+            if late or found is AlState.NONE or (error and time.monotonic() >= deadline - _STATE_S + 0.1):
+                raise BusError(refusal(self._label(position), state, found | (ERROR_BIT if error else 0), code))

@@ -1,0 +1,176 @@
+"""Slaves that are lost and come back, on a whole platform: they come back by themselves, the arm does not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtcp.runtime.client import ControlError
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.paths import blackboard_file, segment_control
+from rtcp.virtual.faults.client import SegmentClient
+from tests.e2e.conftest import Platform
+from tests.e2e.wire import outputs
+
+ENABLE_OPERATION = 0x000F
+ENABLED = 0x27
+"""Statusword of Operation Enabled, masked by 0x6F."""
+LARGEST_STEP = 0.5 * 500e-6 * 1.001
+"""rad: what the fastest joint may do in a cycle."""
+
+
+@pytest.fixture
+def segment(shared: Platform) -> Iterator[SegmentClient]:
+    """The segment of the shared platform; its faults are mended afterwards, and the arm is ready."""
+    with SegmentClient(segment_control(shared.directory)) as client:
+        yield client
+        client.mend()
+    well(shared)
+    if shared.status()["state"] == "fault":
+        shared.call("reset")
+    shared.call("disable")
+
+
+def well(platform: Platform) -> dict[str, Any]:
+    """Wait until every slave is in OP."""
+    return platform.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
+
+
+def lose(platform: Platform, segment: SegmentClient, faults: list[dict[str, Any]]) -> dict[str, Any]:
+    """Break something; return the status when it was noticed and every slave is in OP again."""
+    before = [slave["recovered"] for slave in platform.status()["slaves"]]
+    for fault in faults:
+        segment.fault(fault)
+    platform.until(lambda found: found["state"] == "fault", "the fault")
+    platform.until(lambda found: [slave["recovered"] for slave in found["slaves"]] != before, "the return")
+    return well(platform)
+
+
+def torque(segment: SegmentClient) -> list[bool]:
+    return [slave["torque_on"] for slave in segment.truth()["slaves"] if "torque_on" in slave]
+
+
+def reset_and_enable(platform: Platform) -> None:
+    platform.call("reset")
+    assert platform.status()["state"] == "ready"
+    platform.call("enable")
+    assert platform.status()["state"] == "holding"
+
+
+def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
+    enabled: Platform, segment: SegmentClient, tmp_path: Path
+) -> None:
+    enabled.call("motion", name="joint")
+    moving = enabled.background("move", "1.5", "0.5", "0.3", "0", "0", "0", "--speed", "0.3")
+    enabled.until_moving()
+    observer = Observer(blackboard_file(enabled.directory))
+    first = observer.head
+    path = tmp_path / "frames"
+    with enabled.capture(path):
+        lose(enabled, segment, [{"fault": "power", "slave": 4, "lasts": 0.2}])
+        assert moving.wait() == 5
+        enabled.until(lambda found: not any(abs(one) > 0.002 for one in found["joints"]["velocity"]), "standstill")
+        stood = enabled.status()["joints"]
+        time.sleep(0.3)
+        assert enabled.status()["state"] == "fault"
+        assert not torque(segment)[2]
+        with pytest.raises(ControlError, match="fault"):
+            enabled.call("enable")
+    records, _ = observer.since(first)
+    observer.close()
+    # The drive that came back: no step of its target but to where it is, no command that gives it torque.
+    noticed = int(np.argmax(records["fault"] != 0))
+    came_back = records["statusword"][noticed:, 2] & 0x6F
+    assert ENABLED not in came_back[int(np.argmax(came_back != ENABLED)) :]
+    assert np.abs(np.diff(records["target"], axis=0))[:, [0, 1, 3, 4, 5]].max() <= LARGEST_STEP
+    heard = records[noticed:][records["wkc"][noticed:] == records["wkc_expected"][noticed:]]
+    back = heard[(heard["statusword"][:, 2] & 0x6F) != ENABLED]
+    assert len(back) > 100
+    assert np.abs(back["target"][:, 2] - back["position"][:, 2]).max() < 1e-6
+    after = [drives for _, drives in outputs(path)][-400:]
+    assert ENABLE_OPERATION not in {drive.controlword for drives in after for drive in drives}
+    assert abs(stood["target"][2] - stood["position"][2]) < 1e-3
+    reset_and_enable(enabled)
+    held = enabled.status()["joints"]
+    assert max(abs(a - b) for a, b in zip(held["position"], stood["position"], strict=True)) < 0.01
+
+
+def test_an_io_box_that_was_without_supply_takes_the_segments_time_up_again(
+    enabled: Platform, segment: SegmentClient
+) -> None:
+    observer = Observer(blackboard_file(enabled.directory))
+    first = observer.head
+    found = lose(enabled, segment, [{"fault": "power", "slave": 1, "lasts": 0.4}])
+    assert found["state"] == "fault"
+    reset_and_enable(enabled)
+    records, _ = observer.since(first)
+    observer.close()
+    # The reference clock goes on where the drives' clocks are: its time passes as the host's does, also in the gap.
+    good = records[records["wkc"] == records["wkc_expected"]]
+    passed = np.diff(good["dc_time_ns"].astype(np.int64)) - np.diff(good["time_ns"].astype(np.int64))
+    assert np.abs(passed).max() < 5_000_000
+    assert np.abs(np.diff(records["target"], axis=0)).max() <= LARGEST_STEP
+    told = [one["sentence"] for one in enabled.status()["events"]]
+    assert any("slave 1 (io) is back in OP" in sentence for sentence in told), told
+
+
+def test_a_fall_that_is_over_at_once_still_needs_a_reset(enabled: Platform, segment: SegmentClient) -> None:
+    before = enabled.status()["slaves"][2]
+    began = time.monotonic()
+    found = lose(enabled, segment, [{"fault": "al_fall", "slave": 3, "code": 0x1A}])
+    assert time.monotonic() - began < 5.0
+    slave = found["slaves"][2]
+    assert (found["state"], slave["lost"], slave["recovered"]) == ("fault", before["lost"] + 1, before["recovered"] + 1)
+    with pytest.raises(ControlError, match="fault"):
+        enabled.call("enable")
+    assert enabled.status()["state"] == "fault"
+    told = [one["sentence"] for one in found["events"]]
+    (fell,) = [one for one in told if "left OP: it is in" in one]
+    for part in ("slave 3 (drive2)", "SAFE-OP + ERROR", "0x001A: synchronization error", "check the cycle's jitter"):
+        assert part in fell
+    reset_and_enable(enabled)
+
+
+def test_slaves_behind_a_mended_cable_are_back_when_the_arm_is_reset(enabled: Platform, segment: SegmentClient) -> None:
+    found = lose(enabled, segment, [{"fault": "cable", "after": 3, "lasts": 0.3}])
+    assert found["state"] == "fault"
+    assert ENABLED not in {word & 0x6F for word in enabled.status()["statuswords"][2:]}
+    reset_and_enable(enabled)
+
+
+def test_a_reset_while_a_slave_is_still_away_fails_and_a_later_one_does_not(
+    enabled: Platform, segment: SegmentClient
+) -> None:
+    away = segment.fault({"fault": "power", "slave": 7})
+    enabled.until(lambda found: found["state"] == "fault", "the fault")
+    with pytest.raises(ControlError):
+        enabled.call("reset")
+    assert enabled.status()["state"] == "fault"
+    assert enabled.status()["slaves"][6]["state"] == "no answer"
+    segment.mend(away)
+    assert well(enabled)["state"] == "fault"
+    reset_and_enable(enabled)
+
+
+def test_a_cable_that_damages_frames_is_named_with_the_errors_counted(shared: Platform, segment: SegmentClient) -> None:
+    before = shared.status()["slaves"]
+    segment.fault({"fault": "corrupt", "after": 4, "burst": 40})
+
+    def counted(found: dict[str, Any]) -> bool:
+        return found["slaves"][4]["errors"]["rx"] == before[4]["errors"]["rx"] + 40
+
+    found = shared.until(counted, "the errors")
+    assert found["slaves"][3]["errors"]["rx"] == before[3]["errors"]["rx"]
+    shared.until(
+        lambda found: found["slaves"][5]["errors"]["forwarded"] == before[5]["errors"]["forwarded"] + 40, "forwarded"
+    )
+    told = [one["sentence"] for one in shared.status()["events"]]
+    assert any("errors enter between slave 4 (drive3) and slave 5 (drive4): " in one for one in told), told
+    shown = shared.rtcp("status").stdout
+    assert "lost/err/links" in shown
+    assert "/40/" in shown

@@ -1,0 +1,133 @@
+"""Error counters of the ports, read from real slave controllers without a wire between."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rtcp.config.segment import SegmentConfig, SegmentSlave
+from rtcp.fieldbus import port_errors
+from rtcp.fieldbus.port_errors import ErrorCounters
+from rtcp.fieldbus.registers import Answer, Command, RegisterPort, build_frame
+from rtcp.virtual.segment import Segment
+from rtcp.virtual.server import make_segment
+
+NAMES = ("io", "drive1", "drive2")
+MODELS = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
+
+
+class Direct(RegisterPort):
+    """A port whose frames reach the slaves without a socket."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._segment = segment
+
+    def exchange(
+        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
+    ) -> Answer:  # fmt: skip
+        frame = bytearray(build_frame(command, 0x80, station, address, data))
+        self._segment.process(frame, len(frame), 1)
+        end = 26 + len(data)
+        return Answer(bytes(frame[26:end]), int.from_bytes(frame[end : end + 2], "little"))
+
+
+class Bench:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.segment = make_segment(SegmentConfig(tuple(SegmentSlave(model=model) for model in MODELS), Path()), 0)
+        port = Direct(self.segment)
+        for position, slave in enumerate(self.segment.slaves, 1):
+            slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), 0)
+        self.now = 100.0
+        monkeypatch.setattr(port_errors.time, "monotonic", lambda: self.now)
+        self.said: list[str] = []
+        self.set(2, 0, 7)
+        self.counters = ErrorCounters(port, NAMES, self.said.append)
+
+    def set(self, position: int, register: int, value: int) -> None:
+        self.segment.slaves[position - 1].esc.memory[0x0300 + register] = value
+
+    def get(self, position: int, register: int) -> int:
+        return self.segment.slaves[position - 1].esc.memory[0x0300 + register]
+
+    def round(self) -> list[str]:
+        """Read every slave once; return what is said."""
+        self.said.clear()
+        for _ in NAMES:
+            self.counters.read_next()
+        self.counters.tell()
+        return list(self.said)
+
+
+@pytest.fixture
+def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
+    return Bench(monkeypatch)
+
+
+def test_what_was_counted_before_the_start_is_nobodys_fault(bench: Bench) -> None:
+    assert bench.round() == []
+    assert [one.rx for one in bench.counters.of] == [0, 0, 0]
+
+
+def test_counters_are_cleared_before_they_stop_and_the_sum_goes_on(bench: Bench) -> None:
+    for shown in (107, 150, 60, 200, 255):
+        bench.set(2, 0, shown)
+        bench.round()
+        assert bench.get(2, 0) < 128
+    assert bench.counters.of[1].rx == 100 + 43 + 60 + 140 + 255
+
+
+def test_a_frame_that_counts_as_damaged_and_as_received_wrongly_is_one(bench: Bench) -> None:
+    bench.set(2, 0, 12)
+    bench.set(2, 1, 4)
+    bench.round()
+    assert bench.counters.of[1].rx == 5
+
+
+@pytest.mark.parametrize(
+    ("position", "register", "between"),
+    [
+        (1, 0x00, "between the master and slave 1 (io)"),
+        (2, 0x00, "between slave 1 (io) and slave 2 (drive1)"),
+        (1, 0x02, "between slave 1 (io) and slave 2 (drive1)"),
+        (3, 0x02, "behind slave 3 (drive2)"),
+    ],
+)
+def test_errors_of_a_port_name_the_cable_that_is_plugged_in_there(
+    bench: Bench, position: int, register: int, between: str
+) -> None:
+    bench.set(position, register, bench.get(position, register) + 3)
+    (sentence,) = bench.round()
+    assert sentence.startswith(f"errors enter {between}: 3 damaged frames since ")
+    assert sentence.endswith("; check that cable and its plugs")
+
+
+def test_forwarded_errors_name_no_cable(bench: Bench) -> None:
+    bench.set(3, 0x08, 9)
+    assert bench.round() == []
+    assert bench.counters.of[2].forwarded == 9
+
+
+def test_a_bad_cable_is_told_at_its_beginning_then_every_ten_seconds_with_the_number(bench: Bench) -> None:
+    told = []
+    for second in range(25):
+        bench.now = 100.0 + second
+        bench.set(2, 0, 7 + 2 * (second + 1))
+        told += [(second, sentence.partition(": ")[2].partition(" since")[0]) for sentence in bench.round()]
+    assert told == [(0, "2 damaged frames"), (10, "22 damaged frames"), (20, "42 damaged frames")]
+
+
+def test_a_link_that_both_its_ends_lost_was_lost_once(bench: Bench) -> None:
+    bench.set(2, 0x11, 1)
+    bench.set(3, 0x10, 1)
+    (sentence,) = bench.round()
+    assert sentence.startswith("the link between slave 2 (drive1) and slave 3 (drive2) was lost once since ")
+    assert [one.links for one in bench.counters.of] == [0, 1, 1]
+
+
+def test_a_slave_that_was_without_supply_counts_from_zero(bench: Bench) -> None:
+    bench.set(2, 0, 100)
+    bench.round()
+    bench.set(2, 0, 3)
+    bench.round()
+    assert bench.counters.of[1].rx == 93 + 3

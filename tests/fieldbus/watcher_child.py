@@ -1,0 +1,239 @@
+"""The master's side of the watcher's tests, a process of its own as `master_child`, whose parts it uses."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import master_child
+from master_child import Cycle, arm, to_op, with_device
+
+from rtcp.config.model import SlaveConfig
+from rtcp.fieldbus import AlState
+from rtcp.fieldbus.bus import station_of
+from rtcp.fieldbus.restore import Restorer, take_set_up
+from rtcp.fieldbus.soem import SoemBus
+from rtcp.fieldbus.watcher import Watcher
+from rtcp.virtual.faults.client import SegmentClient
+
+PERIOD = 1_000_000
+PATIENCE_S = 20.0
+"""Only keeps a broken watcher from hanging the tests."""
+SM_STATUS = 5
+SYNC_LIMIT = 0x10F1
+BESIDE = 15
+BURSTS, BURST = 4, 100
+MISSED = 2
+"""Frames that may be damaged between the reading of a counter and its clearing."""
+
+
+def registers(bus: SoemBus, position: int) -> dict[str, str]:
+    """Return the registers that a restoration must bring back, as they were."""
+    station = station_of(position)
+    managers = bytearray(bus.port.read(station, 0x0800, 0x40) or b"")
+    for at in range(SM_STATUS, len(managers), 8):
+        managers[at] = 0
+    found = {"managers": bytes(managers)}
+    for name, address, length in (
+        ("station", 0x0010, 2),
+        ("fmmus", 0x0600, 0x80),
+        ("watchdog", 0x0420, 2),
+        ("delay", 0x0928, 4),
+        ("activation", 0x0981, 1),
+        ("cycle", 0x09A0, 4),
+    ):
+        found[name] = bus.port.read(station, address, length) or b""
+    return {name: data.hex() for name, data in found.items()}
+
+
+def clocks(bus: SoemBus, count: int) -> list[tuple[int, int]]:
+    """Return of each slave how far its clock is from the reference's and where in the cycle its SYNC0 lies, ns."""
+    found = []
+    for position in range(1, count + 1):
+        station = station_of(position)
+        difference = int.from_bytes(bus.port.read(station, 0x092C, 4) or b"", "little")
+        start = int.from_bytes(bus.port.read(station, 0x0990, 8) or b"", "little")
+        sign = -1 if difference >> 31 else 1
+        found.append((sign * (difference & 0x7FFF_FFFF), start % PERIOD))
+    return found
+
+
+class Watching:
+    """What the thread beside the cycle does: turns of the watcher, ten milliseconds apart."""
+
+    def __init__(self, watcher: Watcher) -> None:
+        self.watcher = watcher
+        self.left: list[int] = []
+        self.longest_s = 0.0
+        self.seen: list[list[str]] = [[] for _ in watcher.slaves]
+
+    def until(self, met: Any) -> None:
+        end = time.monotonic() + PATIENCE_S
+        while not met() and time.monotonic() < end:
+            self.turn()
+
+    def during(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        self.until(lambda: time.monotonic() >= end)
+
+    def turn(self) -> None:
+        began = time.monotonic()
+        if position := self.watcher.turn():
+            self.left.append(position)
+        self.longest_s = max(self.longest_s, time.monotonic() - began)
+        for states, slave in zip(self.seen, self.watcher.slaves, strict=True):
+            words = slave.words().partition(" (")[0]
+            if states[-1:] != [words]:
+                states.append(words)
+        time.sleep(0.01)
+
+
+def patient(config: SlaveConfig) -> SlaveConfig:
+    """Let a slave bear a busy host: a longer watchdog, and no end of SYNC0 without outputs."""
+    sdo = tuple(replace(one, value=0) if one.index == SYNC_LIMIT else one for one in config.device.sdo)
+    return with_device(config, watchdog_ms=200, sdo=sdo)
+
+
+class Watched:
+    """A segment in OP, its cycle and its watcher; an episode is a fault and what becomes of it."""
+
+    def __init__(self, bus: SoemBus, count: int, client: SegmentClient) -> None:
+        self.bus = bus
+        self.count = count
+        self.client = client
+        self.slaves = [patient(config) for config in arm(count)]
+        self.data = bus.configure(self.slaves, PERIOD)
+        self.cycle = Cycle(self.data, PERIOD)
+        to_op(bus, self.cycle)
+        self.before = self.registers()
+
+    def registers(self) -> list[dict[str, str]]:
+        return [registers(self.bus, position) for position in range(1, self.count + 1)]
+
+    def strange_watcher(self, position: int, say: Any) -> Watcher:
+        """Return a watcher that expects another device at `position`."""
+        other = replace(self.slaves[position - 1].device, product_id=0x4711)
+        changed = [replace(one, device=other) if at == position else one for at, one in enumerate(self.slaves, 1)]
+        set_ups = [take_set_up(self.bus.port, at, one.name) for at, one in enumerate(self.slaves, 1)]
+        restorer = Restorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
+        return Watcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
+
+    def episode(self, faults: list[dict[str, Any]], act: Any = None, foreign: int = 0) -> dict[str, Any]:
+        """Let the faults begin, watch until every slave is in OP again and tell what came of it.
+
+        `act` is done with the watching meanwhile and may return something to be told; `foreign` is the position at
+        which another device is expected.
+        """
+        said: list[str] = []
+        watcher = self.strange_watcher(foreign, said.append) if foreign else self.bus.watcher(said.append)
+        watching = Watching(watcher)
+
+        def watch() -> dict[str, Any]:
+            began = time.monotonic()
+            for fault in faults:
+                self.client.fault(fault)
+            acted = act(watching) if act is not None else None
+            lost = faults and act is None
+            watching.until(lambda: watcher.all_op and (not lost or any(one.recovered for one in watcher.slaves)))
+            took_s = time.monotonic() - began
+            # Drift compensation is at its end before the clocks are compared.
+            watching.during(0.3 if any(fault["fault"] in ("power", "clock_jump") for fault in faults) else 0.0)
+            return {
+                "said": said, "left": watching.left, "took_s": took_s, "longest_s": watching.longest_s,
+                "states": [slave.words() for slave in watcher.slaves], "seen": watching.seen, "acted": acted,
+                "lost": [slave.lost for slave in watcher.slaves],
+                "recovered": [slave.recovered for slave in watcher.slaves],
+                "errors": [[one.rx, one.forwarded, one.links] for one in watcher.errors.of],
+                "before": self.before, "after": self.registers(), "clocks": clocks(self.bus, self.count),
+            }  # fmt: skip
+
+        result: dict[str, Any] = self.cycle.run(watch)
+        self.cycle.wkcs.clear()
+        self.cycle.for_cycles(20)
+        result["whole"] = self.data.expected_wkc in self.cycle.wkcs
+        return result
+
+    # -- what is done meanwhile -----------------------------------------------------------------------------------
+
+    def al_states(self) -> list[str]:
+        return [one["al"] for one in self.client.truth()["slaves"]]
+
+    def leave_alone(self, watching: Watching) -> list[str]:
+        """Watch for a while; then put the right device there again, in other words: let the right watcher do it."""
+        watching.during(0.5)
+        found = self.al_states()
+        right = Watching(self.bus.watcher(lambda sentence: None))
+        right.turn()
+        right.until(lambda: right.watcher.all_op)
+        watching.turn()
+        return found
+
+    def park(self, watching: Watching) -> list[str]:
+        watching.watcher.park()
+        watching.until(lambda: all(slave.state is AlState.PREOP for slave in watching.watcher.slaves))
+        watching.during(0.3)
+        found = self.al_states()
+        watching.watcher.resume()
+        return found
+
+    def read_beside(self, watching: Watching) -> dict[str, Any]:
+        """Read an object of slave 3 again and again while slave 2 is being set up."""
+        watching.until(lambda: watching.watcher.slaves[1].work is not None)
+        names, count = set(), 0
+        began = time.monotonic()
+        while watching.watcher.slaves[1].work is not None and count < BESIDE:
+            watching.turn()
+            names.add(self.bus.sdo(3).read(0x1008, 0).decode())
+            count += 1
+        return {"names": sorted(names), "count": count, "took_s": time.monotonic() - began}
+
+    def count_damage(self, watching: Watching) -> None:
+        """Damage more frames than a counter holds, no more at once than it holds until it is read."""
+        errors = watching.watcher.errors.of
+        for number in range(1, BURSTS + 1):
+            self.client.fault({"fault": "corrupt", "after": 1, "burst": BURST})
+            least = number * (BURST - MISSED)
+            watching.until(lambda least=least: errors[1].rx >= least and errors[2].forwarded >= least)
+
+    def count_links(self, watching: Watching) -> None:
+        watching.until(lambda: all(one.links for one in watching.watcher.errors.of[1:]))
+
+
+def episodes(bus: SoemBus, count: int, control: str) -> Any:
+    """Break one thing after the other on one segment; return what came of each."""
+    with SegmentClient(Path(control)) as client:
+        one = Watched(bus, count, client)
+        return {
+            "supply": one.episode([{"fault": "power", "slave": 2, "lasts": 0.05}]),
+            "reference": one.episode([{"fault": "power", "slave": 1, "lasts": 0.05}]),
+            "cable": one.episode([{"fault": "cable", "after": 1, "lasts": 0.4}]),
+            "SAFE-OP": one.episode([{"fault": "al_fall", "slave": 3, "state": "SAFE-OP", "code": 0x1B}]),
+            "PRE-OP": one.episode([{"fault": "al_fall", "slave": 3, "state": "PRE-OP", "code": 0x1B}]),
+            "refusal": one.episode(
+                [
+                    {"fault": "al_refuse", "slave": 2, "code": 0x52, "lasts": 1.2},
+                    {"fault": "al_fall", "slave": 2},
+                    {"fault": "al_fall", "slave": 3},
+                ]
+            ),
+            "clock": one.episode([{"fault": "clock_jump", "slave": 3, "us": 20_000}]),
+            "late": one.episode(
+                [
+                    {"fault": "sdo_late", "slave": 2, "ms": 300, "lasts": 0.8},
+                    {"fault": "al_fall", "slave": 2, "state": "PRE-OP"},
+                ],
+                one.read_beside,
+            ),
+            "foreign": one.episode([{"fault": "power", "slave": 3, "lasts": 0.05}], one.leave_alone, foreign=3),
+            "parked": one.episode([], one.park),
+            "damage": one.episode([], one.count_damage),
+            "link": one.episode([{"fault": "cable", "after": 2, "lasts": 0.05}], one.count_links),
+        }
+
+
+master_child.SCENARIOS["episodes"] = episodes
+
+if __name__ == "__main__":
+    master_child.main()

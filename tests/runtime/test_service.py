@@ -1,0 +1,206 @@
+"""The thread beside the cycle: what it tells the cycle of a slave that was lost, and whom it keeps waiting."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.bus import BusError, SlaveState
+from rtcp.fieldbus.charges import Charge
+from rtcp.fieldbus.port_errors import PortErrors
+from rtcp.fieldbus.steps import Steps
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.observer import Health, Observer
+from rtcp.runtime.service import Service
+
+
+class Watching:
+    """A watcher that sees what a test lets it see."""
+
+    silent = False
+
+    def __init__(self) -> None:
+        self.slaves = (Charge(1, "io"), Charge(2, "drive1"))
+        self.errors = SimpleNamespace(of=[PortErrors(), PortErrors()])
+        self.all_op = True
+        self.parked = False
+        self.left = 0
+        self.turns = 0
+        self.resumed = 0
+        self.gone = False
+
+    def turn(self) -> int:
+        self.turns += 1
+        if self.gone:
+            raise BusError("the interface does not take frames any more")
+        left, self.left = self.left, 0
+        return left
+
+    def park(self) -> None:
+        self.parked, self.all_op = True, False
+
+    def resume(self) -> None:
+        self.parked, self.all_op = False, True
+        self.resumed += 1
+
+
+class Bus:
+    """Two slaves in OP whose watcher a test holds; slave 2 takes `patience` turns for an object."""
+
+    def __init__(self) -> None:
+        self.watching = Watching()
+        self.patience = 0
+
+    def request_state(self, state: AlState) -> None:
+        pass
+
+    def wait_for_state(self, state: AlState, timeout_s: float) -> tuple[str, ...]:
+        return ()
+
+    def read_states(self) -> tuple[SlaveState, ...]:
+        return ()
+
+    def emergencies(self) -> tuple[Any, ...]:
+        return ()
+
+    def watcher(self, say: Callable[[str], None]) -> Watching:
+        return self.watching
+
+    def sdo(self, position: int) -> Bus:
+        return self
+
+    def reading(self, index: int, subindex: int) -> Steps[bytes]:
+        until = self.watching.turns + self.patience
+        while self.watching.turns < until:
+            yield
+        return b"\x2a"
+
+
+@pytest.fixture
+def bus() -> Bus:
+    return Bus()
+
+
+@pytest.fixture
+def service(bus: Bus, board: Blackboard) -> Iterator[Service]:
+    made = Service(bus, board, [2], ["joint1"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
+    made.want_op()
+    made.start()
+    until(lambda: made.all_op)
+    yield made
+    made.finish()
+
+
+@pytest.fixture
+def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
+    made = Observer(path)
+    yield made
+    made.close()
+
+
+def until(met: Callable[[], bool]) -> None:
+    end = time.monotonic() + 20
+    while not met():
+        assert time.monotonic() < end
+        time.sleep(0.0005)
+
+
+def turns(bus: Bus, count: int = 20) -> None:
+    before = bus.watching.turns
+    until(lambda: bus.watching.turns >= before + count)
+
+
+def test_a_slave_that_is_back_before_anybody_looked_stays_lost_until_it_is_recovered(
+    bus: Bus, service: Service
+) -> None:
+    bus.watching.left = 2
+    until(lambda: service.lost_slave == 2)
+    turns(bus)
+    assert bus.watching.all_op
+    assert (service.lost_slave, service.all_op) == (2, False)
+    service.recover()
+    assert not service.all_op
+    until(lambda: service.all_op)
+    assert (service.lost_slave, bus.watching.resumed) == (0, 1)
+
+
+def test_a_recovery_lasts_until_every_slave_is_in_op(bus: Bus, service: Service) -> None:
+    bus.watching.left = 2
+    until(lambda: service.lost_slave == 2)
+    bus.watching.resume = lambda: None  # type: ignore[method-assign]
+    bus.watching.all_op = False
+    service.recover()
+    turns(bus)
+    assert not service.all_op
+    bus.watching.all_op = True
+    until(lambda: service.all_op)
+
+
+def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, service: Service) -> None:
+    service.park()
+    until(lambda: bus.watching.parked)
+    bus.watching.all_op = True
+    turns(bus)
+    assert not service.all_op
+    service.recover()
+    until(lambda: service.all_op)
+
+
+def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
+    bus: Bus, service: Service, observer: Observer
+) -> None:
+    bus.patience = 30
+    before = bus.watching.turns
+    observer.ask_service({"do": "sdo_read", "slave": 2, "index": 0x1000, "subindex": 0})
+    found: list[dict[str, Any]] = []
+
+    def answered() -> bool:
+        answer = observer.service_answer()
+        found.extend([] if answer is None else [answer])
+        return bool(found)
+
+    until(answered)
+    assert found == [{"hex": "2a"}]
+    assert bus.watching.turns >= before + 30
+
+
+@pytest.mark.parametrize("request_", [{"do": "nothing", "slave": 1, "index": 0, "subindex": 0}, {"do": "sdo_read"}, []])
+def test_a_request_of_another_form_is_answered_in_a_sentence(
+    service: Service, observer: Observer, request_: Any
+) -> None:  # fmt: skip
+    observer.ask_service(request_)
+    found: list[dict[str, Any]] = []
+
+    def answered() -> bool:
+        answer = observer.service_answer()
+        found.extend([] if answer is None else [answer])
+        return bool(found)
+
+    until(answered)
+    assert "not of the service's form" in found[0]["error"]
+    assert service.is_alive()
+
+
+def test_what_slaves_have_been_through_is_read_as_it_was_written(
+    bus: Bus, service: Service, observer: Observer
+) -> None:
+    bus.watching.slaves[1].lost, bus.watching.slaves[1].recovered = 3, 2
+    bus.watching.errors.of[1] = PortErrors(rx=70_000, forwarded=1 << 40, links=5)
+    until(lambda: observer.health(2)[1] == Health(3, 2, 70_000, 0xFFFF_FFFF, 5))
+    assert observer.health(2)[0] == Health(0, 0, 0, 0, 0)
+
+
+def test_an_interface_that_is_gone_is_said_once_and_not_in_every_turn(
+    bus: Bus, service: Service, observer: Observer
+) -> None:
+    bus.watching.gone = True
+    turns(bus, 100)
+    said = [text.sentence for text in observer.texts_since(0)]
+    assert said == ["the interface does not take frames any more"]
+    assert service.is_alive()
