@@ -4,7 +4,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help setup oracles run test lint format clean
+# Tests of pure computation: as many at once as there are CPUs. The others have sockets, processes and cycles of their own,
+# which would only get into each other's way.
+SIDE_BY_SIDE := $(addprefix tests/,kinematics motion config devices experiments realtime telemetry)
+
+.PHONY: help setup oracles run test faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -20,7 +24,13 @@ run: setup ## run the demonstration: virtual segment, master, a move, the figure
 	@$(BIN)/rtcp demo --square xy
 
 test: setup ## run all tests
-	@$(BIN)/python -m pytest
+	@status=0; \
+	$(BIN)/python -m pytest --numprocesses auto $(SIDE_BY_SIDE) || status=1; \
+	$(BIN)/python -m pytest $(addprefix --ignore=,$(SIDE_BY_SIDE)) || status=1; \
+	exit $$status
+
+faults: setup ## carry out the whole fault matrix and print it as a table
+	@$(BIN)/python benchmarks/faults.py
 
 lint: setup ## check style, format and types
 	@$(BIN)/ruff check .

@@ -322,7 +322,7 @@ def main() -> int:
     )
     console.print(f"{machine}, {date.today().isoformat()}, {given.active} motion")
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
-        os.environ["RTCP_RUNTIME_DIR"] = directory
+        os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
         found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
         found |= compare(
             given.cycle_us,

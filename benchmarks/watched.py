@@ -106,7 +106,7 @@ def main() -> int:
     console.print(f"{machine}, {date.today().isoformat()}")
     found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
-        os.environ["RTCP_RUNTIME_DIR"] = directory
+        os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
         runs: dict[tuple[str, int], list[Round]] = {(kind, spin): [] for spin in (0, 40) for kind in WATCH_MS}
         for _ in range(given.rounds):
             for (kind, spin), rounds in runs.items():

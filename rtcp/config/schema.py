@@ -36,6 +36,7 @@ from rtcp.config.operation import (
     OutputsConfig,
     WatchConfig,
 )
+from rtcp.config.stops import StopsConfig
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,7 @@ class ArmFile:
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
     watch: WatchConfig = field(default_factory=WatchConfig)
+    stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
@@ -119,6 +121,7 @@ def load(path: Path) -> ArmConfig:
         cartesian=arm.cartesian,
         jog=arm.jog,
         watch=arm.watch,
+        stops=arm.stops,
         inputs=arm.inputs,
         outputs=arm.outputs,
         gripper=arm.gripper,

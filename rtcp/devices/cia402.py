@@ -31,6 +31,8 @@ class DriveGoal(Enum):
     QUICK_STOPPED = "stopped by quick stop"
     """Ramps down by itself and holds (0x605A = 6) until it is led to DISABLED; a drive without torque stays without."""
     ENABLED = "enabled"
+    TORQUE_OFF = "without torque at once"
+    """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
     RESET = "free of faults"
     """Resets a fault and takes the drive no further than `switch on disabled`."""
 
@@ -79,6 +81,7 @@ CONTROLWORDS |= {
     for state in DriveState
 }
 
+CONTROLWORDS |= {(state, DriveGoal.TORQUE_OFF): DISABLE_VOLTAGE for state in DriveState}
 _RAMPING = (_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE)
 CONTROLWORDS |= {
     (state, DriveGoal.QUICK_STOPPED): QUICK_STOP if state in _RAMPING else CONTROLWORDS[state, DriveGoal.DISABLED]
@@ -89,6 +92,7 @@ CONTROLWORDS |= {
 REACHED: dict[DriveGoal, frozenset[DriveState]] = {
     DriveGoal.ENABLED: frozenset({_S.OPERATION_ENABLED}),
     DriveGoal.DISABLED: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
+    DriveGoal.TORQUE_OFF: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
     DriveGoal.QUICK_STOPPED: frozenset(
         {_S.QUICK_STOP_ACTIVE, _S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}
     ),

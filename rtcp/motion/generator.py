@@ -110,8 +110,12 @@ class JointGenerator:
         return False
 
     def stop(self, state: MotionState) -> None:
-        """Come to rest under the acceleration and jerk limits, from whatever mode; does nothing at rest."""
-        if self.phase is Phase.STOP or not (any(state.velocity) or any(state.acceleration)):
+        """Come to rest under the acceleration and jerk limits, from whatever mode; at rest nothing begins any more."""
+        if self.phase is Phase.STOP:
+            return
+        if not (any(state.velocity) or any(state.acceleration)):
+            # A move that has not begun, because no frame came since it was asked for, never does.
+            self.hold()
             return
         self._carry_over(self._stop, state)
         self._stop.max_velocity = self._velocity_limit

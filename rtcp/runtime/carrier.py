@@ -13,7 +13,7 @@ from rtcp.runtime.codes import Code
 from rtcp.runtime.machine import Command, State
 from rtcp.runtime.observer import BlackboardError, Event, LeaseRefused, Observer
 from rtcp.runtime.picture import Picture
-from rtcp.runtime.sentences import FAULTS, Sentences
+from rtcp.runtime.sentences import Sentences
 
 Progress = Callable[[dict[str, Any]], Awaitable[None]]
 POLL_S = 0.002
@@ -161,7 +161,7 @@ class Carrier:
         """Return the event after `number` by which a motion ended early, or None."""
         found = None
         for event in self.observer.events_since(number):
-            if event.code >= Code.ENDED or event.code in FAULTS or event.code in _ENDINGS:
+            if event.code >= Code.ENDED or event.code in self._sentences.faults or event.code in _ENDINGS:
                 found = event
         return found
 
@@ -177,7 +177,7 @@ class Carrier:
             for event in self.observer.events_since(since):
                 if event.code == code:
                     return event
-                if event.code in FAULTS:
+                if event.code in self._sentences.faults:
                     raise CommandFailed("fault", self.sentence(event))
                 if event.code == Code.DISABLED:
                     raise CommandFailed("refused", "it was ended by another command: the drives are disabled")

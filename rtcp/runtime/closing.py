@@ -1,6 +1,8 @@
-"""The machine's way out: a controlled stop, torque off, end; an emergency on the way is met by the drives' ramps."""
+"""The machine's way out: a controlled stop, torque off, end; an emergency on the way is met by its rung."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
@@ -10,6 +12,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.operator import Operator
+from rtcp.runtime.stops import Rung
 
 _CLOSING_S = 2.0
 TOLD_CYCLES = 5
@@ -28,6 +31,7 @@ class Closing:
         watch: of the joints; the gripper has its own.
         blackboard: where it is told that an emergency was met.
         lost_limit: so many cycles in a row without frames give the bus up.
+        rungs: how what goes wrong on the way is met.
         period_s: the cycle, s.
     """
 
@@ -39,6 +43,7 @@ class Closing:
         watch: Watch,
         blackboard: Blackboard,
         lost_limit: int,
+        rungs: Mapping[Code, Rung],
         period_s: float,
     ) -> None:
         self._arm = arm
@@ -47,11 +52,13 @@ class Closing:
         self._watch = watch
         self._blackboard = blackboard
         self._lost_limit = lost_limit
+        self._rungs = rungs
         self._patience = round(_CLOSING_S / period_s)
         self._cycles = 0
         self._told = 0
         self._hard = False
-        """Whether an emergency came: what still moves is stopped as quickly as the drives can."""
+        """Whether an emergency came: what still moves is stopped by its rung."""
+        self._goal = DriveGoal.QUICK_STOPPED
 
     def lead(self, good: bool, lost: int) -> bool:
         """Do the cycle's part; return whether all is done.
@@ -65,7 +72,7 @@ class Closing:
         if self._ramps_down(good):
             return False
         if lost >= self._lost_limit:
-            arm.lead(DriveGoal.QUICK_STOPPED)
+            arm.lead(self._rungs[Code.BUS_LOST].goal)
             return lost >= self._lost_limit + _FAREWELL_CYCLES
         if self._cycles > self._patience:
             return True
@@ -82,7 +89,7 @@ class Closing:
         return self._stop() and self._take_torque()
 
     def _ramps_down(self, good: bool) -> bool:
-        """Meet a press, or a measurement beyond its limit; return whether the drives ramp down by themselves."""
+        """Meet a press, or a measurement beyond its limit; return whether the arm still moves after it."""
         arm = self._arm
         if not self._hard and arm.first_with_torque() >= 0:
             found = arm.beyond(self._watch) if good and arm.first_not_enabled() < 0 else None
@@ -92,14 +99,15 @@ class Closing:
                 self._meet(Code.PRESSED)
         if not self._hard or arm.first_moving() < 0 or self._cycles > self._patience:
             return False
-        arm.lead(DriveGoal.QUICK_STOPPED)
+        arm.lead(self._goal)
         if good:
             arm.follow()
         return True
 
     def _meet(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
-        """Let the drives ramp down by themselves from now on, and say why."""
+        """Let the drives stop by themselves from now on, and say why."""
         self._hard = True
+        self._goal = self._rungs[code].goal
         self._cycles = 0
         self._homing.abandon()
         self._arm.hold_target()

@@ -1,4 +1,4 @@
-"""The emergency path: quick stop without a jump before it, torque off at standstill, slaves to PRE-OP.
+"""The emergency path: quick stop without a jump before it, torque off at standstill or at once, slaves to PRE-OP.
 
 Source: the thesis' emergency stop, which stops the network and takes the slaves to PRE-OP (facts, "The drive"). Here
 the drives come to rest first, because a drive that loses its process data in motion lets the arm fall.
@@ -13,6 +13,7 @@ from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.service import Service
+from rtcp.runtime.stops import Rung
 
 _STAND_S = 2.0
 """A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
@@ -45,13 +46,15 @@ class EmergencyStop:
         self._off_cycles = round(_OFF_S / period_s)
         self._step = _Step.QUICK_STOP
         self._cycles = 0
+        self._off = DriveGoal.DISABLED
 
-    def begin(self) -> None:
-        """Begin with the quick stop, in the cycle that found the reason for it."""
-        self._step = _Step.QUICK_STOP
-        self._cycles = 0
+    def begin(self, rung: Rung) -> None:
+        """Begin with the quick stop, or without torque, in the cycle that found the reason for it."""
+        hard = rung is Rung.TORQUE_OFF
+        self._off = DriveGoal.TORQUE_OFF if hard else DriveGoal.DISABLED
+        self._next(_Step.TORQUE_OFF if hard else _Step.QUICK_STOP)
         self._arm.hold_target()
-        self._arm.lead(DriveGoal.QUICK_STOPPED)
+        self._arm.lead(rung.goal)
 
     def lead(self, good: bool) -> None:
         """Do the cycle's part; `good`: the drives have answered."""
@@ -63,14 +66,14 @@ class EmergencyStop:
             if stands or self._cycles > self._stand_cycles:
                 self._next(_Step.TORQUE_OFF)
         elif self._step is _Step.TORQUE_OFF:
-            arm.lead(DriveGoal.DISABLED)
+            arm.lead(self._off)
             off = good and self._cycles > _FIRST_CYCLES and arm.first_with_torque() < 0
             if off or self._cycles > self._off_cycles:
                 self._next(_Step.PARKED)
                 self._service.park()
                 self._blackboard.event(Code.PARKED)
         else:
-            arm.lead(DriveGoal.DISABLED)
+            arm.lead(self._off)
         if good:
             arm.follow()
 

@@ -56,7 +56,8 @@ class Event(IntEnum):
     DISABLE = 11
     DISABLED = 12
     BROKEN = 13
-    """Something was lost or broke: frames, a slave, a drive, the clock."""
+    """Something was lost or broke (frames, a slave, a drive, the clock), or an event's rung is more than a controlled
+    stop."""
     EMERGENCY = 14
     """The emergency stop is pressed, or something measured was beyond its limit for too long."""
     RESET = 15
@@ -66,6 +67,8 @@ class Event(IntEnum):
     ENDED = 19
     HOME = 20
     HOMED = 21
+    WAVERS = 22
+    """The clock was lost and its rung is a controlled stop: a fault follows at standstill."""
 
 
 class Row(NamedTuple):
@@ -92,6 +95,7 @@ _MOVES = frozenset(
 )
 _BROKEN = {Event.BROKEN: State.FAULT, Event.EMERGENCY: State.EMERGENCY_STOP, Event.SHUTDOWN: State.CLOSING}
 _TORQUE = _BROKEN | {Event.DISABLE: State.DISABLING}
+_WAVERS = {Event.WAVERS: State.STOPPING}
 
 TABLE: dict[State, Row] = {
     State.OFF: Row(
@@ -119,13 +123,14 @@ TABLE: dict[State, Row] = {
         "holding",
         "the last set-points, unchanged",
         _READY | _MOVES | {Command.MODE, Command.MOTION, Command.STOP, Command.HOME},
-        _TORQUE | {Event.MOTION: State.MOVING, Event.GUARD: State.STOPPING, Event.HOME: State.HOMING},
+        _TORQUE | _WAVERS | {Event.MOTION: State.MOVING, Event.GUARD: State.STOPPING, Event.HOME: State.HOMING},
     ),
     State.MOVING: Row(
         "moving",
         "the set-points of the active mode, after the guards",
         _READY | _MOVES | {Command.STOP},
         _TORQUE
+        | _WAVERS
         | {
             Event.MOTION: State.MOVING,
             Event.ARRIVED: State.HOLDING,
@@ -138,6 +143,7 @@ TABLE: dict[State, Row] = {
         "down to standstill under the limits of acceleration",
         _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.STOP, Command.GRIPPER},
         _TORQUE
+        | _WAVERS
         | {
             Event.STOPPED: State.HOLDING,
             Event.LIMIT_STOPPED: State.STOPPED_BY_LIMIT,
@@ -160,11 +166,12 @@ TABLE: dict[State, Row] = {
         "disabling",
         "a controlled stop first; then drives led to Switch On Disabled, brakes closed",
         _ANYWHERE | {Command.DISABLE},
-        _BROKEN | {Event.DISABLED: State.READY},
+        _BROKEN | _WAVERS | {Event.DISABLED: State.READY},
     ),
     State.FAULT: Row(
         "fault",
-        "quick stop: each drive ramps down by itself and holds (0x605A = 6), whether or not frames come back",
+        "quick stop: each drive ramps down by itself and holds (0x605A = 6), or torque off where `stops` says so; "
+        "whether or not frames come back",
         _ANYWHERE | {Command.DISABLE, Command.OUTPUT, Command.RESET, Command.LIMITS},
         {
             Event.RESET: State.RESETTING,
@@ -175,7 +182,8 @@ TABLE: dict[State, Row] = {
     ),
     State.EMERGENCY_STOP: Row(
         "emergency stop",
-        "quick stop; at standstill torque off and brakes closed; then the slaves to PRE-OP",
+        "quick stop, at standstill torque off and brakes closed, or torque off at once where `stops` says so; then the "
+        "slaves to PRE-OP",
         _ANYWHERE | {Command.DISABLE, Command.RESET, Command.LIMITS},
         {Event.RESET: State.RESETTING, Event.DISABLE: State.EMERGENCY_STOP, Event.SHUTDOWN: State.CLOSING},
     ),

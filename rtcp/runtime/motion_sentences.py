@@ -7,6 +7,7 @@ from collections.abc import Callable
 from rtcp.motion.state import Reason
 from rtcp.runtime.codes import Code, MotionMode, Refusal
 from rtcp.runtime.naming import Matter, Naming, number
+from rtcp.runtime.stops import Rung
 
 Say = Callable[[Matter], str]
 _SINGULARITIES = ("shoulder", "elbow", "wrist")
@@ -139,25 +140,31 @@ def motion_events(names: Naming) -> dict[int, Say]:
         return Code.ENDED + reason
 
     watch = f"watch in {file}"
-    emergency = "emergency stop"
+
+    def emergency(code: Code) -> str:
+        return names.stop(code, " at once" if names.rungs[code] is Rung.TORQUE_OFF else ", then torque off")
+
+    def watched(code: Code) -> str:
+        return f"emergency stop, {emergency(code)}, `rtcp reset` goes on"
+
     return {
         Code.PRESSED: lambda _: (
-            "the emergency stop was pressed: quick stop, then torque off; release it, `rtcp reset` goes on"
+            f"the emergency stop was pressed: {emergency(Code.PRESSED)}; release it, `rtcp reset` goes on"
         ),
         Code.OVER_SPEED: lambda m: (
             f"{names.joint(m.axis)}: measured speed {number(m.value)} rad/s was beyond {number(m.limit)} rad/s for "
-            f"{names.config.watch.cycles} cycles ({watch}): {emergency}, `rtcp reset` goes on"
+            f"{names.config.watch.cycles} cycles ({watch}): {watched(Code.OVER_SPEED)}"
         ),
         Code.OVER_TORQUE: lambda m: (
             f"{names.joint(m.axis)}: measured torque {number(m.value)} Nm was beyond {number(m.limit)} Nm for "
-            f"{names.config.watch.cycles} cycles ({watch}): {emergency}, `rtcp reset` goes on"
+            f"{names.config.watch.cycles} cycles ({watch}): {watched(Code.OVER_TORQUE)}"
         ),
         Code.FOLLOWING_ERROR: lambda m: (
             f"{names.joint(m.axis)}: it was {number(m.value)} rad away from where it was commanded, at most "
-            f"{number(m.limit)} rad is allowed ({watch}): {emergency}, `rtcp reset` goes on"
+            f"{number(m.limit)} rad is allowed ({watch}): {watched(Code.FOLLOWING_ERROR)}"
         ),
         Code.PARKED: lambda _: "after the emergency stop: the torque is off, the slaves go to PRE-OP",
-        Code.NOT_PERMITTED: lambda _: "the enabling switch was let go: controlled stop",
+        Code.NOT_PERMITTED: lambda _: f"the enabling switch was let go: {names.end(Code.NOT_PERMITTED)}",
         Code.STICK_TAKEN: lambda m: (
             "the stick is the arm's again: it counts from its neutral position on"
             if m.value

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from rtcp.config.model import ArmConfig
+from rtcp.runtime.codes import Code
+from rtcp.runtime.stops import KEYS, Rung, rungs
 
 
 class Matter(NamedTuple):
@@ -29,6 +31,8 @@ class Naming:
 
     def __init__(self, config: ArmConfig) -> None:
         self.config = config
+        self.rungs = rungs(config.stops)
+        """The rung of the ladder of stops that each event takes."""
 
     @property
     def file(self) -> str:
@@ -48,6 +52,15 @@ class Naming:
         """Return the name of the slave at `position`, from 1."""
         slaves = self.config.slaves
         return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
+
+    def stop(self, code: Code, then: str = "") -> str:
+        """Return the rung that an event takes, what comes `then`, and the key that sets it, where one does."""
+        key = f" (stops.{KEYS[code]} in {self.file})" if code in KEYS else ""
+        return f"{self.rungs[code].words}{then}{key}"
+
+    def end(self, code: Code) -> str:
+        """Return the rung of an event after which the arm may go on by itself, and what goes on where it may not."""
+        return self.stop(code) + ("" if self.rungs[code] is Rung.CONTROLLED_STOP else ", `rtcp reset` goes on")
 
     def box(self, which: int) -> str:
         """Return what the box number `which` is called, -1 for the one that the tool stays in, and its key."""

@@ -9,6 +9,7 @@ from rtcp.config.virtual import VIRTUAL
 from rtcp.runtime.machine import ALLOWED, TABLE, Code, Command, Refusal, State
 from rtcp.runtime.motion_sentences import motion_events, motion_refusals
 from rtcp.runtime.naming import Matter, Naming, number
+from rtcp.runtime.stops import Rung
 
 
 class Sentences:
@@ -21,7 +22,10 @@ class Sentences:
     def __init__(self, config: ArmConfig) -> None:
         self._config = config
         self._names = Naming(config)
-        joint, slave, file = self._names.joint, self._names.slave, self._names.file
+        joint, slave, file, stop = self._names.joint, self._names.slave, self._names.file, self._names.stop
+        ends = (Code.LEASE_ENDED, Code.NOT_PERMITTED)
+        self.faults = FAULTS | {code for code in ends if self._names.rungs[code] is not Rung.CONTROLLED_STOP}
+        """Events that are why the machine is in fault or in the emergency stop: what the ladder of stops adds, too."""
         self._refusals: dict[Refusal, Callable[[Matter], str]] = {
             Refusal.NOT_IN_THIS_STATE: self._not_in_this_state,
             Refusal.NO_LEASE: lambda _: "the lease has run out or is another commander's: nothing was moved",
@@ -52,12 +56,11 @@ class Sentences:
         self._events: dict[int, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
                 f"process data lost: {number(m.value)} cycles in a row without the expected working counter "
-                f"({self._lost_cycles()} in {file}); all drives are told to stop, `rtcp reset` goes on when the "
-                "slaves answer"
+                f"({self._lost_cycles()} in {file}): {stop(Code.BUS_LOST)}, `rtcp reset` goes on when the slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
-                f"{joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}); "
-                "all joints are stopped, `rtcp reset` goes on"
+                f"{joint(m.axis)}: the drive left Operation Enabled by itself (statusword 0x{int(m.value):04X}): "
+                f"{stop(Code.DRIVE_LEFT_ENABLED)} of all others, `rtcp reset` goes on"
             ),
             Code.ENABLE_STUCK: lambda m: (
                 f"{joint(m.axis)}: enabling stuck for {self._config.enable_timeout_s:g} s at statusword "
@@ -69,7 +72,7 @@ class Sentences:
                 f"{file})"
             ),
             Code.SLAVE_NOT_OP: lambda m: (
-                f"slave {m.axis} ({slave(m.axis)}) left OP; all drives are told to stop, `rtcp reset` brings it back"
+                f"slave {m.axis} ({slave(m.axis)}) left OP: {stop(Code.SLAVE_NOT_OP)}, `rtcp reset` brings it back"
             ),
             Code.RESET_STUCK: self._reset_stuck,
             Code.RESET_MOVING: lambda m: (
@@ -77,22 +80,24 @@ class Sentences:
                 "its torque goes only at standstill; `rtcp disable` takes it off at once"
             ),
             Code.HOMING_RUNNING: lambda m: (
-                f"{joint(m.axis)} still turns, at {number(m.value)} rad/s, 3 s after its homing was over: all drives "
-                "are told to stop, `rtcp reset` goes on"
+                f"{joint(m.axis)} still turns, at {number(m.value)} rad/s, 3 s after its homing was over: "
+                f"{stop(Code.HOMING_RUNNING)}, `rtcp reset` goes on"
             ),
             Code.GENERATOR: lambda _: (
-                "the trajectory generator refused its input; all drives are told to stop, `rtcp reset` goes on"
+                f"the trajectory generator refused its input: {stop(Code.GENERATOR)}, `rtcp reset` goes on"
             ),
             Code.DRIVE_FAULT: lambda m: (
-                f"{joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}), `rtcp reset` goes on"
+                f"{joint(m.axis)}: the drive is in fault (statusword 0x{int(m.value):04X}): {stop(Code.DRIVE_FAULT)}, "
+                "`rtcp reset` goes on"
             ),
             Code.CLOCK_LOST: lambda _: (
-                "the cycle has not followed the reference clock for 1 s; all drives are told to stop, "
-                "`rtcp reset` goes on"
+                f"the cycle has not followed the reference clock for 1 s: {stop(Code.CLOCK_LOST)}, `rtcp reset` goes on"
             ),
             Code.LEFT_RANGE: self._left_range,
             Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
-            Code.LEASE_ENDED: lambda _: "the commander fell silent or gave up its lease: controlled stop",
+            Code.LEASE_ENDED: lambda _: (
+                f"the commander fell silent or gave up its lease: {self._names.end(Code.LEASE_ENDED)}"
+            ),
             Code.MODE_STUCK: lambda m: (
                 f"{joint(m.axis)}: the drive shows mode {int(m.value)}, {int(m.limit)} was asked for"
             ),
@@ -194,4 +199,4 @@ FAULTS = frozenset(
         Code.FOLLOWING_ERROR,
     }
 )
-"""Events that are why the machine is in fault or in the emergency stop."""
+"""Events that are why the machine is in fault or in the emergency stop, whatever the ladder of stops says."""

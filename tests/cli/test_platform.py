@@ -41,6 +41,7 @@ def test_a_detached_start_returns_when_the_platform_answers_and_stop_ends_it(
     assert {name: type(status[name]) for name in FIELDS} == FIELDS
     assert (status["state"], status["mode"], status["cycle_ns"]) == ("ready", "csv", 2_000_000)
     assert rtcp("start", "--config", str(arm)).code == 3
+    assert rtcp("segment", "faults").out == "no fault is active\n"
     assert rtcp("stop").code == 0
     assert rtcp("stop").code == 4
 

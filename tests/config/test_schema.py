@@ -117,7 +117,7 @@ IN_THE_ARM = {
     "an unknown key at the top": (
         ("lease_s:", "leese_s:"),
         "leese_s: this key is not known here; did you mean lease_s? allowed are name, slaves, joints, cycle, bus, "
-        "mode, enable_timeout_s, lease_s, motion, cartesian, jog, watch, inputs, outputs, gripper, kinematics",
+        "mode, enable_timeout_s, lease_s, motion, cartesian, jog, watch, stops, inputs, outputs, gripper, kinematics",
     ),
     "an unknown key that resembles none": (
         ("priority: 80", "zzz: 1"),
@@ -126,7 +126,7 @@ IN_THE_ARM = {
     "the program's own key": (
         ("lease_s: 0.5", "source: here"),
         "source: this key is not known here; allowed are name, slaves, joints, cycle, bus, mode, "
-        "enable_timeout_s, lease_s, motion, cartesian, jog, watch, inputs, outputs, gripper, kinematics",
+        "enable_timeout_s, lease_s, motion, cartesian, jog, watch, stops, inputs, outputs, gripper, kinematics",
     ),
     "a missing key": (
         ("    jerk: 20.0\n", ""),

@@ -31,7 +31,12 @@ class Platform:
     def __init__(self) -> None:
         # Short, and in memory: a control socket's path has 107 bytes at most.
         self.directory = Path(tempfile.mkdtemp(prefix="rtcp-e2e-", dir="/tmp"))
-        self.environment = {**os.environ, "RTCP_RUNTIME_DIR": str(self.directory), "COLUMNS": "100"}
+        self.environment = {
+            **os.environ,
+            "RTCP_RUNTIME_DIR": str(self.directory),
+            "RTCP_STATE_DIR": str(self.directory / "state"),
+            "COLUMNS": "100",
+        }
 
     def be_patient(self, lost_ms: int) -> None:
         """Use the shipped configuration, but take `lost_ms` without frames (20 to 2000) for a fault; a lease is 3 s.

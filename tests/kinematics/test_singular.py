@@ -115,7 +115,11 @@ def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_t
     assert own.singularity == Singularity.NONE
 
 
-@pytest.mark.parametrize(("kinds", "count"), [({"elbow"}, 4), ({"shoulder"}, 4), ({"shoulder", "elbow"}, 2)], ids=str)
+@pytest.mark.parametrize(
+    ("kinds", "count"),
+    [({"elbow"}, 4), ({"shoulder"}, 4), ({"shoulder", "elbow"}, 2)],
+    ids=["elbow", "shoulder", "both"],
+)
 def test_solutions_that_have_become_one_are_given_once(kinds, count, either, chain, as_pose):
     q = beside(either, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), kinds, 0.0, 1.0)
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), q).solutions

@@ -234,6 +234,20 @@ def test_it_stops_when_another_holds_the_lease(hand: Hand) -> None:
     stopped_on_its_way(hand)
 
 
+def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_arm(
+    with_hand: Callable[..., Hand],
+) -> None:
+    hand = with_hand(replace(CONFIG, stops=replace(CONFIG.stops, lease_ended="quick_stop")))
+    hand.on_its_way()
+    hand.simulation.acquire()
+    hand.until(State.FAULT)
+    hand.simulation.run(0.2)
+    assert len(hand.told_of(Code.LEASE_ENDED)) == 1
+    assert not hand.moving
+    assert abs(hand.model.mechanics.velocity) < 0.01
+    assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
+
+
 def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand) -> None:
     hand.simulation.models[0].objects[0x6098, 0].value = 34
     hand.simulation.models[0].objects[0x6099, 2].value = 1
