@@ -1,8 +1,9 @@
 """The fault matrix: `python benchmarks/faults.py [--only WORD] [--activity NAME] [--json FILE]`; `make faults`.
 
 Every fault of the virtual segment while the arm holds, moves in joint mode and is jogged: how it ended, the time until
-every joint truly stood (by the segment's account), the largest step of any target as a part of what the speed limit
-allows, the first sentence, what it took to use the arm again. Ends with 1 where one did not end as it must.
+every joint truly stood (by the segment's account), how far a joint went meanwhile as a part of what the ladder of stops
+allows, the largest step of any target as a part of what the speed limit allows, the first sentence, what it took to use
+the arm again. Ends with 1 where one did not end as it must.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from tests.e2e.conftest import Platform
 from tests.faults.cases import CASES
 from tests.faults.run import SHIPPED_MS, bench_of, columns, play
 
-HEADS = ("fault", "while", "ends in", "stood after, s", "largest step", "what is said first", "to go on")
+HEADS = ("fault", "while", "ends in", "stood after, s", "way", "largest step", "what is said first", "to go on")
 
 
 def main() -> int:

@@ -75,8 +75,8 @@ def _fault(
     segment: ControlPath = None,
 ) -> None:
     """Make a fault on the segment that runs."""
-    from rtcp.cli.segment_view import named, sentence_of
-    from rtcp.config.faults import ONCE, parse
+    from rtcp.cli.segment_view import named
+    from rtcp.config.faults import ONCE, parse, sentence_of
 
     mapping = _mapping(name, pairs or [], lasts)
     planned, findings = parse(mapping)

@@ -7,7 +7,6 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, get_type_hints
 
 from rtcp.config.checking import allowed
-from rtcp.config.document import Finding, dotted
 from rtcp.config.faults import FAULTS
 
 _IN_HEX = ("code", "index")
@@ -54,9 +53,3 @@ def line_of(active: Mapping[str, Any]) -> str:
     left = "until it is mended" if active["left_s"] is None else f"{active['left_s']:.1f} s to come"
     done = "".join(f", {count} {what.replace('_', ' ')}" for what, count in active["counts"].items())
     return f"fault {active['id']}: {named(active['fault'])}, for {active['since_s']:.1f} s, {left}{done}"
-
-
-def sentence_of(finding: Finding) -> str:
-    """Return the sentence of a mistake."""
-    where, text = finding
-    return f"{dotted(where)}{': ' if where else ''}{text}"

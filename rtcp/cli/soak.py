@@ -72,9 +72,10 @@ def _soak(
 
         for table in tables(summary):
             show(table)
-        report("nothing was lost" if not summary.failures else "\n".join(summary.failures))
+        until_then = "" if interrupted is None else " until then"
+        report("\n".join(summary.failures) or f"nothing was lost{until_then}")
     if interrupted is not None:
-        raise CommandError("interrupted: this is what there was until then", interruption_code(interrupted))
+        raise CommandError("interrupted; the trial under way was cut off", interruption_code(interrupted))
     if summary.failures:
         raise typer.Exit(ExitCode.FAULT)
 

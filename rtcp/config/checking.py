@@ -78,11 +78,11 @@ def keys(kind: object) -> list[str]:
     return [field.name for field in fields(bare)]
 
 
-def unknown_key(key: str, known: list[str]) -> str:
-    """Return the sentence for a key that means nothing here."""
+def unknown_key(key: str, known: list[str], what: str = "key") -> str:
+    """Return the sentence for a key, or another name, that means nothing here."""
     close = difflib.get_close_matches(key, known, n=1)
     guess = f"did you mean {close[0]}? " if close else ""
-    return f"this key is not known here; {guess}allowed are {', '.join(known)}"
+    return f"this {what} is not known here; {guess}allowed are {', '.join(known)}"
 
 
 def allowed(kind: object) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from rtcp.virtual.chain import Chain
 from rtcp.virtual.registers import Register
@@ -20,6 +21,15 @@ BREATH = 50_000
 """SYNC0 that comes faster than it can be followed is looked at again after so many ns: frames come first."""
 
 
+class Damage(NamedTuple):
+    """A cable that damages a frame when `strikes` says so; the cable's number is that of the slave before it."""
+
+    cable: int
+    strikes: Callable[[], bool]
+    back: bool = False
+    """Whether frames are damaged on their way back to the master."""
+
+
 class Segment:
     """The slaves of a segment, driven by three calls.
 
@@ -32,8 +42,7 @@ class Segment:
         self.slaves = tuple(slaves)
         self.chain = Chain(self.slaves)
         self.miscounts: list[Miscount] = []
-        self.damages: list[tuple[int, Callable[[], bool]]] = []
-        """Cables that damage a frame when the second says so; the cable's number is that of the slave before it."""
+        self.damages: list[Damage] = []
         self._attention: list[Slave] = []
         self._waiting: deque[Slave] = deque()
         self._next_tick = t + IDLE_TICK
@@ -63,9 +72,21 @@ class Segment:
     def _process_in_trouble(self, frame: bytearray, size: int, t: int) -> bool:
         """Answer a frame that may not come back, or not come far."""
         reach = self.chain.reach
-        far = min((cable for cable, strikes in tuple(self.damages) if cable < reach and strikes()), default=reach)
-        if far == reach:
+        struck = [damage for damage in tuple(self.damages) if damage.cable < reach and damage.strikes()]
+        if not struck:
             return bool(reach) and self._wire.process(frame, size, t)
+        out = [damage.cable for damage in struck if not damage.back]
+        if out:
+            self._damage_out(frame, size, t, min(out))
+        else:
+            self._wire.process(frame, size, t)
+            self.settle(t)
+            # The first that it meets on its way back.
+            self._count_back(max(damage.cable for damage in struck))
+        return False
+
+    def _damage_out(self, frame: bytearray, size: int, t: int, far: int) -> None:
+        """Let a frame be sound up to slave `far` only."""
         whole, self._wire = self._wire, Wire(self.slaves[:far], self.miscounts, passing=True)
         self._wire.process(frame, size, t)
         self.settle(t)
@@ -73,9 +94,17 @@ class Segment:
         first = self.slaves[far].esc
         first.count(Register.RX_ERRORS)
         first.count(Register.RX_ERRORS + 1)
-        for slave in self.slaves[far + 1 : reach]:
+        for slave in self.slaves[far + 1 : self.chain.reach]:
             slave.esc.count(Register.FORWARDED_RX_ERRORS)
-        return False
+
+    def _count_back(self, cable: int) -> None:
+        """Let the slaves count a frame that was damaged on its way back over `cable`; they get it at port 1."""
+        if cable:
+            last = self.slaves[cable - 1].esc
+            last.count(Register.RX_ERRORS + 2)
+            last.count(Register.RX_ERRORS + 3)
+        for slave in self.slaves[: max(0, cable - 1)]:
+            slave.esc.count(Register.FORWARDED_RX_ERRORS + 1)
 
     def settle(self, t: int) -> None:
         """Do what the frames since the last call, the last of which arrived at `t`, asked of the slaves."""
@@ -157,11 +186,12 @@ class Segment:
         """Whether devices wait to be stepped."""
         return bool(self._waiting)
 
-    def step_one(self) -> None:
-        """Step the device that has waited longest."""
+    def step_one(self) -> Slave | None:
+        """Step the device that has waited longest; return its slave."""
         if not self._waiting:
-            return
+            return None
         slave = self._waiting.popleft()
         until, slave.queued_until = slave.queued_until, None
         if until is not None:
             slave.application.advance(until)
+        return slave

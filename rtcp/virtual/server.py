@@ -156,9 +156,9 @@ class Server:
                     look_at = now + LOOK
                     control.look()
             elif segment.busy:
-                segment.step_one()
-                if truth.watching:
-                    truth.look(now)
+                stepped = segment.step_one()
+                if truth.watching and stepped is not None:
+                    truth.look(stepped, now)
             elif now < awake_from:
                 wait(descriptors, (), (), max(0, min(due, book.due, awake_from) - now) * 1e-9)
             elif now - arrived > SILENCE:

@@ -44,6 +44,7 @@ CASES: tuple[Case, ...] = (
     Case("cable: slave 1 to 2", [_fault("cable", after=1)], (FAULT,), reset_is_refused=True),
     Case("cable: slave 3 to 4", [_fault("cable", after=3)], (FAULT,), reset_is_refused=True),
     Case("cable: slave 6 to 7", [_fault("cable", after=6)], (FAULT,), reset_is_refused=True),
+    # Shorter than lost cycles are held, longer than the watcher needs: whichever looks first on a shared host.
     Case("cable for 50 ms", [_fault("cable", after=3, lasts=0.05)], (GOES_ON, FAULT), watch_s=1.5),
     Case("power: IO box (reference clock)", [_fault("power", slave=BOX)], (FAULT,), reset_is_refused=True),
     Case("power: drive 3", [_fault("power", slave=DRIVE_3)], (FAULT,), reset_is_refused=True),
@@ -71,15 +72,31 @@ CASES: tuple[Case, ...] = (
     Case("frames lost: all", [_fault("loss", rate=1.0)], (FAULT,), (LOST,), reset_is_refused=True),
     Case("answers 3 ms late: 1 in 50", [_fault("delay", ms=3, rate=0.02)], (GOES_ON,), watch_s=1.5),
     Case("answers 3 ms late: all", [_fault("delay", ms=3, rate=1.0)], (FAULT,), reset_is_refused=True),
-    Case("answers twice: all", [_fault("duplicate", rate=1.0)], (GOES_ON, FAULT), watch_s=1.5),
+    Case("answers twice: all", [_fault("duplicate", rate=1.0)], (GOES_ON,), watch_s=1.5),
     Case("answers out of order: 1 in 50", [_fault("reorder", rate=0.02)], (GOES_ON,), watch_s=1.5),
+    # Told at once, and then at most every 10 s: the trials after the first may be too early for it.
     Case(
         "damaged on the cable 3 to 4: 1 in 50",
         [_fault("corrupt", after=3, rate=0.02)],
         (GOES_ON,),
         ("enter between slave 3",),
+        activities=(HOLDING,),
+    ),
+    Case(
+        "damaged on the cable 3 to 4: 1 in 50",
+        [_fault("corrupt", after=3, rate=0.02)],
+        (GOES_ON,),
+        activities=(MOVING, JOGGING),
+        watch_s=1.5,
     ),
     Case("damaged on the cable 3 to 4: 20", [_fault("corrupt", after=3, burst=20)], (GOES_ON,), watch_s=1.0),
+    Case(
+        "damaged on the way back, 3 to 4: 1 in 50",
+        [_fault("corrupt", after=3, way="back", rate=0.02)],
+        (GOES_ON,),
+        watch_s=1.5,
+    ),
+    # Whatever the bits make of the answer: a statusword that says disabled stops the arm, a position may go unseen.
     Case("bits turned, unseen: 1 in 100", [_fault("garble", rate=0.01, bits=2)], (GOES_ON, FAULT, EMERGENCY)),
     Case("working counter wrong: 10 in a row", [_fault("wkc", slave=DRIVE_3, burst=10)], (GOES_ON,), watch_s=1.0),
     Case("working counter wrong: always", [_fault("wkc", slave=DRIVE_3, rate=1.0)], (FAULT,), (LOST,)),
@@ -94,6 +111,7 @@ CASES: tuple[Case, ...] = (
     Case("drive: following error", [_fault("drive", slave=DRIVE_1, error="following-error")], (FAULT,), ("0x8611",)),
     Case("drive: encoder", [_fault("drive", slave=DRIVE_3, error="encoder")], (FAULT,), ("0x7305",)),
     Case("SYNC0 lost", [_fault("sync0", slave=DRIVE_3)], (FAULT,), reset_is_refused=True),
+    # A jump past the next SYNC0 loses it, as in hardware that compares for equality; where it lies is chance.
     Case("clock jumps 200 us: drive 3", [_fault("clock_jump", slave=DRIVE_3, us=200)], (GOES_ON, FAULT)),
     Case("clock jumps 200 us: reference", [_fault("clock_jump", slave=BOX, us=200)], (GOES_ON, FAULT)),
     Case("clock drifts 200 ppm: drive 3", [_fault("clock_drift", slave=DRIVE_3)], (GOES_ON,)),

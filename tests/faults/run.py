@@ -52,9 +52,12 @@ def faults_of(case: Case, outcome: Outcome) -> list[str]:
         found.append(f"it ended in {end}, not in {' or '.join(case.ends_in)}")
     if end not in (GOES_ON, STOPS) and not outcome.said:
         found.append("nothing was said")
-    if end not in (GOES_ON, STOPS):
-        said = " | ".join(outcome.said).lower()
-        found += [f"nobody said {words!r}" for words in case.words if words.lower() not in said]
+    said = " | ".join(outcome.said).lower()
+    found += [f"nobody said {words!r}" for words in case.words if words.lower() not in said]
+    if outcome.way > 1.0:
+        found.append(f"a joint went {outcome.way:.2f} times as far as its stop may be long")
+    if outcome.by_itself:
+        found.append(f"without a reset {outcome.by_itself}")
     if outcome.largest_step > _STEP:
         found.append(f"a target's step was {outcome.largest_step:.4f} of what its speed limit allows")
     if case.reset_is_refused and not outcome.still_broken:
@@ -67,7 +70,7 @@ def faults_of(case: Case, outcome: Outcome) -> list[str]:
 def columns(case: Case, activity: str, outcome: Outcome | None, wrong: list[str]) -> list[str]:
     """Return the row of a table: fault, activity, end, standstill, step, sentence, recovery."""
     if outcome is None:
-        return [case.name, activity, "-", "-", "-", "; ".join(wrong), "-"]
+        return [case.name, activity, "-", "-", "-", "-", "; ".join(wrong), "-"]
     still = "-"
     if outcome.standstill_s is not None:
         still = f"{outcome.standstill_s:.3f}" if activity == MOVING or outcome.standstill_s > 0 else "0"
@@ -76,6 +79,6 @@ def columns(case: Case, activity: str, outcome: Outcome | None, wrong: list[str]
     if end == GOES_ON:
         resets = "none needed"
     return [
-        case.name, activity, end.replace("_", " "), still, f"{outcome.largest_step:.3f}",
+        case.name, activity, end.replace("_", " "), still, f"{outcome.way:.3f}", f"{outcome.largest_step:.3f}",
         "; ".join([outcome.sentence, *(f"WRONG: {sentence}" for sentence in wrong)]), resets,
     ]  # fmt: skip

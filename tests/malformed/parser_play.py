@@ -92,9 +92,9 @@ class Clock:
 
 
 @contextlib.contextmanager
-def looped(line: Line, random: Random) -> Iterator[tuple[RegisterPort, Loopback]]:
+def looped(line: Line, random: Random, kind: type[Loopback] = Loopback) -> Iterator[tuple[RegisterPort, Loopback]]:
     """Lead the master's registers and its time into a segment meanwhile."""
-    loopback, clock = Loopback(line, random), Clock(line)
+    loopback, clock = kind(line, random), Clock(line)
     modules = [module for name, module in sys.modules.items() if name.startswith("rtcp.fieldbus.")]
     timed: list[Any] = [module for module in modules if getattr(module, "time", None) is time]
     made: Any = registers

@@ -103,10 +103,10 @@ def _turn(line: Line, random: Random, corpus: list[bytes], found: Found, count: 
         found.kinds["answered" if answer is not None else "not answered"] += 1
         if answer is not None and len(answer) != len(frame):
             found.failures.append(f"{frame.hex()}: came back with {len(answer)} bytes")
-        if before and line.targets() != before and not _writes(frame):
+        if before and line.targets() != before and not writes(frame):
             found.failures.append(f"{frame.hex()}: writes nothing and changed outputs")
 
 
-def _writes(frame: bytes) -> bool:
+def writes(frame: bytes) -> bool:
     """Whether a well-formed datagram in it may write."""
     return any(frame[at] in _WRITES for at, _ in places(frame))

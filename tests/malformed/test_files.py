@@ -16,6 +16,7 @@ import pytest
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.faults import load_script
+from rtcp.config.kinematics import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
 from rtcp.runtime.blackboard import Blackboard
@@ -33,17 +34,17 @@ HANGS_S = 120
 """No file takes so long, on any machine; a reader that hangs is ended by a signal."""
 SCRIPT = b"""# A script of faults.
 faults:
-  - {do: loss, at: 1.0, rate: 0.1, lasts: 2.0}
-  - {do: cable, at: 2, after: 3, lasts: 1}
-  - {do: drive, at: 3.5, slave: 2, code: 0x8611}
+  - {fault: loss, at: 1.0, rate: 0.1, lasts: 2.0}
+  - {fault: cable, at: 2, after: 3, lasts: 1}
+  - {fault: drive, at: 3.5, slave: 2, error: encoder}
 """
 TRAJECTORY = b"""trajectory:
-  - {t: 0.0, q: [0, 0, 0, 0, 0, 0]}
+  - {t: 0.0, q: [0, 0, 0, 0, 0, 0], v: [0, 0, 0, 0, 0, 0]}
   - {t: 2.0, q: [0, 0.3, pi/4, 0, 0.3, 0], v: [0, 0, 0, 0, 0, 0]}
 """
 PATH = b"speed: 0.1\npath:\n  - {pose: [-0.5, 0.1, 0.6, 0, 0, 0]}\n  - {q: [0, 0.3, pi/2, 0, 0.3, 0], speed: 0.05}\n"
 CSV = b"t,q1,q2,q3,q4,q5,q6\n0,0,0,0,0,0,0\n1.5,0.1,0,0,0,0,-1e-2\n2,0.2,0,0,0,0,0\n"
-POSES = b"x,y,z,rx,ry,rz,speed\n-0.5,0.1,0.6,0,0,0,0.1\n-0.5,0.2,0.6,0,0,0,\n"
+POSES = b"x,y,z,rx,ry,rz,speed\n-0.5,0.1,0.6,0,0,0,0.1\n-0.5,0.2,0.6,0,0,0,0.2\n"
 
 
 @pytest.fixture(autouse=True)
@@ -98,15 +99,17 @@ def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, t
                 return make_segment(config, 0)
             except ValueError as error:
                 raise ConfigError([str(error)]) from error
-        return load(folder / ("abb_irb120.yaml" if name.startswith("abb") else "assistive_arm.yaml"))
+        if name == "abb_irb120.yaml":
+            return load_kinematics(file)
+        return load(folder / "assistive_arm.yaml")
 
+    assert sentences_of(read) == []
     for _ in range(turns):
         file.write_bytes(damaged(whole, random))
         told += bool(sentences_of(read))
     file.write_bytes(whole)
     assert told > turns // 3
-    if not name.startswith("abb"):
-        assert sentences_of(read) == []
+    assert sentences_of(read) == []
 
 
 @pytest.mark.parametrize(
@@ -121,11 +124,13 @@ def test_a_damaged_motion_or_script_is_told_in_sentences(
     random = Random(name)
     file = tmp_path / name
     file.write_bytes(content)
+    assert sentences_of(lambda: read(file)) == []
     told = 0
     for _ in range(300):
         file.write_bytes(damaged(content, random))
         told += bool(sentences_of(lambda: read(file)))
-    assert told > 100
+    # Some mutants are sound: a comment was hit, or a number changed.
+    assert 100 < told < 300
 
 
 def test_a_damaged_file_of_zero_offsets_is_told_in_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.paths import control_socket
-from rtcp.telemetry.trials.bench import NAME, Bench
+from rtcp.telemetry.trials.bench import NAME, Bench, TrialFailed
 
 START = (0.0, 0.2, 1.57, 0.0, 0.4, 0.0)
 """rad; away from every limit and singularity: jogs along each axis are possible from here."""
@@ -39,14 +39,22 @@ class Activity:
         """What ended it, where it was not told to end."""
 
     def begin(self, bench: Bench) -> None:
-        """Begin; return when the arm moves, where it is to."""
+        """Begin; return when the arm moves, where it is to.
+
+        Raises:
+            TrialFailed: it is refused, or the arm does not move.
+        """
         if self.motion != "joint":
-            bench.call("motion", name=self.motion)
+            try:
+                bench.call("motion", name=self.motion)
+            except ControlError as error:
+                raise TrialFailed(f"{self.name} cannot begin: {error.message}") from error
         if not self.moves:
             return
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
-        bench.until(lambda: bench.speed() > 0.03, 5.0)
+        if not bench.until(lambda: bench.speed() > 0.03 or bool(self.refusal), 10.0) or self.refusal:
+            raise TrialFailed(f"{self.name} did not begin: {self.refusal or 'nothing moved for 10 s'}")
         # Well into the motion: past the ramp.
         bench.until(self._ended.is_set, 0.3)
 

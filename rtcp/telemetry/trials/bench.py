@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -13,11 +13,12 @@ import numpy as np
 
 from rtcp.config.model import ArmConfig
 from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.layout import FLAG_ENABLED
 from rtcp.runtime.machine import State
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.paths import blackboard_file, control_socket, segment_control
 from rtcp.runtime.sentences import Sentences
+from rtcp.runtime.session import read_session
+from rtcp.runtime.steps import target_steps
 from rtcp.virtual.faults.client import SegmentClient
 
 POLL_S = 0.02
@@ -25,6 +26,7 @@ STILL_S = 0.25
 """A joint that has not moved for so long stands."""
 _LONGEST_STOP_S = 10.0
 _RESETS, _RESET_PAUSE_S = 5, 1.0
+_MOVES, _SPEED = 3, 0.4
 NAME = "a trial"
 
 
@@ -53,12 +55,16 @@ class Bench:
         self.directory = directory
         self.config = config
         self.client = ControlClient(NAME, control_socket(directory))
-        self.segment = SegmentClient(segment_control(directory))
+        self.segment = SegmentClient(_segment_socket(directory))
         self.observer = Observer(blackboard_file(directory))
+        # The segment watches its joints from the first question on.
+        self.segment.clear_peaks()
         self._sentences = Sentences(config)
         self._speeds = np.array([joint.velocity for joint in config.joints])
         self._seen = self.observer.head
         self._last: Any = None
+        self.injected = 0
+        """Faults made."""
         self.records = 0
         """Cycle records read."""
         self.torn = 0
@@ -95,10 +101,7 @@ class Bench:
         self.wrong += int((found["wkc"] != found["wkc_expected"]).sum())
         joined = found if self._last is None else np.concatenate([self._last, found])
         self._last = found[-1:].copy()
-        numbers = joined["number"].astype(np.int64)
-        enabled = (joined["flags"] & FLAG_ENABLED) != 0
-        pairs = (numbers[1:] - numbers[:-1] == 1) & enabled[1:] & enabled[:-1]
-        steps = np.abs(np.diff(joined["target"], axis=0))[pairs]
+        _, steps = target_steps(joined)
         if len(steps):
             allowed = self._speeds * self.observer.period_ns * 1e-9
             self.largest_step = max(self.largest_step, float((steps / allowed).max()))
@@ -144,6 +147,12 @@ class Bench:
         """Return the last instant at which any joint truly moved (ns, CLOCK_MONOTONIC), as the segment knows it."""
         return max((slave["moved_ns"] for slave in self.segment.truth()["slaves"] if "moved_ns" in slave), default=0)
 
+    def drives(self) -> list[dict[str, Any]]:
+        """Return what the segment knows of each joint's drive: position, whether it has torque."""
+        found = {slave["position"]: slave for slave in self.segment.truth()["slaves"]}
+        places = {slave.name: at for at, slave in enumerate(self.config.slaves, 1)}
+        return [found[places[joint.slave]] for joint in self.config.joints]
+
     def until_still(self) -> int:
         """Wait until every joint truly stands; return the last instant at which one moved.
 
@@ -156,6 +165,11 @@ class Bench:
         return self.moved_ns()
 
     # -- what is done -------------------------------------------------------------------------------------------
+
+    def fault(self, fault: Mapping[str, Any]) -> None:
+        """Make a fault; raises SegmentRefused, SegmentAway."""
+        self.segment.fault(fault)
+        self.injected += 1
 
     def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
         """Ask the platform; raises ControlError."""
@@ -183,11 +197,30 @@ class Bench:
 
     def stand_at(self, q: Sequence[float]) -> None:
         """Move to `q`, rad, in mode joint; raises TrialFailed where the arm cannot be brought there."""
-        _, sentence = self.bring_up()
+        sentence = self.move(q)
         if sentence:
-            raise TrialFailed(f"the arm cannot be enabled: {sentence}")
-        try:
-            self.call("motion", name="joint")
-            self.call("move", q=list(q), speed=0.4)
-        except ControlError as error:
-            raise TrialFailed(f"the arm cannot be brought to where a trial begins: {error.message}") from error
+            raise TrialFailed(f"the arm cannot be brought to where a trial begins: {sentence}")
+
+    def move(self, q: Sequence[float]) -> str:
+        """Move to `q`, rad, in mode joint; return why that was not possible, empty where it was.
+
+        It is tried again: on a host that holds the gateway up for longer than `lease_s` a move ends, as it must.
+        """
+        sentence = ""
+        for _ in range(_MOVES):
+            _, sentence = self.bring_up()
+            if sentence:
+                break
+            try:
+                self.call("motion", name="joint")
+                self.call("move", q=list(q), speed=_SPEED)
+            except ControlError as error:
+                sentence = error.message
+                continue
+            return ""
+        return sentence
+
+
+def _segment_socket(directory: Path) -> Path:
+    """Return where the platform's own segment is asked: another one may have the usual place."""
+    return read_session(directory / "session.pickle").segment_control or segment_control(directory)

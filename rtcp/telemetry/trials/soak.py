@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
+from rtcp.runtime.client import ControlError
 from rtcp.telemetry.trials.activities import ACTIVITIES
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.resources import Resources, grown, resources
 from rtcp.telemetry.trials.trial import GOES_ON, Outcome, carry_out, shown
+from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
 
 SETTLE_S = 60.0
 """A process's memory is looked at from then on: by that time all that it keeps has been allocated."""
 _STEP = 1.0 + 1e-6
 _WATCH_S = 1.0
+_ON_FRAMES = frozenset({"cable", "power", "loss", "delay", "duplicate", "reorder", "corrupt", "wkc", "noise"})
+"""Faults that show in the working counter; of others a cycle without the right one says nothing."""
 _STATIONS = ("loop", "gateway", "segment")
 Report = Callable[[str], None]
 
@@ -46,7 +51,7 @@ def draw(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[str, Any]
         {"fault": "delay", "ms": random.choice((0.5, 3.0)), **often, "seed": seed},
         {"fault": "duplicate", **often, "seed": seed},
         {"fault": "reorder", **often, "seed": seed},
-        {"fault": "corrupt", "after": cable, **often, "seed": seed},
+        {"fault": "corrupt", "after": cable, "way": random.choice(("out", "back")), **often, "seed": seed},
         {"fault": "wkc", "slave": slave, **often, "seed": seed},
         {
             "fault": "drive",
@@ -121,16 +126,19 @@ class Soak:
         summary = self.summary
         summary.first = self._held()
         settled = False
-        for number, (fault, activity) in enumerate(self._choices(), 1):
-            if (passed := time.monotonic() - begun) > minutes * 60.0:
-                break
-            if not settled and passed > SETTLE_S:
-                settled, summary.first = True, self._held()
-            self._trial(number, fault, activity)
+        try:
+            for number, (fault, activity) in enumerate(self._choices(), 1):
+                if (passed := time.monotonic() - begun) > minutes * 60.0:
+                    break
+                if not settled and passed > SETTLE_S:
+                    settled, summary.first = True, self._held()
+                self._trial(number, fault, activity)
+                if len(self._held()) < len(self._pids):
+                    break
+        finally:
+            # Also of a soak that was interrupted.
             summary.minutes = (time.monotonic() - begun) / 60.0
-            if summary.failures and not self._lives():
-                break
-        self._look_at_what_is_held(settled)
+            self._look_at_what_is_held(settled)
         return summary
 
     def _choices(self) -> Iterator[tuple[dict[str, Any], str]]:
@@ -140,42 +148,47 @@ class Soak:
     def _trial(self, number: int, fault: dict[str, Any], activity: str) -> None:
         bench, summary = self._bench, self.summary
         account = summary.accounts.setdefault(str(fault["fault"]), Account())
-        account.injected += 1
         where = f"trial {number}, {shown([fault])}, while {activity}"
+        before = bench.injected
         try:
             outcome = carry_out(bench, [fault], activity, _WATCH_S)
-        except (TrialFailed, OSError, RuntimeError) as error:
+            bench.follow()
+        except (TrialFailed, ControlError, SegmentRefused, SegmentAway, OSError) as error:
             summary.failures.append(f"{where}: {error}")
             self._report(f"{where}: {error}")
-            bench.segment.mend()
+            with contextlib.suppress(SegmentRefused, SegmentAway, OSError):
+                bench.segment.mend()
             return
-        self._count(account, outcome)
-        summary.records, summary.torn = bench.records, bench.torn
+        finally:
+            account.injected += bench.injected - before
+        self._count(account, outcome, counted=fault["fault"] in _ON_FRAMES)
         summary.largest_step = max(summary.largest_step, outcome.largest_step)
         if outcome.largest_step > _STEP:
             summary.failures.append(f"{where}: a target's step was {outcome.largest_step:.3f} of what is allowed")
+        if outcome.way > 1.0:
+            summary.failures.append(f"{where}: a joint went {outcome.way:.2f} times as far as its stop may be long")
+        if outcome.by_itself:
+            summary.failures.append(f"{where}: without a reset {outcome.by_itself}")
         if not outcome.recovered:
             summary.failures.append(f"{where}: not brought back: {outcome.refusal}")
         self._report(f"{where}: {outcome.state.replace('_', ' ')}; {outcome.sentence or 'nothing said'}")
 
     @staticmethod
-    def _count(account: Account, outcome: Outcome) -> None:
+    def _count(account: Account, outcome: Outcome, *, counted: bool) -> None:
         went_on = outcome.state in GOES_ON
         account.went_on += went_on
         account.stopped += not went_on
-        account.noticed += bool(outcome.said) or outcome.wrong_cycles > 0 or not went_on
+        account.noticed += bool(outcome.said) or (counted and outcome.wrong_cycles > 0) or not went_on
         account.recovered += outcome.recovered
 
     def _held(self) -> dict[str, Resources]:
         found = {name: resources(pid) for name, pid in self._pids.items()}
         return {name: held for name, held in found.items() if held is not None}
 
-    def _lives(self) -> bool:
-        return resources(self._pids["loop"]) is not None
-
     def _look_at_what_is_held(self, settled: bool) -> None:
         summary = self.summary
         summary.last = self._held()
+        summary.records, summary.torn = self._bench.records, self._bench.torn
         if summary.torn:
             summary.failures.append(f"{summary.torn} cycle records were torn or lost")
         summary.failures += grown(summary.first, summary.last, settled=settled)

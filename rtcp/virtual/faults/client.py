@@ -68,7 +68,8 @@ class SegmentClient:
 
         `time_ns` (CLOCK_MONOTONIC) and `slaves`, a list with `position`, `model`, `al` (as "SAFE-OP"), `reachable`; of
         drives `position_rad`, `velocity_rad_s`, `state` (CiA 402), `torque_on`, `moved_ns` (last instant at which it
-        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`).
+        was faster than 0.002 rad/s; 0: not since the first question) and `peak_rad_s` (since `clear_peaks`). Who asks
+        for nothing for 10 s misses what moves until the next request.
         """
         return dict(self._ask({"do": "truth"}))
 

@@ -19,8 +19,7 @@ from types import MappingProxyType
 from typing import Any
 
 from rtcp.config.checking import shown, unknown_key
-from rtcp.config.document import dotted
-from rtcp.config.faults import FAULTS, parse
+from rtcp.config.faults import FAULTS, parse, sentence_of
 from rtcp.runtime.paths import listens
 from rtcp.virtual.faults.book import Book
 from rtcp.virtual.faults.slaves import FaultRefused
@@ -149,7 +148,9 @@ class Control:
             verb = request.pop("do", None)
             if not isinstance(verb, str) or verb not in self._verbs:
                 raise FaultRefused(f"do: found {shown(verb)}, allowed is one of {', '.join(self._verbs)}")
-            return {"ok": True, "result": self._verbs[verb](request, time.monotonic_ns())}
+            now = time.monotonic_ns()
+            self._truth.requested(now)
+            return {"ok": True, "result": self._verbs[verb](request, now)}
         except FaultRefused as refusal:
             return {"ok": False, "error": str(refusal)}
 
@@ -160,7 +161,7 @@ class Control:
             raise FaultRefused(f"a fault has at most {MOST_KEYS} keys, found {len(mapping)}")
         planned, findings = parse(mapping)
         if planned is None:
-            raise FaultRefused("; ".join(f"{dotted(where)}{': ' if where else ''}{text}" for where, text in findings))
+            raise FaultRefused("; ".join(map(sentence_of, findings)))
         if planned.at:
             raise FaultRefused("at: a fault that is asked for begins at once; only a script has times")
         return {"id": self._book.begin(planned, now)}
@@ -182,7 +183,7 @@ class Control:
 
     def _clear_peaks(self, request: dict[str, Any], now: int) -> dict[str, Any]:
         _only(request)
-        self._truth.clear_peaks()
+        self._truth.clear_peaks(now)
         return {}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 from rtcp.config.faults import (
     AlFall,
@@ -29,10 +29,13 @@ from rtcp.virtual.faults import devices
 from rtcp.virtual.faults.devices import FaultRefused
 from rtcp.virtual.faults.strikes import Strikes
 from rtcp.virtual.registers import State
-from rtcp.virtual.segment import Segment
+from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
+from rtcp.virtual.wire import Miscount
 
 __all__ = ["FaultRefused", "SlaveUndo", "Undo", "begin"]
+
+_T = TypeVar("_T")
 
 Undo = Callable[[int], None]
 """Ends a fault at an instant; it may have `over`, whether it has passed by itself."""
@@ -72,7 +75,7 @@ class _Counted:
     def __init__(self, what: str, fault: Corrupt | WorkingCounter) -> None:
         self.what = what
         self.count = 0
-        self.when_passed: Callable[[], object] = lambda: None
+        self.when_passed: Callable[[], object] | None = None
         """Called when the burst has passed: it costs nothing any more."""
         self._strikes = Strikes(fault)
 
@@ -83,7 +86,7 @@ class _Counted:
     def __call__(self) -> bool:
         struck = self._strikes.next()
         self.count += struck
-        if struck and self.passed:
+        if struck and self.passed and self.when_passed is not None:
             self.when_passed()
         return struck
 
@@ -194,18 +197,27 @@ def _abort(segment: Segment, fault: SdoAbort, t: int) -> SlaveUndo:
 
 def _corrupt(segment: Segment, fault: Corrupt, t: int) -> SlaveUndo:
     strikes = _Counted("corrupted", fault)
-    damage = (_cable(segment, fault.after), strikes)
-    segment.damages.append(damage)
-    strikes.when_passed = lambda: segment.damages.remove(damage)
-    return SlaveUndo(segment, lambda _: segment.damages.remove(damage), strikes)
+    damage = Damage(_cable(segment, fault.after), strikes, fault.way == "back")
+    return _list(segment, segment.damages, damage, strikes)
 
 
 def _miscount(segment: Segment, fault: WorkingCounter, t: int) -> SlaveUndo:
     strikes = _Counted("not_counted", fault)
-    miscount = (_slave(segment, fault.slave), strikes)
-    segment.miscounts.append(miscount)
-    strikes.when_passed = lambda: segment.miscounts.remove(miscount)
-    return SlaveUndo(segment, lambda _: segment.miscounts.remove(miscount), strikes)
+    miscount: Miscount = (_slave(segment, fault.slave), strikes)
+    return _list(segment, segment.miscounts, miscount, strikes)
+
+
+def _list(segment: Segment, listed: list[_T], entry: _T, strikes: _Counted) -> SlaveUndo:
+    """Put `entry`, which calls `strikes`, on a list of the segment until its burst has passed or it is mended."""
+
+    def leave() -> None:
+        listed.remove(entry)
+        # entry -> strikes -> leave -> entry is a ring, and the segment's process collects none.
+        strikes.when_passed = None
+
+    listed.append(entry)
+    strikes.when_passed = leave
+    return SlaveUndo(segment, lambda _: leave(), strikes)
 
 
 def _sync0(slave: Slave) -> SyncGenerator | None:

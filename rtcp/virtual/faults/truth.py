@@ -11,6 +11,8 @@ from rtcp.virtual.slave import Slave
 
 STANDSTILL = 0.002
 """A joint slower than this, rad/s, stands."""
+PATIENCE = 10_000_000_000
+"""Without a request for so many ns the joints are not watched any more."""
 
 
 class _Joint:
@@ -32,36 +34,50 @@ class _Joint:
 
 
 class Truth:
-    """Watches the joints from the first question on: a segment that nobody asks pays nothing.
+    """Watches the joints from the first question on, for as long as requests come: else a segment pays nothing.
 
     While `watching`, `look` is to be called after each step of a device.
     """
 
     def __init__(self, segment: Segment, models: Sequence[str]) -> None:
         self.watching = False
+        self._asked: int | None = None
+        """Instant of the last request; None: nobody has ever asked for the truth."""
         self._chain = segment.chain
         self._segment = segment
         self._models = tuple(models)
         self._joints = {
             slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
         }
-        self._watched = tuple(self._joints.values())
 
-    def look(self, now: int) -> None:
-        """See which joints move at instant `now`."""
-        for joint in self._watched:
+    def look(self, slave: Slave, now: int) -> None:
+        """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
+        joint = self._joints.get(slave)
+        if joint is not None:
             joint.look(now)
+        if self._asked is not None and now - self._asked > PATIENCE:
+            self.watching = False
 
-    def clear_peaks(self) -> None:
-        """Forget how fast the joints were."""
+    def requested(self, now: int) -> None:
+        """Somebody asked for something: who has once asked for the truth may ask for it again."""
+        if self._asked is not None:
+            self._watch(now)
+
+    def _watch(self, now: int) -> None:
         self.watching = True
-        for joint in self._watched:
+        self._asked = now
+
+    def clear_peaks(self, now: int) -> None:
+        """Forget how fast the joints were."""
+        self._watch(now)
+        for joint in self._joints.values():
             joint.peak = 0.0
 
     def answer(self, now: int) -> dict[str, Any]:
         """Return what is true at instant `now`, slave by slave."""
-        self.watching = True
-        self.look(now)
+        self._watch(now)
+        for joint in self._joints.values():
+            joint.look(now)
         slaves = zip(self._segment.slaves, self._models, strict=True)
         return {
             "time_ns": now,

@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 
 from rtcp.config.faults import CableFault, Corrupt, WorkingCounter
+from rtcp.fieldbus.port_errors import ErrorCounters
+from rtcp.fieldbus.registers import Answer, RegisterPort
 from rtcp.virtual.faults.slaves import FaultRefused, begin
 from rtcp.virtual.frame import Command, Datagram, build
 from tests.virtual.line import MS, STATION, Line, TinyDevice
 
 COUNTERS = 0x0300
+
+
+class Direct(RegisterPort):
+    """The master's port, whose frames reach the slaves without a socket."""
+
+    def __init__(self, line: Line) -> None:
+        self._line = line
+
+    def exchange(self, command: int, station: int, address: int, data: bytes, *, timeout_s: float = 0.02,
+                 tries: int = 3) -> Answer:  # fmt: skip
+        answer = self._line.one(Command(command), station, address, data)
+        return Answer(answer.data, answer.counter)
 
 
 def in_op(count: int = 4) -> Line:
@@ -75,6 +91,78 @@ def test_a_rate_damages_its_share_and_the_same_frames_with_the_same_seed() -> No
     first = struck()
     assert 60 < sum(first) < 140
     assert struck() == first
+
+
+def errors_behind(line: Line) -> list[tuple[int, int, int]]:
+    """Of each slave: invalid frames and receive errors at port 1, forwarded ones."""
+    found = [line.read(n, COUNTERS, 20) for n in range(len(line.slaves))]
+    return [(raw[2], raw[3], raw[9]) for raw in found]
+
+
+@pytest.mark.parametrize("after", [0, 1, 2, 3])
+def test_all_slaves_have_worked_when_a_frame_is_damaged_on_its_way_back_and_those_before_the_cable_count_at_port_1(
+    after: int,
+) -> None:
+    line = in_op()
+    undo = begin(line.segment, Corrupt(after, "back", burst=1), line.now)
+    line.pass_time(MS)
+    assert line.raw(lrw(1, 2, 3, 4)) is None
+    assert undo.over
+    assert undo.counts == {"corrupted": 1}
+    assert [device.out.value for device in line.devices] == [1, 2, 3, 4]
+    assert errors_behind(line) == ([(0, 0, 1)] * (after - 1) + [(1, 1, 0)] * bool(after) + [(0, 0, 0)] * (4 - after))
+    assert errors(line) == [(0, 0, 0)] * 4
+    assert line.exchange(5, 6, 7, 8)[1] == 12
+    assert line.exchange(5, 6, 7, 8) == ([6, 7, 8, 9], 12)
+
+
+def test_a_request_in_a_frame_that_is_damaged_on_its_way_back_is_done() -> None:
+    line = in_op()
+    begin(line.segment, Corrupt(2, "back", burst=2), line.now)
+    for slave in (0, 3):
+        assert line.raw(build(Datagram(Command.FPWR, 0, STATION + slave, 0x0120, b"\x04\x00"))) is None
+    assert [line.al(n)[0] for n in range(4)] == [4, 8, 8, 4]
+
+
+def test_a_frame_that_is_damaged_twice_counts_as_an_error_where_it_is_damaged_first() -> None:
+    line = in_op()
+    undo = [
+        begin(line.segment, Corrupt(1, "back", rate=1.0), line.now),
+        begin(line.segment, Corrupt(2, "back", rate=1.0), line.now),
+    ]
+    assert line.raw(lrw(1, 2, 3, 4)) is None
+    undo.append(begin(line.segment, Corrupt(3, rate=1.0), line.now))
+    assert line.raw(lrw(5, 6, 7, 8)) is None
+    assert [each.counts["corrupted"] for each in undo] == [2, 2, 1]
+    for each in undo:
+        each(line.now)
+    assert errors_behind(line) == [(0, 0, 1), (1, 1, 0), (0, 0, 0), (0, 0, 0)]
+    assert errors(line) == [(0, 0, 0)] * 3 + [(1, 1, 0)]
+    assert not line.segment.damages
+
+
+@pytest.mark.parametrize("way", ["out", "back"])
+@pytest.mark.parametrize("after", [0, 1, 2])
+def test_the_master_names_the_cable_over_which_damaged_frames_come_whichever_way_they_went(
+    after: int, way: Literal["out", "back"]
+) -> None:
+    line = in_op(3)
+    port, said = Direct(line), list[str]()
+    counters = ErrorCounters(port, ("a", "b", "c"), said.append)
+    undo = begin(line.segment, Corrupt(after, way, burst=5), line.now)
+    for _ in range(5):
+        assert line.raw(lrw(0, 0, 0)) is None
+    assert undo.over
+    for _ in range(3):
+        counters.read_next()
+    counters.tell()
+    named = ("the master and slave 1 (a)", "slave 1 (a) and slave 2 (b)", "slave 2 (b) and slave 3 (c)")[after]
+    if (after, way) == (0, "back"):
+        # Nobody but the master's network card gets them.
+        assert said == []
+    else:
+        assert len(said) == 1
+        assert said[0].startswith(f"errors enter between {named}: 5 damaged frames since ")
 
 
 @pytest.mark.parametrize("after", [2, 3])

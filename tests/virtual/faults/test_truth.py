@@ -9,9 +9,11 @@ import pytest
 
 from rtcp.config.segment import load_segment
 from rtcp.virtual.faults.client import SegmentClient
-from rtcp.virtual.faults.truth import Truth
+from rtcp.virtual.faults.truth import PATIENCE, Truth
 from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.segment import Segment
 from rtcp.virtual.server import make_segment
+from rtcp.virtual.slave import Slave
 from tests.virtual.faults.conftest import BeginSegment
 from tests.virtual.line import MS
 
@@ -28,33 +30,80 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-def watched(config: Path) -> tuple[Truth, CubemarsDrive]:
+def watched(config: Path) -> tuple[Truth, Segment]:
     loaded = load_segment(config)
     segment = make_segment(loaded, 0)
-    drive = segment.slaves[1].device
-    assert isinstance(drive, CubemarsDrive)
-    return Truth(segment, [slave.model for slave in loaded.slaves]), drive
+    return Truth(segment, [slave.model for slave in loaded.slaves]), segment
+
+
+def drive_of(slave: Slave) -> CubemarsDrive:
+    assert isinstance(slave.device, CubemarsDrive)
+    return slave.device
 
 
 def test_the_last_motion_and_the_largest_velocity_are_kept(config: Path) -> None:
-    truth, drive = watched(config)
+    truth, segment = watched(config)
+    slave = segment.slaves[1]
+    drive = drive_of(slave)
     assert not truth.watching
     truth.answer(MS)
     assert truth.watching
     for now, velocity in ((2 * MS, 0.5), (3 * MS, -0.8), (4 * MS, 0.0021), (5 * MS, 0.0019), (6 * MS, 0.0)):
         drive.mechanics.velocity = velocity
-        truth.look(now)
+        truth.look(slave, now)
     told = truth.answer(7 * MS)["slaves"][1]
     assert (told["moved_ns"], told["peak_rad_s"], told["velocity_rad_s"]) == (4 * MS, 0.8, 0.0)
 
 
 def test_the_largest_velocity_counts_from_when_it_was_cleared(config: Path) -> None:
-    truth, drive = watched(config)
+    truth, segment = watched(config)
+    drive = drive_of(segment.slaves[1])
     drive.mechanics.velocity = 0.8
     truth.answer(MS)
-    truth.clear_peaks()
+    truth.clear_peaks(MS)
     drive.mechanics.velocity = 0.3
     assert truth.answer(2 * MS)["slaves"][1]["peak_rad_s"] == 0.3
+
+
+def test_a_step_is_a_look_at_the_stepped_joint_alone(config: Path) -> None:
+    truth, segment = watched(config)
+    io, stepped, other = segment.slaves
+    truth.answer(MS)
+    drive_of(stepped).mechanics.velocity = drive_of(other).mechanics.velocity = 0.5
+    truth.look(io, 2 * MS)
+    truth.look(stepped, 3 * MS)
+    drive_of(stepped).mechanics.velocity = drive_of(other).mechanics.velocity = 0.0
+    told = truth.answer(4 * MS)["slaves"]
+    assert [(one["moved_ns"], one["peak_rad_s"]) for one in told[1:]] == [(3 * MS, 0.5), (0, 0.0)]
+
+
+def test_nothing_is_watched_any_more_when_nobody_has_asked_for_long_and_everything_from_the_next_request_on(
+    config: Path,
+) -> None:
+    truth, segment = watched(config)
+    slave = segment.slaves[1]
+    truth.requested(0)
+    assert not truth.watching, "somebody asked, but never for the truth"
+    truth.answer(MS)
+    truth.look(slave, MS + PATIENCE)
+    assert truth.watching
+    truth.requested(2 * MS)
+    truth.look(slave, 2 * MS + PATIENCE)
+    assert truth.watching
+    truth.look(slave, 2 * MS + PATIENCE + 1)
+    assert not truth.watching
+    truth.requested(3 * PATIENCE)
+    assert truth.watching
+
+
+def test_the_segment_says_which_slave_it_has_stepped(config: Path) -> None:
+    _, segment = watched(config)
+    segment.tick(2 * MS)
+    stepped = []
+    while segment.busy:
+        stepped.append(segment.step_one())
+    assert stepped == list(segment.slaves)
+    assert segment.step_one() is None
 
 
 def test_a_real_segment_tells_of_a_load_that_falls_without_any_master(

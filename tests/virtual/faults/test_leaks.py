@@ -1,0 +1,202 @@
+"""The segment's process runs without a garbage collector: what faults leave behind is there for good."""
+
+from __future__ import annotations
+
+import gc
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config.faults import FAULTS, ONCE, load_script, parse
+from rtcp.virtual.faults.book import Book
+from rtcp.virtual.faults.control import Control, control_socket
+from rtcp.virtual.faults.slaves import FaultRefused
+from rtcp.virtual.faults.truth import Truth
+from rtcp.virtual.frame import Command, Datagram, build
+from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
+
+ROUNDS = 8
+MS = 1_000_000
+KINDS: dict[str, dict[str, Any]] = {
+    "cable": {"after": 3},
+    "power": {"slave": 3},
+    "al_refuse": {"slave": 2, "state": "OP"},
+    "al_hang": {"slave": 2},
+    "al_fall": {"slave": 2},
+    "sdo_late": {"slave": 2, "ms": 5},
+    "sdo_abort": {"slave": 2},
+    "loss": {"rate": 0.5},
+    "delay": {"ms": 1, "rate": 0.5},
+    "duplicate": {"rate": 0.5},
+    "reorder": {"rate": 0.5},
+    "corrupt": {"after": 3, "rate": 0.5},
+    "garble": {"rate": 0.5},
+    "wkc": {"slave": 2, "rate": 0.5},
+    "drive": {"slave": 2, "error": "encoder"},
+    "sync0": {"slave": 2},
+    "clock_jump": {"slave": 2, "us": 1},
+    "clock_drift": {"slave": 2},
+    "input": {"number": 3, "how": "bounce"},
+    "stick_code": {"value": 9},
+    "noise": {"rate_hz": 2000},
+}
+BY_RATE = [name for name, keys in KINDS.items() if "rate" in keys]
+WRONG: list[bytes] = [
+    b'{"do":"fault","fault":{"fault":"corupt","after":1}}', b'{"do":"fault","fault":{"fault":"corrupt","after":"x"}}',
+    b'{"do":"fault","fault":{"fault":"corrupt","after":1,"rate":2,"way":7}}', b'{"do":"fault"}',
+    b'{"do":"mend","id":9999}',
+    b'{"do":"fault","fault":{"fault":"drive","slave":1,"error":"encoder"}}', b"{", b"[]", b"\xff", b'{"do":"dance"}',
+    b'{"do":"faults","x":1}', b"[" * 900, b'{"do":"fault","fault":{"fault":"cable","after":99,"lasts":1e99}}',
+]  # fmt: skip
+
+
+class Bench:
+    """The shipped segment in OP, its book, and a master's frames through both, as the server leads them."""
+
+    def __init__(self) -> None:
+        self.line = Line()
+        self.line.start(OP)
+        self.sent = 0
+        self.book = Book(self.line.segment, self._send, self.line.now)
+        self._frame = build(Datagram(Command.LRW, 0, 0, 0, bytes(184)), Datagram(Command.BRD, 0, 0, 0x0130, bytes(2)))
+
+    def _send(self, frame: bytes) -> None:
+        self.sent += 1
+
+    def frames(self, count: int) -> None:
+        line, book = self.line, self.book
+        for _ in range(count):
+            line.pass_time(MS)
+            if book.due <= line.now:
+                book.tick(line.now)
+            size = len(self._frame)
+            line.buffer[:size] = self._frame
+            if not book.frames.active:
+                line.segment.process(line.buffer, size, line.now)
+                line.segment.settle(line.now)
+            elif book.frames.arrives() and line.segment.process(line.buffer, size, line.now):
+                book.answers(bytes(line.buffer[:size]), line.now)
+                line.segment.settle(line.now)
+
+    def begin(self, name: str, **more: Any) -> int:
+        planned, findings = parse({"fault": name, **KINDS[name], **more})
+        assert planned is not None, findings
+        return self.book.begin(planned, self.line.now)
+
+    def again_in_op(self) -> None:
+        for state in (ACK | SAFE_OP, OP):
+            self.line.ask(Command.FPWR, STATION + 1, 0x0120, bytes((state, 0)))
+            self.line.pass_time(MS)
+            self.frames(1)
+
+
+@pytest.fixture(scope="module")
+def _bench() -> Bench:
+    return Bench()
+
+
+@pytest.fixture
+def bench(_bench: Bench) -> Iterator[Bench]:
+    """The one of this file, its collector off as in the segment's process."""
+    gc.collect()
+    gc.disable()
+    try:
+        yield _bench
+    finally:
+        gc.enable()
+
+
+def left_by(play: Callable[[], object]) -> int:
+    """Return how many objects it leaves that only a collector would find."""
+    play()
+    gc.collect()
+    for _ in range(ROUNDS):
+        play()
+    return gc.collect()
+
+
+def test_every_kind_of_fault_is_tried_here() -> None:
+    assert set(KINDS) == set(FAULTS)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_fault_that_is_mended_or_ends_at_its_time_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
+    once = FAULTS[name] in ONCE
+
+    def play() -> None:
+        bench.again_in_op()
+        number = bench.begin(name)
+        bench.frames(3)
+        if not once and name != "drive":
+            bench.book.mend(number, bench.line.now)
+            bench.begin(name, lasts=0.002)
+            bench.frames(4)
+        elif name == "drive":
+            bench.begin(name, lasts=0.002)
+            bench.frames(4)
+        assert bench.book.listing(bench.line.now) == []
+
+    assert left_by(play) == 0
+
+
+@pytest.mark.parametrize("way", ["out", "back"])
+def test_damage_on_either_way_leaves_nothing_to_collect(bench: Bench, way: str) -> None:
+    def play() -> None:
+        number = bench.begin("corrupt", way=way)
+        bench.frames(3)
+        bench.book.mend(number, bench.line.now)
+
+    assert left_by(play) == 0
+
+
+@pytest.mark.parametrize("name", BY_RATE)
+def test_a_burst_that_has_passed_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
+    keys = {key: value for key, value in KINDS[name].items() if key != "rate"}
+    planned, _ = parse({"fault": name, **keys, "burst": 2})
+    assert planned is not None
+
+    def play() -> None:
+        bench.book.begin(planned, bench.line.now)
+        bench.frames(5)
+        assert bench.book.listing(bench.line.now) == []
+
+    assert left_by(play) == 0
+
+
+def test_a_script_leaves_nothing_to_collect(bench: Bench, tmp_path: Path) -> None:
+    script = tmp_path / "script.yaml"
+    entries = [json.dumps({"fault": name, **keys, "at": 0.001}) for name, keys in KINDS.items() if name != "al_fall"]
+    script.write_text("faults:\n" + "".join(f"  - {entry}\n" for entry in entries))
+    planned = load_script(script, len(bench.line.segment.slaves))
+
+    def play() -> None:
+        bench.book = Book(bench.line.segment, bench._send, bench.line.now, planned)
+        bench.frames(3)
+        # All but what is over at once: the drive's single occurrence, the clock's jump.
+        assert len(bench.book.mend(None, bench.line.now)) == len(entries) - 2
+
+    assert left_by(play) == 0
+
+
+def test_what_is_refused_leaves_nothing_to_collect(bench: Bench, tmp_path: Path) -> None:
+    with control_socket(tmp_path / "segment.sock") as listener:
+        control = Control(listener, bench.book, Truth(bench.line.segment, ["x"] * len(bench.line.segment.slaves)))
+        assert left_by(lambda: [control._answer(packet)["ok"] for packet in WRONG].index(False)) == 0
+        assert not any(control._answer(packet)["ok"] for packet in WRONG)
+        control.close()
+
+
+def test_a_book_that_is_full_leaves_nothing_to_collect(bench: Bench) -> None:
+    def play() -> None:
+        refused = False
+        while not refused:
+            try:
+                bench.begin("corrupt")
+            except FaultRefused:
+                refused = True
+        bench.book.mend(None, bench.line.now)
+
+    assert left_by(play) == 0
