@@ -48,9 +48,14 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
         return client.call(verb, arguments)
 
 
+def loop_lives() -> bool:
+    """Whether the platform's loop runs, whoever answers for it."""
+    return is_ours(read_processes(runtime_directory()).loop)
+
+
 def _is_our_loop(directory: Path) -> bool:
     """Whether a loop lives, of this user: another's could not use a gateway of ours."""
-    return is_ours(read_processes(directory).loop) and directory.stat().st_uid == os.geteuid()
+    return loop_lives() and directory.stat().st_uid == os.geteuid()
 
 
 def _replace_gateway(directory: Path, error: ControlError) -> None:

@@ -14,6 +14,9 @@ from rtcp.cli.output import emit_json, report, show
 if TYPE_CHECKING:
     from rtcp.runtime.blackbox_file import Listed
 
+SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
+"""Of the service and of root; `systemd/` has it as StateDirectory=."""
+
 PICTURES = (".png", ".svg", ".pdf")
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
@@ -43,7 +46,7 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
     else:
         from rtcp.runtime.blackbox_file import faults_directory
 
-        report(f"no fault has been recorded ({faults_directory()})")
+        report(f"no fault has been recorded ({faults_directory()}){_elsewhere()}")
 
 
 def _show(
@@ -105,8 +108,17 @@ def _path(number: int) -> Path:
         raise CommandError(str(error), ExitCode.INTERNAL) from error
     if number in there:
         return there[number]
-    which = f"recorded: {_spans(sorted(there))}" if there else "none has been recorded"
+    which = f"recorded: {_spans(sorted(there))}" if there else f"none has been recorded{_elsewhere()}"
     raise CommandError(f"there is no fault {number} in {directory}: {which}")
+
+
+def _elsewhere() -> str:
+    """Return where the service records, of which another user has an empty list of their own."""
+    from rtcp.runtime.blackbox_file import faults_directory
+
+    if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
+        return ""
+    return f"; the service records in {SERVICE_FAULTS} (`sudo rtcp faults`)"
 
 
 def _spans(numbers: list[int]) -> str:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import os
+import secrets
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
@@ -64,7 +67,20 @@ def draw(recording: Recording, out: Path) -> None:
     for one in near:
         one.tick_params(labelleft=False)
     figure.text(0.065, 0.15 / height, "\n".join(legend), fontsize=8.5, va="bottom", linespacing=1.25)
-    figure.savefig(out, dpi=110)
+    _save(figure, out)
+
+
+def _save(figure: Figure, out: Path) -> None:
+    """Write the picture beside and rename it: what a link at that place leads to stays as it is."""
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format=out.suffix[1:].lower(), dpi=110)
+    new = out.with_name(f".{out.stem}-{secrets.token_hex(4)}{out.suffix}")
+    try:
+        with open(new, "xb") as file:
+            file.write(drawn.getbuffer())
+        os.replace(new, out)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def _curves(axes: Sequence[Any], recording: Recording, begin: float, end: float) -> None:

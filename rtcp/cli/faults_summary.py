@@ -9,6 +9,7 @@ import numpy as np
 
 from rtcp.runtime.blackbox_file import Listed, Recording
 from rtcp.runtime.machine import TABLE
+from rtcp.runtime.steps import target_steps
 
 _WORDS = {int(state): row.words for state, row in TABLE.items()}
 
@@ -104,10 +105,9 @@ def _words(state: Any) -> str:
 
 
 def _largest_step(recording: Recording) -> dict[str, Any] | None:
-    """Return the largest step of a target from one cycle to the next; None where no two follow each other."""
-    records, about = recording.records, recording.about
-    steps = np.abs(np.diff(records["target"], axis=0))
-    steps[np.diff(records["number"].astype(np.int64)) != 1] = 0.0  # across a gap there is no step
+    """Return the largest step of a target from one enabled cycle to the next; None where there is none."""
+    about = recording.about
+    cycles, steps = target_steps(recording.records)
     if not steps.size:
         return None
     row, joint = np.unravel_index(int(np.argmax(steps)), steps.shape)
@@ -116,5 +116,5 @@ def _largest_step(recording: Recording) -> dict[str, Any] | None:
         "joint": about.joints[int(joint)],
         "rad": step,
         "rad_per_s": step / (about.period_ns * 1e-9),
-        "t_s": round(float(seconds(recording)[row + 1]), 4),
+        "t_s": round(float(seconds(recording)[cycles[row]]), 4),
     }

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.connection import connect
+from rtcp.cli.connection import connect, loop_lives
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import console, emit, emit_json, show
 from rtcp.runtime.client import ControlClient, ControlError
@@ -67,25 +67,35 @@ def _watch(client: ControlClient, as_json: bool) -> None:
 
 
 def _again(client: ControlClient) -> ControlClient:
-    """Connect again where only the gateway has ended."""
+    """Connect again where only the gateway has ended.
+
+    Raises:
+        CommandError: the loop has ended too.
+        ControlError: it lives, and nobody answers for it.
+    """
     client.close()
     try:
         return connect("status")
     except ControlError as error:
+        if loop_lives():
+            raise
         raise CommandError("the platform has ended", ExitCode.NOT_RUNNING) from error
 
 
 def _pictures(client: ControlClient, interval_s: float) -> Iterator[dict[str, Any]]:
     """Yield the status on an even grid; a platform that ends while it is watched is `not running`."""
     due = time.monotonic()
-    while True:
-        try:
-            status = client.call("status")
-        except ControlError as error:
-            if error.kind != "lost":
-                raise
-            client = _again(client)
-            continue
-        yield status
-        due = max(due + interval_s, time.monotonic())
-        time.sleep(max(0.0, due - time.monotonic()))
+    try:
+        while True:
+            try:
+                status = client.call("status")
+            except ControlError as error:
+                if error.kind != "lost":
+                    raise
+                client = _again(client)
+                continue
+            yield status
+            due = max(due + interval_s, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+    finally:
+        client.close()  # also one that took the first one's place

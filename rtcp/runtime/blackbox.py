@@ -11,9 +11,8 @@ import os
 import platform
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,30 +20,19 @@ import numpy.typing as npt
 
 import rtcp
 from rtcp.runtime.blackbox_file import About, Moment, Recording, RecordingError, listed, write
+from rtcp.runtime.fault_events import AFTER_S, BEFORE_S, Fault, FaultEvents
 from rtcp.runtime.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
-from rtcp.runtime.machine import TABLE, Code, State
+from rtcp.runtime.machine import TABLE, State
 from rtcp.runtime.observer import Event, Observer, Text
 from rtcp.runtime.sentences import Sentences
 from rtcp.runtime.session import Session
 
-BEFORE_S = 10.0
-AFTER_S = 1.0
 SILENT_S = 1.0
 """A loop that has published nothing for so long hangs."""
 _WATCHDOG = "the drives' watchdog stops them"
 _ENDED = f"ended unexpectedly; {_WATCHDOG}"
 _IN_FAULT = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 log = logging.getLogger("rtcp.blackbox")
-
-
-@dataclass(frozen=True)
-class _Fault:
-    """What has begun: by an event of the loop, or (number 0) by its silence or end."""
-
-    time_ns: int
-    what: str
-    number: int = 0
-    code: int = 0
 
 
 class BlackBox:
@@ -63,8 +51,8 @@ class BlackBox:
         self._directory = directory
         self._tell = tell
         self._sentences = Sentences(session.config)
+        self._events = FaultEvents(self._sentences.faults, self._words)
         self._event = 0
-        self._in_fault = False
         self._since = 0.0
         """When the fault that is on was seen."""
         self._head, self._head_at = observer.head, time.monotonic()
@@ -73,8 +61,8 @@ class BlackBox:
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="blackbox")
         self._over = threading.Event()
         """Nobody is there to wait for what follows a fault."""
-        for fault in self._begun():
-            self._writer.submit(self._make_up_for, fault)
+        if faults := self._begun():
+            self._writer.submit(self._make_up_for, faults)
 
     # -- when -------------------------------------------------------------------------------------------------------
 
@@ -86,9 +74,9 @@ class BlackBox:
             self._writer.submit(self._record, fault)
         now = time.monotonic()
         self._listen(now)
-        if self._in_fault and now - self._since > AFTER_S and not self._machine_in_fault():
+        if self._events.on and now - self._since > AFTER_S and not self._machine_in_fault():
             # Not every event of this kind leads to a state that only a reset ends.
-            self._in_fault = False
+            self._events.on = False
 
     def end_is_wanted(self) -> None:
         """Take it that the loop is told to end: from here on neither its silence nor its end is a fault."""
@@ -110,24 +98,22 @@ class BlackBox:
         if latest is not None:
             sentence = f"the loop (process {self._observer.loop_pid}) {_ENDED}"
             last_ns = int(latest["time_ns"][0]) - time.monotonic_ns() + time.time_ns()
-            self._writer.submit(self._make_up_for, _Fault(last_ns, sentence))
+            self._writer.submit(self._make_up_for, [Fault(last_ns, sentence)])
 
     def finish(self) -> None:
         """Write what is still to be written and return when it is; a second time is harmless."""
         self.look()
+        for fault in self._events.put_off():
+            self._writer.submit(self._record, fault)
         self._over.set()
         self._writer.shutdown()
 
-    def _begun(self) -> list[_Fault]:
+    def _begun(self) -> list[Fault]:
         """Return the faults that events have begun since the last look."""
-        found = []
-        for event in self._observer.events_since(self._event):
-            self._event = event.number
-            if event.code in self._sentences.faults and not self._in_fault:
-                self._in_fault, self._since = True, time.monotonic()
-                found.append(_Fault(event.time_ns, self._words(event), event.number, event.code))
-            elif event.code == Code.RESET:
-                self._in_fault = False
+        events = self._observer.events_since(self._event)
+        self._event = events[-1].number if events else self._event
+        if found := self._events.begun(events, time.time_ns()):
+            self._since = time.monotonic()
         return found
 
     def _listen(self, now: float) -> None:
@@ -150,7 +136,7 @@ class BlackBox:
         sentence = f"the loop (process {self._observer.loop_pid}) {what}"
         self._say(sentence)
         if not self._over.is_set():
-            self._writer.submit(self._record, _Fault(time_ns, sentence))
+            self._writer.submit(self._record, Fault(time_ns, sentence))
 
     def _say(self, sentence: str) -> None:
         log.error("%s", sentence)
@@ -161,27 +147,29 @@ class BlackBox:
 
     # -- what; in the writer's thread -------------------------------------------------------------------------------
 
-    def _make_up_for(self, fault: _Fault) -> None:
-        """Record a fault that began before this gateway did, unless that was done or it has left the ring."""
+    def _make_up_for(self, faults: Sequence[Fault]) -> None:
+        """Record faults that began before this gateway did, unless that was done or they have left the ring."""
         try:
-            done = any(
-                (one.about.began_ns, one.about.event) == (self._session.began_ns, fault.number)
-                and (fault.number or one.about.what == fault.what)
-                for one in listed(self._directory)
-                if one.about is not None
-            )
+            abouts = [one.about for one in listed(self._directory) if one.about is not None]
+            mine = [about for about in abouts if about.began_ns == self._session.began_ns]
+            done = {(about.event, "" if about.event else about.what) for about in mine}
+            missing = [fault for fault in faults if (fault.number, "" if fault.number else fault.what) not in done]
+            if not missing:
+                return
+            ring, _ = self._observer.since(0)
         except RecordingError as error:
             self._say(f"black box: {error}")
             return
-        ring, _ = self._observer.since(0)
-        if done:
+        except Exception as error:
+            self._defect("what no gateway saw was not recorded", error)
             return
-        if len(ring) and int(ring["time_ns"][0]) > _monotonic(fault.time_ns):
-            log.info("black box: a fault that no gateway saw has left the ring: %s", fault.what)
-            return
-        self._record(fault)
+        for fault in missing:
+            if len(ring) and int(ring["time_ns"][0]) > _monotonic(fault.time_ns):
+                log.info("black box: a fault that no gateway saw has left the ring: %s", fault.what)
+            else:
+                self._record(fault)
 
-    def _record(self, fault: _Fault) -> None:
+    def _record(self, fault: Fault) -> None:
         try:
             # At once: a short cycle's ring is soon written over.
             before, _ = self._observer.since(0)
@@ -194,18 +182,21 @@ class BlackBox:
             self._say(f"black box: {error}")
         except Exception as error:
             # One fault's recording is lost, and said to be; the next is tried again.
-            log.exception("black box")
-            self._say(f"black box: a fault was not recorded, by a defect: {type(error).__name__} {error}")
+            self._defect("a fault was not recorded", error)
         else:
             sentence = f"black box: this fault is number {number} (`rtcp faults show {number}`)"
             log.info("%s: %s", sentence, path)
             self._tell(sentence)
 
+    def _defect(self, what: str, error: Exception) -> None:
+        log.exception("black box")
+        self._say(f"black box: {what}, by a defect: {type(error).__name__} {error}")
+
     def _recording(
-        self, fault: _Fault, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
+        self, fault: Fault, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
     ) -> Recording:
         records = np.concatenate([before, after])
-        at = _place(records, fault) if fault.number else len(before) - 1
+        at = _place(records, fault, len(before) - 1)
         instants = records["time_ns"]
         if len(records):
             kept = np.abs(instants - instants[at] - (AFTER_S - BEFORE_S) * 5e8) <= (BEFORE_S + AFTER_S) * 5e8
@@ -233,7 +224,7 @@ class BlackBox:
         )
         return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
 
-    def _timeline(self, fault: _Fault, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
+    def _timeline(self, fault: Fault, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""
         begins_ns = fault.time_ns - round(BEFORE_S * 1e9)
         events, texts = self._observer.events_since(0), self._observer.texts_since(0)
@@ -251,15 +242,18 @@ class BlackBox:
         return tuple(sorted(kept, key=lambda moment: moment.time_ns)), notes
 
 
-def _place(records: npt.NDArray[np.void], fault: _Fault) -> int:
-    """Return the index of the cycle in which the fault began, -1 without records."""
+def _place(records: npt.NDArray[np.void], fault: Fault, newest: int) -> int:
+    """Return the index of the cycle in which the fault began, -1 without records; `newest` was the last one then."""
     if not len(records):
         return -1
+    if not fault.number:
+        return max(newest, 0)
     codes = records["fault"].astype(np.int64)
     begins = np.flatnonzero((codes == fault.code) & (np.concatenate([[0], codes[:-1]]) != fault.code))
     away = np.abs(records["time_ns"] - _monotonic(fault.time_ns))
-    # An event that is no fault of the machine's state has no such cycle: the clock tells.
-    return int(begins[np.argmin(away[begins])]) if len(begins) else int(np.argmin(away))
+    # An event that is no fault of the machine's state, or not its first, has no such cycle: the clock tells.
+    own = len(begins) and not fault.later
+    return int(begins[np.argmin(away[begins])]) if own else int(np.argmin(away))
 
 
 def _monotonic(realtime_ns: int) -> int:

@@ -119,9 +119,9 @@ class Listed:
     """From its first cycle to its last."""
 
 
-def faults_directory() -> Path:
-    """Return where the recordings are, without making it."""
-    return state_directory() / "faults"
+def faults_directory(state: Path | None = None) -> Path:
+    """Return where the recordings are, without making it; None: in this process' state directory."""
+    return (state or state_directory()) / "faults"
 
 
 # -- writing --------------------------------------------------------------------------------------------------------
@@ -204,8 +204,8 @@ def listed(directory: Path) -> list[Listed]:
         try:
             with _opened(path) as archive:
                 about = _about(path, archive)
-                instants = _array(path, archive, "time_ns")
-            seconds = float(instants[-1] - instants[0]) * 1e-9 if instants.ndim == 1 and len(instants) else 0.0
+                instants = _instants(path, archive)
+            seconds = (int(instants[-1]) - int(instants[0])) * 1e-9 if len(instants) else 0.0
         except RecordingError as error:
             found.append(Listed(number, path, None, str(error)))
         else:
@@ -272,6 +272,13 @@ def _array(path: Path, archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
         raise RecordingError(f"{path}: there is no {name} in it, it is no recording") from None
     except _DAMAGE as error:
         raise RecordingError(f"{path}: {name} is damaged: {error}") from error
+    return found
+
+
+def _instants(path: Path, archive: zipfile.ZipFile) -> npt.NDArray[np.int64]:
+    found = _array(path, archive, "time_ns")
+    if found.ndim != 1 or found.dtype != np.dtype("<i8"):
+        raise RecordingError(f"{path}: time_ns is {found.dtype} of the shape {found.shape}, allowed is a row of int64")
     return found
 
 

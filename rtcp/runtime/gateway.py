@@ -14,6 +14,7 @@ import os
 import signal
 import struct
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,8 @@ from rtcp.runtime.session import (
 from rtcp.runtime.verbs import Verb, Verbs
 
 _FOLLOW_S = 0.02
+_COMPLAINT_S = 10.0
+"""Between two lines of the log on the same defect."""
 _LINE_LIMIT = 1 << 16
 _TOO_LONG = b""
 """Stands for a line beyond the limit; a true one has its newline at least."""
@@ -62,6 +65,8 @@ class Gateway:
         self._picture = Picture(self._observer, session, started)
         self._arm = Verbs(self._observer, self._picture, session.config, session.bus, directory)
         self._box = BlackBox(self._observer, session, faults_directory(), self._picture.note)
+        self._complained: dict[str, float] = {}
+        """When a defect was logged, by what met it."""
         self._connections = 0
         self._ended = asyncio.Event()
         self._stopping = False
@@ -122,10 +127,23 @@ class Gateway:
 
     async def _follow(self) -> None:
         while True:
-            for sentence in self._picture.follow():
-                log.info("%s", sentence)
-            self._box.look()
+            self._go_on("the picture", self._tell_news)
+            self._go_on("the black box", self._box.look)
             await asyncio.sleep(_FOLLOW_S)
+
+    def _tell_news(self) -> None:
+        for sentence in self._picture.follow():
+            log.info("%s", sentence)
+
+    def _go_on(self, what: str, turn: Callable[[], None]) -> None:
+        """Take one turn; a defect in it is logged, now and then, and ends neither the others nor the next one."""
+        try:
+            turn()
+        except Exception:
+            now = time.monotonic()
+            if now - self._complained.get(what, -_COMPLAINT_S) >= _COMPLAINT_S:
+                self._complained[what] = now
+                log.exception("%s cannot follow the loop; it is tried again", what)
 
     # -- clients ------------------------------------------------------------------------------------------------
 

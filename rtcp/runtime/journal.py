@@ -32,6 +32,11 @@ def open_log(path: Path) -> BinaryIO:
     return open(path, "ab")
 
 
+def place_of_log(path: Path) -> str:
+    """Return where the log is that `open_log` opens, in words."""
+    return "the journal" if stderr_is_journal() else str(path)
+
+
 def log_format() -> logging.Formatter:
     """Return how a line of a log looks: with its time in a file, with its level for the journal, which has the time."""
     return JournalFormat() if stderr_is_journal() else logging.Formatter("%(asctime)s %(message)s")

@@ -34,7 +34,7 @@ from rtcp.runtime.paths import (
 )
 from rtcp.runtime.running import Report, Running, StartError, ask_gateway, clear, undisturbed
 from rtcp.runtime.session import Processes, Session, SessionError, is_ours, read_processes, read_session
-from rtcp.runtime.zero import read_zeros
+from rtcp.runtime.zero import read_zeros, state_directory
 
 CheckSegment = Callable[[Path], object]
 """Raises ConfigError where no segment can be made of the file. Which models there are is known to `rtcp.virtual`."""
@@ -51,14 +51,22 @@ class StartOptions:
     poll: bool = False
 
 
+START_WAITS_S = 1.0
+"""For whoever gives a loop its gateway back: that takes a moment."""
+STOP_WAITS_S = 30.0
+"""For another stop, which takes 20 s at most, or a start; nobody else has the lock for long."""
+
+
 @contextlib.contextmanager
-def _alone(directory: Path) -> Iterator[None]:
+def _alone(directory: Path, patience_s: float = 0.0, waits: Callable[[], None] | None = None) -> Iterator[None]:
     """Hold the directory's lock: two starts at once would each find nothing running."""
     try:
-        with alone(directory):
+        with alone(directory, patience_s, waits):
             yield
     except Busy:
-        raise StartError("another `rtcp start` or `rtcp stop` is under way", "refused") from None
+        waited = f", for {patience_s:g} s and more" if patience_s else ""
+        sentence = f"another process starts or stops the platform of {directory}{waited}: this one has done nothing"
+        raise StartError(sentence, "refused") from None
 
 
 def start(options: StartOptions, report: Report, check_segment: CheckSegment = load_segment) -> Running:
@@ -86,17 +94,21 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
         prepare(directory)
     except RuntimeDirectoryError as error:
         raise StartError(str(error), "usage") from None
-    with _alone(directory):
+    with _alone(directory, START_WAITS_S):
         _record_unseen_end(directory, report)
         stopping_mark(directory).unlink(missing_ok=True)
-        if adopted := _adopt(directory, options, report):
-            return adopted
-        config = _configured(options)
-        _check_bus(config, check_segment)
-        return _start_all(directory, config, options, began_ns, report)
+        adopted = _adopt(directory, options, report)
+        if adopted is None:
+            config = _configured(options)
+            _check_bus(config, check_segment)
+            return _start_all(directory, config, options, began_ns, report)
+    # Without the lock: a stop must not wait for a gateway.
+    running, reading = adopted
+    running.await_gateway(reading)
+    return running
 
 
-def _adopt(directory: Path, options: StartOptions, report: Report) -> Running | None:
+def _adopt(directory: Path, options: StartOptions, report: Report) -> tuple[Running, int] | None:
     """Deal with what an earlier start left: refuse, give a lone loop its gateway back, or clear remnants away."""
     found = read_processes(directory)
     if is_ours(found.loop):
@@ -122,26 +134,28 @@ def _record_unseen_end(directory: Path, report: Report) -> None:
     if not found.loop or any(is_ours(pid) for pid in (found.loop, found.gateway)) or stopping_mark(directory).exists():
         return
     try:
-        session, observer = read_session(directory / "session.pickle"), Observer(blackboard_file(directory))
-    except (BlackboardError, SessionError):
-        return  # nothing is left of it, or it was of another version
-    try:
-        if observer.loop_pid == found.loop:
-            box = BlackBox(observer, session, faults_directory(), report)
-            box.loop_had_ended()
-            box.finish()
-    finally:
-        observer.close()
+        with contextlib.closing(Observer(blackboard_file(directory))) as observer:
+            if observer.loop_pid == found.loop:
+                session = read_session(directory / "session.pickle")
+                box = BlackBox(observer, session, faults_directory(session.state), report)
+                box.loop_had_ended()
+                box.finish()
+    except BlackboardError:
+        return  # nothing is left of it
+    except Exception as error:
+        # What is left of a platform is cleared away all the same, whatever is wrong with it.
+        why = str(error) if isinstance(error, SessionError) else f"{type(error).__name__}: {error}"
+        report(f"the end of the loop (process {found.loop}) was not recorded: {why}")
 
 
-def _with_gateway(directory: Path, found: Processes) -> Running:
+def _with_gateway(directory: Path, found: Processes) -> tuple[Running, int]:
+    """Begin a loop's new gateway; return the pipe on which it says that it is ready too."""
     try:
-        config = read_session(directory / "session.pickle").config
+        session = read_session(directory / "session.pickle")
     except SessionError as error:
         raise StartError(f"{error}: `rtcp stop`, then start anew", "fault") from error
-    running = Running(directory, config, found)
-    running.start_gateway()
-    return running
+    running = Running(directory, session.config, found, session.state)
+    return running, running.begin_gateway()
 
 
 def replace_gateway(directory: Path) -> int:
@@ -154,7 +168,14 @@ def replace_gateway(directory: Path) -> int:
         found = read_processes(directory)
         if not is_ours(found.loop) or is_ours(found.gateway) or stopping_mark(directory).exists():
             return 0
-        return _with_gateway(directory, found).processes.gateway
+        running, reading = _with_gateway(directory, found)
+    try:
+        running.await_gateway(reading)
+    except StartError:
+        if is_ours(found.loop) and not stopping_mark(directory).exists():
+            raise
+        return 0  # the platform was stopped meanwhile, and the gateway with it
+    return running.processes.gateway
 
 
 def _configured(options: StartOptions) -> ArmConfig:
@@ -192,7 +213,8 @@ def _start_all(
     directory: Path, config: ArmConfig, options: StartOptions, began_ns: int, report: Report
 ) -> Running:  # fmt: skip
     bus = config.bus.interface
-    running = Running(directory, config, Processes())
+    state = state_directory().absolute()
+    running = Running(directory, config, Processes(), state)
     for log in directory.glob("*.log"):
         log.unlink()  # of an earlier start; a gateway that is replaced goes on with its own
     try:
@@ -201,7 +223,8 @@ def _start_all(
             facts = running.start_segment(segment_path(config), options.poll)
             interface, segment = str(facts["interface"]), int(facts["pid"])
             report(f"segment of {facts['slaves']} virtual slaves (process {segment})")
-        Session(config, bus, interface, segment, began_ns).write(directory / "session.pickle")
+        session = Session(config, bus, interface, segment, began_ns, state, running.segment_control)
+        session.write(directory / "session.pickle")
         running.start_loop(report)
         running.start_gateway()
     except BaseException:
@@ -216,13 +239,17 @@ def stop(report: Report) -> None:
 
     Raises:
         ControlError: `not running` where nothing runs.
-        StartError: while another start or stop is under way.
+        StartError: while another start or stop is under way, for longer than is waited for.
     """
     directory = runtime_directory()
     found = read_processes(directory)
     if not any(is_ours(pid) for pid in (found.loop, found.gateway, found.segment)):
         raise ControlError("not running", f"no platform is running (runtime directory {directory})")
-    with _alone(directory):
+
+    def waits() -> None:
+        report(f"another process starts or stops the platform: waiting for it, at most {STOP_WAITS_S:g} s")
+
+    with _alone(directory, STOP_WAITS_S, waits):
         _record_unseen_end(directory, report)
         found = read_processes(directory)  # a gateway may have been replaced meanwhile
         ask_gateway(directory)

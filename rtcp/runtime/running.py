@@ -45,12 +45,22 @@ class StartError(Exception):
 
 
 class Running:
-    """A platform that runs; made by `start`."""
+    """A platform that runs; made by `start`.
 
-    def __init__(self, directory: Path, config: ArmConfig, processes: Processes) -> None:
+    Args:
+        directory: the runtime directory.
+        config: the arm.
+        processes: those that run already.
+        state: directory of what outlives a restart, handed to the processes; None: as this process' environment has it.
+    """
+
+    def __init__(self, directory: Path, config: ArmConfig, processes: Processes, state: Path | None = None) -> None:
         self.directory = directory
         self.processes = processes
         self._config = config
+        self._environment = None if state is None else {**os.environ, "RTCP_STATE_DIR": str(state)}
+        self.segment_control: Path | None = None
+        """Control socket of the segment that was started."""
         self.facts: dict[str, Any] = {}
         """What the loop told of its start: realtime, start_to_op_s."""
         self._children: list[subprocess.Popen[bytes]] = []
@@ -59,26 +69,44 @@ class Running:
 
     def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
         reading, writing = os.pipe()
-        with open_log(self.directory / f"{name}.log") as log, undisturbed():
-            # A signal between start and registration would leave a process that nobody knows of.
-            child = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=(writing,),
-                start_new_session=True,
-            )
+        try:
+            with open_log(self.directory / f"{name}.log") as log, undisturbed():
+                # A signal between start and registration would leave a process that nobody knows of.
+                child = subprocess.Popen(
+                    [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    env=self._environment,
+                    pass_fds=(writing,),
+                    start_new_session=True,
+                )
+                self._register(name, child)
+        except BaseException:
+            os.close(reading)
+            raise
+        finally:
             os.close(writing)
-            self._children.append(child)
-            setattr(self.processes, name, identify(child.pid))
-            self.processes.write(self.directory)
         return child, reading
+
+    def _register(self, name: str, child: subprocess.Popen[bytes]) -> None:
+        """Write down whose process it is; where the disk refuses that, it is ended again."""
+        before = getattr(self.processes, name)
+        self._children.append(child)
+        setattr(self.processes, name, identify(child.pid))
+        try:
+            self.processes.write(self.directory)
+        except BaseException:
+            setattr(self.processes, name, before)
+            child.kill()
+            child.wait()
+            raise
 
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line."""
         more = ["--poll"] if poll else []
-        more += ["--control", str(free_segment_control(self.directory))]
+        self.segment_control = free_segment_control(self.directory)
+        more += ["--control", str(self.segment_control)]
         child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
         self._keep_off(child.pid)
         for line in _lines(reading, _SEGMENT_S, child):
@@ -108,7 +136,10 @@ class Running:
 
     def start_gateway(self) -> None:
         """Start the gateway; return when the control socket listens."""
-        reading = self.begin_gateway()
+        self.await_gateway(self.begin_gateway())
+
+    def await_gateway(self, reading: int) -> None:
+        """Return when the gateway that was begun last says on its pipe that the control socket listens."""
         child = self._children[-1]
         for _ in _lines(reading, _GATEWAY_S, child):
             return

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import pickle
 import signal
 import stat
 import time
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TypeVar
 
+import rtcp
 from rtcp.config.model import ArmConfig
 from rtcp.runtime.paths import processes_file, starts_file
 
@@ -142,27 +145,31 @@ class Session:
     segment_pid: int
     began_ns: int
     """When the start was asked for, CLOCK_MONOTONIC."""
+    state: Path | None = None
+    """Directory of what outlives a restart, whoever starts a gateway later; None: as its environment has it."""
+    segment_control: Path | None = None
+    """Control socket of the virtual segment that was started with it; None: there is none."""
 
     def write(self, path: Path) -> None:
         """Write the file, for its user alone: whoever reads it runs what it says."""
         path.unlink(missing_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         with open(descriptor, "wb") as file:
-            file.write(pickle.dumps(self))
+            file.write(pickle.dumps((_form(self), self)))
 
 
 def read_session(path: Path) -> Session:
     """Read what `Session.write` wrote.
 
     Raises:
-        SessionError: the file is not there, is damaged, or others may write it.
+        SessionError: the file is not there, is damaged or of another version, or others may write it.
     """
     try:
         with open(path, "rb") as file:
-            found = os.fstat(file.fileno())
-            if found.st_uid not in (0, os.geteuid()) or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            owned = os.fstat(file.fileno())
+            if owned.st_uid not in (0, os.geteuid()) or owned.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
                 raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
-            session = pickle.load(file)
+            found = pickle.load(file)
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
     except SessionError:
@@ -170,9 +177,32 @@ def read_session(path: Path) -> Session:
     except Exception as error:
         # What a damaged pickle leads to is not told by its documentation.
         raise SessionError(f"{path} is damaged ({type(error).__name__}: {error})") from error
+    form, session = found if isinstance(found, tuple) and len(found) == 2 else ("", found)
     if not isinstance(session, Session):
         raise SessionError(f"{path} holds no session")
+    if form != _form(session):
+        raise SessionError(f"{path} was written by another version of rtcp: it is not read by this one")
     return session
+
+
+def _form(session: Session) -> str:
+    """Return a digest of the version and all fields in it: pickle takes what an older class made without a word."""
+    seen: dict[str, list[str]] = {}
+
+    def look(value: object) -> None:
+        if is_dataclass(value):
+            kind = type(value)
+            seen[f"{kind.__module__}.{kind.__qualname__}"] = [f"{one.name}: {one.type}" for one in fields(value)]
+            for one in vars(value).values():
+                look(one)
+        elif isinstance(value, tuple | list | set | frozenset):
+            for one in value:
+                look(one)
+        elif isinstance(value, Mapping):
+            look(tuple(value.items()))
+
+    look(session)
+    return hashlib.sha256(json.dumps([rtcp.__version__, seen], sort_keys=True).encode()).hexdigest()
 
 
 def read_json(path: Path, kind: type[T]) -> T:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rtcp.cli import faults
 from rtcp.runtime.blackbox_file import About, Moment, Recording, faults_directory, write
-from rtcp.runtime.layout import RecordLayout
+from rtcp.runtime.layout import FLAG_ENABLED, RecordLayout
 from rtcp.runtime.machine import State
 from rtcp.runtime.observer import record_type
 
@@ -37,6 +38,7 @@ def recording() -> Recording:
     whole["wkc_expected"] = 10
     whole["wkc"] = np.where((cycles > AT) & (cycles <= AT + 40), -1, 10)
     whole["lost"] = np.where((cycles > AT) & (cycles <= AT + 40), cycles - AT, 0)
+    whole["flags"] = FLAG_ENABLED
     whole["missed"] = np.where(cycles < 100, 2, 5)
     whole["target"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
     whole["target"][300:, 1] += 0.01
@@ -138,6 +140,45 @@ def test_a_step_across_cycles_that_are_missing_is_none(rtcp: Callable[..., Any])
     write(faults_directory(), Recording(about, {name: array[kept] for name, array in made.records.items()}))
     step = json.loads(rtcp("faults", "show", "1", "--json").out)["largest_step"]
     assert step["rad"] == pytest.approx(2e-4)
+
+
+@pytest.mark.parametrize("disabled", [299, 300])
+def test_a_step_counts_only_where_the_drives_are_enabled_on_both_of_its_cycles(
+    rtcp: Callable[..., Any], disabled: int
+) -> None:
+    made = recording()
+    made.records["flags"][disabled] = 0
+    write(faults_directory(), made)
+    step = json.loads(rtcp("faults", "show", "1", "--json").out)["largest_step"]
+    assert (step["joint"], step["rad"]) == ("elbow", pytest.approx(2e-4))
+    made.records["flags"][:] = 0
+    write(faults_directory(), made)
+    assert json.loads(rtcp("faults", "show", "2", "--json").out)["largest_step"] is None
+    assert rtcp("faults", "show", "2").code == 0
+
+
+def test_a_picture_replaces_a_link_and_leaves_what_that_leads_to(rtcp: Callable[..., Any], tmp_path: Path) -> None:
+    _, path = write(faults_directory(), recording())
+    precious = tmp_path / "precious"
+    precious.write_text("precious")
+    picture = path.with_suffix(".png")
+    picture.symlink_to(precious)
+    assert rtcp("faults", "show", "1").code == 0
+    assert precious.read_text() == "precious"
+    assert not picture.is_symlink()
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert [one.name for one in path.parent.iterdir() if one.name.startswith(".") and one.suffix == ".png"] == []
+
+
+def test_who_has_recorded_nothing_is_told_where_the_service_records(
+    rtcp: Callable[..., Any], state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    service = tmp_path / "service"
+    monkeypatch.setattr(faults, "SERVICE_FAULTS", service)
+    assert str(service) not in rtcp("faults").out
+    service.mkdir()
+    assert f"no fault has been recorded ({state}/faults); the service records in {service}" in rtcp("faults").out
+    assert f"the service records in {service}" in rtcp("faults", "show", "1").trouble
 
 
 def test_a_fault_without_a_single_cycle_is_shown(rtcp: Callable[..., Any]) -> None:

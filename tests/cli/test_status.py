@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import time
@@ -10,6 +11,8 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
+
+from rtcp.runtime.session import Processes, identify
 
 
 def test_status_shows_state_joints_slaves_times_and_clocks(platform: Any, rtcp: Callable[..., Any]) -> None:
@@ -134,3 +137,17 @@ def test_a_watch_goes_on_when_only_the_gateway_was_replaced(
         assert json.loads(watching.stdout.readline()) == platform.status
     watching.send_signal(signal.SIGINT)
     assert (watching.communicate()[1], watching.returncode) == ("", 0)
+
+
+def test_a_watch_that_cannot_connect_again_to_a_loop_that_lives_says_why(
+    platform: Any, rtcp_process: Callable[..., Any]
+) -> None:
+    watching = rtcp_process("status", "--json", "--watch")
+    assert watching.stdout.readline()
+    # A loop of this user's, whose gateway can neither be reached nor replaced: the session is missing.
+    Processes(loop=identify(os.getpid())).write(platform.path.parent)
+    platform.end()
+    _, trouble = watching.communicate()
+    assert "the platform has ended" not in trouble
+    assert "session.pickle" in trouble
+    assert watching.returncode == 4

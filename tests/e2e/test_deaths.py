@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from rtcp.runtime.paths import segment_control
+from rtcp.runtime.session import read_session
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, kill, lives
 
@@ -131,12 +132,18 @@ def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_hap
     platform.be_patient(200)
     platform.rtcp("start", "--detach")
     platform.rtcp("enable")
+    session = read_session(platform.directory / "session.pickle")
+    state = platform.directory / "state"
+    assert (session.state, session.segment_control) == (state, segment_control(platform.directory))
     before = platform.pids()
     kill(before["gateway"])
     os.kill(before["segment"], signal.SIGSTOP)
     time.sleep(0.5)
     os.kill(before["segment"], signal.SIGCONT)
+    # Whatever that shell has for a state directory: the recording goes where the others are.
+    platform.environment["RTCP_STATE_DIR"] = str(platform.directory / "of another shell")
     done = platform.rtcp("status", "--json")
+    platform.environment["RTCP_STATE_DIR"] = str(state)
     after = platform.pids()
     assert f"the gateway had ended and was started anew (process {after['gateway']})" in done.stderr
     assert after["loop"] == before["loop"]

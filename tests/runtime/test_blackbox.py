@@ -15,7 +15,7 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime import blackbox, launcher
+from rtcp.runtime import blackbox, fault_events, launcher
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.blackbox import BlackBox
 from rtcp.runtime.blackbox_file import Recording, listed, read
@@ -128,6 +128,66 @@ def test_further_fault_events_are_in_the_same_file_until_a_reset(play: Callable[
     assert len(sentences(first)) == 4
     assert "process data lost" in first.about.what
     assert "emergency stop" in second.about.what.lower()
+
+
+class Clock:
+    """The black box's clock, and the events' of a blackboard: an hour of faults in an instant."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.s = 0.0
+        self._began_ns = time.time_ns()
+        monkeypatch.setattr(time, "time_ns", self.now_ns)
+        monkeypatch.setattr(blackbox, "AFTER_S", 0.1)
+        monkeypatch.setattr(fault_events, "AFTER_S", 0.1)
+
+    def now_ns(self) -> int:
+        return self._began_ns + round(self.s * 1e9)
+
+
+def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_ten_seconds(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    happens = {
+        0.0: Code.BUS_LOST, 0.05: Code.DRIVE_FAULT, 3.0: Code.DRIVE_FAULT, 5.0: Code.PRESSED, 130.0: Code.RESET_STUCK,
+        131.5: Code.RESET_MOVING, 131.6: Code.RESET, 131.7: Code.PRESSED,
+    }  # fmt: skip
+    for at_s in sorted({*happens, 9.9, 10.0, 20.0, 140.0}):
+        clock.s = at_s
+        if at_s in happens:
+            played.board.event(happens[at_s])
+        box.look()
+        # What was written when: the file of 5.0 s not before 10 s, that of 131.5 s at the reset.
+        seen = {9.9: [1], 10.0: [1, 4], 131.5: [1, 4, 5]}.get(at_s)
+        if seen:
+            box._writer.submit(int).result()
+            assert [recording.about.event for recording in played.recordings] == seen
+    box.finish()
+    assert [recording.about.event for recording in played.recordings] == [1, 4, 5, 6, 8]
+    second = played.recordings[1]
+    assert len(sentences(second)) == 4, "the events of the ten seconds before are in it"
+    # A new gateway divides them in the same way, and finds each of them written.
+    played.watched().finish()
+    assert len(played.recordings) == 5
+
+
+def test_what_was_put_off_is_written_when_the_gateway_ends(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    played.board.event(Code.BUS_LOST)
+    box.look()
+    clock.s = 4.0
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert [recording.about.event for recording in played.recordings] == [1, 2]
 
 
 def test_what_follows_a_fault_is_waited_for(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -277,6 +337,73 @@ def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_onl
     recording_file.unlink()
     launcher._record_unseen_end(tmp_path, told.append)
     assert played.recordings == []
+
+
+def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_that_are_written(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    for _ in range(5):
+        played.board.event(Code.BUS_LOST, value=5)
+        played.board.event(Code.RESET)
+    played.watched().finish()
+    assert len(played.recordings) == 5
+    asked: list[str] = []
+
+    def heard(name: str, answer: Callable[..., Any]) -> Callable[..., Any]:
+        def ask(given: Any) -> Any:
+            asked.append(name)
+            return answer(given)
+
+        return ask
+
+    monkeypatch.setattr(blackbox, "listed", heard("list", listed))
+    monkeypatch.setattr(played.observer, "since", heard("ring", played.observer.since))
+    played.watched().finish()
+    assert asked == ["list"]
+    assert len(played.recordings) == 5
+
+
+def test_a_list_that_cannot_be_made_is_told_and_the_next_fault_is_recorded(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+
+    def broken(directory: Path) -> object:
+        raise TypeError("odd")
+
+    monkeypatch.setattr(blackbox, "listed", broken)
+    box = played.watched()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert any("by a defect: TypeError odd" in sentence for sentence in played.told)
+    assert [recording.about.event for recording in played.recordings] == [3]
+
+
+def test_a_fault_before_the_first_cycle_is_recorded_with_the_cycles_that_follow(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    box = played.watched()
+    read_once, since = threading.Event(), played.observer.since
+
+    def followed(number: int) -> object:
+        found = since(number)
+        read_once.set()
+        return found
+
+    monkeypatch.setattr(played.observer, "since", followed)
+    box._process_fault(time.time_ns(), "has published nothing")
+    assert read_once.wait(60)
+    played.fill(100)
+    box.finish()
+    (recording,) = played.recordings
+    assert (recording.about.at, len(recording.records["cycle"])) == (0, 100)
 
 
 def test_a_fault_that_has_left_the_ring_is_not_made_up(play: Callable[..., Played]) -> None:

@@ -214,6 +214,27 @@ def test_a_foreign_file_is_a_sentence(tmp_path: Path, made: Callable[[Path], tup
         read(path)
 
 
+INSTANTS: dict[str, object] = {
+    "bytes": np.array([b"a", b"b"]),
+    "truths": np.array([True, False]),
+    "several fields": np.zeros(2, dtype=[("a", "<i8"), ("b", "<i8")]),
+    "a table": np.zeros((2, 2), dtype="<i8"),
+    "one number": np.int64(3),
+    "fractions": np.zeros(2),
+}
+
+
+@pytest.mark.parametrize("instants", INSTANTS.values(), ids=INSTANTS.keys())
+def test_one_odd_file_is_a_sentence_in_the_list_and_the_others_are_listed(tmp_path: Path, instants: object) -> None:
+    _, path = write(tmp_path, recording())
+    write(tmp_path, recording())
+    _changed(path, "time_ns.npy", _npy(instants))
+    odd, sound = listed(tmp_path)
+    assert odd.about is None
+    assert "time_ns is" in odd.trouble
+    assert sound.about is not None
+
+
 def test_what_is_pickled_in_a_file_is_not_run(tmp_path: Path) -> None:
     _, path = write(tmp_path, recording())
     trap = tmp_path / "trap"

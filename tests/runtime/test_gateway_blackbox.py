@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.runtime import gateway
 from rtcp.runtime.blackbox_file import About, listed
 from rtcp.runtime.client import ControlClient
 from rtcp.runtime.codes import Code
@@ -101,3 +103,32 @@ def test_the_status_is_answered_while_a_fault_is_written_and_names_its_number(ga
             answers += 1
         assert answers > 3
         assert client.call("status")["message"].startswith("process data lost")
+
+
+def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
+    gateways: Gateways, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(gateway, "_FOLLOW_S", 0.0)
+    made = gateway.Gateway(gateways.directory)
+    turns = {"the picture": 0, "the black box": 0}
+
+    def broken(what: str) -> None:
+        turns[what] += 1
+        raise ValueError(what)
+
+    monkeypatch.setattr(made._picture, "follow", lambda: broken("the picture"))
+    monkeypatch.setattr(made._box, "look", lambda: broken("the black box"))
+
+    async def followed() -> None:
+        following = asyncio.create_task(made._follow())
+        while min(turns.values()) < 50 and not following.done():
+            await asyncio.sleep(0)
+        following.cancel()
+
+    asyncio.run(followed())
+    monkeypatch.undo()
+    made._box.finish()
+    made._observer.close()
+    assert min(turns.values()) >= 50
+    said = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert said == [f"{what} cannot follow the loop; it is tried again" for what in turns]

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import resource
+import signal
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -61,6 +64,7 @@ def test_a_gateway_that_cannot_live_is_started_only_so_often_and_its_log_keeps_e
     assert len(kept.told) == 3
     assert kept.told[0] == f"the gateway (process {1 << 22}) has ended: it is started anew"
     assert "has ended with code 1, 2 times within 60 s: it is left alone for a while" in kept.told[2]
+    assert kept.told[2].endswith(f"; {tmp_path / 'gateway.log'} says why")
     assert (tmp_path / "gateway.log").read_text().count("No such file") == 2
     # The minute has passed.
     monkeypatch.setattr(keeper, "WINDOW_S", 0.0)
@@ -96,3 +100,50 @@ def test_a_gateway_that_a_command_has_started_meanwhile_is_taken_over(kept: Kept
     kept.keeper.look()
     assert kept.told == []
     assert kept.running.processes.gateway == os.getpid()
+
+
+def open_files() -> set[str]:
+    return set(os.listdir("/proc/self/fd"))
+
+
+@pytest.mark.parametrize("what", ["gateway.log", "starts.new"])
+def test_a_gateway_that_cannot_be_started_is_said_once_and_counts_as_a_start(
+    kept: Kept, tmp_path: Path, what: str
+) -> None:
+    # A directory in the place of the file, or of the one beside it, as a disk that refuses to write.
+    (tmp_path / what).mkdir()
+    before = open_files()
+    for _ in range(5):
+        kept.keeper.look()
+    assert [sentence.partition(":")[0] for sentence in kept.told] == [
+        "the gateway cannot be started anew",
+        f"the gateway (process {1 << 22}) has ended, 2 times within 60 s",
+    ]
+    assert "Is a directory" in kept.told[0]
+    assert open_files() == before
+    assert kept.running.processes.gateway == 1 << 22
+    assert [child.poll() for child in kept.running._children] == [-signal.SIGKILL] * len(kept.running._children)
+    # It is tried again when the minute has passed.
+    (tmp_path / what).rmdir()
+    kept.keeper._starts.clear()
+    kept.keeper.look()
+    assert kept.starts == 1
+
+
+def test_no_file_left_to_open_does_not_end_the_launcher(kept: Kept) -> None:
+    allowed = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, allowed[1]))
+    try:
+        kept.keeper.look()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, allowed)
+    assert "Too many open files" in kept.told[0]
+
+
+def test_a_signal_without_a_name_is_told_by_its_number(kept: Kept) -> None:
+    child = subprocess.Popen(["sleep", "60"])
+    kept.running._children.append(child)
+    kept.running.processes.gateway = identify(child.pid)
+    child.send_signal(40)
+    kept.look_until(lambda: kept.told != [])
+    assert f"the gateway (process {child.pid}) has ended by signal 40: it is started anew" in kept.told[0]

@@ -1,0 +1,87 @@
+"""Which events begin a recording of the black box: the first of a fault, and what comes after a file has ended.
+
+The division follows the events' own instants: a gateway that finds old ones divides them as the one before it did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+from rtcp.runtime.codes import Code
+from rtcp.runtime.observer import Event
+
+BEFORE_S = 10.0
+AFTER_S = 1.0
+"""A recording's time before and after the fault's instant."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What has begun: by an event of the loop, or (number 0) by its silence or end."""
+
+    time_ns: int
+    what: str
+    number: int = 0
+    code: int = 0
+    later: bool = False
+    """It came while a fault was on already."""
+
+
+class FaultEvents:
+    """Divides events into recordings: within one fault at most one begins in 10 s.
+
+    What comes in between is put off: the newest event of it begins a recording then, and the others are in the ten
+    seconds before that.
+
+    Args:
+        faults: codes of the events that begin a fault.
+        words: makes a sentence of an event.
+    """
+
+    def __init__(self, faults: Collection[int], words: Callable[[Event], str]) -> None:
+        self._faults = faults
+        self._words = words
+        self.on = False
+        """A fault is on."""
+        self._later: Fault | None = None
+        self._ends_ns = self._next_ns = 0
+        """When the newest recording ends, and from when on another may begin; CLOCK_REALTIME."""
+
+    def begun(self, events: Sequence[Event], now_ns: int) -> list[Fault]:
+        """Return what begins a recording, of new events and of what was put off."""
+        found: list[Fault] = []
+        for event in events:
+            found += self._due(event.time_ns)
+            if event.code == Code.RESET:
+                found += self.put_off()
+                self.on = False
+            elif event.code in self._faults:
+                found += self._met(event)
+        return found + self._due(now_ns)
+
+    def put_off(self) -> list[Fault]:
+        """Return what was put off: it begins its recording now."""
+        if self._later is None:
+            return []
+        fault, self._later = self._later, None
+        self._begin(fault, max(self._next_ns, fault.time_ns))
+        return [fault]
+
+    def _met(self, event: Event) -> list[Fault]:
+        fault = Fault(event.time_ns, self._words(event), event.number, event.code, self.on)
+        if not self.on:
+            self.on = True
+            before = self.put_off()
+            self._begin(fault, fault.time_ns)
+            return [*before, fault]
+        if event.time_ns > self._ends_ns:
+            self._later = fault
+        return self._due(event.time_ns)
+
+    def _due(self, now_ns: int) -> list[Fault]:
+        return self.put_off() if now_ns >= self._next_ns else []
+
+    def _begin(self, fault: Fault, begun_ns: int) -> None:
+        self._ends_ns = fault.time_ns + round(AFTER_S * 1e9)
+        self._next_ns = begun_ns + round(BEFORE_S * 1e9)

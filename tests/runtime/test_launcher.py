@@ -1,0 +1,196 @@
+"""The launcher beside others: what an older version left, who waits for whom, what a gateway is handed."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.runtime import launcher
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.layout import PER_JOINT, SCALARS
+from rtcp.runtime.lock import Busy, alone
+from rtcp.runtime.paths import blackboard_file, stopping_mark
+from rtcp.runtime.running import Running, StartError
+from rtcp.runtime.session import Pid, Processes, Session, SessionError, identify, is_ours, read_processes, read_session
+
+JOINTS = 6
+
+
+@pytest.fixture(scope="module")
+def config() -> ArmConfig:
+    return load(default_config())
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    return tmp_path
+
+
+@pytest.fixture
+def other() -> Iterator[subprocess.Popen[bytes]]:
+    """A process of a platform that only has to live."""
+    process = subprocess.Popen(["sleep", "600"])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def session_of(config: ArmConfig) -> Session:
+    return Session(config, "virtual", "ecat0", 0, 77)
+
+
+def older(config: ArmConfig) -> ArmConfig:
+    """A configuration as a version without the section `stops` has made it."""
+    made = replace(config)
+    vars(made).pop("stops")
+    return made
+
+
+@pytest.fixture
+def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
+    board = Blackboard(blackboard_file(directory), JOINTS, 500_000)
+    board.publish([0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS))
+    Processes(loop=Pid(os.getpid(), 1), segment=identify(other.pid)).write(directory)
+    yield
+    board.close()
+    blackboard_file(directory).unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("how", ["as it was", "with a digest"])
+def test_a_session_of_other_classes_is_a_sentence(tmp_path: Path, config: ArmConfig, how: str) -> None:
+    file = tmp_path / "session.pickle"
+    session_of(config).write(file)
+    assert read_session(file) == session_of(config)
+    form, _ = pickle.loads(file.read_bytes())
+    old = session_of(older(config))
+    file.write_bytes(pickle.dumps(old if how == "as it was" else ("0" * len(form), old)))
+    with pytest.raises(SessionError, match=r"session\.pickle was written by another version of rtcp"):
+        read_session(file)
+
+
+@pytest.mark.parametrize("wrong", ["session", "black box"])
+def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
+    directory: Path, dead_loop: None, other: subprocess.Popen[bytes], config: ArmConfig,
+    monkeypatch: pytest.MonkeyPatch, wrong: str,
+) -> None:  # fmt: skip
+    if wrong == "session":
+        (directory / "session.pickle").write_bytes(pickle.dumps(session_of(older(config))))
+    else:
+        session_of(config).write(directory / "session.pickle")
+        monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)
+    told: list[str] = []
+    launcher.stop(told.append)
+    assert len(told) == 1
+    assert f"the end of the loop (process {os.getpid()}) was not recorded" in told[0]
+    assert ("another version" if wrong == "session" else "AttributeError") in told[0]
+    assert other.wait(timeout=60) == -signal.SIGTERM
+    assert not blackboard_file(directory).exists()
+    assert read_processes(directory) == Processes()
+
+
+def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subprocess.Popen[bytes]) -> None:
+    Processes(segment=identify(other.pid)).write(directory)
+    told: list[str] = []
+    stopper = threading.Thread(target=launcher.stop, args=(told.append,))
+    with alone(directory):
+        stopper.start()
+        time.sleep(0.3)
+        assert other.poll() is None
+        assert told == ["another process starts or stops the platform: waiting for it, at most 30 s"]
+    stopper.join()
+    assert other.wait(timeout=60) == -signal.SIGTERM
+
+
+def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
+    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launcher, "STOP_WAITS_S", 0.1)
+    Processes(segment=identify(other.pid)).write(directory)
+    with alone(directory), pytest.raises(StartError, match=r"another process starts or stops .* has done nothing"):
+        launcher.stop(print)
+    assert other.poll() is None
+
+
+class Replacement:
+    """A gateway that is being started for a loop (this process) and is held up before it is ready."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.ended: list[object] = []
+        self._thread = threading.Thread(target=self._replace)
+        self._thread.start()
+        while not (gateway := read_processes(directory).gateway):
+            time.sleep(0.002)
+        self.gateway = gateway
+        os.kill(gateway, signal.SIGSTOP)
+
+    def _replace(self) -> None:
+        try:
+            self.ended.append(launcher.replace_gateway(self._directory))
+        except StartError as error:
+            self.ended.append(error)
+
+    def until_ended(self) -> object:
+        self._thread.join()
+        return self.ended[0]
+
+
+@pytest.fixture
+def replacement(directory: Path, config: ArmConfig) -> Iterator[Replacement]:
+    session_of(config).write(directory / "session.pickle")
+    Processes(loop=identify(os.getpid())).write(directory)
+    made = Replacement(directory)
+    yield made
+    if is_ours(made.gateway):
+        os.kill(made.gateway, signal.SIGKILL)
+    made.until_ended()
+
+
+def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, replacement: Replacement) -> None:
+    until = time.monotonic() + 20
+    while True:
+        try:
+            with alone(directory):
+                break
+        except Busy:
+            assert time.monotonic() < until, "the lock is held until the gateway is ready"
+            time.sleep(0.01)
+    assert replacement.ended == []
+    # A gateway that is already on its way is nobody else's to start.
+    assert launcher.replace_gateway(directory) == 0
+    os.kill(replacement.gateway, signal.SIGKILL)
+    assert f"the gateway (process {replacement.gateway}) ended with code -9" in str(replacement.until_ended())
+
+
+def test_a_gateway_that_a_stop_ends_while_it_is_waited_for_is_no_error(
+    directory: Path, replacement: Replacement
+) -> None:
+    stopping_mark(directory).touch()
+    os.kill(replacement.gateway, signal.SIGKILL)
+    assert replacement.until_ended() == 0
+
+
+def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
+    running = Running(directory, config, Processes(), directory / "of the start")
+    os.close(running.begin_gateway())
+    (child,) = running._children
+    try:
+        environment = Path(f"/proc/{child.pid}/environ").read_bytes().split(b"\0")
+    finally:
+        child.kill()
+        child.wait()
+    assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment
