@@ -146,9 +146,9 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(platform: Platfor
         segment.fault({"fault": "al_refuse", "slave": 1, "state": "PRE-OP"})
     platform.wire("init", "0")
     assert moving.wait() == 5
-    status = platform.status()
+    # Not the first look alone: the cycle that it shows may be one whose frame a shared host held up.
+    status = platform.until(lambda found: 0 < found["wkc"]["actual"] < 21, "an answer without the IO box")
     assert status["state"] == "fault"
-    assert 0 < status["wkc"]["actual"] < 21
 
     def positions() -> list[int]:
         return [
