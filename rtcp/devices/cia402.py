@@ -82,11 +82,9 @@ CONTROLWORDS |= {
 }
 
 CONTROLWORDS |= {(state, DriveGoal.TORQUE_OFF): DISABLE_VOLTAGE for state in DriveState}
-_RAMPING = (_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE)
-CONTROLWORDS |= {
-    (state, DriveGoal.QUICK_STOPPED): QUICK_STOP if state in _RAMPING else CONTROLWORDS[state, DriveGoal.DISABLED]
-    for state in DriveState
-}
+# Whatever state is shown: where a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
+# Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays there.
+CONTROLWORDS |= {(state, DriveGoal.QUICK_STOPPED): QUICK_STOP for state in DriveState}
 
 # States in which a goal is reached.
 REACHED: dict[DriveGoal, frozenset[DriveState]] = {

@@ -105,6 +105,10 @@ class Outputs:
         lamps = (self._powered if powered else 0) | (self._moving if moving else 0)
         return (outputs & ~(self._powered | self._moving) | lamps) ^ self._heartbeat
 
+    def lamps(self, outputs: int) -> int:
+        """Return `outputs` with all off that is neither a lamp nor the heartbeat."""
+        return outputs & (self._powered | self._moving | self._heartbeat)
+
     def grip(self, outputs: int, close: bool) -> int:
         """Return `outputs` with the gripper closed or open."""
         on = close is self._closed

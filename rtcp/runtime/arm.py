@@ -14,7 +14,7 @@ from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, Veloci
 from rtcp.motion.state import MotionState, Phase
 from rtcp.motion.watch import Watch
 from rtcp.runtime.codes import Code
-from rtcp.runtime.gripper import DrivenGripper
+from rtcp.runtime.gripper import FOLLOWED_RAD, DrivenGripper
 from rtcp.runtime.motions import Motions
 
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
@@ -187,6 +187,20 @@ class Arm:
             if not low[axis] - RANGE_MARGIN_RAD <= drive.position <= high[axis] + RANGE_MARGIN_RAD:
                 return axis
         return len(self.drives) if self.gripper is not None and self.gripper.outside else -1
+
+    def first_off_target(self) -> int:
+        """Return the first joint that `follow` would take further than it can have turned since the last, or -1."""
+        position = self.state.position
+        for axis, drive in enumerate(self.drives):
+            if drive.state not in _HOLDING and not abs(drive.position - position[axis]) <= FOLLOWED_RAD:
+                return axis
+        return len(self.drives) if self.gripper is not None and self.gripper.off_target else -1
+
+    def followed_to(self, axis: int) -> float:
+        """Return where the set-point of a joint, or of the gripper, is: where its drive was followed to, rad."""
+        if axis < len(self.drives) or self.gripper is None:
+            return self.state.position[axis]
+        return self.gripper.motion.position
 
     def first_not_resting(self) -> int:
         """Return the first joint whose drive is in fault or enabled, or -1."""

@@ -29,6 +29,8 @@ _MODE_S = 1.0
 _PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
 """States that the emergency stop's input ends. On the way to OP the inputs are not yet valid; while ready no drive has
 torque, and enabling is refused for as long as it is pressed."""
+_BROUGHT_BACK = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
+"""States in which a slave that has left OP may come back to it."""
 
 
 class Behaviour:
@@ -122,6 +124,8 @@ class Behaviour:
         if operator.emergency_stop and self.state in _PRESSABLE:
             self._failing.stop_in_emergency(Code.PRESSED)
         self._steps[self.state](good)
+        if self.state in _BROUGHT_BACK and self._box_left_op:
+            operator.forget_outputs()
         operator.show(self.all_enabled, self.state is State.MOVING)
         gripper = self._arm.gripper
         if gripper is not None and gripper.came_to_rest() and self.all_enabled:
@@ -144,6 +148,12 @@ class Behaviour:
         return self._discipline is None or self._discipline.locked
 
     @property
+    def _box_left_op(self) -> bool:
+        """Whether the IO box is not in OP; where it left first, until the reset, however soon it was back."""
+        box = self._operator.box_position
+        return box > 0 and (self._service.lost_slave == box or not self._blackboard.in_op(box))
+
+    @property
     def _waited(self) -> int:
         return self.cycle - self._since
 
@@ -153,6 +163,11 @@ class Behaviour:
         """Stop, disable and end; once it is said, nothing else is done."""
         if self.state is not State.CLOSING:
             self.on(Event.SHUTDOWN)
+
+    def enable(self) -> None:
+        """Lead the drives to Operation Enabled; the arm stands."""
+        self._enables.begin()
+        self.on(Event.ENABLE)
 
     def begin_motion(self, lease: int) -> None:
         """Let the active mode move the arm, for the commander of `lease`; 0: for the stick."""
@@ -191,6 +206,9 @@ class Behaviour:
 
     def _starting(self, good: bool) -> None:
         service = self._service
+        if service.lost_slave:
+            # It fell before the first cycle in which all was well: nothing has moved yet that a person would reset.
+            service.recover()
         if self.clock_followed:
             service.want_op()
         self._arm.lead(DriveGoal.DISABLED)
@@ -282,10 +300,12 @@ class Behaviour:
             self._since = self.cycle
             self._tracking.track(good)
             return
+        if self._failing.bus_fails(good):
+            return
         if self._failing.pending:
             self._failing.come_to_rest(Rung.TORQUE_OFF)
             return
-        if self._failing.bus_fails(good) or not good:
+        if not good:
             return
         self.all_enabled = False
         arm.lead(DriveGoal.DISABLED)

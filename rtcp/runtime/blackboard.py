@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from rtcp.fieldbus.alstatus import AlState
 from rtcp.runtime.layout import (
     ANSWER,
     ANSWER_AT,
@@ -50,6 +51,7 @@ from rtcp.runtime.plans import mark_in_use, place
 from rtcp.runtime.words import Words
 
 _U16, _U32 = 0xFFFF, 0xFFFF_FFFF
+_AL_STATE = 0x0F
 
 
 class Blackboard:
@@ -129,6 +131,11 @@ class Blackboard:
         """Note the state of the slave at `position` (from 1)."""
         if 1 <= position <= SLAVES_MAX:
             self._words[SLAVES_AT + (position - 1) * 8] = al_status | al_status_code << 16
+
+    def in_op(self, position: int) -> bool:
+        """Whether the slave at `position` was in OP when its state was last noted; beyond what is noted: always."""
+        at = SLAVES_AT + (position - 1) * 8
+        return position > SLAVES_MAX or self._words[at] & _AL_STATE == AlState.OP
 
     def health(self, position: int, lost: int, recovered: int, rx: int, forwarded: int, links: int) -> None:
         """Note how often the slave at `position` left OP and came back, and what its ports have counted."""

@@ -182,6 +182,8 @@ class Code(IntEnum):
     """Enabled beyond the bounds of a box; axis: the box, value: its distance, m, less than 0."""
     GRIPPER_AT = 40
     """A gripper with a drive came to rest; value: position, rad, limit: 1 where it holds something."""
+    POSITION_JUMPED = 43
+    """While being enabled; axis, value: where the drive says it is, limit: where it was followed to, rad."""
     CAME_OUT = 38
     """The stick's code was none, or came back to one."""
     ENDED = 100

@@ -128,15 +128,18 @@ class Failing:
     def _lose_clock(self) -> bool:
         """Stop for the clock; return whether it ended in a fault: under a controlled stop the arm still obeys."""
         behaviour, arm = self._behaviour, self._arm
-        obeys = Event.WAVERS in TABLE[behaviour.state].left_by and not arm.all_still
+        # On its way to no torque it goes on to there: who asked for none is not left with an arm that holds.
+        disables = behaviour.state is State.DISABLING
+        obeys = disables or (Event.WAVERS in TABLE[behaviour.state].left_by and not arm.all_still)
         if self.rungs[Code.CLOCK_LOST] is not Rung.CONTROLLED_STOP or not obeys:
             self.fail(Code.CLOCK_LOST)
             return True
         self.pending = behaviour.fault = Code.CLOCK_LOST
-        self._operator.wait_for_neutral()
-        arm.stop()
         self._blackboard.event(Code.CLOCK_LOST)
-        behaviour.on(Event.WAVERS)
+        if not disables:
+            self._operator.wait_for_neutral()
+            arm.stop()
+            behaviour.on(Event.WAVERS)
         return False
 
     def watch_stops(self) -> bool:

@@ -12,6 +12,10 @@ from rtcp.motion.watch import FOLLOWING_ERROR, SPEED, Found
 _RANGE_MARGIN_RAD = 0.02
 """So far beyond its range it may stand and still be enabled, to be brought back to the edge."""
 
+FOLLOWED_RAD = 0.03
+"""No joint that stood turns so far between two frames: where a drive says so while it is enabled, it is not followed.
+More than what a joint may stand beyond its range, which it is not followed out of."""
+
 
 class DrivenGripper:
     """The gripper's drive in CSP: enabled and disabled with the arm's, on its way by itself.
@@ -47,6 +51,14 @@ class DrivenGripper:
     def outside(self) -> bool:
         """Whether it stands so far outside its range that it must not be enabled."""
         return abs(self.motion.clamped(self.drive.position) - self.drive.position) > _RANGE_MARGIN_RAD
+
+    @property
+    def off_target(self) -> bool:
+        """Whether `follow` would take the set-point further than a gripper can have turned since it was followed."""
+        drive = self.drive
+        return drive.state is not DriveState.OPERATION_ENABLED and not (
+            abs(drive.position - self.motion.position) <= FOLLOWED_RAD
+        )
 
     def lead(self, goal: DriveGoal) -> None:
         """Lead the drive one step towards `goal`."""

@@ -68,7 +68,8 @@ class Event(IntEnum):
     HOME = 20
     HOMED = 21
     WAVERS = 22
-    """The clock was lost and its rung is a controlled stop: a fault follows at standstill."""
+    """The clock was lost and its rung is a controlled stop: a fault follows at standstill. Disabling goes on to its end
+    first."""
 
 
 class Row(NamedTuple):
@@ -166,7 +167,7 @@ TABLE: dict[State, Row] = {
         "disabling",
         "a controlled stop first; then drives led to Switch On Disabled, brakes closed",
         _ANYWHERE | {Command.DISABLE},
-        _BROKEN | _WAVERS | {Event.DISABLED: State.READY},
+        _BROKEN | {Event.DISABLED: State.READY},
     ),
     State.FAULT: Row(
         "fault",

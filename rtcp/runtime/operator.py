@@ -24,6 +24,8 @@ class Operator:
     def __init__(self, config: ArmConfig, box: IoBox | None) -> None:
         cycle_s = config.cycle.period_us * 1e-6
         self._box = box
+        self.box_position = 0 if box is None else 1 + [slave.name for slave in config.slaves].index(box.name)
+        """The box's position on the cable; 0: there is none."""
         self._inputs = Inputs(config.inputs, cycle_s)
         self._outputs = Outputs(config.outputs, config.gripper)
         self._stick = Stick(config.inputs, cycle_s)
@@ -75,6 +77,11 @@ class Operator:
         """Switch the lamps and toggle the heartbeat."""
         if self._box is not None:
             self._box.outputs = self._outputs.write(self._box.outputs, powered, moving)
+
+    def forget_outputs(self) -> None:
+        """Let the gripper's output, and what was switched by hand, be off as they are at a box that has left OP."""
+        if self._box is not None:
+            self._box.outputs = self._outputs.lamps(self._box.outputs)
 
     def wait_for_neutral(self) -> None:
         """Let the stick count only after it has been neutral."""

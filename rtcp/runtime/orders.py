@@ -124,7 +124,7 @@ class Orders:
         arm.set_mode(DriveMode.CSP)
         arm.hold_target()
         self._operator.wait_for_neutral()
-        self._behaviour.on(Event.ENABLE)
+        self._behaviour.enable()
         return DONE
 
     def _disable(self, lease: int, numbers: Sequence[float]) -> Verdict:

@@ -94,6 +94,7 @@ class Sentences:
                 f"the cycle has not followed the reference clock for 1 s: {stop(Code.CLOCK_LOST)}, `rtcp reset` goes on"
             ),
             Code.LEFT_RANGE: self._left_range,
+            Code.POSITION_JUMPED: self._position_jumped,
             Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
             Code.LEASE_ENDED: lambda _: (
                 f"the commander fell silent or gave up its lease: {self._names.end(Code.LEASE_ENDED)}"
@@ -164,6 +165,14 @@ class Sentences:
             f"enabled or homed: it stands at {number(matter.value)} rad ({self._key(matter)}.position in {self._file})"
         )
 
+    def _position_jumped(self, matter: Matter) -> str:
+        return (
+            f"{self._joint(matter)} was followed to {number(matter.limit)} rad while being enabled and is suddenly at "
+            f"{number(matter.value)} rad, for {self._config.watch.cycles} cycles (watch.cycles in {self._file}): it "
+            f"was turned, or its drive shows a false position; {self._names.stop(Code.POSITION_JUMPED)}, let it stand, "
+            "compare it with `rtcp status`; `rtcp reset` goes on"
+        )
+
     def _reset_stuck(self, matter: Matter) -> str:
         if matter.axis < 0:
             return "reset did not succeed within 3 s: not all slaves came back to OP, or the clock is not followed"
@@ -193,6 +202,7 @@ FAULTS = frozenset(
         Code.DRIVE_FAULT,
         Code.CLOCK_LOST,
         Code.LEFT_RANGE,
+        Code.POSITION_JUMPED,
         Code.PRESSED,
         Code.OVER_SPEED,
         Code.OVER_TORQUE,

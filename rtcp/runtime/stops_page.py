@@ -114,8 +114,15 @@ Which event takes which rung is the section `stops` of the arm's file:
   `torque_off` category 0. These stops are software; a protective device in hardware stays the builder's.
 - A guard that ends a motion always takes a controlled stop: it brakes in time on a way that was examined, which the
   drives' own ramps would leave. What has no key (a drive that does not enable, a reset that fails) is a quick stop.
+- The quick stop is sent whatever a drive's statusword says: a word that is false for one frame takes no joint's torque.
+- **Enabling** is watched as motion is (`stops.watch`), and a drive that leaves Operation Enabled before all are there
+  is a `drive_fault`. A drive obeys some frames before it shows that it does, and until then its target is the place
+  that it shows: a place more than 0.03 rad from the last is not followed, and after `watch.cycles` in a row a fault.
+- A `disable` goes on to its end where the clock is lost under `controlled_stop`: the fault is then without torque.
 - Nothing goes on by itself. A drive that comes back, from another AL state or from a loss of its supply, is sent its
-  own position and no enable until reset and enable.
+  own position and no enable until reset and enable. An IO box that leaves OP shows 0 at its outputs, and comes back
+  with 0: what the gripper's output was, or was switched by hand, is forgotten, and counts again when it is commanded
+  after the reset. Where `gripper.closed` is `off` it is at 0 that the gripper closes, as at a loss of the supply.
 """
 
 

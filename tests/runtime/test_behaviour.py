@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
+from rtcp.fieldbus.alstatus import AlState
 from rtcp.motion.state import MotionState, Reason, Target
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
@@ -189,6 +190,8 @@ class Bench:
         self.discipline.locked = True
         self.service = Service(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
         self.slaves_come_back = True
+        for position in range(1, 1 + len(config.slaves)):
+            board.slave(position, AlState.OP, 0)
         if not with_box:
             config = replace(config, slaves=(replace(config.slaves[0], device=NO_BOX), *config.slaves[1:]))
         parts = assemble(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
@@ -511,6 +514,21 @@ def joint_is_turned_back(bench: Bench) -> None:
     bench.models[1].mechanics.position = 1.9
 
 
+def joint_says_it_is_elsewhere(bench: Bench) -> None:
+    bench.start().do(Command.ENABLE)
+    said = bench.data.input
+
+    def elsewhere(slot: int) -> bytes:
+        values = _WIRE.unpack(said(slot))
+        return _WIRE.pack(values[0], 1000, *values[2:]) if slot == 2 else said(slot)
+
+    bench.data.input = lambda slot: elsewhere(slot) if slot else said(slot)
+
+
+def joint_says_where_it_is(bench: Bench) -> None:
+    del bench.data.input
+
+
 def generator_refuses(bench: Bench) -> None:
     generator = bench.set_in_motion().arm.motions.generator
 
@@ -592,6 +610,11 @@ FAULT_STORIES = (
         "a joint that is turned out of its range", Code.LEFT_RANGE, 1,
         ("joint2", "left its range", "2.1 rad", "joints[1].position in assistive_arm.yaml"),
         joint_is_turned_out_of_its_range, joint_is_turned_back,
+    ),
+    Fault(
+        "a joint that says it is elsewhere while it is enabled", Code.POSITION_JUMPED, 1,
+        ("joint2", "followed to 0 rad", "0.1 rad", "5 cycles (watch.cycles in assistive_arm.yaml)", "`rtcp reset`"),
+        joint_says_it_is_elsewhere, joint_says_where_it_is,
     ),
     Fault(
         "a generator that refuses", Code.GENERATOR, -1,
@@ -712,6 +735,19 @@ def test_ready_is_told_when_all_slaves_are_in_op_and_not_before(bench: Bench) ->
     bench.service.all_op = True
     bench.cycle()
     assert (bench.state, bench.codes) == (State.READY, [Code.DC_LOCKED, Code.READY])
+
+
+def test_a_slave_that_leaves_op_before_the_machine_is_ready_is_brought_back_without_a_reset(bench: Bench) -> None:
+    asked: list[int] = []
+    bench.service.recover = lambda: asked.append(len(bench.log))
+    bench.run(0.01)
+    assert asked == []
+    bench.service.lost_slave = 2
+    bench.cycle()
+    assert asked == [10]
+    bench.service.lost_slave, bench.service.all_op = 0, True
+    bench.cycle()
+    assert (asked, bench.state) == ([10], State.READY)
 
 
 # -- enabling -------------------------------------------------------------------------------------------------------

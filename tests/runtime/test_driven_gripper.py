@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
@@ -41,6 +42,7 @@ class Hand:
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
+        self.received: list[bytes] = []
         self.gripper = simulation.parts.arm.gripper
         model = simulation.bus.slaves[SLOT].device
         assert self.gripper is not None
@@ -55,6 +57,7 @@ class Hand:
     def _see(self, frame: Frame) -> None:
         self.path.append(self.gripper.motion.position)
         self.told.append(frame.sent[SLOT])
+        self.received.append(frame.received[SLOT])
         if self.object_at is not None:
             mechanics = self.model.mechanics
             inside = max(0.0, self.object_at - mechanics.position)
@@ -417,6 +420,42 @@ def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) 
     assert hand.simulation.until(lambda: bool(hand.told_of(Code.OVER_SPEED)), 1.0)
     hand.simulation.run(0.01)
     assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
+
+
+def disabled(hand: Hand) -> Hand:
+    assert hand.simulation.order(Command.DISABLE).refusal == Refusal.NONE
+    hand.until(State.READY)
+    return hand
+
+
+def test_it_does_not_follow_a_false_position_while_it_is_being_enabled(hand: Hand) -> None:
+    disabled(hand)
+    data, said = hand.simulation.data, hand.simulation.data.input
+    assert hand.simulation.order(Command.ENABLE).refusal == Refusal.NONE
+    assert hand.simulation.until(lambda: hand.told[-1][:2] == ENABLED, 1.0)
+
+    def false(slot: int) -> bytes:
+        if slot != SLOT:
+            return said(slot)
+        _, position, *others = struct.unpack("<Hiiib", hand.received[-1])
+        return struct.pack("<Hiiib", 0x0233, position + 1000, *others)
+
+    data.input = false  # type: ignore[method-assign]
+    hand.path.clear()
+    hand.simulation.run(2 * PERIOD_S)
+    data.input = said  # type: ignore[method-assign]
+    hand.until(State.HOLDING)
+    hand.simulation.run(0.2)
+    assert max(abs(position - START) for position in hand.path) < 1e-3
+    assert hand.position == pytest.approx(START, abs=2e-3)
+
+
+def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_names_its_joint(hand: Hand) -> None:
+    disabled(hand)
+    assert hand.simulation.order(Command.ENABLE).refusal == Refusal.NONE
+    hand.model.mechanics.position += 0.1
+    hand.until(State.FAULT)
+    assert hand.sentence(Code.POSITION_JUMPED).startswith("finger was followed to 1 rad while being enabled")
 
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:

@@ -30,6 +30,7 @@ from .test_behaviour import (
     LOST_CYCLES,
     PERIOD_S,
     QUICK_STOP,
+    SWITCH_ON,
     UNDER_VOLTAGE,
     VOLTAGE_OFF,
     Bench,
@@ -273,7 +274,8 @@ def test_for_a_lost_clock_the_arm_comes_to_rest_under_its_limits_before_it_is_a_
     assert bench.state is state
     bench.wait(lambda: Code.CLOCK_LOST in bench.codes)
     at = len(bench.log)
-    assert (bench.state, bench.behaviour.fault) == (State.STOPPING, Code.CLOCK_LOST)
+    on_the_way = State.DISABLING if state is State.DISABLING else State.STOPPING
+    assert (bench.state, bench.behaviour.fault) == (on_the_way, Code.CLOCK_LOST)
     bench.until(State.FAULT)
     ramp = bench.log[at:-1]
     assert {said.controlword for cycle in ramp for said in cycle.drives} == {ENABLE_OPERATION}
@@ -281,7 +283,20 @@ def test_for_a_lost_clock_the_arm_comes_to_rest_under_its_limits_before_it_is_a_
     assert bench.codes.count(Code.CLOCK_LOST) == 1
     assert bench.behaviour.fault is Code.CLOCK_LOST
     bench.run(0.2)
-    assert [model.powered for model in bench.models] == [True, True]
+    # Whoever asked for no torque has none.
+    assert [model.powered for model in bench.models] == [state is not State.DISABLING] * 2
+
+
+def test_a_clock_that_is_lost_while_the_torque_is_taken_ends_without_torque(made: Callable[..., Bench]) -> None:
+    bench = made(clock_lost="controlled_stop").hold()
+    CAUSES["clock_lost"][0](bench)
+    bench.run(0.98)
+    bench.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    bench.do(Command.DISABLE)
+    bench.until(State.FAULT, 0.05)
+    bench.run(0.1)
+    assert bench.codes.count(Code.CLOCK_LOST) == 1
+    assert (bench.behaviour.fault, [model.powered for model in bench.models]) == (Code.CLOCK_LOST, [False, False])
 
 
 def test_an_arm_that_stands_goes_into_the_fault_of_a_lost_clock_at_once(made: Callable[..., Bench]) -> None:
@@ -318,7 +333,6 @@ def test_where_a_lost_clock_may_end_in_a_controlled_stop_set_points_move_the_arm
         State.HOLDING,
         State.MOVING,
         State.STOPPING,
-        State.DISABLING,
     }
 
 

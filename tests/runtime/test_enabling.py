@@ -1,0 +1,173 @@
+"""Enabling: what a drive shows meanwhile that is not so, what is measured meanwhile, and who leaves it again."""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.machine import Code, Command, State
+from rtcp.runtime.observer import Observer
+
+from .test_behaviour import (
+    CONFIG,
+    CONTROLWORD,
+    COUNTS,
+    ENABLE_OPERATION,
+    LONGEST_STEP,
+    PERIOD_S,
+    QUICK_STOP,
+    SWITCH_ON,
+    Bench,
+)
+
+_INPUTS = struct.Struct("<Hiiib")
+ENABLED, SWITCHED_ON, NO_STATE = 0x0237, 0x0233, 0x0213
+"""Statuswords; the last is none that the standard defines."""
+
+
+@pytest.fixture(scope="module")
+def board() -> Iterator[tuple[Blackboard, Observer]]:
+    path = Path(f"/dev/shm/rtcp-enabling-{os.getpid()}")
+    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
+    observer = Observer(path)
+    path.unlink()
+    yield written, observer
+    observer.close()
+    written.close()
+
+
+@pytest.fixture
+def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+    made = Bench(*board)
+    yield made
+    board[1].release(made.lease)
+
+
+def falsify(bench: Bench, axis: int = 0, word: int | None = None, position: float | None = None) -> Callable[[], None]:
+    """Let all frames from now on carry a false statusword or position (rad) of a drive; return what ends it."""
+    real = bench.data.input
+
+    def read(slot: int) -> bytes:
+        data = real(slot)
+        if slot != axis + 1:
+            return data
+        values = list(_INPUTS.unpack(data))
+        values[0] = values[0] if word is None else word
+        values[1] = values[1] if position is None else round(position * COUNTS)
+        return _INPUTS.pack(*values)
+
+    bench.data.input = read  # type: ignore[method-assign]
+
+    def end() -> None:
+        bench.data.input = real  # type: ignore[method-assign]
+
+    return end
+
+
+def until_told_to_enable(bench: Bench, axis: int = 0) -> Bench:
+    """Enable, up to the cycle in which the drive has been told to and does not show it yet."""
+    bench.start().do(Command.ENABLE)
+    bench.wait(lambda: bench.log[-1].drives[axis].controlword == ENABLE_OPERATION)
+    assert bench.log[-1].drives[axis].statusword & 0x6F == 0x23
+    return bench
+
+
+def largest_way(bench: Bench, seconds: float) -> float:
+    """Run; return the largest distance of the first joint from 0, where it began, rad."""
+    found = 0.0
+    for _ in range(round(seconds / PERIOD_S)):
+        bench.cycle()
+        found = max(found, abs(bench.models[0].mechanics.position))
+    return found
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+@pytest.mark.parametrize("position", [0.05, 0.1, -0.14])
+def test_no_joint_follows_a_false_position_while_its_drive_is_being_enabled(
+    bench: Bench, position: float, frames: int
+) -> None:
+    end = falsify(until_told_to_enable(bench), word=SWITCHED_ON, position=position)
+    bench.run(frames * PERIOD_S)
+    end()
+    assert largest_way(bench, 0.5) < 1e-4
+    assert bench.state is State.HOLDING
+    assert {said.drives[0].target for said in bench.log if said.drives[0].controlword == ENABLE_OPERATION} == {0}
+
+
+def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_places(bench: Bench) -> None:
+    falsify(until_told_to_enable(bench), word=SWITCHED_ON, position=0.1)
+    bench.run((CONFIG.watch.cycles - 1) * PERIOD_S)
+    assert bench.state is State.ENABLING
+    bench.cycle()
+    assert (bench.state, bench.codes[-1]) == (State.FAULT, Code.POSITION_JUMPED)
+    assert bench.said[-1].startswith("joint1 was followed to 0 rad while being enabled and is suddenly at 0.1 rad")
+    assert largest_way(bench, 0.5) < 1e-4
+
+
+def test_false_positions_that_do_not_follow_each_other_are_not_added_up(bench: Bench) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    until_told_to_enable(bench)
+    for _ in range(2 * CONFIG.watch.cycles):
+        end = falsify(bench, axis=1, position=0.1)
+        bench.cycle()
+        end()
+        bench.cycle()
+    bench.data.deaf.clear()
+    bench.until(State.HOLDING)
+
+
+def test_a_joint_that_sags_while_its_brake_opens_is_followed_and_enabled(bench: Bench) -> None:
+    bench.start().do(Command.ENABLE)
+    model = bench.models[1].mechanics
+    while bench.log[-1].drives[1].statusword & 0x6F != 0x27:
+        model.position -= 0.4 * PERIOD_S
+        bench.cycle()
+    bench.until(State.HOLDING)
+    assert bench.longest_step(1) <= LONGEST_STEP
+
+
+def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(bench: Bench) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    bench.start().do(Command.ENABLE)
+    bench.wait(lambda: bench.log[-1].drives[0].statusword & 0x6F == 0x27)
+    turned = bench.models[0].mechanics
+    turned.inertia, turned.velocity = 1e5, 0.9
+    bench.until(State.EMERGENCY_STOP, (CONFIG.watch.cycles + 3) * PERIOD_S)
+    assert bench.codes[-1] is Code.OVER_SPEED
+
+
+def test_a_drive_that_leaves_operation_enabled_while_others_are_on_their_way_is_not_enabled_again(
+    bench: Bench,
+) -> None:
+    bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    bench.start().do(Command.ENABLE)
+    bench.wait(lambda: bench.log[-1].drives[0].statusword & 0x6F == 0x27)
+    bench.run(0.02)
+    bench.data.deaf[0, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    bench.until(State.FAULT, 5 * PERIOD_S)
+    assert (bench.codes[-1], bench.events[-1].axis) == (Code.DRIVE_LEFT_ENABLED, 0)
+    bench.data.deaf.clear()
+    bench.run(0.3)
+    assert bench.words(0).count(ENABLE_OPERATION) == 1
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    bench.enable()
+
+
+def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(bench: Bench) -> None:
+    bench.hold()
+    end = falsify(bench, word=NO_STATE)
+    bench.cycle()
+    end()
+    assert bench.state is State.FAULT
+    assert [said.controlword for said in bench.log[-1].drives] == [QUICK_STOP, QUICK_STOP]
+    bench.run(0.1)
+    assert [model.powered for model in bench.models] == [True, True]
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    bench.enable()
