@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtcp.config.model import ArmConfig
+from rtcp.devices.cia402 import DriveState
 from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
@@ -21,6 +22,8 @@ from rtcp.runtime.stops import Rung, rungs
 
 if TYPE_CHECKING:
     from rtcp.runtime.behaviour import Behaviour
+
+_IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
 _CLOCK_S = 1.0
 
@@ -74,9 +77,12 @@ class Failing:
         self._break(code, max(self.rungs[code], Rung.QUICK_STOP))
 
     def fail_drive(self, code: Code, axis: int) -> None:
-        """Fail for a drive, whose error code is looked up."""
+        """Fail for a drive, whose error code is looked up; one that shows a fault is in it, whatever it left."""
         self._service.explain_drive(axis)
-        self.fail(code, axis, float(self._arm.all_drives[axis].statusword))
+        drive = self._arm.all_drives[axis]
+        if code is Code.DRIVE_LEFT_ENABLED and drive.state in _IN_FAULT:
+            code = Code.DRIVE_FAULT
+        self.fail(code, axis, float(drive.statusword))
 
     def fail_mode(self, axis: int) -> None:
         """Fail for a drive that does not take the mode."""

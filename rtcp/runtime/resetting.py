@@ -55,4 +55,4 @@ class Resetting:
         if axis >= 0 and all_op:
             failing.fail_drive(Code.RESET_STUCK, axis)
         else:
-            failing.fail(Code.RESET_STUCK)
+            failing.fail(Code.RESET_STUCK, -1, float(all_op))

@@ -72,7 +72,8 @@ class Sentences:
                 f"{file})"
             ),
             Code.SLAVE_NOT_OP: lambda m: (
-                f"slave {m.axis} ({slave(m.axis)}) left OP: {stop(Code.SLAVE_NOT_OP)}, `rtcp reset` brings it back"
+                f"slave {m.axis} ({slave(m.axis)}) left OP or does not answer: {stop(Code.SLAVE_NOT_OP)}, "
+                "`rtcp reset` goes on when it is back"
             ),
             Code.RESET_STUCK: self._reset_stuck,
             Code.RESET_MOVING: lambda m: (
@@ -175,7 +176,15 @@ class Sentences:
 
     def _reset_stuck(self, matter: Matter) -> str:
         if matter.axis < 0:
-            return "reset did not succeed within 3 s: not all slaves came back to OP, or the clock is not followed"
+            if not matter.value:
+                return (
+                    "reset did not succeed within 3 s: not all slaves are back in OP (`rtcp status` shows which); mend "
+                    "what keeps them, then `rtcp reset`"
+                )
+            return (
+                "reset did not succeed within 3 s: frames do not come back, or the reference clock is not followed "
+                "(`rtcp status`)"
+            )
         return f"{self._joint(matter)}: the drive stays in fault after reset (statusword 0x{int(matter.value):04X})"
 
     def refusal(self, code: int, axis: int, value: float, limit: float) -> str:

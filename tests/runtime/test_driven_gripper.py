@@ -373,7 +373,7 @@ def test_a_fault_of_its_own_drive_stops_the_arm_and_names_its_joint(hand: Hand) 
     hand.on_its_way()
     hand.model.inject_fault(0x7305)
     hand.until(State.FAULT)
-    assert hand.sentence(Code.DRIVE_LEFT_ENABLED).startswith("finger: the drive left Operation Enabled by itself")
+    assert hand.sentence(Code.DRIVE_FAULT).startswith("finger: the drive is in fault")
     hand.simulation.run(1.0)
     goes_nowhere_by_itself(hand)
 
