@@ -7,16 +7,22 @@ from collections.abc import Callable, Sequence
 
 from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, refusal
 from rtcp.fieldbus.bus import BusError
-from rtcp.fieldbus.charges import SAY_AGAIN_S, Action, Charge, action_for
+from rtcp.fieldbus.charges import LONG_AGO, SAY_AGAIN_S, Action, Charge, action_for
 from rtcp.fieldbus.registers import Command, RegisterPort
 from rtcp.fieldbus.restore import STATION, ForeignSlave, Restorer
 from rtcp.fieldbus.states import AL_CONTROL
 
-_REQUESTS = {Action.REQUEST_OP: AlState.OP, Action.REQUEST_SAFEOP: AlState.SAFEOP}
+_REQUESTS = {
+    Action.REQUEST_OP: AlState.OP,
+    Action.REQUEST_SAFEOP: AlState.SAFEOP,
+    Action.REQUEST_PREOP: AlState.PREOP,
+}
 _TRIES = 3
 """So often a slave may refuse before it is set up again."""
 _PAUSE_S, _LONGEST_PAUSE_S, _FOREIGN_PAUSE_S = 1.0, 5.0, 10.0
 _PATIENCE_S = 3.0
+_WELL_S = 1.0
+"""A slave that leaves OP sooner than this after it got there has not been well in between."""
 _PROBE_S = 0.05
 _POLL_S = 0.0003
 _STEPS_S = 0.003
@@ -41,10 +47,18 @@ class Care:
         self._restorer = restorer
         self._say = say
         self._reached = len(slaves)
+        self._op_allowed = True
 
-    def take_steps(self, now: float, reached: int) -> None:
-        """Take a step with every slave that is not well; `reached`: so many slaves answer on the cable."""
+    def take_steps(self, now: float, reached: int, op_allowed: bool) -> None:
+        """Take a step with every slave that is not well.
+
+        Args:
+            now: the instant (time.monotonic).
+            reached: so many slaves answer on the cable.
+            op_allowed: whether OP may be asked for; otherwise slaves wait in SAFE-OP.
+        """
         self._reached = reached
+        self._op_allowed = op_allowed
         until = now + _STEPS_S
         for charge in self._slaves:
             if not charge.well:
@@ -69,8 +83,12 @@ class Care:
         action = action_for(state, error)
         if charge.kept and state is AlState.PREOP and not error:
             action = Action.REQUEST_SAFEOP
-        if charge.failed >= _TRIES and action is not Action.MARK_LOST:
+        if (charge.failed >= _TRIES or charge.unfinished) and action is not Action.MARK_LOST:
             action = Action.RECONFIGURE
+        if charge.leaving and state is AlState.OP:
+            action = Action.REQUEST_PREOP
+        if action is Action.REQUEST_OP and not self._op_allowed:
+            return
         if action is Action.MARK_LOST:
             self._probe(charge, now)
         elif action is Action.RECONFIGURE:
@@ -80,12 +98,23 @@ class Care:
             self.request(charge, state, acknowledge=True)
         else:
             charge.asked = action, state, error, now + _PATIENCE_S
-            self.request(charge, _REQUESTS[action])
+            self.request(charge, _REQUESTS[action], acknowledge=error)
 
-    def request(self, charge: Charge, state: AlState, *, acknowledge: bool = False) -> None:
-        """Request `state` of a slave; what comes of it shows later."""
+    def request(self, charge: Charge, state: AlState, *, acknowledge: bool = False) -> bool:
+        """Request `state` of a slave; return False where it has surely not heard. What comes of it shows later."""
         word = state | (ERROR_BIT if acknowledge else 0)
-        self._port.exchange(Command.FPWR, charge.station, AL_CONTROL, word.to_bytes(2, "little"), tries=1)
+        data = word.to_bytes(2, "little")
+        return self._port.exchange(Command.FPWR, charge.station, AL_CONTROL, data, tries=1).wkc != 0
+
+    def note_fall(self, charge: Charge, now: float) -> None:
+        """Note that a slave left OP; one that does so again and again is brought back after pauses, and set up."""
+        if now - charge.back_at < _WELL_S:
+            charge.flaps += 1
+            charge.pause_until = now + min(_PAUSE_S * charge.flaps, _LONGEST_PAUSE_S)
+        else:
+            charge.flaps = 0
+            charge.told_at = LONG_AGO
+        charge.failed = charge.flaps
 
     def _fail(self, charge: Charge, now: float, wanted: AlState) -> None:
         charge.failed += 1
@@ -116,8 +145,9 @@ class Care:
     def _begin(self, charge: Charge, *, lost_address: bool) -> None:
         charge.asked = None
         charge.kept = False
+        charge.unfinished = True
         what = "it was without supply" if lost_address else f"it is in {charge.words()}"
-        if charge.failed == 0:
+        if charge.failed == 0 and charge.flaps == 0:
             self._say(f"{charge.label} is set up again: {what}")
         charge.work = self._restorer.restore(charge.position, lost_address)
 
@@ -131,6 +161,7 @@ class Care:
                 next(work)
         except StopIteration:
             charge.work = None
+            charge.unfinished = False
             charge.failed = 0
         except BusError as error:
             charge.work = None

@@ -9,6 +9,7 @@ from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
 from rtcp.fieldbus.steps import Steps
 
+LONG_AGO = float("-inf")
 SAY_AGAIN_S = 10.0
 """A slave's trouble is told at once, and then at most so often."""
 
@@ -20,6 +21,7 @@ class Action(Enum):
     ACKNOWLEDGE = "acknowledge its error"
     REQUEST_SAFEOP = "request SAFE-OP"
     REQUEST_OP = "request OP"
+    REQUEST_PREOP = "request PRE-OP: it was to be parked"
     RECONFIGURE = "set it up again"
     MARK_LOST = "mark it lost; when it answers again, recover it"
 
@@ -54,15 +56,28 @@ class Charge:
     """How often it was back in OP after that."""
     left_at: float | None = None
     was_in_op: bool = True
+    back_at: float = LONG_AGO
+    """When it last came to OP."""
+    flaps: int = 0
+    """How often in a row it fell out of OP again at once."""
     kept: bool = False
     """Whether it is in PRE-OP because it was sent there, its set-up untouched."""
+    leaving: bool = False
+    """Whether it was sent to PRE-OP and has been seen in nothing but OP since."""
+    unfinished: bool = False
+    """Whether a restoration was begun that did not come to its end."""
     work: Steps[None] | None = None
     asked: tuple[Action, AlState, bool, float] | None = None
     """What was asked, in which state it was then, and until when it may take."""
     failed: int = 0
     pause_until: float = 0.0
     probe_at: float = 0.0
-    told_at: float = -SAY_AGAIN_S
+    told_at: float = LONG_AGO
+    fall_told_at: float = LONG_AGO
+    untold: int = 0
+    """How often it left OP since that was told last."""
+    return_due: bool = False
+    """Whether its return is to be told: its fall was."""
 
     @property
     def label(self) -> str:
@@ -76,8 +91,14 @@ class Charge:
 
     @property
     def well(self) -> bool:
-        """Whether it is in OP, without an error."""
-        return self.state is AlState.OP and not self.error
+        """Whether it is in OP, without an error, and not about to leave it as it was told to."""
+        return self.state is AlState.OP and not self.error and not self.leaving
+
+    def take(self, state: AlState, error: bool, code: int) -> None:
+        """Note the state in which it was found."""
+        self.state, self.error, self.code = state, error, code
+        if state not in (AlState.OP, AlState.NONE):
+            self.leaving = False
 
     def words(self) -> str:
         """Return its state in words."""

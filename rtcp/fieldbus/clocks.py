@@ -21,7 +21,7 @@ _DC_SPEED, _DC_SPEED_DEFAULT = 0x0930, b"\x00\x10"
 _DC_CYCLIC_UNIT, _DC_START, _DC_CYCLES = 0x0980, 0x0990, 0x09A0
 _SYNC_DELAY_NS = 100_000_000
 """From the activation to the first SYNC0 at least."""
-_CLOSE_NS, _SETTLED_NS = 10_000, 2_000
+_SETTLED_NS = 2_000
 _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
 _SYNC1 = 0x0400
@@ -89,13 +89,15 @@ def take_over_time(
         always: set it also where it shows the reference's time already.
 
     Raises:
-        BusError: it stopped answering.
+        BusError: it stopped answering, or nobody took the broadcast.
     """
     if not always:
         shown = port.read_at(position, _DC_DIFFERENCE, 4)
-        if shown is not None and _difference(shown) < _CLOSE_NS:
+        if shown is not None and _difference(shown) < _SETTLED_NS:
             return
-    port.write_all(_DC_RECEIVE_TIMES, bytes(4))
+    # Without it the two registers below would hold times of two different frames.
+    if port.write_all(_DC_RECEIVE_TIMES, bytes(4)) < 1:
+        raise BusError(f"{label}: the local times could not be latched while its clock was set")
     own = port.read_at(position, _DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
@@ -110,22 +112,28 @@ def take_over_time(
             time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
             break
     offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
-    port.write_at(position, _DC_DELAY, delay)
-    port.write_at(position, _DC_OFFSET, offset.to_bytes(8, "little"))
+    port.put_at(position, _DC_DELAY, delay, label)
+    port.put_at(position, _DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
-def forget_drift(port: RegisterPort, position: int) -> None:
+def forget_drift(port: RegisterPort, position: int, label: str) -> None:
     """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
-    port.write_at(position, _DC_SPEED, _DC_SPEED_DEFAULT)
+    port.put_at(position, _DC_SPEED, _DC_SPEED_DEFAULT, label)
 
 
-def settle_clock(port: RegisterPort, station: int) -> Steps[None]:
-    """Let drift compensation bring a slave's clock to the reference's; after a while go on whatever it shows."""
+def settle_clock(port: RegisterPort, station: int, label: str) -> Steps[None]:
+    """Let drift compensation bring a slave's clock to the reference's; raises BusError where it does not get there."""
     until = time.monotonic() + _SETTLE_S
-    while time.monotonic() < until:
+    while True:
         shown = port.read(station, _DC_DIFFERENCE, 4)
         if shown is not None and _difference(shown) < _SETTLED_NS:
             return
+        if time.monotonic() >= until:
+            found = "nothing" if shown is None else f"{_difference(shown) / 1000:g} us"
+            raise BusError(
+                f"{label}: its clock is not within {_SETTLED_NS / 1000:g} us of the reference clock's after "
+                f"{_SETTLE_S:g} s (register 0x092C shows {found}); it is set anew"
+            )
         yield
 
 
@@ -141,16 +149,19 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
         BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
     """
     shift = round(device.sync0_shift_us * 1000)
-    port.write(station, DC_ACTIVATE, b"\0")
-    port.write(station, _DC_CYCLIC_UNIT, b"\0")
+    port.put(station, DC_ACTIVATE, b"\0", label)
+    port.put(station, _DC_CYCLIC_UNIT, b"\0", label)
     now = port.read(station, _DC_SYSTEM_TIME, 8)
     if now is None:
         raise BusError(f"{label} stopped answering while its SYNC0 was started")
     begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
-    port.write(station, _DC_START, begin.to_bytes(8, "little"))
-    port.write(station, _DC_CYCLES, struct.pack("<II", period_ns, 0))
+    cycles = struct.pack("<II", period_ns, 0)
+    port.put(station, _DC_START, begin.to_bytes(8, "little"), label)
+    port.put(station, _DC_CYCLES, cycles, label)
+    if port.read(station, _DC_CYCLES, len(cycles)) != cycles:
+        raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
     activation = bytes((device.assign_activate >> 8,))
-    port.write(station, DC_ACTIVATE, activation)
+    port.put(station, DC_ACTIVATE, activation, label)
     if not first_sync_is_ahead(port, station):
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
     if port.read(station, DC_ACTIVATE, 1) != activation:

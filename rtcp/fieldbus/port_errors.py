@@ -16,6 +16,8 @@ from rtcp.fieldbus.registers import Command, RegisterPort
 _COUNTERS, _SIZE = 0x0300, 0x14
 _FORWARDED, _LINKS = 0x08, 0x10
 _PORTS = 4
+_OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + _PORTS), slice(_LINKS, _LINKS + _PORTS)
+"""What is cleared, each with one write; between them are errors of the processing unit, which are nobody's cable."""
 _CLEAR_FROM = 128
 """Counters stop at 255; from here on they are set to 0, which a write of any value does."""
 _SAY_AGAIN_S = 10.0
@@ -71,12 +73,14 @@ class ErrorCounters:
         found, wkc = self._port.exchange(Command.FPRD, station, _COUNTERS, bytes(_SIZE), tries=1)
         if wkc != 1:
             return
-        before, self._last[index] = self._last[index], found
+        before = self._last[index]
         if before is not None and found != before:
             self._add(index, before, found)
-        if max(found) >= _CLEAR_FROM and self._port.write(station, _COUNTERS, bytes(_LINKS - 4)):
-            self._port.write(station, _COUNTERS + _LINKS, bytes(_PORTS))
-            self._last[index] = bytes(_SIZE)
+        for part in (_OF_FRAMES, _OF_LINKS):
+            shown = found[part]
+            if max(shown) >= _CLEAR_FROM and self._port.write(station, _COUNTERS + part.start, bytes(len(shown))):
+                found = found[: part.start] + bytes(len(shown)) + found[part.stop :]
+        self._last[index] = found
 
     def _add(self, index: int, before: bytes, found: bytes) -> None:
         # A counter that shows less than before was set to 0 meanwhile.

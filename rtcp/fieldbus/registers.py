@@ -20,7 +20,8 @@ from rtcp.fieldbus.bus import BusError
 ETHERTYPE = 0x88A4
 FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
 """Datagram indices of this port; those above are the fence's."""
-_INDEX_AT = 17
+_COMMAND_AT, _INDEX_AT, _STATION_AT, _ADDRESS_AT, _LENGTH_AT = 16, 17, 18, 20, 22
+_LENGTH_MASK = 0x07FF
 _DATA_AT = 26
 _SMALLEST_FRAME = 60
 _SO_ATTACH_FILTER = 26
@@ -38,6 +39,10 @@ class Command(IntEnum):
     FPWR = 5
     BRD = 7
     BWR = 8
+
+
+_BY_STATION = (Command.FPRD, Command.FPWR)
+_NOT_TAKEN = "{label} did not take what was written to register 0x{address:04X}"
 
 
 class Answer(NamedTuple):
@@ -85,6 +90,17 @@ def attach_filter(port: socket.socket, first: int, last: int) -> None:
     port.setsockopt(socket.SOL_SOCKET, _SO_ATTACH_FILTER, struct.pack("@HP", 5, ctypes.addressof(buffer)))
 
 
+def _answers(frame: bytes, sent: bytes, length: int) -> bool:
+    """Whether `frame` is what was sent, come back. Indices are used again soon: the index alone does not tell it."""
+    if len(frame) < _DATA_AT + length + 2 or frame[_COMMAND_AT:_STATION_AT] != sent[_COMMAND_AT:_STATION_AT]:
+        return False
+    # Each slave counts up the station field of every command that goes by position or to all of them.
+    kept = _STATION_AT if sent[_COMMAND_AT] in _BY_STATION else _ADDRESS_AT
+    if frame[kept:_LENGTH_AT] != sent[kept:_LENGTH_AT]:
+        return False
+    return int.from_bytes(frame[_LENGTH_AT : _LENGTH_AT + 2], "little") & _LENGTH_MASK == length
+
+
 class RegisterPort:
     """Single datagrams to one slave or to all of them. Its methods may be called from any thread."""
 
@@ -105,21 +121,21 @@ class RegisterPort:
                 frame = build_frame(command, self._index, station, address, data)
                 try:
                     self._socket.send(frame)
-                    answer = self._wait(command, len(data), time.monotonic() + timeout_s)
+                    answer = self._wait(frame, len(data), time.monotonic() + timeout_s)
                 except OSError as error:
                     raise BusError(f"the interface does not take frames any more: {error.strerror}") from error
                 if answer is not None:
                     return answer
         return Answer(b"", -1)
 
-    def _wait(self, command: Command, length: int, deadline: float) -> Answer | None:
+    def _wait(self, sent: bytes, length: int, deadline: float) -> Answer | None:
         while (left := deadline - time.monotonic()) > 0:
             self._socket.settimeout(left)
             try:
                 frame = self._socket.recv(1518)
             except TimeoutError:
                 return None
-            if len(frame) >= _DATA_AT + length + 2 and frame[16] == command and frame[_INDEX_AT] == self._index:
+            if _answers(frame, sent, length):
                 end = _DATA_AT + length
                 return Answer(frame[_DATA_AT:end], int.from_bytes(frame[end : end + 2], "little"))
         return None
@@ -133,6 +149,11 @@ class RegisterPort:
         """Write registers of the slave at configured address `station` (FPWR); return whether it took them."""
         return self.exchange(Command.FPWR, station, address, data).wkc == 1
 
+    def put(self, station: int, address: int, data: bytes, label: str) -> None:
+        """Write registers as `write` does; raises BusError where the slave, named `label`, does not take them."""
+        if not self.write(station, address, data):
+            raise BusError(_NOT_TAKEN.format(label=label, address=address))
+
     def read_at(self, position: int, address: int, length: int) -> bytes | None:
         """Return registers of the slave at `position` on the cable (APRD), which needs no station address for it."""
         data, wkc = self.exchange(Command.APRD, 1 - position & 0xFFFF, address, bytes(length))
@@ -141,6 +162,11 @@ class RegisterPort:
     def write_at(self, position: int, address: int, data: bytes) -> bool:
         """Write registers of the slave at `position` on the cable (APWR); return whether it took them."""
         return self.exchange(Command.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
+
+    def put_at(self, position: int, address: int, data: bytes, label: str) -> None:
+        """Write registers as `write_at` does; raises BusError where the slave, named `label`, does not take them."""
+        if not self.write_at(position, address, data):
+            raise BusError(_NOT_TAKEN.format(label=label, address=address))
 
     def read_all(self, address: int, length: int) -> Answer:
         """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""

@@ -30,7 +30,7 @@ _MAILBOXES = 2
 _FEATURES, _FEATURE_DC, _DELAY = 0x0008, 0x04, 0x0928
 _EEPROM_CONFIG, _EEPROM_CONTROL, _EEPROM_DATA = 0x0500, 0x0502, 0x0508
 _EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
-_SII_VENDOR, _SII_PRODUCT = 0x08, 0x0A
+_SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 _EEPROM_S, _STATE_S = 0.5, 3.0
 
 
@@ -47,10 +47,12 @@ class SetUp:
     """Eight bytes each, status and the slave's own byte left out."""
     delay: bytes | None
     """Propagation delay from the reference clock; None: it has no clock."""
+    serial: int
+    """Serial number in its EEPROM; 0: it has none."""
 
 
-def take_set_up(port: RegisterPort, position: int, name: str) -> SetUp:
-    """Copy a slave's set-up; raises BusError where it does not answer."""
+def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SetUp:
+    """Copy a slave's set-up, `serial` its serial number; raises BusError where it does not answer."""
     station = station_of(position)
     fmmus = port.read(station, _FMMUS, _FMMUS_SIZE)
     managers = port.read(station, _SYNC_MANAGERS, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
@@ -62,6 +64,7 @@ def take_set_up(port: RegisterPort, position: int, name: str) -> SetUp:
         fmmus,
         tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
         port.read(station, _DELAY, 4) if features[0] & _FEATURE_DC else None,
+        serial,
     )
 
 
@@ -104,33 +107,34 @@ class Restorer:
             BusError: it refuses something, or stops answering.
         """
         port, station, config = self._port, station_of(position), self._slaves[position - 1]
-        set_up = self._set_ups[position - 1]
+        set_up, label = self._set_ups[position - 1], self._label(position)
         if lost_address:
             yield from self._identify(position)
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
             # reference clock by its address, and every other slave follows what it says.
-            port.write_at(position, DC_ACTIVATE, b"\0")
+            port.put_at(position, DC_ACTIVATE, b"\0", label)
             others = [other for other in self._clocks if other != position]
-            take_over_time(port, position, self._label(position), set_up.delay, others, always=lost_address)
+            take_over_time(port, position, label, set_up.delay, others, always=lost_address)
         if lost_address:
             self._write_address(position)
         if set_up.delay is not None:
-            forget_drift(port, position)
+            forget_drift(port, position, label)
         yield
         yield from self._lead(position, AlState.INIT)
-        port.write(station, _SYNC_MANAGERS, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT))
-        port.write(station, _FMMUS, bytes(_FMMUS_SIZE))
+        port.put(station, _SYNC_MANAGERS, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
+        port.put(station, _FMMUS, bytes(_FMMUS_SIZE), label)
         self._write_sync_managers(position, range(_MAILBOXES))
-        eeprom_to_device(port, station)
+        if not eeprom_to_device(port, station):
+            raise BusError(f"{label} did not take its EEPROM back")
         yield from self._lead(position, AlState.PREOP)
         yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
         self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
-        port.write(station, _FMMUS, set_up.fmmus)
+        port.put(station, _FMMUS, set_up.fmmus, label)
         if config.device.assign_activate:
             if position != self._clocks[0]:
-                yield from settle_clock(port, station)
-            start_sync(port, station, self._label(position), config.device, self._period_ns)
+                yield from settle_clock(port, station, label)
+            start_sync(port, station, label, config.device, self._period_ns)
         yield
         yield from self._lead(position, AlState.SAFEOP)
 
@@ -147,14 +151,22 @@ class Restorer:
                 f"0x{product:08X}), expected {device.name} (vendor 0x{device.vendor_id:08X}, product "
                 f"0x{device.product_id:08X}): it is left alone; put the right one there"
             )
+        # Two of a kind that were swapped move each other's joint.
+        expected = self._set_ups[position - 1].serial
+        if expected and (serial := (yield from self._reading_eeprom(position, _SII_SERIAL))) != expected:
+            raise ForeignSlave(
+                f"{self._label(position)}: at its place answers another {device.name} (serial number {serial}), "
+                f"expected serial number {expected}: it is left alone; put the right one there, or start anew with "
+                "this one"
+            )
 
     def _reading_eeprom(self, position: int, word: int) -> Steps[int]:
         """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
-        port = self._port
+        port, label = self._port, self._label(position)
         # Taken back from the device by force, as it may have it after power-on.
-        port.write_at(position, _EEPROM_CONFIG, b"\x02")
-        port.write_at(position, _EEPROM_CONFIG, b"\x00")
-        port.write_at(position, _EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word))
+        port.put_at(position, _EEPROM_CONFIG, b"\x02", label)
+        port.put_at(position, _EEPROM_CONFIG, b"\x00", label)
+        port.put_at(position, _EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
         deadline = time.monotonic() + _EEPROM_S
         while True:
             data = port.read_at(position, _EEPROM_CONTROL, 2)
@@ -181,7 +193,7 @@ class Restorer:
             setting = self._set_ups[position - 1].sync_managers[number]
             if any(setting):
                 address = _SYNC_MANAGERS + number * _SYNC_MANAGER_SIZE
-                self._port.write(station_of(position), address, setting)
+                self._port.put(station_of(position), address, setting, self._label(position))
 
     def _lead(self, position: int, state: AlState) -> Steps[None]:
         """Request `state`, acknowledging what error there is, and wait for it; raises BusError."""

@@ -66,9 +66,9 @@ def read_serial(slave: Any) -> int:
     return int.from_bytes(slave.eeprom_read(_SII_SERIAL), "little")
 
 
-def eeprom_to_device(port: RegisterPort, station: int) -> None:
-    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2)."""
-    port.write(station, _EEPROM_CONFIG, b"\x01\x00")
+def eeprom_to_device(port: RegisterPort, station: int) -> bool:
+    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
+    return port.write(station, _EEPROM_CONFIG, b"\x01\x00")
 
 
 def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:

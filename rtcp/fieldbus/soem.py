@@ -66,6 +66,7 @@ class SoemBus:
         self._fence: Fence | None = None
         self._names: list[str] = []
         self._infos: list[MailboxInfo | None] = []
+        self._serials: list[int] = []
         self._boxes: Mailboxes | None = None
         self._restorer: Restorer | None = None
 
@@ -119,11 +120,10 @@ class SoemBus:
             BusError: no slave answers.
         """
         self._discover()
-        serials = [read_serial(slave) for slave in self._master.slaves]
         self._to_preop()
         self._master.config_dc()
         found = [
-            describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], serials[i])
+            describe(slave, self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), self._infos[i], self._serials[i])
             for i, slave in enumerate(self._master.slaves)
         ]
         before = parents([info.ports for info in found])
@@ -166,7 +166,10 @@ class SoemBus:
         self.request_state(AlState.SAFEOP)
         if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
             raise BusError(*refused)
-        set_ups = [take_set_up(self.port, position, config.name) for position, config in enumerate(slaves, 1)]
+        set_ups = [
+            take_set_up(self.port, position, config.name, serial)
+            for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
+        ]
         self._restorer = Restorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
         return data
 
@@ -179,6 +182,7 @@ class SoemBus:
         found = self._master.slaves
         self._names = [name_of(slave) for slave in found]
         self._infos = [read_mailbox(slave) for slave in found]
+        self._serials = [read_serial(slave) for slave in found]
         self._boxes = Mailboxes(self.port, self._names, self._infos)
         for position in range(1, len(found) + 1):
             eeprom_to_device(self.port, station_of(position))

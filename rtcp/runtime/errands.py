@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rtcp.fieldbus.bus import BusError, WatchedBus
+from rtcp.fieldbus.bus import BusError, SdoAborted, WatchedBus
 from rtcp.fieldbus.emergency import error_words
 from rtcp.fieldbus.steps import Steps
 from rtcp.runtime.blackboard import Blackboard
@@ -37,6 +37,11 @@ class Errands:
         self._asked_at = 0.0
         self._explaining: Steps[None] | None = None
 
+    @property
+    def explaining(self) -> bool:
+        """Whether the error code of a drive is still being read."""
+        return self._explaining is not None
+
     def explain(self, name: str, position: int) -> None:
         """Read the error code of the drive at `position` and say it."""
         self._explaining = self._explanation(name, position)
@@ -52,7 +57,7 @@ class Errands:
             elif until - self._asked_at > _LONGEST_S:
                 self._answering.close()
                 self._answering = None
-                self._reply({"error": f"the slave takes longer than {_LONGEST_S:g} s for its answer"})
+                self._reply(_error("timeout", f"the slave takes longer than {_LONGEST_S:g} s for its answer"))
         if self._explaining is not None:
             try:
                 ended = _follow(self._explaining, until, lambda nothing: None)
@@ -73,17 +78,20 @@ class Errands:
         try:
             request = json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
             return (yield from self._serve(request))
+        except SdoAborted as error:
+            return _error("refused", str(error))
         except BusError as error:
-            return {"error": "; ".join(error.sentences)}
+            return _error("timeout", "; ".join(error.sentences))
         except Exception as error:
             # Whatever is wrong with a request, it must not end the thread that watches the slaves.
-            return {"error": f"the request is not of the service's form: {type(error).__name__} {error}"}
+            return _error("invalid", f"the request is not of the service's form: {type(error).__name__} {error}")
 
     def _reply(self, answer: dict[str, Any]) -> None:
         memory, words = self._blackboard.memory, self._blackboard.words
         text = json.dumps(answer).encode()
         if len(text) > SERVICE_TEXT_SIZE:
-            text = json.dumps({"error": f"the answer is {len(text)} bytes long, {SERVICE_TEXT_SIZE} fit"}).encode()
+            sentence = f"the answer is {len(text)} bytes long, {SERVICE_TEXT_SIZE} fit"
+            text = json.dumps(_error("refused", sentence)).encode()
         memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
         words[SERVICE_LENGTH_AT] = len(text)
         words.fence()
@@ -92,14 +100,23 @@ class Errands:
     def _serve(self, request: dict[str, Any]) -> Steps[dict[str, Any]]:
         position, index, subindex = int(request["slave"]), int(request["index"]), int(request["subindex"])
         if not (0 <= index <= 0xFFFF and 0 <= subindex <= 0xFF):
-            raise BusError(f"object {index}:{subindex} does not exist: index 0 to 65535, subindex 0 to 255")
+            return _error("invalid", f"object {index}:{subindex} does not exist: index 0 to 65535, subindex 0 to 255")
+        try:
+            objects = self._bus.sdo(position)
+        except BusError as error:
+            return _error("invalid", str(error))
         if request["do"] == "sdo_read":
-            data = yield from self._bus.sdo(position).reading(index, subindex)
+            data = yield from objects.reading(index, subindex)
             return {"hex": data.hex()}
         if request["do"] == "sdo_write":
-            yield from self._bus.sdo(position).writing(index, subindex, bytes.fromhex(request["hex"]))
+            yield from objects.writing(index, subindex, bytes.fromhex(request["hex"]))
             return {}
         raise ValueError(f"{request['do']!r} is neither sdo_read nor sdo_write")
+
+
+def _error(kind: str, sentence: str) -> dict[str, Any]:
+    """Return an answer that is none: `kind` as the control socket has it."""
+    return {"error": sentence, "kind": kind}
 
 
 def _follow(steps: Steps[Any], until: float, done: Callable[[Any], None]) -> bool:

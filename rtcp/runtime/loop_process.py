@@ -26,6 +26,7 @@ from rtcp.fieldbus.soem import SoemBus
 from rtcp.realtime import scheduling
 from rtcp.runtime.assembly import assemble, discipline_of, position_of
 from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.ending import LEFT, write_end
 from rtcp.runtime.paths import blackboard_file
 from rtcp.runtime.service import Service
 from rtcp.runtime.session import Session, SessionError, read_session
@@ -58,7 +59,11 @@ class Report:
 
 
 def main() -> int:
-    """Run the loop's process; return 0 after an orderly end, 2 where the bus refused, 1 after a defect of ours."""
+    """Run the loop's process.
+
+    Return 0 after an orderly end, `LEFT` where slaves did not come to INIT then, 2 where the bus refused, 1 after a
+    defect of ours.
+    """
     parser = argparse.ArgumentParser(prog="rtcp.runtime.loop_process")
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--ready-fd", type=int, required=True)
@@ -75,6 +80,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     fraction = session.config.bus.receive_fraction
     bus = SoemBus(session.interface, fraction, namespace_pid=session.segment_pid or None)
+    left: list[str] = []
     try:
         bus.open()
         _work(bus, session, given.directory, report)
@@ -84,8 +90,12 @@ def main() -> int:
         sys.stderr.write("\n".join(sentences) + "\n")
         return 2
     finally:
+        before = len(bus.notes)
         bus.close()
-    return 0
+        left += bus.notes[before:]
+        write_end(given.directory, os.getpid(), left)
+        sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
+    return LEFT if left else 0
 
 
 def _leave(number: int, frame: FrameType | None) -> None:
@@ -135,6 +145,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         report.close()
 
     service.on_op = started
+    service.clock_followed = lambda: discipline is None or discipline.locked
     service.on_refused = loop.shut_down
     service.start()
     signal.signal(signal.SIGTERM, lambda number, frame: loop.shut_down())

@@ -6,7 +6,6 @@ It shares a few plain attributes with the cycle (one writer each) and never hold
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 
 from rtcp.fieldbus.alstatus import AlState
@@ -15,16 +14,22 @@ from rtcp.fieldbus.watcher import Watcher
 from rtcp.realtime.scheduling import thread_beside
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.errands import Errands
+from rtcp.runtime.rationed import Rationed
 
 _TELL_S = 0.1
 """Slave states and counters go to the blackboard, and emergencies are looked for, so often."""
 _LOCK_S = 15.0
-_SAY_AGAIN_S = 10.0
+_MOST_COMPLAINTS, _MOST_EMERGENCIES = 8, 4
+"""So many different sentences are said in 10 s: of all that failed, and of each slave's emergencies."""
 _ERROR_BIT = 0x10
 
 
 def _nothing() -> None:
     pass
+
+
+def _always() -> bool:
+    return True
 
 
 class Service(threading.Thread):
@@ -65,12 +70,12 @@ class Service(threading.Thread):
         self._watch_s = watch_s
         self._tell_turns = max(round(_TELL_S / watch_s), 1)
         self._op_wanted = False
-        self._recovery_wanted = False
-        self._park_wanted = False
-        self._parked = False
-        self._explain = -1
-        self._complaint: tuple[str, ...] = ()
-        self._complained_at = 0.0
+        self._asked = 0
+        """What the cycle asked last, counted up: odd to park, even to recover."""
+        self._done = 0
+        self._explain = [False] * len(joint_names)
+        self._complaints = Rationed(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
+        self._emergencies: dict[int, Rationed] = {}
         self._end = threading.Event()
         self.all_op = False
         """Whether every slave is in OP, and was since the start or the last `recover`; read by the cycle."""
@@ -78,6 +83,8 @@ class Service(threading.Thread):
         """Position of a slave that has left OP; 0: none. It stays until `recover`, however soon the slave is back."""
         self.refused: tuple[str, ...] = ()
         """Why OP was not reached at the start; the cycle then ends."""
+        self.clock_followed: Callable[[], bool] = _always
+        """Whether the cycle follows the reference clock; slaves that were lost wait in SAFE-OP for it."""
         self.on_op: Callable[[], None] = _nothing
         """Called once, from this thread, when all slaves are in OP for the first time."""
         self.on_refused: Callable[[], None] = _nothing
@@ -90,18 +97,18 @@ class Service(threading.Thread):
         self._op_wanted = True
 
     def recover(self) -> None:
-        """Ask for the slaves that left OP to be brought back."""
+        """Ask for the slaves that left OP to be brought back; of this and `park` the last one counts."""
+        self._asked = (self._asked | 1) + 1
         self.all_op = False
-        self._recovery_wanted = True
 
     def park(self) -> None:
         """Ask for all slaves to be taken to PRE-OP, as an emergency stop ends; `recover` brings them back."""
+        self._asked = (self._asked + 1) | 1
         self.all_op = False
-        self._park_wanted = True
 
     def explain_drive(self, axis: int) -> None:
-        """Ask for the drive's error code to be read and put into words."""
-        self._explain = axis
+        """Ask for the drive's error code to be read and put into words; several drives may fail at once."""
+        self._explain[axis] = True
 
     def finish(self) -> None:
         """End the thread and wait for it."""
@@ -133,15 +140,15 @@ class Service(threading.Thread):
                     part(turn)
                 except BusError as error:
                     self._complain(error)
-        self._tell_states(self._bus.read_states())
+        try:
+            self._tell_states(self._bus.read_states())
+        except BusError as error:
+            self._complain(error)
 
     def _complain(self, error: BusError) -> None:
         """Say what failed; what fails again in every turn, as where the interface is gone, is said now and then."""
-        now = time.monotonic()
-        if error.sentences != self._complaint or now - self._complained_at > _SAY_AGAIN_S:
-            self._complaint, self._complained_at = error.sentences, now
-            for sentence in error.sentences:
-                self._blackboard.text(sentence)
+        for sentence in error.sentences:
+            self._complaints.say(sentence)
 
     def _watch(self, turn: int) -> None:
         watcher = self._watcher
@@ -149,23 +156,29 @@ class Service(threading.Thread):
             if not self.refused:
                 self._start(turn)
             return
-        if self._park_wanted:
-            self._park_wanted = False
-            self._parked = True
+        asked = self._asked
+        parked = asked & 1 == 1
+        if asked != self._done:
+            self._done = asked
             self.all_op = False
-            watcher.park()
-        if self._recovery_wanted:
-            self._recovery_wanted = False
-            self._parked = False
-            self.lost_slave = 0
-            watcher.resume()
+            if parked:
+                watcher.park()
+            else:
+                self.lost_slave = 0
+                # After a reset the next fault is told whole, however soon it comes.
+                self._emergencies.clear()
+                watcher.resume()
+        watcher.op_allowed = self.clock_followed()
         was_well = watcher.all_op
         left = watcher.turn()
         if left and self.all_op:
             self.lost_slave = left
             self.all_op = False
-        elif watcher.all_op and not (self.lost_slave or self._parked or self._recovery_wanted or self._park_wanted):
+        elif watcher.all_op and not (self.lost_slave or parked):
             self.all_op = True
+        if self._asked != asked:
+            # The cycle asked meanwhile: what was seen was before that.
+            self.all_op = False
         if turn % self._tell_turns == 0 or not (was_well and watcher.all_op):
             self._tell_health(watcher)
 
@@ -189,15 +202,25 @@ class Service(threading.Thread):
             self.on_refused()
 
     def _run_errands(self, turn: int) -> None:
-        if self._explain >= 0:
-            axis, self._explain = self._explain, -1
+        if True in self._explain and not self._errands.explaining:
+            axis = self._explain.index(True)
+            self._explain[axis] = False
             self._errands.explain(self._joint_names[axis], self._drive_positions[axis])
         self._errands.take_steps()
 
     def _listen(self, turn: int) -> None:
-        if turn % self._tell_turns == 0 and not (self._watcher is not None and self._watcher.silent):
-            for emergency in self._bus.emergencies():
-                self._blackboard.text(emergency.sentence())
+        if turn % self._tell_turns:
+            return
+        for rationed in (self._complaints, *self._emergencies.values()):
+            rationed.tell()
+        if self._watcher is not None and self._watcher.silent:
+            return
+        for emergency in self._bus.emergencies():
+            position = emergency.position
+            if position not in self._emergencies:
+                what = f"emergency messages of slave {position}"
+                self._emergencies[position] = Rationed(self._blackboard.text, _MOST_EMERGENCIES, what)
+            self._emergencies[position].say(emergency.sentence())
 
     def _tell_states(self, states: Sequence[SlaveState]) -> None:
         for slave in states:

@@ -9,40 +9,25 @@ import pytest
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import port_errors
 from rtcp.fieldbus.port_errors import ErrorCounters
-from rtcp.fieldbus.registers import Answer, Command, RegisterPort, build_frame
-from rtcp.virtual.segment import Segment
+from rtcp.fieldbus.registers import Command
 from rtcp.virtual.server import make_segment
+from tests.fieldbus.direct import Direct
 
 NAMES = ("io", "drive1", "drive2")
 MODELS = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
 
 
-class Direct(RegisterPort):
-    """A port whose frames reach the slaves without a socket."""
-
-    def __init__(self, segment: Segment) -> None:
-        self._segment = segment
-
-    def exchange(
-        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
-    ) -> Answer:  # fmt: skip
-        frame = bytearray(build_frame(command, 0x80, station, address, data))
-        self._segment.process(frame, len(frame), 1)
-        end = 26 + len(data)
-        return Answer(bytes(frame[26:end]), int.from_bytes(frame[end : end + 2], "little"))
-
-
 class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.segment = make_segment(SegmentConfig(tuple(SegmentSlave(model=model) for model in MODELS), Path()), 0)
-        port = Direct(self.segment)
+        self.port = Direct(self.segment)
         for position, slave in enumerate(self.segment.slaves, 1):
             slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), 0)
         self.now = 100.0
         monkeypatch.setattr(port_errors.time, "monotonic", lambda: self.now)
         self.said: list[str] = []
         self.set(2, 0, 7)
-        self.counters = ErrorCounters(port, NAMES, self.said.append)
+        self.counters = ErrorCounters(self.port, NAMES, self.said.append)
 
     def set(self, position: int, register: int, value: int) -> None:
         self.segment.slaves[position - 1].esc.memory[0x0300 + register] = value
@@ -131,3 +116,36 @@ def test_a_slave_that_was_without_supply_counts_from_zero(bench: Bench) -> None:
     bench.set(2, 0, 3)
     bench.round()
     assert bench.counters.of[1].rx == 93 + 3
+
+
+def test_errors_that_are_no_cables_are_not_cleared_for_ever(bench: Bench) -> None:
+    bench.set(2, 0x0D, 200)
+    bench.set(2, 0x00, 9)
+    bench.round()
+    assert (bench.get(2, 0x0D), bench.get(2, 0x00)) == (200, 9)
+    assert bench.counters.of[1].rx == 2
+
+
+def test_links_whose_clearing_got_lost_are_not_counted_twice(bench: Bench) -> None:
+    bench.port.lost = {(Command.FPWR, 0x0310)}
+    bench.set(2, 0x00, 130)
+    for _ in range(3):
+        # Not all slave controllers clear the links with the first write.
+        bench.set(2, 0x11, 200)
+        bench.round()
+    assert (bench.counters.of[1].rx, bench.counters.of[1].links) == (123, 200)
+    bench.port.lost.clear()
+    bench.round()
+    bench.set(2, 0x11, 3)
+    bench.round()
+    assert bench.counters.of[1].links == 203
+
+
+def test_a_cable_that_damages_frames_on_their_way_back_is_the_one_that_is_named(bench: Bench) -> None:
+    # Who is before the cable hears them first, at the port that looks away from the master; the others forward them.
+    bench.set(2, 0x02, 4)
+    bench.set(2, 0x03, 4)
+    bench.set(1, 0x09, 4)
+    (sentence,) = bench.round()
+    assert sentence.startswith("errors enter between slave 2 (drive1) and slave 3 (drive2): 4 damaged frames since ")
+    assert [(one.rx, one.forwarded) for one in bench.counters.of] == [(0, 4), (4, 0), (0, 0)]

@@ -112,22 +112,25 @@ class Watched:
     def registers(self) -> list[dict[str, str]]:
         return [registers(self.bus, position) for position in range(1, self.count + 1)]
 
-    def strange_watcher(self, position: int, say: Any) -> Watcher:
-        """Return a watcher that expects another device at `position`."""
-        other = replace(self.slaves[position - 1].device, product_id=0x4711)
+    def strange_watcher(self, position: int, say: Any, serial: int) -> Watcher:
+        """Return a watcher that expects another device at `position`, or where `serial` is not 0 one of its kind."""
+        own = self.slaves[position - 1].device
+        other = own if serial else replace(own, product_id=0x4711)
         changed = [replace(one, device=other) if at == position else one for at, one in enumerate(self.slaves, 1)]
-        set_ups = [take_set_up(self.bus.port, at, one.name) for at, one in enumerate(self.slaves, 1)]
+        set_ups = [take_set_up(self.bus.port, at, one.name, serial) for at, one in enumerate(self.slaves, 1)]
         restorer = Restorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
         return Watcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
 
-    def episode(self, faults: list[dict[str, Any]], act: Any = None, foreign: int = 0) -> dict[str, Any]:
+    def episode(
+        self, faults: list[dict[str, Any]], act: Any = None, foreign: int = 0, serial: int = 0
+    ) -> dict[str, Any]:  # fmt: skip
         """Let the faults begin, watch until every slave is in OP again and tell what came of it.
 
         `act` is done with the watching meanwhile and may return something to be told; `foreign` is the position at
-        which another device is expected.
+        which another device is expected, or one of the same kind with the number `serial`.
         """
         said: list[str] = []
-        watcher = self.strange_watcher(foreign, said.append) if foreign else self.bus.watcher(said.append)
+        watcher = self.strange_watcher(foreign, said.append, serial) if foreign else self.bus.watcher(said.append)
         watching = Watching(watcher)
 
         def watch() -> dict[str, Any]:
@@ -227,6 +230,9 @@ def episodes(bus: SoemBus, count: int, control: str) -> Any:
                 one.read_beside,
             ),
             "foreign": one.episode([{"fault": "power", "slave": 3, "lasts": 0.05}], one.leave_alone, foreign=3),
+            "swapped": one.episode(
+                [{"fault": "power", "slave": 3, "lasts": 0.05}], one.leave_alone, foreign=3, serial=0x4711
+            ),
             "parked": one.episode([], one.park),
             "damage": one.episode([], one.count_damage),
             "link": one.episode([{"fault": "cable", "after": 2, "lasts": 0.05}], one.count_links),

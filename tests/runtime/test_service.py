@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import BusError, SlaveState
 from rtcp.fieldbus.charges import Charge
+from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.port_errors import PortErrors
 from rtcp.fieldbus.steps import Steps
 from rtcp.runtime.blackboard import Blackboard
@@ -34,9 +36,13 @@ class Watching:
         self.turns = 0
         self.resumed = 0
         self.gone = False
+        self.op_allowed = True
+        self.hold: Callable[[], None] | None = None
 
     def turn(self) -> int:
         self.turns += 1
+        if self.hold is not None:
+            self.hold()
         if self.gone:
             raise BusError("the interface does not take frames any more")
         left, self.left = self.left, 0
@@ -56,6 +62,8 @@ class Bus:
     def __init__(self) -> None:
         self.watching = Watching()
         self.patience = 0
+        self.waiting: list[Emergency] = []
+        self.read_state: Callable[[], tuple[SlaveState, ...]] = tuple
 
     def request_state(self, state: AlState) -> None:
         pass
@@ -64,10 +72,10 @@ class Bus:
         return ()
 
     def read_states(self) -> tuple[SlaveState, ...]:
-        return ()
+        return self.read_state()
 
-    def emergencies(self) -> tuple[Any, ...]:
-        return ()
+    def emergencies(self) -> tuple[Emergency, ...]:
+        return tuple(self.waiting)
 
     def watcher(self, say: Callable[[str], None]) -> Watching:
         return self.watching
@@ -81,6 +89,9 @@ class Bus:
             yield
         return b"\x2a"
 
+    def reading_int(self, index: int, subindex: int) -> Steps[int]:
+        return int.from_bytes((yield from self.reading(index, subindex)), "little")
+
 
 @pytest.fixture
 def bus() -> Bus:
@@ -89,7 +100,7 @@ def bus() -> Bus:
 
 @pytest.fixture
 def service(bus: Bus, board: Blackboard) -> Iterator[Service]:
-    made = Service(bus, board, [2], ["joint1"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
+    made = Service(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
     made.want_op()
     made.start()
     until(lambda: made.all_op)
@@ -109,6 +120,20 @@ def until(met: Callable[[], bool]) -> None:
     while not met():
         assert time.monotonic() < end
         time.sleep(0.0005)
+
+
+def hold_turn(bus: Bus) -> threading.Event:
+    """Hold the watcher in the middle of a turn until the event is set."""
+    held, inside = threading.Event(), threading.Event()
+
+    def hold() -> None:
+        bus.watching.hold = None
+        inside.set()
+        held.wait(20)
+
+    bus.watching.hold = hold
+    assert inside.wait(20)
+    return held
 
 
 def turns(bus: Bus, count: int = 20) -> None:
@@ -150,6 +175,40 @@ def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, se
     assert not service.all_op
     service.recover()
     until(lambda: service.all_op)
+
+
+def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: Bus, service: Service) -> None:
+    for asked, parked in (
+        (("park",), True),
+        (("recover", "park"), True),
+        (("park", "recover"), False),
+        (("recover", "park", "recover", "park"), True),
+        (("recover",), False),
+    ):
+        held = hold_turn(bus)
+        for name in asked:
+            getattr(service, name)()
+        held.set()
+        turns(bus)
+        assert (bus.watching.parked, service.all_op) == (parked, not parked), asked
+
+
+def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_success(bus: Bus, service: Service) -> None:
+    # Asked while the watcher is looking: it saw slaves in OP, and they are not when it has brought them back.
+    bus.watching.resume = lambda: setattr(bus.watching, "all_op", False)  # type: ignore[method-assign]
+    held = hold_turn(bus)
+    service.recover()
+    held.set()
+    seen = []
+    until(lambda: seen.append(service.all_op) or len(seen) > 50)  # type: ignore[func-returns-value]
+    assert True not in seen
+
+
+def test_slaves_are_not_asked_for_op_while_the_clock_is_not_followed(bus: Bus, service: Service) -> None:
+    for followed in (False, True):
+        service.clock_followed = lambda followed=followed: followed  # type: ignore[misc]
+        turns(bus, 2)
+        assert bus.watching.op_allowed is followed
 
 
 def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
@@ -204,3 +263,62 @@ def test_an_interface_that_is_gone_is_said_once_and_not_in_every_turn(
     said = [text.sentence for text in observer.texts_since(0)]
     assert said == ["the interface does not take frames any more"]
     assert service.is_alive()
+
+
+def gone() -> tuple[SlaveState, ...]:
+    raise BusError("the interface does not take frames any more")
+
+
+def sentences(observer: Observer) -> list[str]:
+    return [text.sentence for text in observer.texts_since(0)]
+
+
+def test_an_end_without_the_interface_is_no_defect(bus: Bus, service: Service, observer: Observer) -> None:
+    bus.read_state = gone
+    service.finish()
+    assert (service.refused, sentences(observer)) == ((), ["the interface does not take frames any more"])
+
+
+def test_two_failures_that_take_turns_are_said_once_each(bus: Bus, service: Service, observer: Observer) -> None:
+    def alternate() -> None:
+        bus.watching.gone = False
+        raise BusError(f"failure {bus.watching.turns % 2}")
+
+    bus.watching.hold = alternate
+    turns(bus, 100)
+    assert sorted(sentences(observer)) == ["failure 0", "failure 1"]
+
+
+def test_emergencies_of_one_slave_without_an_end_leave_room_for_those_of_another(
+    bus: Bus, service: Service, observer: Observer
+) -> None:
+    bus.waiting = [Emergency(1, "io", code, 0, bytes(5)) for code in (0x1000, *range(0x5000, 0x5030))]
+    bus.waiting += [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
+    turns(bus, 500)
+    said = sentences(observer)
+    assert [sum(sentence.startswith(f"slave {position} ") for sentence in said) for position in (1, 2)] == [4, 1]
+    assert len(said) == 5
+
+
+def test_an_emergency_that_comes_again_after_a_reset_is_said_again(
+    bus: Bus, service: Service, observer: Observer
+) -> None:
+    bus.waiting = [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
+    for _ in range(2):
+        turns(bus, 300)
+        service.recover()
+        turns(bus)
+    bus.waiting = []
+    turns(bus, 200)
+    assert 2 <= len(sentences(observer)) <= 3
+    assert len(set(sentences(observer))) == 1
+
+
+def test_drives_that_fail_together_are_all_explained(bus: Bus, service: Service, observer: Observer) -> None:
+    bus.patience = 10
+    held = hold_turn(bus)
+    service.explain_drive(1)
+    service.explain_drive(0)
+    held.set()
+    until(lambda: len(sentences(observer)) == 2)
+    assert [sentence.partition(":")[0] for sentence in sentences(observer)] == ["joint1 (slave 2)", "joint2 (slave 3)"]

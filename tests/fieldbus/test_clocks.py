@@ -1,0 +1,71 @@
+"""The clock of a slave that is set up again: what is lost or not kept ends the attempt, it does not pass unseen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rtcp.config.segment import SegmentConfig, SegmentSlave
+from rtcp.fieldbus import clocks
+from rtcp.fieldbus.bus import BusError
+from rtcp.fieldbus.clocks import settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.registers import Command
+from rtcp.fieldbus.steps import finish
+from rtcp.virtual.server import make_segment
+from tests.fieldbus.direct import Direct
+from tests.fieldbus.master_child import arm
+
+LABEL, STATION = "slave 3 (drive2)", 0x1003
+PERIOD = 1_000_000
+
+
+@pytest.fixture
+def port() -> Direct:
+    """An IO box and two drives that have their addresses."""
+    models = ("diewu-io", "cubemars-orh70", "cubemars-orh70")
+    segment = make_segment(SegmentConfig(tuple(SegmentSlave(model=model) for model in models), Path()), 0)
+    for position, slave in enumerate(segment.slaves, 1):
+        slave.esc.write(0x0010, (0x1000 + position).to_bytes(2, "little"), 0)
+    return Direct(segment)
+
+
+def test_a_clock_that_does_not_get_to_the_references_ends_the_set_up(
+    port: Direct, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clocks, "_SETTLE_S", 0.02)
+    monkeypatch.setattr(port, "read", lambda station, address, length: (0x8000_0000 + 1_250_000).to_bytes(4, "little"))
+    with pytest.raises(BusError, match=r"slave 3 \(drive2\): its clock is not within 2 us .* 0x092C shows 1250 us"):
+        finish(settle_clock(port, STATION, LABEL))
+
+
+def test_a_clock_that_has_settled_at_last_is_believed(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = iter((90_000, 5_000, 1_999))
+    monkeypatch.setattr(port, "read", lambda station, address, length: next(shown).to_bytes(4, "little"))
+    finish(settle_clock(port, STATION, LABEL))
+    assert list(shown) == []
+
+
+def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Direct) -> None:
+    port.lost = {(Command.BWR, 0x0900)}
+    before = port.read(STATION, 0x0920, 8)
+    with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
+        take_over_time(port, 3, LABEL, bytes(4), (1, 2), always=True)
+    assert port.read(STATION, 0x0920, 8) == before
+
+
+@pytest.mark.parametrize("register", [0x0981, 0x0980, 0x0990, 0x09A0])
+def test_sync0_is_not_started_with_half_of_its_settings(port: Direct, register: int) -> None:
+    port.lost = {(Command.FPWR, register)}
+    with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* 0x{register:04X}"):
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+    assert port.read(STATION, 0x0981, 1) == b"\0"
+
+
+def test_a_cycle_of_sync0_that_is_not_kept_is_told(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    # One that writes nothing: the slave answers and keeps what it had, a single SYNC0.
+    put = port.put
+    monkeypatch.setattr(port, "put", lambda station, address, *rest: address == 0x09A0 or put(station, address, *rest))
+    with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us \(register 0x09A0\)"):
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+    assert port.read(STATION, 0x0981, 1) == b"\0"
