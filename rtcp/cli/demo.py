@@ -17,7 +17,7 @@ from rtcp.cli.connection import connect
 from rtcp.cli.launch import launch, refuse_a_second_platform
 from rtcp.cli.motion import arrival, move
 from rtcp.cli.options import BusName, ConfigFile
-from rtcp.cli.outcome import CommandError, ExitCode, interruption_code, orderly_signals
+from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import report, show
 from rtcp.runtime import offline
 from rtcp.runtime.client import ControlClient
@@ -35,7 +35,7 @@ POSES = ((1, -1, 1, 1, -1, 1), (-1, 1, 1, -1, 1, -1), (1, 1, -1, 1, 1, 1), (-1, 
 MARGIN = 0.05
 """Part of a joint's range that the demo keeps away from each end."""
 
-ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *SUSPENDING)
 LOCK_TIMEOUT_S = 10.0
 LONGEST_S = 3600.0
 
@@ -72,7 +72,7 @@ def _demo(
 
     options = StartOptions(config=config, bus=bus, mode="csp")
     try:
-        with orderly_signals(), _platform(options) as started_s, connect("demo") as client:
+        with orderly_signals(*SUSPENDING), _platform(options) as started_s, connect("demo") as client:
             status, mean_ns = _run(client, arm.joints, seconds, drive)
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: the platform has been stopped", interruption_code(interruption)) from None
@@ -170,8 +170,9 @@ def _platform(options: StartOptions) -> Iterator[float]:
     finally:
         kept = {number: signal.signal(number, signal.SIG_IGN) for number in ENDING_SIGNALS}
         try:
-            running.stop()
+            left = running.stop(report)
         finally:
             for number, handler in kept.items():
                 signal.signal(number, handler)
-        report("stopped")
+        if not left:
+            report("stopped")

@@ -74,7 +74,12 @@ def _show(
         from rtcp.cli.faults_plot import draw
 
         told["picture"] = str(out := _place(plot, path))
-        draw(recording, out)
+        try:
+            draw(recording, out)
+        except OSError as error:
+            option, code = ("", ExitCode.FAULT) if plot is None else ("--plot ", ExitCode.USAGE)
+            why = f"{option}{out}: the picture cannot be written there: {error.strerror or error}"
+            raise CommandError(why, code) from error
     if as_json:
         emit_json(told)
         return
@@ -90,7 +95,7 @@ def _listed() -> list[Listed]:
     try:
         return listed(faults_directory())
     except RecordingError as error:
-        raise CommandError(str(error), ExitCode.INTERNAL) from error
+        raise CommandError(str(error), ExitCode.FAULT) from error
 
 
 def _path(number: int) -> Path:
@@ -105,7 +110,7 @@ def _path(number: int) -> Path:
     try:
         there = dict(files(directory))
     except RecordingError as error:
-        raise CommandError(str(error), ExitCode.INTERNAL) from error
+        raise CommandError(str(error), ExitCode.FAULT) from error
     if number in there:
         return there[number]
     which = f"recorded: {_spans(sorted(there))}" if there else f"none has been recorded{_elsewhere()}"

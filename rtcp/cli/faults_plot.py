@@ -44,7 +44,9 @@ def draw(recording: Recording, out: Path) -> None:
     figure = Figure(figsize=(13.0, height))
     figure.text(0.065, 1 - 0.3 / height, f"fault {about.number}: {_short(about.what)}", fontsize=13, weight="bold")
     below = f"{about.when:%Y-%m-%d %H:%M:%S}, {about.arm} on {about.bus}, every {about.period_ns / 1000:g} us"
-    figure.text(0.065, 1 - 0.55 / height, f"{below}, {about.before} before; targets dashed", fontsize=10)
+    figure.text(
+        0.065, 1 - 0.55 / height, f"{below}, {about.before} before; targets dashed; gaps: not heard", fontsize=10
+    )
     grid = figure.add_gridspec(
         len(_ROWS), 2, height_ratios=tuple(_ROWS.values()), width_ratios=(2, 1), hspace=0.09, wspace=0.07,
         left=0.065, right=0.88, top=1 - 0.95 / height, bottom=(0.8 + _LINE * rows) / height,
@@ -86,10 +88,12 @@ def _save(figure: Figure, out: Path) -> None:
 def _curves(axes: Sequence[Any], recording: Recording, begin: float, end: float) -> None:
     records, times = recording.records, seconds(recording)
     where, speed, counter, lost = axes
+    # What a drive says is taken over only with the right working counter: else the last of it would be drawn on.
+    heard = records["lost"] == 0
     for at, name in enumerate(recording.about.joints):
-        where.plot(times, records["position"][:, at], color=COLOURS[at], lw=1.3, label=name)
+        where.plot(times, np.where(heard, records["position"][:, at], np.nan), color=COLOURS[at], lw=1.3, label=name)
         where.plot(times, records["target"][:, at], color=COLOURS[at], lw=1.1, ls=(0, (4, 3)))
-        speed.plot(times, records["velocity"][:, at], color=COLOURS[at], lw=1.0)
+        speed.plot(times, np.where(heard, records["velocity"][:, at], np.nan), color=COLOURS[at], lw=1.0)
     counter.plot(times, records["wkc"], color=COLOURS[0], lw=1.1, drawstyle="steps-post", label="found")
     counter.plot(times, records["wkc_expected"], color="black", lw=0.9, ls=":", label="expected")
     lost.plot(times, records["lost"], color=COLOURS[3], lw=1.1, drawstyle="steps-post", label="in a row")

@@ -21,9 +21,9 @@ def table(found: Sequence[Listed]) -> RenderableType:
     rows = Table(box=box.SIMPLE_HEAD, show_edge=False, expand=True, padding=(0, 1))
     rows.add_column("#", justify="right")
     rows.add_column("time", no_wrap=True)
-    rows.add_column("what", ratio=1, no_wrap=True, overflow="ellipsis")
+    rows.add_column("what", ratio=1)
     rows.add_column("before", no_wrap=True)
-    rows.add_column("duration", justify="right", no_wrap=True)
+    rows.add_column("recorded", justify="right", no_wrap=True)
     below: list[RenderableType] = []
     for one in found:
         if one.about is None:

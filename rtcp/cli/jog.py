@@ -7,16 +7,17 @@ import re
 import sys
 import time
 from collections.abc import Callable
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from rtcp.cli.connection import connect
 from rtcp.cli.keys import ESCAPE, HeldKey, Keys
 from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, positive, refuse_options
-from rtcp.cli.outcome import CommandError
+from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
+from rtcp.cli.renewal import Renewal
 from rtcp.config.plain_number import plain_number
 from rtcp.runtime.client import ControlClient
 
@@ -24,11 +25,13 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 TURN_S = 0.05
 """So often a jog is said again."""
 HOLD_S = 0.25
-"""So long it counts: a client that is stopped or cut off moves the arm no longer than that."""
+"""So long it counts: a client that is stopped or cut off moves the arm no longer than that, and never again."""
 LONGEST_S = 60.0
 BACKWARDS = ("down", "left", "-")
 QUITS = ("q", ESCAPE, "\x04")
 _JOINT = re.compile(r"joint([1-9]\d?)")
+Say = Callable[[float, float], None]
+"""Says the jog: its direction, and when that was wanted, s of CLOCK_MONOTONIC."""
 
 
 def register(app: typer.Typer) -> None:
@@ -60,10 +63,11 @@ def _jog(
         if at >= count:
             raise CommandError(f"{axis} does not exist: joint1 to joint{count}")
 
-        def say(direction: float) -> dict[str, Any]:
+        def say(direction: float, now: float) -> None:
             speeds = [0.0] * count
             speeds[at] = direction * wanted
-            return client.call("jog", {"v": speeds, "frame": "joints" if joints else frame, "hold_s": HOLD_S})
+            arguments = {"v": speeds, "frame": "joints" if joints else frame, "hold_s": HOLD_S, "t": now}
+            client.call("jog", arguments)
 
         if seconds is not None:
             _for_a_time(client, say, seconds)
@@ -73,16 +77,26 @@ def _jog(
         _show_end(client)
 
 
-def _for_a_time(client: ControlClient, say: Callable[[float], object], seconds: float) -> None:
+def _for_a_time(client: ControlClient, say: Say, seconds: float) -> None:
     until = time.monotonic() + seconds
-    while (now := time.monotonic()) < until:
-        say(1.0)
+    renewal = Renewal(HOLD_S)
+    while True:
+        now = time.monotonic()
+        if missed := renewal.missed(now):
+            client.call("halt")
+            raise CommandError(
+                f"the jog was not said again for {missed:.1f} s: the arm had stopped, and stays so", ExitCode.FAULT
+            )
+        if now >= until:
+            break
+        say(1.0, now)
         time.sleep(max(0.0, min(TURN_S, until - now)))
     client.call("halt")
 
 
-def _while_held(client: ControlClient, say: Callable[[float], object]) -> None:
+def _while_held(client: ControlClient, say: Say) -> None:
     key = HeldKey()
+    renewal = Renewal(HOLD_S)
     moves = False
     due = time.monotonic()
     with Keys() as keys:
@@ -91,18 +105,29 @@ def _while_held(client: ControlClient, say: Callable[[float], object]) -> None:
             now = time.monotonic()
             if pressed in QUITS:
                 break
-            if pressed:
+            missed = renewal.missed(now)
+            if missed:
+                report(f"the keys were not looked at for {missed:.1f} s: what was pressed meanwhile does not count")
+                key.release()
+            elif pressed:
                 key.press(pressed, now)
             if now < due:
                 continue
             due = now + TURN_S
             held = key.held(now)
             if held:
-                say(-1.0 if held in BACKWARDS else 1.0)
+                say(-1.0 if held in BACKWARDS else 1.0, now)
                 moves = True
-            elif moves:
+                continue
+            if moves:
                 client.call("halt")
                 moves = False
+                renewal.missed(time.monotonic())  # the halt's wait is no silence
+            elif not missed:
+                continue
+            # A key that was pressed while nobody looked, be it during the halt, must not move the arm now.
+            if not keys.drain().isdisjoint(QUITS):
+                break
     if moves:
         client.call("halt")
 

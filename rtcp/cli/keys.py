@@ -64,6 +64,13 @@ class Keys:
             return ESCAPE
         return first.decode("latin-1")
 
+    def drain(self) -> set[str]:
+        """Return what was typed and not read so far: keys of the past, which lead nothing any more."""
+        typed = set()
+        while key := self.read(0.0):
+            typed.add(key)
+        return typed
+
 
 class HeldKey:
     """Tells by the repetition of a key that it is held.

@@ -65,5 +65,4 @@ def serve(options: StartOptions, report: Callable[[str], None], announce: Callab
             announce()
             return running.wait(report)
         except KeyboardInterrupt:  # a signal that came before `wait` had taken them over
-            running.stop()
-            return ExitCode.DONE
+            return ExitCode.FAULT if running.stop(report) else ExitCode.DONE

@@ -46,8 +46,12 @@ class CommandError(Exception):
         self.code = int(code)
 
 
+SUSPENDING = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+"""What suspends a command: Ctrl-Z, and a terminal that one in the background reads or, by its setting, writes."""
+
+
 class Interrupted(KeyboardInterrupt):
-    """SIGTERM or SIGHUP came: everything winds up as after Ctrl-C."""
+    """A signal came that ends a command: everything winds up as after Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {signal.Signals(number).name}")
@@ -65,13 +69,13 @@ def interruption_code(error: KeyboardInterrupt) -> int:
 
 
 @contextmanager
-def orderly_signals() -> Iterator[None]:
-    """While inside, SIGTERM and SIGHUP raise `Interrupted`, so that `finally` ends what was started."""
+def orderly_signals(*more: signal.Signals) -> Iterator[None]:
+    """While inside, SIGTERM, SIGHUP and `more` raise `Interrupted`, so that `finally` ends what was started."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise Interrupted(number)
 
-    kept = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP)}
+    kept = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP, *more)}
     try:
         yield
     finally:

@@ -1,4 +1,4 @@
-"""How a motion shows its progress: a bar on a terminal, a line every tenth of the way elsewhere. Ctrl-C stops it."""
+"""How a motion shows its progress: a bar on a terminal, else a line every tenth of the way; Ctrl-C, Ctrl-Z stop it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from rtcp.cli.outcome import CommandError, interruption_code, orderly_signals
+from rtcp.cli.outcome import SUSPENDING, CommandError, interruption_code, orderly_signals
 from rtcp.cli.output import console, report
 from rtcp.runtime.client import ControlClient
 
@@ -18,17 +18,20 @@ Follow = Callable[[Mapping[str, Any]], None]
 def stopping(client: ControlClient) -> Iterator[None]:
     """While inside, Ctrl-C and its kin close the connection, which stops the arm.
 
+    So does what would suspend the command: the arm would move on, and Ctrl-C would not reach whoever could stop it.
+
     Raises:
         CommandError: that it was interrupted.
     """
-    with orderly_signals(), client:
+    with orderly_signals(*SUSPENDING), client:
         try:
             yield
         except KeyboardInterrupt as interruption:
             client.close()
+            code = interruption_code(interruption)
+            what = "ended, not suspended" if code - 128 in SUSPENDING else "interrupted"
             raise CommandError(
-                "interrupted: the connection is closed, so the arm comes to a controlled stop",
-                interruption_code(interruption),
+                f"{what}: the connection is closed, so the arm comes to a controlled stop", code
             ) from None
 
 

@@ -63,7 +63,8 @@ def _soak(
                 except KeyboardInterrupt as interruption:
                     interrupted = interruption
         finally:
-            running.stop()
+            left = running.stop()
+    soak.summary.failures.extend(left)
     summary = soak.summary
     if as_json:
         emit(json.dumps(_as_json(summary), indent=2))

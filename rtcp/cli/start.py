@@ -9,7 +9,7 @@ import typer
 
 from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
-from rtcp.cli.outcome import CommandError, code_of
+from rtcp.cli.outcome import CommandError, ExitCode, code_of
 from rtcp.cli.output import report
 
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
@@ -59,7 +59,9 @@ def _stop() -> None:
     from rtcp.runtime.running import StartError
 
     try:
-        launcher.stop(report)
+        left = launcher.stop(report)
     except StartError as error:
         raise CommandError(str(error), code_of(error.kind)) from error
+    if left:
+        raise CommandError("\n".join(f"stopped, but: {sentence}" for sentence in left), ExitCode.FAULT)
     report("stopped")

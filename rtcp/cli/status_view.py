@@ -35,6 +35,9 @@ DIGITAL_BITS = 16
 
 ABSENT = "-"
 
+UNHEARD_S = 0.1
+"""Where cycles have been without the right working counter for longer, what the joints say is old, and said to be."""
+
 MESSAGES = 5
 """So many of the last sentences are shown."""
 
@@ -90,6 +93,10 @@ def _joints(status: Mapping[str, Any]) -> Table:
     names = _sequence(status.get("joint_names"))
     count = max([len(values) for values in columns.values()] + [0])
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, expand=True, padding=(0, 1))
+    unheard_s = status.get("unheard_s")
+    if isinstance(unheard_s, int | float) and unheard_s > UNHEARD_S:
+        table.caption = f"as last heard, {unheard_s:.1f} s ago: not every slave takes part since then"
+        table.caption_justify = "left"
     table.add_column("joint")
     for name, unit in JOINT_COLUMNS:
         table.add_column(f"{name} {unit}", justify="right")
@@ -154,8 +161,9 @@ def _facts(status: Mapping[str, Any]) -> Table:
         stick = _mapping(status.get("stick"))
         whose = "the arm's" if stick.get("arm_has_it") else "the wheelchair's"
         table.add_row("stick", f"{stick.get('mode', ABSENT)}, it is {whose}")
-    table.add_row("frames", _working_counter(_mapping(status.get("wkc"))))
-    table.add_row("clocks", _clocks(_mapping(status.get("dc"))))
+    wkc = _mapping(status.get("wkc"))
+    table.add_row("frames", _working_counter(wkc))
+    table.add_row("clocks", _clocks(_mapping(status.get("dc")), _answered(wkc)))
     table.add_row("inputs", _bits(status.get("inputs")))
     table.add_row("outputs", _bits(status.get("outputs")))
     table.add_row("real time", realtime_line(_mapping(status.get("realtime"))))
@@ -179,14 +187,24 @@ def _robot(robot: Mapping[str, Any]) -> Text:
     return line
 
 
+def _answered(wkc: Mapping[str, Any]) -> bool:
+    """Whether any slave took part in the last frame: its counter is above 0; -1: the frame did not come back."""
+    actual = wkc.get("actual")
+    return not isinstance(actual, int) or actual > 0
+
+
 def _working_counter(wkc: Mapping[str, Any]) -> Text:
     expected, actual = wkc.get("expected", ABSENT), wkc.get("actual", ABSENT)
+    if not _answered(wkc):
+        return Text(f"no answer, {expected} expected", "bold red")
     return Text(f"working counter {actual} of {expected}", "" if actual == expected else "bold red")
 
 
-def _clocks(clocks: Mapping[str, Any]) -> Text:
+def _clocks(clocks: Mapping[str, Any], answered: bool) -> Text:
     if not clocks:
         return Text(ABSENT)
+    if not answered:
+        return Text("not followed: no answer", "yellow")
     line = Text("locked" if clocks.get("locked") else "not locked", "" if clocks.get("locked") else "yellow")
     for key, label in (("offset_ns", "offset"), ("filtered_ns", "filtered")):
         value = clocks.get(key)

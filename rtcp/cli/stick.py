@@ -12,8 +12,9 @@ import typer
 from rtcp.cli.connection import connect
 from rtcp.cli.keys import ESCAPE, HeldKey, Keys
 from rtcp.cli.numbers import positive
-from rtcp.cli.outcome import CommandError, interruption_code, orderly_signals
+from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import emit, report
+from rtcp.cli.renewal import Renewal
 from rtcp.runtime.client import ControlClient
 
 TURN_S = 0.08
@@ -68,9 +69,9 @@ def _stick(
         return
     pressed, byte = _position(words)
     try:
-        with orderly_signals(), connect("stick") as client:
+        with orderly_signals(*SUSPENDING), connect("stick") as client:
             if words == ["release"]:
-                _force(client, [], None, HOLD_S)
+                _force(client, [], None, HOLD_S, time.monotonic())
             else:
                 _hold(client, pressed, byte, seconds)
     except KeyboardInterrupt as interruption:
@@ -91,21 +92,26 @@ def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
     return [NAMES[word] for word in words], None
 
 
-def _force(client: ControlClient, pressed: Sequence[str], byte: int | None, hold_s: float) -> dict[str, Any]:
-    return client.call("stick", {"pressed": list(pressed), "byte": byte, "hold_s": hold_s})
+def _force(client: ControlClient, pressed: Sequence[str], byte: int | None, hold_s: float, now: float) -> None:
+    client.call("stick", {"pressed": list(pressed), "byte": byte, "hold_s": hold_s, "t": now})
 
 
 def _hold(client: ControlClient, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
     until = time.monotonic() + seconds
-    while (left := until - time.monotonic()) > 0:
-        _force(client, pressed, byte, HOLD_S)
-        time.sleep(max(0.0, min(TURN_S, left)))
+    renewal = Renewal(HOLD_S)
+    while (now := time.monotonic()) < until:
+        if missed := renewal.missed(now):
+            raise CommandError(
+                f"the stick was not said again for {missed:.1f} s: it had been let go, and stays so", ExitCode.FAULT
+            )
+        _force(client, pressed, byte, HOLD_S, now)
+        time.sleep(max(0.0, min(TURN_S, until - now)))
 
 
 def _play(client: ControlClient) -> None:
     """Let the keys be the stick, until q."""
     report("arrows: the stick, while held; +, -: mode paddles; t: toggle arm or chair; e: emergency stop; q: end")
-    key = HeldKey()
+    key, renewal = HeldKey(), Renewal(HOLD_S)
     switched: set[str] = set()
     paddle, paddle_until, shown_at = "", 0.0, 0.0
     due = time.monotonic()
@@ -115,6 +121,12 @@ def _play(client: ControlClient) -> None:
             now = time.monotonic()
             if pressed in QUITS:
                 break
+            if renewal.missed(now):
+                # What was pressed while nobody looked must not move the arm now.
+                key.release()
+                pressed, paddle_until = "", now
+                if not keys.drain().isdisjoint(QUITS):
+                    break
             if pressed in ARROWS:
                 key.press(pressed, now)
             elif pressed:
@@ -128,7 +140,7 @@ def _play(client: ControlClient) -> None:
             due = now + TURN_S
             held = key.held(now)
             stick = [paddle] if now < paddle_until else [ARROWS[held]] if held else []
-            _force(client, [*stick, *sorted(switched)], None, HOLD_S)
+            _force(client, [*stick, *sorted(switched)], None, HOLD_S, now)
             if now - shown_at > SHOWN_EVERY_S:
                 shown_at = now
                 _show(client.call("status"), stick, switched)

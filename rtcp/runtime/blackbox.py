@@ -74,7 +74,7 @@ class BlackBox:
             self._writer.submit(self._record, fault)
         now = time.monotonic()
         self._listen(now)
-        if self._events.on and now - self._since > AFTER_S and not self._machine_in_fault():
+        if self._events.on and now - self._since > AFTER_S and not (self._silent or self._machine_in_fault()):
             # Not every event of this kind leads to a state that only a reset ends.
             self._events.on = False
 
@@ -122,6 +122,7 @@ class BlackBox:
             self._head, self._head_at = head, now
             if self._silent:
                 self._silent = False
+                self._since = now  # a fault that it finds itself in shows a little later
                 self._say(f"the loop (process {self._observer.loop_pid}) publishes again")
         elif now - self._head_at > SILENT_S and not (self._silent or self._dead or self._end_wanted):
             self._silent = True
@@ -135,8 +136,14 @@ class BlackBox:
     def _process_fault(self, time_ns: int, what: str) -> None:
         sentence = f"the loop (process {self._observer.loop_pid}) {what}"
         self._say(sentence)
-        if not self._over.is_set():
-            self._writer.submit(self._record, Fault(time_ns, sentence))
+        if self._over.is_set():
+            return
+        fault = Fault(time_ns, sentence)
+        # Nothing comes after its end that would have to be kept apart from it.
+        begun = [fault] if self._dead else self._events.met(fault)
+        self._since = time.monotonic()
+        for one in begun:
+            self._writer.submit(self._record, one)
 
     def _say(self, sentence: str) -> None:
         log.error("%s", sentence)

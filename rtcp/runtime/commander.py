@@ -145,7 +145,7 @@ class Commander:
         # A client that goes away takes no request back: the next would be written over one that is being worked on.
         answer = await asyncio.shield(asyncio.ensure_future(self._serve(request)))
         if "error" in answer:
-            raise CommandFailed("refused", str(answer["error"]))
+            raise CommandFailed(str(answer["kind"]), str(answer["error"]))
         return answer
 
     async def _serve(self, request: dict[str, Any]) -> dict[str, Any]:

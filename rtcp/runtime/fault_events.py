@@ -6,7 +6,7 @@ The division follows the events' own instants: a gateway that finds old ones div
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rtcp.runtime.codes import Code
 from rtcp.runtime.observer import Event
@@ -57,7 +57,7 @@ class FaultEvents:
                 found += self.put_off()
                 self.on = False
             elif event.code in self._faults:
-                found += self._met(event)
+                found += self.met(Fault(event.time_ns, self._words(event), event.number, event.code))
         return found + self._due(now_ns)
 
     def put_off(self) -> list[Fault]:
@@ -68,16 +68,18 @@ class FaultEvents:
         self._begin(fault, max(self._next_ns, fault.time_ns))
         return [fault]
 
-    def _met(self, event: Event) -> list[Fault]:
-        fault = Fault(event.time_ns, self._words(event), event.number, event.code, self.on)
+    def met(self, fault: Fault) -> list[Fault]:
+        """Return what a fault begins: its own recording, or that of what was put off."""
+        fault = replace(fault, later=self.on)
         if not self.on:
             self.on = True
             before = self.put_off()
             self._begin(fault, fault.time_ns)
             return [*before, fault]
-        if event.time_ns > self._ends_ns:
+        # A silence shows only after it has begun: no recording that began before has it.
+        if fault.time_ns > self._ends_ns or not fault.number:
             self._later = fault
-        return self._due(event.time_ns)
+        return self._due(fault.time_ns)
 
     def _due(self, now_ns: int) -> list[Fault]:
         return self.put_off() if now_ns >= self._next_ns else []

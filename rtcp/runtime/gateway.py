@@ -23,6 +23,7 @@ from rtcp.runtime.arguments import Arguments
 from rtcp.runtime.blackbox import BlackBox
 from rtcp.runtime.blackbox_file import faults_directory
 from rtcp.runtime.carrier import CommandFailed, Progress
+from rtcp.runtime.ending import end_of
 from rtcp.runtime.held import Caller
 from rtcp.runtime.journal import log_format
 from rtcp.runtime.observer import BlackboardError, Observer
@@ -63,6 +64,7 @@ class Gateway:
         self._observer = Observer(blackboard_file(directory))
         started = read_json(directory / "started.json", dict)
         self._picture = Picture(self._observer, session, started)
+        self._picture.follow()  # what an earlier gateway has logged, with its time, is not logged again
         self._arm = Verbs(self._observer, self._picture, session.config, session.bus, directory)
         self._box = BlackBox(self._observer, session, faults_directory(), self._picture.note)
         self._complained: dict[str, float] = {}
@@ -231,7 +233,8 @@ class Gateway:
 
     async def _stop(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         processes = read_processes(self._directory)
-        if processes.loop and not is_ours(processes.loop):
+        lived = is_ours(processes.loop)
+        if processes.loop and not lived:
             # It has died before it was told to, and whoever saw that was quicker here than its end.
             self._loop_has_ended()
         self._box.end_is_wanted()
@@ -249,7 +252,7 @@ class Gateway:
         blackboard_file(self._directory).unlink(missing_ok=True)
         forget_processes(self._directory)
         self._stopping = True
-        return {}
+        return {"left": list(end_of(self._directory, processes.loop, lived))}
 
 
 async def _read_line(reader: asyncio.StreamReader) -> bytes | None:

@@ -22,6 +22,7 @@ from rtcp.fieldbus.link import check_name
 from rtcp.runtime.blackbox import BlackBox
 from rtcp.runtime.blackbox_file import faults_directory
 from rtcp.runtime.client import LONGEST_SOCKET_PATH, ControlError
+from rtcp.runtime.ending import forget_end
 from rtcp.runtime.lock import Busy, alone
 from rtcp.runtime.observer import BlackboardError, Observer
 from rtcp.runtime.paths import (
@@ -32,7 +33,7 @@ from rtcp.runtime.paths import (
     runtime_directory,
     stopping_mark,
 )
-from rtcp.runtime.running import Report, Running, StartError, ask_gateway, clear, undisturbed
+from rtcp.runtime.running import Report, Running, StartError, clear, end_platform, undisturbed
 from rtcp.runtime.session import Processes, Session, SessionError, is_ours, read_processes, read_session
 from rtcp.runtime.zero import read_zeros, state_directory
 
@@ -215,8 +216,10 @@ def _start_all(
     bus = config.bus.interface
     state = state_directory().absolute()
     running = Running(directory, config, Processes(), state)
+    forget_end(directory)
     for log in directory.glob("*.log"):
-        log.unlink()  # of an earlier start; a gateway that is replaced goes on with its own
+        # Of an earlier start, kept until the next; a gateway that is replaced goes on with its own.
+        log.replace(log.with_name(f"{log.name}.1"))
     try:
         interface, segment = bus, 0
         if bus == VIRTUAL:
@@ -234,8 +237,10 @@ def _start_all(
     return running
 
 
-def stop(report: Report) -> None:
+def stop(report: Report) -> tuple[str, ...]:
     """Stop the platform of this runtime directory; `report` is told what is worth it.
+
+    Return in sentences what is not left as it should be: drives disabled, slaves in INIT.
 
     Raises:
         ControlError: `not running` where nothing runs.
@@ -251,6 +256,6 @@ def stop(report: Report) -> None:
 
     with _alone(directory, STOP_WAITS_S, waits):
         _record_unseen_end(directory, report)
-        found = read_processes(directory)  # a gateway may have been replaced meanwhile
-        ask_gateway(directory)
-        clear(directory, found)
+        now = read_processes(directory)  # a gateway may have been replaced meanwhile
+        # Another stop may have ended it all: how the loop ended then is to be told all the same.
+        return end_platform(directory, now if now.loop else found, report)

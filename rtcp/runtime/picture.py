@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from rtcp.realtime.statistics import SlidingPercentiles
 from rtcp.runtime.layout import FLAG_ARM_HAS_STICK, FLAG_DC_LOCKED, FLAG_SWITCHING
-from rtcp.runtime.machine import Code, State
+from rtcp.runtime.machine import TABLE, Code, State
 from rtcp.runtime.motion_sentences import STICK_MODES, motion_name
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.robot_status import robot_status
@@ -25,6 +25,9 @@ _MESSAGES = 50
 _TOLD = 10
 """The last so many of them are told."""
 _STALE_S = 1.0
+_NO_ERROR = "sent emergency 0x0000:"
+"""An emergency that takes an earlier one back (CiA 301, error code 0)."""
+_UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
 
 
 def al_name(status: int) -> str:
@@ -68,6 +71,13 @@ class Picture:
         self.faults = 0
         """How many sentences of faults have been read: tells a new one from the last."""
         self.message = ""
+        """The last sentence that says what has become of the arm."""
+        self._message_ns = 0
+        """When it was said, CLOCK_REALTIME."""
+        self._moves = 0
+        self._moving = False
+        self._began_ns = 0
+        """When the last motion began, CLOCK_MONOTONIC."""
         self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
         self.loop_lives = True
 
@@ -78,6 +88,7 @@ class Picture:
         if len(records):
             self._at = int(records[-1]["number"])
             self._count(records)
+            self._see_motion(records)
         return self._listen()
 
     def note(self, sentence: str) -> None:
@@ -97,6 +108,23 @@ class Picture:
         self._offset.add(now, np.abs(records["dc_offset_ns"]) / 1e3)
         self._filtered.add(now, np.abs(records["dc_filtered_ns"]) / 1e3)
 
+    def _see_motion(self, records: npt.NDArray[np.void]) -> None:
+        """Look for the last cycle in which a motion began: from rest, or one that took another's place."""
+        moving, moves = np.isin(records["state"], _UNDER_WAY), records["moves"].astype(np.int64)
+        rested = ~np.concatenate([[self._moving], moving[:-1]])
+        other = moves != np.concatenate([[self._moves], moves[:-1]])
+        begun = np.flatnonzero(moving & (rested | other))
+        if len(begun):
+            self._began_ns = int(records["time_ns"][begun[-1]])
+        self._moving, self._moves = bool(moving[-1]), int(moves[-1])
+
+    def _headline(self, state: State) -> str:
+        """Return why the machine is in fault, else what was said last; of an earlier motion nothing while one lasts."""
+        if self.fault or int(state) not in _UNDER_WAY:
+            return self.fault or self.message
+        began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
+        return self.message if self._message_ns > began_ns else TABLE[state].words
+
     def _listen(self) -> list[str]:
         said: list[tuple[int, str]] = []
         for event in self._observer.events_since(self._event):
@@ -114,8 +142,9 @@ class Picture:
             said.append((text.time_ns, text.sentence))
         said.sort()
         self.messages.extend(said)
-        if said:
-            self.message = said[-1][1]
+        for at_ns, sentence in said:
+            if _NO_ERROR not in sentence:
+                self.message, self._message_ns = sentence, at_ns
         return [sentence for _, sentence in said]
 
     def refusal(self, code: int, axis: int, value: float, limit: float) -> str:
@@ -133,7 +162,7 @@ class Picture:
         return latest is not None and bool(int(latest[0]["flags"]) & FLAG_SWITCHING)
 
     def _robot(self, record: np.void, speaks: bool) -> dict[str, Any]:
-        if not (self.loop_lives and speaks):
+        if not speaks:
             # Nobody leads the drives any more: their watchdog has stopped them.
             return robot_status(State.FAULT, int(record["motion"]), 0, int(Code.BUS_LOST), 0)
         numbers = (int(record[name]) for name in ("motion", "flags", "fault", "limit"))
@@ -147,8 +176,9 @@ class Picture:
             raise RuntimeError("the loop has published no cycle yet")
         record = latest[0]
         state = State(int(record["state"])).name.lower()
-        message = self.fault or self.message
+        message = self._headline(State(int(record["state"])))
         silent_s = (time.monotonic_ns() - int(record["time_ns"])) * 1e-9
+        speaks = self.loop_lives and silent_s <= _STALE_S
         if not self.loop_lives:
             state = "fault"
             message = (
@@ -157,7 +187,10 @@ class Picture:
             )
         elif silent_s > _STALE_S:
             state = "fault"
-            message = f"the loop (process {self._observer.loop_pid}) has published nothing for {silent_s:.1f} s"
+            message = (
+                f"the loop (process {self._observer.loop_pid}) has published nothing for {silent_s:.1f} s; the drives' "
+                "watchdog stops them: `rtcp stop`, then `rtcp start`, if it stays so"
+            )
         slaves = [
             {
                 "position": i + 1,
@@ -186,13 +219,14 @@ class Picture:
                 "mode": STICK_MODES[int(record["stick_mode"]) % len(STICK_MODES)],
                 "arm_has_it": bool(int(record["flags"]) & FLAG_ARM_HAS_STICK),
             },
-            "robot": self._robot(record, silent_s <= _STALE_S),
+            "robot": self._robot(record, speaks),
             "bus": self._session.bus,
             "cycle_ns": self._observer.period_ns,
             "cycles": int(record["cycle"]),
             "time_ns": int(record["time_ns"]),
             "missed": int(record["missed"]),
-            "wkc": {"expected": int(record["wkc_expected"]), "actual": int(record["wkc"]) if self.loop_lives else -1},
+            "unheard_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
+            "wkc": {"expected": int(record["wkc_expected"]), "actual": int(record["wkc"]) if speaks else -1},
             "slaves": slaves,
             "joint_names": [joint.name for joint in config.joints],
             "joints": {
@@ -207,7 +241,7 @@ class Picture:
             "exchange_us": self._exchange.read().as_json(),
             "compute_us": self._compute.read().as_json(),
             "dc": {
-                "locked": self.loop_lives and bool(int(record["flags"]) & FLAG_DC_LOCKED),
+                "locked": speaks and bool(int(record["flags"]) & FLAG_DC_LOCKED),
                 "offset_ns": int(record["dc_offset_ns"]),
                 "filtered_ns": int(record["dc_filtered_ns"]),
                 "offset_us": self._offset.read().as_json(),

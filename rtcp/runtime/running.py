@@ -21,16 +21,26 @@ from typing import Any, Literal
 from rtcp.config.model import ArmConfig
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.runtime.ending import LEFT, end_of
 from rtcp.runtime.journal import open_log
 from rtcp.runtime.keeper import GatewayKeeper
 from rtcp.runtime.notifier import Notifier
-from rtcp.runtime.paths import blackboard_file, control_socket, free_segment_control, processes_file, stopping_mark
+from rtcp.runtime.paths import (
+    blackboard_file,
+    control_socket,
+    free_segment_control,
+    listens,
+    processes_file,
+    stopping_mark,
+)
 from rtcp.runtime.session import NONE, Processes, end, forget_processes, identify, is_ours, read_processes
 
 _SEGMENT_S = 60.0
 _LOOP_S = 60.0
 _GATEWAY_S = 60.0
 _STOP_S = 20.0
+_LOOP_END_S = 10.0
+"""For a controlled stop, the drives' torque and the way to INIT: a loop that is killed leaves them to a watchdog."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Report = Callable[[str], None]
 Kind = Literal["refused", "fault", "usage", "timeout"]
@@ -169,8 +179,8 @@ class Running:
     def wait(self, report: Report) -> int:
         """Wait until the platform is stopped or its loop ends; return the exit code. Its gateway is kept there.
 
-        SIGINT, SIGTERM and SIGHUP stop it in an orderly way (0), and so does `rtcp stop` (0); a loop that ends by
-        itself is a fault (5), whereupon the rest is stopped too.
+        SIGINT, SIGTERM and SIGHUP stop it in an orderly way (0), and so does `rtcp stop` (0); what could not be left as
+        it should is told (5); a loop that ends by itself is a fault (5), whereupon the rest is stopped too.
         """
         stopped: list[int] = []
         before = {number: signal.signal(number, lambda got, frame: stopped.append(got)) for number in _SIGNALS}
@@ -185,9 +195,9 @@ class Running:
             notifier.stopping("stopping" if stopped else "the loop has ended")
             if not stopped and self._ended_orderly():
                 self._reap(10.0)
-                return 0
-            self.stop()
-            return 0 if stopped else 5
+                return 5 if self.exit_code(self.processes.loop) == LEFT else 0
+            left = self.stop(report)
+            return 0 if stopped and not left else 5
         finally:
             notifier.close()
             keeper.close()
@@ -197,7 +207,7 @@ class Running:
     def _ended_orderly(self) -> bool:
         """Whether another `rtcp stop` ended the loop: the directory, maybe a new platform's by now, is left alone."""
         loop = next((child for child in self._children if child.pid == self.processes.loop), None)
-        if loop is not None and loop.wait() != 0:
+        if loop is not None and loop.wait() not in (0, LEFT):
             return False
         return stopping_mark(self.directory).exists() or not processes_file(self.directory).exists()
 
@@ -206,11 +216,30 @@ class Running:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 child.wait(timeout=patience_s)
 
-    def stop(self) -> None:
-        """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended. May be called twice."""
-        ask_gateway(self.directory)
-        clear(self.directory, self.processes)
+    def stop(self, report: Report | None = None) -> tuple[str, ...]:
+        """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended. May be called twice.
+
+        Return, and tell `report`, in sentences what of that could not be done.
+        """
+        left = end_platform(self.directory, self.processes)
         self._reap(2.0)
+        if report is not None:
+            for sentence in left:
+                report(f"stopped, but: {sentence}")
+        return left
+
+
+def end_platform(directory: Path, found: Processes, report: Report | None = None) -> tuple[str, ...]:
+    """Stop a platform, by its gateway where that answers; return in sentences what is not left as it should be.
+
+    `report` is told why the gateway did not do it.
+    """
+    lived, answers = is_ours(found.loop), is_ours(found.gateway)
+    error = ask_gateway(directory)
+    if error is not None and answers and report is not None:
+        report(f"the gateway did not stop the platform: {error}; its processes are ended one by one")
+    clear(directory, found)
+    return end_of(directory, found.loop, lived)
 
 
 def clear(directory: Path, found: Processes) -> None:
@@ -218,19 +247,23 @@ def clear(directory: Path, found: Processes) -> None:
     now = read_processes(directory)
     # A gateway that has been replaced since.
     newer = now.gateway if now.loop == found.loop else NONE
-    for pid in (found.loop, found.gateway, newer, found.segment):
+    end(found.loop, _LOOP_END_S)
+    for pid in (found.gateway, newer, found.segment):
         end(pid, 5.0)
     forget_processes(directory)
-    for path in (control_socket(directory), blackboard_file(directory)):
+    sockets = [path for path in directory.glob("segment*.sock") if not listens(path)]
+    for path in (control_socket(directory), blackboard_file(directory), *sockets):
         path.unlink(missing_ok=True)
 
 
-def ask_gateway(directory: Path) -> None:
-    """Let the gateway end the platform; where it does not answer, the processes are ended one by one afterwards."""
-    with contextlib.suppress(ControlError, OSError):
-        path = control_socket(directory)
-        with ControlClient("rtcp stop", path) as client:
+def ask_gateway(directory: Path) -> Exception | None:
+    """Let the gateway end the platform; return why it did not: the processes are then ended one by one."""
+    try:
+        with ControlClient("rtcp stop", control_socket(directory)) as client:
             client.call("stop", timeout_s=_STOP_S)
+    except (ControlError, OSError) as error:
+        return error
+    return None
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.motion_points import Point, Stop
 from rtcp.motion.limits import Limits
 from rtcp.runtime.arguments import Arguments
-from rtcp.runtime.carrier import Carrier, Progress
+from rtcp.runtime.carrier import Carrier, CommandFailed, Progress
 from rtcp.runtime.commander import Commander
 from rtcp.runtime.held import Caller, Held
 from rtcp.runtime.limit_keeper import LimitKeeper
@@ -136,7 +137,7 @@ class Verbs:
         if not (args.has("byte") or args.has("pressed")):
             return await self.stick.release(client)
         pressed = args.texts("pressed") if args.has("pressed") else []
-        hold_s = _or(args.number_or_none("hold_s"), STICK_HOLD_S)
+        hold_s = _in_time(args, _or(args.number_or_none("hold_s"), STICK_HOLD_S))
         return await self.stick.force(client, pressed, args.integer_or_none("byte"), hold_s)
 
     async def _sdo_read(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
@@ -152,7 +153,15 @@ def _or(value: float | None, default: float) -> float:
 
 
 def _hold_s(args: Arguments) -> float:
-    return _or(args.number_or_none("hold_s"), HOLD_S)
+    return _in_time(args, _or(args.number_or_none("hold_s"), HOLD_S))
+
+
+def _in_time(args: Arguments, hold_s: float) -> float:
+    """Return `hold_s` unless it has passed since `t`, the instant, s of CLOCK_MONOTONIC, at which this was wanted."""
+    sent_s = args.number_or_none("t")
+    if sent_s is not None and not (late_s := time.monotonic() - sent_s) <= hold_s:
+        raise CommandFailed("timeout", f"it came {late_s:.1f} s after it was said, and counts for {hold_s:g} s only")
+    return hold_s
 
 
 def _tuple(args: Arguments, key: str) -> tuple[float, ...] | None:

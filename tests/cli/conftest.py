@@ -72,6 +72,7 @@ def status() -> dict[str, Any]:
         "cycle_ns": 500_000,
         "cycles": 123_456,
         "missed": 2,
+        "unheard_s": 0.0,
         "wkc": {"expected": 21, "actual": 21},
         "slaves": [{"position": 1, "name": "io", "state": "OP"}]
         + [{"position": n + 1, "name": f"drive{n}", "state": "OP"} for n in range(1, JOINTS + 1)],

@@ -64,7 +64,7 @@ def test_without_a_recording_the_list_says_so(rtcp: Callable[..., Any], state: P
     assert not state.exists()
 
 
-def test_the_list_has_number_time_first_sentence_state_before_and_duration(rtcp: Callable[..., Any]) -> None:
+def test_the_list_has_number_time_first_sentence_state_before_and_the_length_recorded(rtcp: Callable[..., Any]) -> None:
     write(faults_directory(), recording())
     write(faults_directory(), recording())
     ended = rtcp("faults")
@@ -72,6 +72,8 @@ def test_the_list_has_number_time_first_sentence_state_before_and_duration(rtcp:
     when = recording().about.when
     assert f"2 {when:%Y-%m-%d %H:%M:%S} joint2: the drive is in" in shown
     assert "moving 1.2 s" in shown
+    assert "recorded" in shown
+    assert "duration" not in shown
     assert "1: 0.8 s before the fault instead of 10 s" in shown
     assert max(len(line) for line in ended.out.splitlines()) <= 80
     rows = json.loads(rtcp("faults", "--json").out)["faults"]
@@ -211,6 +213,31 @@ def test_a_picture_of_another_kind_is_refused_before_anything_is_read(rtcp: Call
 
 def test_a_picture_that_cannot_be_written_is_a_sentence(rtcp: Callable[..., Any], tmp_path: Path) -> None:
     write(faults_directory(), recording())
-    ended = rtcp("faults", "show", "1", "--plot", str(tmp_path / "none" / "picture.png"))
-    assert ended.code == 1
-    assert "No such file or directory" in ended.trouble
+    (tmp_path / "directory.png").mkdir()
+    for out, why in (("none/picture.png", "No such file or directory"), ("directory.png", "Is a directory")):
+        ended = rtcp("faults", "show", "1", "--plot", str(tmp_path / out))
+        assert ended.code == 2
+        assert f"--plot {tmp_path / out}: the picture cannot be written there: {why}" in ended.trouble
+
+
+@pytest.mark.parametrize("command", [(), ("show", "1")])
+def test_a_state_directory_that_is_a_file_is_a_sentence(
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[str, ...]
+) -> None:
+    (tmp_path / "a file").write_text("")
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "a file"))
+    ended = rtcp("faults", *command)
+    assert (ended.code, ended.out) == (5, "")
+    assert f"{tmp_path / 'a file' / 'faults'}: the directory cannot be read: Not a directory" in ended.trouble
+
+
+def test_two_faults_that_begin_alike_are_told_apart_at_80_columns(rtcp: Callable[..., Any]) -> None:
+    made = recording()
+    for end in ("drive1 with statusword 0x0218", "drive2 with statusword 0x0208"):
+        what = f"a long sentence about something that went wrong with the drive {end}"
+        write(faults_directory(), Recording(replace(made.about, what=what), made.records))
+    ended = rtcp("faults")
+    shown = " ".join(ended.out.split())
+    assert "0x0218" in shown
+    assert "0x0208" in shown
+    assert max(len(line) for line in ended.out.splitlines()) <= 80

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli.keys import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey
+from rtcp.cli.renewal import Renewal
 
 ARROW_UP, ARROW_LEFT = b"\x1b[A", b"\x1b[D"
 
@@ -94,6 +95,103 @@ def test_another_key_lets_go_of_the_first() -> None:
     assert key.held(0.66) == ""
 
 
+# -- a process that was suspended ----------------------------------------------------------------------------------
+
+
+def test_a_silence_longer_than_a_word_counts_is_told_once() -> None:
+    renewal = Renewal(0.25)
+    assert [renewal.missed(at) for at in (7.0, 7.25, 7.75, 8.0)] == [0.0, 0.0, 0.5, 0.0]
+
+
+def suspend(process: Any, seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None:
+    """Stop a process as nothing can prevent, and let it go on."""
+    process.send_signal(signal.SIGSTOP)
+    os.waitpid(process.pid, os.WUNTRACED)
+    meanwhile()
+    time.sleep(seconds)
+    process.send_signal(signal.SIGCONT)
+
+
+@pytest.mark.parametrize(
+    ("command", "verb", "last", "words"),
+    [
+        (("jog", "joint1", "0.1"), "jog", "halt", "the arm had stopped, and stays so"),
+        (("stick", "forward"), "stick", "stick", "it had been let go, and stays so"),
+    ],
+)
+def test_what_was_suspended_ends_and_moves_nothing_again(
+    platform: Any,
+    rtcp_process: Callable[..., Any],
+    wait_until: Callable[..., None],
+    command: tuple[str, ...],
+    verb: str,
+    last: str,
+    words: str,
+) -> None:
+    held = rtcp_process(*command, "--seconds", "8")
+    wait_until(lambda: len(platform.asked(verb)) > 2)
+    counts: list[int] = []
+    suspend(held, 0.6, lambda: counts.append(settled(lambda: len(platform.asked(verb)))))
+    _, trouble = held.communicate()
+    assert held.returncode == 5
+    assert f"the {verb} was not said again for 0." in trouble
+    assert words in trouble
+    assert len(platform.asked(verb)) == counts[0]
+    assert platform.requests[-1]["do"] == last
+
+
+def settled(count: Callable[[], int]) -> int:
+    """Return a count once the other thread has taken what had been sent."""
+    time.sleep(0.1)
+    return count()
+
+
+def test_a_jog_carries_the_instant_at_which_it_was_wanted(platform: Any, rtcp: Callable[..., Any]) -> None:
+    before = time.monotonic()
+    rtcp("jog", "x", "0.1", "--seconds", "0.1")
+    instants = [one["t"] for one in platform.asked("jog")]
+    assert before < instants[0] < instants[-1] < time.monotonic()
+
+
+def test_keys_that_were_typed_while_the_process_was_suspended_move_nothing(
+    platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
+) -> None:
+    keyboard = terminal("jog", "joint1", "0.1")
+    keyboard.hold(b" ", 0.7)
+    counts: list[int] = []
+
+    def meanwhile() -> None:
+        counts.append(settled(lambda: len(platform.asked("jog"))))
+        keyboard.press(b" " * 300)
+
+    suspend(keyboard.process, 0.6, meanwhile)
+    wait_until(lambda: bool(platform.asked("halt")))
+    time.sleep(0.4)
+    assert counts[0] > 2
+    assert len(platform.asked("jog")) == counts[0]
+    assert "the keys were not looked at for" in keyboard.process.stdout.readline()
+    keyboard.hold(b" ", 0.6)
+    assert len(platform.asked("jog")) > counts[0]
+    assert keyboard.quit() == 0
+
+
+def test_arrows_that_were_typed_while_the_process_was_suspended_are_no_stick(
+    platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
+) -> None:
+    keyboard = terminal("stick")
+    wait_until(lambda: bool(platform.asked("stick")))
+    counts: list[int] = []
+
+    def meanwhile() -> None:
+        counts.append(settled(lambda: len(platform.asked("stick"))))
+        keyboard.press(ARROW_UP * 150 + b"+" + ARROW_UP * 3)
+
+    suspend(keyboard.process, 0.8, meanwhile)
+    wait_until(lambda: len(platform.asked("stick")) > counts[0] + 4)
+    assert all(one["pressed"] == [] for one in platform.asked("stick"))
+    assert keyboard.quit() == 0
+
+
 # -- jog ------------------------------------------------------------------------------------------------------------
 
 
@@ -113,7 +211,7 @@ def test_a_jog_for_a_time_is_said_again_and_again_and_ends_in_a_halt(
     assert ended.out.startswith("stopped at 0.1000 -0.2000")
     asked = platform.asked("jog")
     assert 5 <= len(asked) <= 9
-    assert all(one == {"v": speeds, "frame": frame, "hold_s": 0.25} for one in asked)
+    assert all(one == {"v": speeds, "frame": frame, "hold_s": 0.25, "t": one["t"]} for one in asked)
     assert platform.requests[-2]["do"] == "halt"
 
 
@@ -150,6 +248,16 @@ def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
     _, trouble = ended.communicate()
     assert (ended.returncode, platform.requests) == (2, [])
     assert words in trouble
+
+
+def test_a_stick_that_would_be_suspended_is_let_go_and_ended(
+    platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
+) -> None:
+    held = rtcp_process("stick", "forward", "--seconds", "50")
+    wait_until(lambda: bool(platform.asked("stick")))
+    held.send_signal(signal.SIGTSTP)
+    _, trouble = held.communicate()
+    assert (held.returncode, trouble) == (148, "rtcp: interrupted: the stick is let go\n")
 
 
 def test_an_interrupted_jog_closes_its_connection_and_says_that_the_arm_stops(
@@ -217,7 +325,7 @@ def test_a_position_is_held_for_a_time_by_saying_it_again(
     assert (ended.code, ended.out) == (0, "the stick is let go\n")
     asked = platform.asked("stick")
     assert 4 <= len(asked) <= 7
-    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4} for one in asked)
+    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "t": one["t"]} for one in asked)
 
 
 @pytest.mark.parametrize(

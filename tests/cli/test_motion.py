@@ -231,13 +231,24 @@ def test_help_is_help_among_the_numbers_too(rtcp: Callable[..., Any], help_optio
     assert "--speed" in ended.out
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+@pytest.mark.parametrize(
+    ("number", "code", "what"),
+    [
+        (signal.SIGINT, 130, "interrupted"),
+        (signal.SIGTERM, 143, "interrupted"),
+        (signal.SIGHUP, 129, "interrupted"),
+        (signal.SIGTSTP, 148, "ended, not suspended"),
+        (signal.SIGTTIN, 149, "ended, not suspended"),
+        (signal.SIGTTOU, 150, "ended, not suspended"),
+    ],
+)
 def test_an_interrupted_move_closes_its_connection_and_says_that_the_arm_stops(
     platform: Any,
     rtcp_process: Callable[..., Any],
     wait_until: Callable[..., None],
     number: signal.Signals,
     code: int,
+    what: str,
 ) -> None:
     platform.move_steps, platform.step_s = 10_000, 0.01
     moving = rtcp_process("move", *HOME)
@@ -245,7 +256,7 @@ def test_an_interrupted_move_closes_its_connection_and_says_that_the_arm_stops(
     moving.send_signal(number)
     _, trouble = moving.communicate()
     assert moving.returncode == code
-    assert trouble == "rtcp: interrupted: the connection is closed, so the arm comes to a controlled stop\n"
+    assert trouble == f"rtcp: {what}: the connection is closed, so the arm comes to a controlled stop\n"
     wait_until(platform.left_while_moving.is_set)
 
 

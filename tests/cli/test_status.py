@@ -151,3 +151,24 @@ def test_a_watch_that_cannot_connect_again_to_a_loop_that_lives_says_why(
     assert "the platform has ended" not in trouble
     assert "session.pickle" in trouble
     assert watching.returncode == 4
+
+
+@pytest.mark.parametrize("actual", [-1, 0])
+def test_without_an_answer_the_clocks_are_not_followed_and_no_counter_is_made_up(
+    platform: Any, rtcp: Callable[..., Any], actual: int
+) -> None:
+    platform.status["wkc"]["actual"] = actual
+    shown = rtcp("status").out
+    assert "no answer, 21 expected" in shown
+    assert "working counter" not in shown
+    assert "not followed: no answer" in shown
+    assert "offset" not in shown
+
+
+def test_what_the_joints_last_said_is_said_to_be_old_where_they_are_not_heard(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    platform.status["unheard_s"] = 1.5
+    assert "as last heard, 1.5 s ago" in rtcp("status").out
+    platform.status["unheard_s"] = 0.0
+    assert "as last heard" not in rtcp("status").out

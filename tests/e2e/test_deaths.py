@@ -156,3 +156,39 @@ def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_hap
     shown = platform.rtcp("faults", "show", number)
     assert "lost" in shown.stdout or "left OP" in shown.stdout
     assert "picture: " in shown.stdout
+
+
+def test_a_stop_that_had_to_kill_the_loop_says_so_and_fails(platform: Platform) -> None:
+    platform.be_patient(2000)
+    platform.rtcp("start", "--detach")
+    platform.call("enable")
+    loop = platform.pids()["loop"]
+    os.kill(loop, signal.SIGSTOP)
+    done = platform.rtcp("stop", check=5)
+    said = f"the loop (process {loop}) did not end in time and was killed: its drives were left to their watchdog"
+    assert said in done.stderr
+    assert "stopped\n" not in done.stdout
+    assert not lives(loop)
+
+
+def test_a_stop_names_the_slaves_that_did_not_come_to_init_and_fails(platform: Platform) -> None:
+    platform.be_patient(2000)
+    platform.rtcp("start", "--detach")
+    with SegmentClient(segment_control(platform.directory)) as segment:
+        segment.fault({"fault": "al_hang", "slave": 3})
+        segment.fault({"fault": "cable", "after": 5})
+    done = platform.rtcp("stop", check=5)
+    assert "stopped, but: the slaves on ecat" in done.stderr
+    assert "slave 3 (drive2) was to go to INIT and is in " in done.stderr
+    assert "slave 6 (drive5)" in done.stderr
+    assert "slave 4" not in done.stderr
+
+
+def test_a_stop_without_a_segment_says_that_no_frame_comes_back(platform: Platform) -> None:
+    foreground = started(platform)
+    kill(platform.pids()["segment"])
+    foreground.send_signal(signal.SIGINT)
+    said = foreground.communicate()
+    assert foreground.returncode == 5, said
+    assert "no frame comes back" in "".join(said)
+    assert list(platform.directory.glob("*.sock")) == []

@@ -120,6 +120,39 @@ def test_a_jogger_that_is_killed_leaves_an_arm_at_rest(bent: Platform) -> None:
     assert again == found["joints"]["target"]
 
 
+def test_a_jogger_that_was_suspended_does_not_move_the_arm_again(bent: Platform) -> None:
+    jogging = bent.background("jog", "joint1", "0.2", "--seconds", "30")
+    bent.until_moving()
+    jogging.send_signal(signal.SIGSTOP)
+    rest = bent.until(lambda found: found["state"] == "holding", "rest")["joints"]["target"]
+    jogging.send_signal(signal.SIGCONT)
+    _, trouble = jogging.communicate(timeout=20)
+    assert jogging.returncode == 5
+    assert "the arm had stopped, and stays so" in trouble
+    assert bent.status()["joints"]["target"] == rest
+
+
+def test_ctrl_z_stops_a_move_on_its_way(bent: Platform) -> None:
+    moving = bent.background("move", "0.9", *NUMBERS[1:], "--speed", "0.1")
+    bent.until_moving()
+    moving.send_signal(signal.SIGTSTP)
+    _, trouble = moving.communicate(timeout=20)
+    assert moving.returncode == 148
+    assert "ended, not suspended" in trouble
+    found = bent.until(lambda found: found["state"] == "holding", "rest")
+    assert found["joints"]["target"][0] < 0.6
+
+
+def test_an_object_that_does_not_come_is_a_timeout_and_one_that_is_refused_a_refusal(bent: Platform) -> None:
+    bent.rtcp("segment", "fault", "sdo_late", "slave=2", "ms=3000")
+    try:
+        done = bent.rtcp("sdo", "read", "drive1", "0x6041", "--type", "uint16", check=5)
+        assert "no answer in time" in done.stderr
+    finally:
+        bent.rtcp("segment", "mend")
+    bent.rtcp("sdo", "read", "drive2", "0x5FFF", "--type", "uint16", check=3)
+
+
 def test_a_second_jogger_is_refused_with_the_firsts_name(bent: Platform, client: ControlClient) -> None:
     client.call("jog", {"v": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
     with (

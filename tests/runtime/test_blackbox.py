@@ -139,6 +139,7 @@ class Clock:
         monkeypatch.setattr(time, "time_ns", self.now_ns)
         monkeypatch.setattr(blackbox, "AFTER_S", 0.1)
         monkeypatch.setattr(fault_events, "AFTER_S", 0.1)
+        monkeypatch.setattr(blackbox, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
 
     def now_ns(self) -> int:
         return self._began_ns + round(self.s * 1e9)
@@ -302,6 +303,35 @@ def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(play: Callable[..
     (recording,) = played.recordings
     assert "has published nothing for 1 s" in recording.about.what
     assert int(recording.records["cycle"][recording.about.at]) == 1
+
+
+def test_a_loop_that_hangs_and_goes_on_into_a_fault_makes_one_recording_until_the_reset(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    monkeypatch.setattr(blackbox, "SILENT_S", 1.0)
+    monkeypatch.setattr(time, "monotonic", lambda: clock.s)
+    played = play()
+    played.fill(100)
+    box = played.watched()
+
+    def recorded_at(at_s: float) -> int:
+        clock.s = at_s
+        box.look()
+        box._writer.submit(int).result()
+        return len(played.recordings)
+
+    assert [recorded_at(at_s) for at_s in (0.5, 1.5, 2.5, 3.0)] == [0, 1, 1, 1]
+    played.fill(1, fault_at=1)
+    assert recorded_at(3.1) == 1
+    played.board.event(Code.SLAVE_NOT_OP)
+    assert recorded_at(3.2) == 1
+    assert "has published nothing" in played.recordings[0].about.what
+    # What the file does not hold is written at the reset, and a silence after that is a new fault.
+    played.board.event(Code.RESET)
+    assert recorded_at(3.3) == 2
+    assert recorded_at(5.0) == 3
+    box.finish()
 
 
 def test_a_fault_that_no_gateway_saw_is_written_by_the_next_one_and_only_once(play: Callable[..., Played]) -> None:

@@ -132,3 +132,19 @@ def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
     assert min(turns.values()) >= 50
     said = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert said == [f"{what} cannot follow the loop; it is tried again" for what in turns]
+
+
+def test_a_new_gateway_knows_what_was_said_before_it_and_logs_only_what_comes(
+    gateways: Gateways, caplog: pytest.LogCaptureFixture
+) -> None:
+    gateways.loop.board.text("said before")
+    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    caplog.set_level("INFO", "rtcp.gateway")
+    made = gateway.Gateway(gateways.directory)
+    gateways.loop.board.text("said now")
+    made._tell_news()
+    made._box.finish()
+    assert [one.getMessage() for one in caplog.records if one.name == "rtcp.gateway"] == ["said now"]
+    messages = [sentence for _, sentence in made._picture.messages]
+    assert "said before" in messages
+    assert made._picture.fault.startswith("process data lost")

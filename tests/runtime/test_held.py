@@ -71,6 +71,20 @@ def test_an_argument_of_another_form_is_one_sentence_and_nothing_is_commanded(
     assert arm.loop.commands == []
 
 
+@pytest.mark.parametrize(("verb", "args"), [("jog", JOG), ("stick", {"byte": 62})])
+def test_what_comes_later_than_it_counts_is_not_carried_out(arm: Played, verb: str, args: dict[str, Any]) -> None:
+    failed = arm.refused(verb, **args, hold_s=0.3, t=time.monotonic() - 2.5)
+    assert failed.kind == "timeout"
+    assert "it came 2.5 s after it was said, and counts for 0.3 s only" in str(failed)
+    assert arm.loop.commands == []
+    assert arm.loop.requests == []
+
+
+def test_what_comes_in_time_is_carried_out(arm: Played) -> None:
+    arm.ask("jog", **JOG, hold_s=1.0, t=time.monotonic())
+    assert len(arm.loop.taken(Command.JOG)) == 1
+
+
 def test_joints_are_jogged_as_joint_speeds_where_the_arm_is_in_mode_velocity(arm: Played) -> None:
     arm.show(motion=MotionMode.VELOCITY)
     arm.ask("jog", v=SIX, frame="joints")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import socket
 import subprocess
 import threading
 import time
@@ -18,6 +19,7 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.runtime import launcher
 from rtcp.runtime.blackboard import Blackboard
+from rtcp.runtime.ending import end_of, forget_end, write_end
 from rtcp.runtime.layout import PER_JOINT, SCALARS
 from rtcp.runtime.lock import Busy, alone
 from rtcp.runtime.paths import blackboard_file, stopping_mark
@@ -92,8 +94,15 @@ def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
     else:
         session_of(config).write(directory / "session.pickle")
         monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)
+    sockets = [directory / "segment.sock", directory / "segment-7.sock"]
+    for path in sockets:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+            left.bind(str(path))
     told: list[str] = []
-    launcher.stop(told.append)
+    left_over = launcher.stop(told.append)
+    said = "had ended before, and not in order: its drives were left to their watchdog"
+    assert left_over == (f"the loop (process {os.getpid()}) {said}",)
+    assert not any(path.exists() for path in sockets)
     assert len(told) == 1
     assert f"the end of the loop (process {os.getpid()}) was not recorded" in told[0]
     assert ("another version" if wrong == "session" else "AttributeError") in told[0]
@@ -194,3 +203,28 @@ def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Pat
         child.kill()
         child.wait()
     assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment
+
+
+def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmConfig) -> None:
+    (directory / "loop.log").write_text("what went wrong")
+    (directory / "gateway.log").write_text("who asked")
+    (directory / "gateway.log.1").write_text("long ago")
+    broken = replace(config, bus=replace(config.bus, interface="nosuch0"))
+    with pytest.raises(StartError):
+        launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda said: None)
+    assert (directory / "loop.log.1").read_text() == "what went wrong"
+    assert (directory / "gateway.log.1").read_text() == "who asked"
+
+
+@pytest.mark.parametrize("lived", [True, False])
+def test_a_loop_of_another_start_does_not_answer_for_this_one(directory: Path, lived: bool) -> None:
+    this = identify(os.getpid())
+    write_end(directory, this, ["a slave stayed in OP"])
+    assert end_of(directory, this, lived) == ("a slave stayed in OP",)
+    gone = Pid(this, this.started - 1)
+    (sentence,) = end_of(directory, gone, lived)
+    assert ("was killed" in sentence) == lived
+    assert "left to their watchdog" in sentence
+    forget_end(directory)
+    assert "left to their watchdog" in end_of(directory, gone, lived)[0]
+    assert end_of(directory, Pid(0), lived) == ()
