@@ -122,6 +122,11 @@ class JogMode:
             self._asked[:] = self._zero
             self.phase = Phase.STOP
 
+    def hold(self) -> None:
+        """End whatever is under way where the set-points are: something else has taken the arm."""
+        self._asked[:] = self._zero
+        self.phase = Phase.HOLD
+
     def update(self, state: MotionState, dt: float) -> Target:
         """Return the set-points of the next cycle."""
         target = self._target

@@ -58,6 +58,9 @@ class Motions:
     def rest(self) -> None:
         """Hold where the set-points are; at standstill."""
         self.generator.hold()
+        if self.jog is not None:
+            # A jog that a fault ended in its midst would never be begun anew by the stick.
+            self.jog.hold()
         self.active = self.generator
 
     def stop(self, state: MotionState) -> None:

@@ -193,3 +193,21 @@ def test_the_emergency_stop_is_met_while_the_loop_closes(arm: Arm) -> None:
     assert {drive.controlword for drive in simulation.parts.arm.drives} == {0x0002}
     assert simulation.until(lambda: simulation.done, 5.0)
     assert simulation.parts.arm.first_with_torque() == -1
+
+
+def test_the_stick_moves_the_arm_again_after_a_fault_that_came_while_it_did(arm: Arm) -> None:
+    simulation = arm.simulation
+    arm.stick(BACKWARD, 0.5)
+    assert simulation.state is State.MOVING
+    simulation.models[1].inject_fault(0x8611)
+    assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
+    arm.stick(NEUTRAL, 1.0)
+    assert simulation.order(Command.RESET).refusal == 0
+    assert simulation.until(lambda: simulation.state is State.READY, 5.0)
+    assert simulation.order(Command.ENABLE).refusal == 0
+    assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+    arm.stick(NEUTRAL, 0.2)
+    before = arm.tool
+    arm.stick(BACKWARD, 0.5)
+    assert simulation.state is State.MOVING
+    assert arm.tool[0] < before[0] - 0.01

@@ -21,6 +21,7 @@ _SPEED = 0.4
 _JOG_M_S, _TURN_S = 0.06, 1.2
 _SAY_AGAIN_S, _HOLD_S = 0.05, 0.25
 _STICK_HOLD_S = 0.5
+_NEUTRAL = 63
 
 
 class Activity:
@@ -130,6 +131,9 @@ class Stick(Activity):
     moves = True
 
     def _ask(self, client: ControlClient) -> None:
+        # The arm waits for a stick in its middle before it follows it.
+        client.call("stick", {"pressed": [], "byte": _NEUTRAL, "hold_s": _STICK_HOLD_S})
+        self._ended.wait(_STICK_HOLD_S / 2)
         begun = time.monotonic()
         while not self._ended.is_set():
             way = "forward" if (time.monotonic() - begun) % (2 * _TURN_S) < _TURN_S else "backward"
