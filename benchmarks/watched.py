@@ -1,8 +1,9 @@
 """What onlookers cost the cycle: `python benchmarks/watched.py [--seconds N] [--rounds N] [--json FILE]`.
 
-In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and nobody looking; and
-with the watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`. Both
-with the timer alone (`spin_us: 0`), whose wake-up p99 is what onlookers could delay, and both moving in joint mode.
+In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and nobody looking; with
+the watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`; and, as the
+watcher's worst, with the last drive losing its supply for 50 ms every second and being set up again. With the timer
+alone (`spin_us: 0`), whose wake-up p99 is what onlookers could delay, and as shipped; the first two in joint motion.
 Medians over the rounds; the ratio is that of the medians. Ends with 1 where it is above 1.2.
 """
 
@@ -19,6 +20,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from datetime import date
@@ -33,9 +35,10 @@ from cycle import Round, figures, platform_round, spread
 
 from rtcp.config.find import find_config
 from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, runtime_directory
+from rtcp.runtime.paths import blackboard_file, runtime_directory, segment_control
+from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
 
-WATCH_MS = {"alone": 1000, "watched": 10}
+WATCH_MS = {"alone": 1000, "watched": 10, "setting up": 10}
 TURN_S = 0.01
 AIM = 1.2
 
@@ -43,6 +46,7 @@ AIM = 1.2
 def configured(directory: Path, watch_ms: int, spin_us: int) -> Path:
     """Copy the default configuration with these two numbers; return the arm's file."""
     copied = directory / f"watch-{watch_ms}-{spin_us}"
+    shutil.rmtree(copied, ignore_errors=True)
     shutil.copytree(find_config(None).parent, copied)
     arm = copied / find_config(None).name
     text = re.sub(r"spin_us: \d+", f"spin_us: {spin_us}", arm.read_text())
@@ -80,6 +84,32 @@ def onlookers() -> Iterator[None]:
             child.wait()
 
 
+@contextlib.contextmanager
+def losses() -> Iterator[None]:
+    """Take the last drive's supply away for 50 ms every second."""
+    ended = threading.Event()
+
+    def lose() -> None:
+        while not (runtime_directory() / "started.json").exists() and not ended.wait(0.1):
+            pass
+        # By then the arm is enabled and measured.
+        ended.wait(1.5)
+        while not ended.wait(1.0):
+            with (
+                contextlib.suppress(SegmentAway, SegmentRefused, OSError),
+                SegmentClient(segment_control(runtime_directory())) as segment,
+            ):
+                segment.fault({"fault": "power", "slave": 7, "lasts": 0.05})
+
+    thread = threading.Thread(target=lose, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def measure(directory: Path, kind: str, spin_us: int, seconds: float) -> Round:
     """Run one round."""
     config = configured(directory, WATCH_MS[kind], spin_us)
@@ -87,7 +117,10 @@ def measure(directory: Path, kind: str, spin_us: int, seconds: float) -> Round:
         with contextlib.ExitStack() as around:
             if kind == "watched":
                 around.enter_context(onlookers())
-            return platform_round(500, seconds, poll=False, active="joint", config=config)
+            elif kind == "setting up":
+                around.enter_context(losses())
+            active = None if kind == "setting up" else "joint"
+            return platform_round(500, seconds, poll=False, active=active, config=config)
     finally:
         shutil.rmtree(config.parent)
 
