@@ -173,10 +173,13 @@ def test_keys_that_were_typed_while_the_process_was_suspended_move_nothing(
         counts.append(settled(lambda: len(platform.asked("jog"))))
         keyboard.press(b" " * 300)
 
+    suspended = time.monotonic()
     suspend(keyboard.process, 0.6, meanwhile)
     wait_until(lambda: bool(platform.asked("halt")))
     time.sleep(0.4)
-    assert len(platform.asked("jog")) == counts[0]
+    # One may have been on its way: the platform refuses it by its instant.
+    assert len(platform.asked("jog")) <= counts[0] + 1
+    assert all(one["t"] < suspended + 0.1 for one in platform.asked("jog"))
     assert "the keys were not looked at for" in keyboard.process.stdout.readline()
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > counts[0])
     assert keyboard.quit() == 0
