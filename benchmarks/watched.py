@@ -73,9 +73,12 @@ def onlookers() -> Iterator[None]:
         "time.sleep(1.0); watched.read_everything()"
     )
     watch = f"while :; do {sys.executable} -m rtcp.cli status --watch; sleep 0.2; done"
-    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet = subprocess.DEVNULL
     commands = ([sys.executable, "-c", script, str(Path(__file__).parent)], ["sh", "-c", watch])
-    started = [subprocess.Popen(command, start_new_session=True, **quiet) for command in commands]  # type: ignore[call-overload]
+    started = [
+        subprocess.Popen(command, stdin=quiet, stdout=quiet, stderr=quiet, start_new_session=True)
+        for command in commands
+    ]
     try:
         yield
     finally:

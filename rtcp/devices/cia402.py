@@ -86,14 +86,14 @@ CONTROLWORDS |= {(state, DriveGoal.TORQUE_OFF): DISABLE_VOLTAGE for state in Dri
 # Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays there.
 CONTROLWORDS |= {(state, DriveGoal.QUICK_STOPPED): QUICK_STOP for state in DriveState}
 
+_WITHOUT_TORQUE = frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT})
+
 # States in which a goal is reached.
 REACHED: dict[DriveGoal, frozenset[DriveState]] = {
     DriveGoal.ENABLED: frozenset({_S.OPERATION_ENABLED}),
-    DriveGoal.DISABLED: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
-    DriveGoal.TORQUE_OFF: frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}),
-    DriveGoal.QUICK_STOPPED: frozenset(
-        {_S.QUICK_STOP_ACTIVE, _S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT}
-    ),
+    DriveGoal.DISABLED: _WITHOUT_TORQUE,
+    DriveGoal.TORQUE_OFF: _WITHOUT_TORQUE,
+    DriveGoal.QUICK_STOPPED: _WITHOUT_TORQUE | {_S.QUICK_STOP_ACTIVE},
     DriveGoal.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
 }
 

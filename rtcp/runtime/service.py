@@ -6,10 +6,11 @@ It shares a few plain attributes with the cycle (one writer each) and never hold
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import BusError, SlaveState, WatchedBus
+from rtcp.fieldbus.charges import Charge
 from rtcp.fieldbus.watcher import Watcher
 from rtcp.realtime.scheduling import thread_beside
 from rtcp.runtime.blackboard import Blackboard
@@ -222,13 +223,13 @@ class Service(threading.Thread):
                 self._emergencies[position] = Rationed(self._blackboard.text, _MOST_EMERGENCIES, what)
             self._emergencies[position].say(emergency.sentence())
 
-    def _tell_states(self, states: Sequence[SlaveState]) -> None:
+    def _tell_states(self, states: Iterable[SlaveState | Charge]) -> None:
         for slave in states:
             self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
 
     def _tell_health(self, watcher: Watcher) -> None:
+        self._tell_states(watcher.slaves)
         for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
-            self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
             self._blackboard.health(
                 slave.position, slave.lost, slave.recovered, errors.rx, errors.forwarded, errors.links
             )

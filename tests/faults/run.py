@@ -8,15 +8,13 @@ from collections.abc import Iterator
 from rtcp.runtime.session import read_session
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.trial import GOES_ON as GOING_ON
-from rtcp.telemetry.trials.trial import Outcome, carry_out
+from rtcp.telemetry.trials.trial import LARGEST_STEP, Outcome, carry_out
 from tests.e2e.conftest import Platform
 from tests.faults.cases import GOES_ON, MOVING, STOPS, Case
 
 SHIPPED_MS = 500
 """What the shipped configuration takes without frames on the virtual bus; the tests' lease is longer than the shipped
 one alone, for a shared host at times lets a gateway wait."""
-_STEP = 1.0 + 1e-6
-"""A target may step as far as its speed limit allows in a cycle, and the last bit of a double further."""
 
 
 @contextlib.contextmanager
@@ -58,7 +56,7 @@ def faults_of(case: Case, outcome: Outcome) -> list[str]:
         found.append(f"a joint went {outcome.way:.2f} times as far as its stop may be long")
     if outcome.by_itself:
         found.append(f"without a reset {outcome.by_itself}")
-    if outcome.largest_step > _STEP:
+    if outcome.largest_step > LARGEST_STEP:
         found.append(f"a target's step was {outcome.largest_step:.4f} of what its speed limit allows")
     if case.reset_is_refused and not outcome.still_broken:
         found.append("a reset was not refused while the fault lasted")

@@ -13,12 +13,11 @@ from rtcp.runtime.client import ControlError
 from rtcp.telemetry.trials.activities import ACTIVITIES
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.resources import Resources, grown, resources
-from rtcp.telemetry.trials.trial import GOES_ON, Outcome, carry_out, shown
+from rtcp.telemetry.trials.trial import GOES_ON, LARGEST_STEP, Outcome, carry_out, shown
 from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
 
 SETTLE_S = 60.0
 """A process's memory is looked at from then on: by that time all that it keeps has been allocated."""
-_STEP = 1.0 + 1e-6
 _WATCH_S = 1.0
 _ON_FRAMES = frozenset({"cable", "power", "loss", "delay", "duplicate", "reorder", "corrupt", "wkc", "noise"})
 """Faults that show in the working counter; of others a cycle without the right one says nothing."""
@@ -163,7 +162,7 @@ class Soak:
             account.injected += bench.injected - before
         self._count(account, outcome, counted=fault["fault"] in _ON_FRAMES)
         summary.largest_step = max(summary.largest_step, outcome.largest_step)
-        if outcome.largest_step > _STEP:
+        if outcome.largest_step > LARGEST_STEP:
             summary.failures.append(f"{where}: a target's step was {outcome.largest_step:.3f} of what is allowed")
         if outcome.way > 1.0:
             summary.failures.append(f"{where}: a joint went {outcome.way:.2f} times as far as its stop may be long")

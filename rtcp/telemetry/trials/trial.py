@@ -21,6 +21,8 @@ _AFTER_S = 0.3
 _MENDED_S = 0.4
 """So long after the mending nothing may move or get torque: nobody has asked for it."""
 _MOVED_RAD = 0.003
+LARGEST_STEP = 1.0 + 1e-6
+"""A target may step as far as its speed limit allows in a cycle, and the last bit of a double further."""
 _A_LITTLE = 0.02
 """rad: by so much every joint is moved to see that the arm works again."""
 
