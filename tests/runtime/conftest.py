@@ -16,9 +16,31 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.client import ControlClient
+from rtcp.runtime.observer import Observer
 from rtcp.runtime.paths import blackboard_file, control_socket
 from rtcp.runtime.session import Session
+from tests.runtime.bench import CONFIG, PERIOD_S, Bench
 from tests.runtime.played_loop import Loop
+
+
+@pytest.fixture(scope="module")
+def bench_board() -> Iterator[tuple[Blackboard, Observer]]:
+    """One for all benches of a file: to make one, 16 MB of memory are touched."""
+    path = Path(f"/dev/shm/rtcp-bench-{os.getpid()}")
+    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
+    observer = Observer(path)
+    path.unlink()
+    yield written, observer
+    observer.close()
+    written.close()
+
+
+@pytest.fixture
+def bench(bench_board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+    """A bench whose lease is given back."""
+    made = Bench(*bench_board)
+    yield made
+    bench_board[1].release(made.lease)
 
 
 @pytest.fixture

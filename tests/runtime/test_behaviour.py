@@ -3,399 +3,42 @@ models, cycle by cycle, without a bus and without a clock."""
 
 from __future__ import annotations
 
-import os
-import struct
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
-from rtcp.fieldbus.alstatus import AlState
 from rtcp.motion.state import MotionState, Reason, Target
-from rtcp.realtime.clock import monotonic_ns
-from rtcp.realtime.discipline import Discipline
-from rtcp.runtime.assembly import assemble
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Answer, Event, Observer
-from rtcp.runtime.sentences import FAULTS, Sentences
-from rtcp.runtime.service import Service
-from rtcp.virtual.models import CubemarsDrive, create
-from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
+from rtcp.runtime.observer import Observer
+from rtcp.runtime.sentences import FAULTS
 
-PERIOD_S = 0.001
-COUNTS = 10000
-ENABLE_TIMEOUT_S = 0.2
-DEBOUNCE_S = 0.005
-"""Of the emergency stop's input, which a reset waits for as well."""
-LOST_CYCLES = 40
-CSP, CSV, CST = 8, 9, 10
-EMERGENCIES = {Code.PRESSED, Code.OVER_SPEED, Code.OVER_TORQUE, Code.FOLLOWING_ERROR}
-"""Codes of the emergency stop: told in test_emergency_stop.py."""
-CONTROLWORD, QUICK_STOP_OPTION, MODES_OF_OPERATION = 0x6040, 0x605A, 0x6060
-VOLTAGE_OFF, QUICK_STOP, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02, 0x07, 0x0F
-UNDER_VOLTAGE = 0x3220
-SPEED = 0.3
-NOTHING_PRESSED = 0x033F
-"""Levels at the box's inputs: stick neutral, toggle at arm (9), emergency stop closed (10)."""
-EMERGENCY_STOP_INPUT = 9
-"""Channel of the box, from 0."""
-WITH_TORQUE = (0x27, 0x07)
-"""Statuswords, masked, of Operation Enabled and Quick Stop Active (CiA 402-2, object 0x6041)."""
-
-
-def small_arm() -> ArmConfig:
-    """The first two joints of the default arm with its IO box, on a network interface: nothing is widened there."""
-    config = load(default_config())
-    return replace(
-        config,
-        slaves=config.slaves[:3],
-        joints=config.joints[:2],
-        cycle=replace(config.cycle, period_us=PERIOD_S * 1e6),
-        bus=replace(config.bus, interface="eth0", lost_cycles=LOST_CYCLES),
-        enable_timeout_s=ENABLE_TIMEOUT_S,
-        arm=None,
-    )
-
-
-CONFIG = small_arm()
-NO_BOX = replace(CONFIG.slaves[0].device, kind="cia402")
-"""The box's description under another kind: nobody drives it, and the platform finds no box."""
-LONGEST_STEP = CONFIG.joints[0].velocity * PERIOD_S * COUNTS + 1
-"""Counts; one more than the speed limit allows, for the rounding of both ends."""
-
-
-class Segment:
-    """A process image whose other end are the device models, mapped by the virtual segment's own code."""
-
-    def __init__(self) -> None:
-        self.drives = [CubemarsDrive("orh70", load_inertia=2.0), CubemarsDrive("orh60", load_inertia=0.5)]
-        self.devices = [create("diewu-io", inputs=NOTHING_PRESSED), *self.drives]
-        self.expected_wkc = 3 * len(self.devices)
-        self.dc_time = self.missed = self.stale = 0
-        self.carries = True
-        """Whether frames go out and come back."""
-        self.deaf: dict[tuple[int, int], dict[int, int]] = {}
-        """What a drive understands instead of what it is told: (drive from 0, object) -> {told: understood}."""
-        self._rx = [PdoImage.from_assignment(device.objects, RX_ASSIGN) for device in self.devices]
-        self._tx = [PdoImage.from_assignment(device.objects, TX_ASSIGN) for device in self.devices]
-        self._outputs = [bytes(image.byte_length) for image in self._rx]
-        self._inputs = [bytearray(image.byte_length) for image in self._tx]
-        for device in self.devices:
-            device.set_outputs_valid(True)
-            # The self-test.
-            device.step(0.2)
-        for drive in self.drives:
-            # As the start-up SDOs of the drive's description set it: ramp down, then hold.
-            drive.objects[QUICK_STOP_OPTION, 0].value = 6
-        self._answer()
-
-    def send(self) -> None:
-        if not self.carries:
-            return
-        for image, outputs in zip(self._rx, self._outputs, strict=True):
-            image.unpack(outputs)
-        for (axis, index), understood in self.deaf.items():
-            entry = self.drives[axis].objects[index, 0]
-            entry.value = understood.get(entry.value, entry.value)
-
-    def receive(self) -> int:
-        # A frame brings what was before it: devices take its outputs over with the SYNC0 after it.
-        if self.carries:
-            self._answer()
-        for device in self.devices:
-            device.step(PERIOD_S)
-        return self.expected_wkc if self.carries else -1
-
-    def input(self, index: int) -> bytes:
-        return bytes(self._inputs[index])
-
-    def set_output(self, index: int, data: bytes) -> None:
-        assert len(data) == len(self._outputs[index])
-        self._outputs[index] = data
-
-    def output(self, index: int) -> bytes:
-        return self._outputs[index]
-
-    def _answer(self) -> None:
-        for image, inputs in zip(self._tx, self._inputs, strict=True):
-            image.pack(inputs)
-
-
-class Said(NamedTuple):
-    """A drive's inputs and outputs of one cycle as they are on the wire, in counts."""
-
-    statusword: int
-    position: int
-    velocity: int
-    torque: int
-    mode_display: int
-    controlword: int
-    target: int
-    speed: int
-    effort: int
-    mode: int
-
-    @property
-    def has_torque(self) -> bool:
-        return self.statusword & 0x6F in WITH_TORQUE
-
-    @property
-    def obeys_target(self) -> bool:
-        """Whether the drive goes, or may go on, to the target of this frame."""
-        return self.has_torque and self.controlword in (ENABLE_OPERATION, QUICK_STOP)
-
-
-_WIRE = struct.Struct("<Hiiib")
-
-
-class Cycle(NamedTuple):
-    """What is seen of a cycle from outside."""
-
-    state: State
-    drives: tuple[Said, ...]
-
-
-class Followed(Discipline):
-    """A reference clock that is followed for as long as the test says so: the segment here has none."""
-
-    def observe(self, woken: int, dc_time: int) -> None:
-        pass
-
-    def coast(self) -> None:
-        pass
-
-
-class Bench:
-    """The loop's parts without the loop: each call of `cycle` does what `Loop.run` does once, in its order.
-
-    The service thread is not started; the bench does what it would do: slaves reach OP, and come back after a reset.
-    """
-
-    def __init__(
-        self, board: Blackboard, observer: Observer, *, with_box: bool = True, config: ArmConfig = CONFIG
-    ) -> None:
-        self.data = Segment()
-        self.models = self.data.drives
-        self.board, self.observer = board, observer
-        period_ns = round(PERIOD_S * 1e9)
-        self.discipline = Followed(period_ns, 0)
-        self.discipline.locked = True
-        self.service = Service(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
-        self.slaves_come_back = True
-        for position in range(1, 1 + len(config.slaves)):
-            board.slave(position, AlState.OP, 0)
-        if not with_box:
-            config = replace(config, slaves=(replace(config.slaves[0], device=NO_BOX), *config.slaves[1:]))
-        parts = assemble(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
-        self.arm, self.box, self.operator = parts.arm, parts.box, parts.operator
-        self.behaviour, self.orders, self.loop = parts.behaviour, parts.orders, parts.loop
-        self.now_ns = monotonic_ns()
-        self.sentences = Sentences(CONFIG)
-        self.log: list[Cycle] = []
-        self._events_before = max((event.number for event in observer.events_since(0)), default=0)
-        self.lease = observer.acquire("the bench", 3600.0)
-
-    @property
-    def state(self) -> State:
-        return self.behaviour.state
-
-    @property
-    def events(self) -> list[Event]:
-        return self.observer.events_since(self._events_before)
-
-    @property
-    def codes(self) -> list[int]:
-        return [event.code if event.code > Code.ENDED else Code(event.code) for event in self.events]
-
-    def cycle(self) -> None:
-        data, behaviour = self.data, self.behaviour
-        if self.slaves_come_back and behaviour.state is State.RESETTING:
-            self.service.lost_slave = 0
-            self.service.all_op = True
-        self.now_ns = monotonic_ns()
-        self.loop.cycle(self.now_ns, self.now_ns)
-        self.log.append(
-            Cycle(
-                behaviour.state,
-                tuple(
-                    Said(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
-                    for slot in range(1, len(data.devices))
-                ),
-            )
-        )
-
-    def run(self, seconds: float) -> None:
-        for _ in range(round(seconds / PERIOD_S)):
-            self.cycle()
-
-    def wait(self, condition: Callable[[], bool], seconds: float = 5.0) -> float:
-        """Run until `condition`; return the time it took."""
-        for n in range(round(seconds / PERIOD_S) + 1):
-            if condition():
-                return n * PERIOD_S
-            self.cycle()
-        raise AssertionError(f"not within {seconds} s, but {self.state.name}; {self.said}")
-
-    def until(self, state: State, seconds: float = 5.0) -> float:
-        """Run until the machine is in `state`; return the time it took."""
-        return self.wait(lambda: self.state is state, seconds)
-
-    def finish(self) -> float:
-        """Run until the loop may end; return the time it took."""
-        return self.wait(lambda: self.behaviour.done)
-
-    def order(self, command: int, numbers: Sequence[float] = (), lease: int | None = None) -> Answer:
-        """Give a command as a commander does, run one cycle and return the answer to it."""
-        number = self.observer.command(self.lease if lease is None else lease, command, numbers)
-        self.cycle()
-        answer = self.observer.answer(number)
-        assert answer is not None
-        return answer
-
-    def do(self, command: Command, numbers: Sequence[float] = ()) -> None:
-        """Give a command that is taken."""
-        answer = self.order(command, numbers)
-        assert answer.refusal == 0, self.sentences.refusal(*vars(answer).values())
-
-    def move(self, *target: float, speed: float = SPEED) -> None:
-        self.do(Command.MOVE, move_numbers(*target, speed=speed))
-
-    def refused(self, answer: Answer) -> str:
-        """Return the sentence of a refusal."""
-        return self.sentences.refusal(answer.refusal, answer.axis, answer.value, answer.limit)
-
-    @property
-    def said(self) -> list[str]:
-        """All events so far, in words."""
-        return [self.sentences.event(event.code, event.axis, event.value, event.limit) for event in self.events]
-
-    def press(self, pressed: bool = True) -> None:
-        """Press the emergency stop, or release it, and let it be seen."""
-        self.data.devices[0].set_input(EMERGENCY_STOP_INPUT, not pressed)
-        self.run(0.02)
-
-    # -- ways to the states -------------------------------------------------------------------------------------
-
-    def start(self) -> Bench:
-        self.service.all_op = True
-        self.until(State.READY)
-        # What the inputs mean counts once it has lasted.
-        self.run(0.01)
-        return self
-
-    def enable(self) -> Bench:
-        self.do(Command.ENABLE)
-        self.until(State.HOLDING)
-        return self
-
-    def hold(self, mode: int = CSP) -> Bench:
-        self.start()
-        self.do(Command.MODE, [mode])
-        self.enable()
-        self.wait(lambda: not self.behaviour.switching)
-        return self
-
-    def set_in_motion(self, mode: int = CSP) -> Bench:
-        """Both joints, at full speed on a long way."""
-        self.hold(mode)
-        self.move(1.8, 1.8)
-        self.run(0.6)
-        assert all(drive.velocity > 0.9 * SPEED for drive in self.arm.drives)
-        return self
-
-    def bring_to(self, state: State) -> Bench:
-        """Lead the machine into `state` from its beginning, by what leads there on a robot."""
-        if state is State.STARTING:
-            self.cycle()
-        elif state is State.READY:
-            self.start()
-        elif state is State.ENABLING:
-            self.start().do(Command.ENABLE)
-        elif state is State.HOLDING:
-            self.hold()
-        elif state is State.MOVING:
-            self.set_in_motion()
-        elif state is State.STOPPING:
-            self.set_in_motion().do(Command.STOP)
-        elif state is State.DISABLING:
-            self.set_in_motion().do(Command.DISABLE)
-        elif state is State.FAULT:
-            self.hold()
-            self.service.lost_slave = 3
-            self.cycle()
-        elif state is State.EMERGENCY_STOP:
-            self.hold().press()
-        elif state is State.STOPPED_BY_LIMIT:
-            # The limits close in on a move that was planned under wider ones.
-            self.set_in_motion()
-            self.arm.limits.high[0] = self.arm.state.position[0] + 0.3
-            self.until(State.STOPPED_BY_LIMIT)
-        elif state is State.HOMING:
-            self.hold()
-            # A search that finds nothing: the speed is too small.
-            self.models[0].objects[0x6098, 0].value = 34
-            self.models[0].objects[0x6099, 2].value = 1
-            self.do(Command.HOME, [0])
-        elif state is State.RESETTING:
-            self.bring_to(State.FAULT)
-            self.slaves_come_back = False
-            self.do(Command.RESET)
-        else:
-            self.set_in_motion().do(Command.SHUTDOWN)
-        assert self.state is state
-        return self
-
-    # -- what is seen on the wire -------------------------------------------------------------------------------
-
-    def words(self, axis: int) -> list[int]:
-        """The controlwords that a drive was sent, each once where it was repeated."""
-        sent = [cycle.drives[axis].controlword for cycle in self.log]
-        return [word for n, word in enumerate(sent) if n == 0 or sent[n - 1] != word]
-
-    def longest_step(self, axis: int) -> int:
-        """The longest step, in counts, between two targets in a row that the drive obeyed."""
-        said = [cycle.drives[axis] for cycle in self.log]
-        return max(
-            (
-                abs(after.target - before.target)
-                for before, after in pairwise(said)
-                if before.obeys_target and after.obeys_target
-            ),
-            default=0,
-        )
-
-
-def move_numbers(*target: float, speed: float = SPEED) -> list[float]:
-    """The numbers of a move as they lie in the command ring: targets first, speed last of twelve."""
-    return [*target, *([0.0] * (11 - len(target))), speed]
-
-
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    # One for all tests of the file: to make one, 16 MB of memory are touched.
-    path = Path(f"/dev/shm/rtcp-behaviour-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-@pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
-    made = Bench(*board)
-    yield made
-    board[1].release(made.lease)
-
+from .bench import (
+    _WIRE,
+    CONFIG,
+    CONTROLWORD,
+    COUNTS,
+    CSP,
+    CST,
+    CSV,
+    DEBOUNCE_S,
+    EMERGENCIES,
+    ENABLE_OPERATION,
+    ENABLE_TIMEOUT_S,
+    LONGEST_STEP,
+    LOST_CYCLES,
+    MODES_OF_OPERATION,
+    PERIOD_S,
+    QUICK_STOP,
+    SWITCH_ON,
+    UNDER_VOLTAGE,
+    Bench,
+    move_numbers,
+)
 
 # -- every fault: what it is, what is said, what the drives are told, and the way back ------------------------------
 
@@ -667,12 +310,12 @@ class Story:
 
 
 @pytest.fixture(scope="module", params=FAULT_STORIES, ids=lambda fault: fault.name)
-def story(request: pytest.FixtureRequest, board: tuple[Blackboard, Observer]) -> Story:
-    bench = Bench(*board)
+def story(request: pytest.FixtureRequest, bench_board: tuple[Blackboard, Observer]) -> Story:
+    bench = Bench(*bench_board)
     try:
         return Story(request.param, bench)
     finally:
-        board[1].release(bench.lease)
+        bench_board[1].release(bench.lease)
 
 
 def test_every_code_of_a_fault_has_its_story() -> None:
@@ -1207,15 +850,15 @@ def happen(bench: Bench, deed: str, how: object) -> None:
 @settings(max_examples=15, deadline=None, derandomize=True, phases=[Phase.generate])
 @given(deeds=st.lists(DEEDS, min_size=20, max_size=40))
 def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(
-    board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]
+    bench_board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]
 ) -> None:
-    bench = Bench(*board)
+    bench = Bench(*bench_board)
     try:
         bench.set_in_motion()
         for deed, how in deeds:
             happen(bench, deed, how)
     finally:
-        board[1].release(bench.lease)
+        bench_board[1].release(bench.lease)
     for axis, joint in enumerate(CONFIG.joints):
         assert bench.longest_step(axis) <= LONGEST_STEP
         obeyed = [said.target for cycle in bench.log if (said := cycle.drives[axis]).obeys_target]

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +13,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Command, State
 from rtcp.runtime.observer import Observer
 
-from .test_behaviour import CONFIG, PERIOD_S, Bench
+from .bench import CONFIG, Bench
 
 GRIPPER, BY_HAND = 4, 5
 """Numbers of outputs."""
@@ -25,24 +23,13 @@ BOX, DRIVE = 1, 3
 """Positions of slaves."""
 
 
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-box-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
 @pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+def bench(bench_board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
     """The arm holds; the gripper is closed and an output switched on."""
-    made = Bench(*board, config=WITH_GRIPPER).hold()
+    made = Bench(*bench_board, config=WITH_GRIPPER).hold()
     switch_on(made)
     yield made
-    board[1].release(made.lease)
+    bench_board[1].release(made.lease)
 
 
 def switch_on(bench: Bench) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -14,30 +12,12 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Observer
 
-from .test_behaviour import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, QUICK_STOP, SPEED, Bench, move_numbers
+from .bench import CONFIG, COUNTS, LONGEST_STEP, QUICK_STOP, SPEED, Bench, move_numbers
 
 WITH_TORQUE = [State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.HOMING, State.STOPPED_BY_LIMIT]
 PRESSED_SAYS = (
     "the emergency stop is pressed (inputs.emergency_stop in assistive_arm.yaml): release it, then `rtcp reset`"
 )
-
-
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-emergency-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-@pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
-    made = Bench(*board)
-    yield made
-    board[1].release(made.lease)
 
 
 # -- the button -----------------------------------------------------------------------------------------------------
@@ -305,12 +285,12 @@ def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(be
 
 
 @pytest.fixture
-def held(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
+def held(bench_board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
     """A bench with an enabling switch at input 11."""
     switch = InputConfig(11)
-    made = Bench(*board, config=replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=switch)))
+    made = Bench(*bench_board, config=replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=switch)))
     yield made
-    board[1].release(made.lease)
+    bench_board[1].release(made.lease)
 
 
 def permit(bench: Bench, pressed: bool) -> None:

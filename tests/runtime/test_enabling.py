@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import struct
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import pytest
 
-from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Observer
 
-from .test_behaviour import (
+from .bench import (
     CONFIG,
     CONTROLWORD,
     COUNTS,
@@ -28,24 +24,6 @@ from .test_behaviour import (
 _INPUTS = struct.Struct("<Hiiib")
 ENABLED, SWITCHED_ON, NO_STATE = 0x0237, 0x0233, 0x0213
 """Statuswords; the last is none that the standard defines."""
-
-
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-enabling-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-@pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
-    made = Bench(*board)
-    yield made
-    board[1].release(made.lease)
 
 
 def falsify(bench: Bench, axis: int = 0, word: int | None = None, position: float | None = None) -> Callable[[], None]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
-from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
@@ -18,7 +16,7 @@ from rtcp.runtime.observer import Observer
 from rtcp.runtime.sentences import Sentences
 from rtcp.runtime.stops import KEYS
 
-from .test_behaviour import (
+from .bench import (
     CONFIG,
     CONTROLWORD,
     CSP,
@@ -99,36 +97,25 @@ CAUSES: dict[str, tuple[Callable[[Bench], object], Callable[[Bench], object]]] =
 """For each key what brings its event about, and what mends it."""
 
 
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-ladder-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-def bench_with(board: tuple[Blackboard, Observer], **rungs: str) -> Bench:
+def bench_with(bench_board: tuple[Blackboard, Observer], **rungs: str) -> Bench:
     config = replace(WITH_SWITCH, stops=with_stops(**rungs))
-    bench = Bench(*board, config=config)
+    bench = Bench(*bench_board, config=config)
     bench.sentences = Sentences(config)
     put(bench, SWITCH_INPUT, True)
     return bench
 
 
 @pytest.fixture
-def made(board: tuple[Blackboard, Observer]) -> Iterator[Callable[..., Bench]]:
+def made(bench_board: tuple[Blackboard, Observer]) -> Iterator[Callable[..., Bench]]:
     """Make a bench whose enabling switch is held, with rungs by key."""
     benches: list[Bench] = []
 
     def make(**rungs: str) -> Bench:
-        benches.append(bench_with(board, **rungs))
+        benches.append(bench_with(bench_board, **rungs))
         return benches[-1]
 
     yield make
-    board[1].release(benches[-1].lease)
+    bench_board[1].release(benches[-1].lease)
 
 
 def codes_of(key: str) -> set[Code]:
@@ -176,13 +163,13 @@ class Lived:
 
 
 @pytest.fixture(scope="module", params=EVERY, ids="-".join)
-def lived(request: pytest.FixtureRequest, board: tuple[Blackboard, Observer]) -> Lived:
+def lived(request: pytest.FixtureRequest, bench_board: tuple[Blackboard, Observer]) -> Lived:
     key, rung = request.param
-    bench = bench_with(board, **{key: rung})
+    bench = bench_with(bench_board, **{key: rung})
     try:
         return Lived(bench, key, rung)
     finally:
-        board[1].release(bench.lease)
+        bench_board[1].release(bench.lease)
 
 
 def test_an_event_takes_the_rung_of_its_key(lived: Lived) -> None:

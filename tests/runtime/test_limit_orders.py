@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
 from dataclasses import replace
 from math import nan
-from pathlib import Path
 
 import pytest
 
@@ -19,27 +16,9 @@ from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Answer, Observer
 from rtcp.runtime.sentences import Sentences
 
-from .test_behaviour import CONFIG, COUNTS, PERIOD_S, Bench, move_numbers
+from .bench import CONFIG, COUNTS, PERIOD_S, Bench, move_numbers
 
 WIDEST = Values.configured(CONFIG)
-
-
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-limits-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-@pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
-    made = Bench(*board)
-    yield made
-    board[1].release(made.lease)
 
 
 def of_first(name: str, number: float) -> Values:
@@ -154,13 +133,13 @@ def test_a_place_or_a_count_that_is_none_is_refused(bench: Bench, numbers: list[
     assert in_force(bench) == WIDEST
 
 
-def test_boxes_that_the_arm_stands_in_are_refused(board: tuple[Blackboard, Observer]) -> None:
+def test_boxes_that_the_arm_stands_in_are_refused(bench_board: tuple[Blackboard, Observer]) -> None:
     config = load(default_config())
     arm = Arm(config, [])
     widest = arm.limits.widest
     arm.state.position[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
     arm.guards.latch(arm.state)
-    orders = LimitOrders(arm, board[0])
+    orders = LimitOrders(arm, bench_board[0])
     x = arm.guards.poses[6].position[0]
     assert widest.box is not None
     for side, expected in (
@@ -169,13 +148,13 @@ def test_boxes_that_the_arm_stands_in_are_refused(board: tuple[Blackboard, Obser
     ):
         new = replace(widest, box=(*widest.box[:3], side, *widest.box[4:]))
         plan = rows(new)
-        assert orders.take(1, [board[1].write_plan(plan), len(plan)]) == expected
+        assert orders.take(1, [bench_board[1].write_plan(plan), len(plan)]) == expected
     assert arm.limits.box == new.box
 
 
 @pytest.mark.parametrize("name", ["user", "chair"])
 def test_a_keep_out_box_that_the_arm_stands_in_is_refused_by_its_name(
-    board: tuple[Blackboard, Observer], name: str
+    bench_board: tuple[Blackboard, Observer], name: str
 ) -> None:
     config = load(default_config())
     which = [box.name for box in config.cartesian.keep_out].index(name)
@@ -191,7 +170,7 @@ def test_a_keep_out_box_that_the_arm_stands_in_is_refused_by_its_name(
     grown += [max(a, b + 0.05) for a, b in zip(high, tool, strict=True)]
     boxes[which] = tuple(grown)  # type: ignore[assignment]
     plan = rows(replace(widest, keep_out=tuple(boxes)))
-    answer = LimitOrders(arm, board[0]).take(1, [board[1].write_plan(plan), len(plan)])
+    answer = LimitOrders(arm, bench_board[0]).take(1, [bench_board[1].write_plan(plan), len(plan)])
     assert (answer[0], answer[1], answer[3]) == (Refusal.LIMITS_OUTSIDE, -1, float(which))
     assert Sentences(config).refusal(*answer) == (
         f"the tool, the wrist or the elbow would pass the new bounds of the keep-out box {name} "
@@ -235,12 +214,14 @@ def test_a_torque_that_is_not_lowered_is_no_matter_whatever_is_held(loaded: Benc
     assert give(loaded, replace(of_first("torque", 10.0), velocity=(0.2, 0.2))).refusal == Refusal.NONE
 
 
-def test_without_torque_any_torque_limit_is_taken(loaded: Bench, board: tuple[Blackboard, Observer]) -> None:
+def test_without_torque_any_torque_limit_is_taken(loaded: Bench, bench_board: tuple[Blackboard, Observer]) -> None:
     loaded.do(Command.DISABLE)
     loaded.until(State.READY)
     # Whatever a drive without torque shows.
     loaded.arm.state.torque[0] = 5.0
     new = of_first("torque", 2.0)
     plan = rows(new)
-    assert LimitOrders(loaded.arm, board[0]).take(1, [board[1].write_plan(plan), len(plan)]) == (Refusal.NONE,)
+    assert LimitOrders(loaded.arm, bench_board[0]).take(1, [bench_board[1].write_plan(plan), len(plan)]) == (
+        Refusal.NONE,
+    )
     assert in_force(loaded) == new

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from math import inf, nan
-from pathlib import Path
 
 import pytest
 
@@ -14,7 +12,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Command, Refusal, State
 from rtcp.runtime.observer import Observer
 
-from .test_behaviour import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, Bench, move_numbers
+from .bench import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, Bench, move_numbers
 
 # What is taken (x) where, written down a second time: a slip in the machine's own table shows here.
 TABLE = """
@@ -88,24 +86,6 @@ FIRST_STATE = {
     Command.SHUTDOWN: State.HOLDING,
 }  # fmt: skip
 """A state in which each command is taken and changes something."""
-
-
-@pytest.fixture(scope="module")
-def board() -> Iterator[tuple[Blackboard, Observer]]:
-    path = Path(f"/dev/shm/rtcp-orders-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
-    observer = Observer(path)
-    path.unlink()
-    yield written, observer
-    observer.close()
-    written.close()
-
-
-@pytest.fixture
-def bench(board: tuple[Blackboard, Observer]) -> Iterator[Bench]:
-    made = Bench(*board)
-    yield made
-    board[1].release(made.lease)
 
 
 # -- every command in every state -----------------------------------------------------------------------------------
@@ -383,8 +363,8 @@ def test_an_output_that_does_not_exist_is_refused(bench: Bench, number: float, s
     assert bench.data.devices[0].outputs & ~HEARTBEAT == 0
 
 
-def test_without_an_io_box_there_are_no_outputs(board: tuple[Blackboard, Observer]) -> None:
-    bench = Bench(*board, with_box=False)
+def test_without_an_io_box_there_are_no_outputs(bench_board: tuple[Blackboard, Observer]) -> None:
+    bench = Bench(*bench_board, with_box=False)
     try:
         answer = bench.start().order(Command.OUTPUT, [1, 1])
     finally:

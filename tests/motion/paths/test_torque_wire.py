@@ -12,7 +12,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Refusal
 from rtcp.runtime.machine import Code, Command, State
 from rtcp.runtime.observer import Observer
-from tests.runtime.test_behaviour import CONFIG, CST, PERIOD_S, Bench
+from tests.runtime.bench import CONFIG, CST, PERIOD_S, Bench
 
 TORQUE_MODE = 5.0
 
