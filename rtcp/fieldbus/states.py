@@ -12,11 +12,20 @@ AL_CONTROL = 0x0120
 AL_STATUS = 0x0130
 """AL status (2 bytes), two bytes of nothing, AL status code (2 bytes)."""
 _POLL_S = 0.002
+_TRIES = 3
+_LAST_TRIES = 25
+"""Frames for the look that a slave is judged by: half a second in which none comes back is no shared host's stall."""
 
 
-def read_al(port: RegisterPort, station: int) -> tuple[AlState, bool, int]:
-    """Return state, error indication and AL status code of a slave; state NONE where it does not answer."""
-    data = port.read(station, AL_STATUS, 6)
+def read_al(port: RegisterPort, station: int, tries: int = _TRIES) -> tuple[AlState, bool, int]:
+    """Return state, error indication and AL status code of a slave; state NONE where it does not answer.
+
+    Args:
+        port: the port to ask through.
+        station: the slave's configured address.
+        tries: frames that may be lost before it counts as one that does not answer.
+    """
+    data = port.read(station, AL_STATUS, 6, tries=tries)
     if data is None:
         return AlState.NONE, False, 0
     status = int.from_bytes(data[:2], "little")
@@ -65,7 +74,7 @@ def wait_for_state(
     while waiting:
         late = time.monotonic() >= deadline
         for station, label in tuple(waiting.items()):
-            found, error, code = read_al(port, station)
+            found, error, code = read_al(port, station, _LAST_TRIES if late else _TRIES)
             if found is state and not error:
                 del waiting[station]
             elif error or late:

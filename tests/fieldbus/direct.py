@@ -14,12 +14,19 @@ class Direct(RegisterPort):
         self._t = 0
         self.lost: set[tuple[Command, int]] = set()
         """Command and register of datagrams that get lost."""
+        self.hole = 0
+        """How many of the next frames get lost, whatever is in them."""
 
     def exchange(
         self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
     ) -> Answer:  # fmt: skip
         if (command, address) in self.lost:
             return Answer(b"", -1)
+        if self.hole:
+            lost = min(self.hole, tries)
+            self.hole -= lost
+            if lost == tries:
+                return Answer(b"", -1)
         frame = bytearray(build_frame(command, 0x80, station, address, data))
         self._t += 1_000_000
         self._segment.process(frame, len(frame), self._t)
