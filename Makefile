@@ -4,10 +4,6 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-# Tests of pure computation: as many at once as there are CPUs. The others have sockets, processes and cycles of their own,
-# which would only get into each other's way.
-SIDE_BY_SIDE := $(addprefix tests/,kinematics motion config devices experiments realtime telemetry)
-
 .PHONY: help setup oracles run test faults lint format clean
 .DEFAULT_GOAL := help
 
@@ -25,8 +21,8 @@ run: setup ## run the demonstration: virtual segment, master, a move, the figure
 
 test: setup ## run all tests
 	@status=0; \
-	$(BIN)/python -m pytest --numprocesses auto $(SIDE_BY_SIDE) || status=1; \
-	$(BIN)/python -m pytest $(addprefix --ignore=,$(SIDE_BY_SIDE)) || status=1; \
+	$(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
+	$(BIN)/python -m pytest -m alone || status=1; \
 	exit $$status
 
 faults: setup ## carry out the whole fault matrix and print it as a table

@@ -14,6 +14,8 @@ import pytest
 from rtcp.cli.keys import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey
 from rtcp.cli.renewal import Renewal
 
+pytestmark = pytest.mark.alone
+
 ARROW_UP, ARROW_LEFT = b"\x1b[A", b"\x1b[D"
 
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.alone
+
 
 def test_a_scan_of_the_virtual_bus_starts_a_segment_and_ends_it(
     rtcp: Callable[..., Any], arm: Path, processes_of: Callable[[Path], list[int]]

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.alone
+
 SLOW = ("--cycle-us", "2000")
 """A cycle that a loaded machine keeps: what is tested here is how the commands start and end it."""
 

@@ -14,6 +14,8 @@ import pytest
 from rtcp.cli.segment_view import kinds
 from rtcp.config.faults import FAULTS, load_script
 
+pytestmark = pytest.mark.alone
+
 PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
 Rtcp = Callable[..., Any]
 Segment = tuple["subprocess.Popen[str]", list[str]]

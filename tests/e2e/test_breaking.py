@@ -16,6 +16,8 @@ from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import outputs
 
+pytestmark = pytest.mark.alone
+
 OP, SAFE_OP_ERROR, INIT = 0x08, 0x14, 0x01
 
 

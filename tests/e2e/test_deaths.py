@@ -17,6 +17,8 @@ from rtcp.runtime.session import read_session
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, kill, lives
 
+pytestmark = pytest.mark.alone
+
 SAFE_OP_ERROR, SYNC_MANAGER_WATCHDOG = 0x14, 0x1B
 STILL_RAD_S = 0.002
 MOVE = ("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")

@@ -16,6 +16,8 @@ from rtcp.telemetry.recording import recording
 from rtcp.telemetry.square import SPEED_M_S, judge, place
 from tests.e2e.conftest import Platform
 
+pytestmark = pytest.mark.alone
+
 
 def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform) -> None:
     start = enabled.status()["joints"]["position"]

@@ -18,6 +18,8 @@ from rtcp.runtime.paths import blackboard_file
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
+pytestmark = pytest.mark.alone
+
 Q = ["0.3", "-0.2", "0.4", "-0.1", "0.25", "-0.35"]
 
 

@@ -17,6 +17,8 @@ from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import outputs
 
+pytestmark = pytest.mark.alone
+
 ENABLE_OPERATION = 0x000F
 ENABLED = 0x27
 """Statusword of Operation Enabled, masked by 0x6F."""

@@ -15,6 +15,8 @@ import pytest
 
 from tests.e2e.conftest import Platform
 
+pytestmark = pytest.mark.alone
+
 
 class Manager:
     """What systemd has: a socket that takes messages, and patience."""

@@ -10,6 +10,8 @@ from tests.e2e.wire import BOX_OUT, DRIVE, HEAD, LEAVES, LRW, datagrams, frames
 from tests.sessions.play import Outcome
 from tests.sessions.wire_play import judge, play_on_the_wire
 
+pytestmark = pytest.mark.alone
+
 PERIOD_US = 2000
 SECONDS = 15.0
 SEED = 5

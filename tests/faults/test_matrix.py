@@ -11,6 +11,8 @@ from tests.e2e.conftest import Platform
 from tests.faults.cases import CASES, HOLDING, JOGGING, MOVING, STICK, Case
 from tests.faults.run import SHIPPED_MS, bench_of, play
 
+pytestmark = pytest.mark.alone
+
 PART = (
     ("cable: slave 3 to 4", MOVING),
     ("power: IO box (reference clock)", HOLDING),

@@ -14,6 +14,8 @@ from rtcp.telemetry.trials.soak import draw
 from tests.e2e.conftest import Platform
 from tests.faults.run import SHIPPED_MS
 
+pytestmark = pytest.mark.alone
+
 DRIVES = (2, 3, 4, 5, 6, 7)
 HELD = Resources(rss=60 << 20, threads=2, files=10)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+pytestmark = pytest.mark.alone
+
 OP_MAPPING = ["05", "10004060", "20007a60", "2000ff60", "20007160", "08006060"]
 INIT, NO_SYNC = "01", "00"
 PROMISCUOUS = 0x100

@@ -10,6 +10,8 @@ from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.charges import Action, action_for
 from tests.fieldbus.conftest import WATCHER, Segment
 
+pytestmark = pytest.mark.alone
+
 OP = ["OP"] * 3
 
 

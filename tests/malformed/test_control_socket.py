@@ -15,6 +15,8 @@ import pytest
 from rtcp.runtime.paths import control_socket
 from tests.e2e.conftest import Platform, lives
 
+pytestmark = pytest.mark.alone
+
 LINES = 800
 A_CONNECTION = 60
 Q = [0.1] * 6

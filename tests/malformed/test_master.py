@@ -15,6 +15,8 @@ from tests.malformed import parser_play
 from tests.malformed.cable import answerer, master, told
 from tests.malformed.line import Line
 
+pytestmark = pytest.mark.alone
+
 
 def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_again_after_them() -> None:
     with answerer(1) as pid:

@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).parents[2]
 CHILD = Path(__file__).with_name("soem_child.py")
 FACTS = [0, 820, 1660, 2500, 3320, 4160, 5020]

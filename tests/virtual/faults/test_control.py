@@ -20,6 +20,8 @@ from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS
 from rtcp.virtual.frame import Command, Datagram, build, parse
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
 
+pytestmark = pytest.mark.alone
+
 BROADCASTS = [build(Datagram(Command.BRD, number, 0, 0, bytes(2))) for number in range(20)]
 
 
