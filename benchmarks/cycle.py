@@ -36,7 +36,6 @@ from rtcp.realtime.scheduling import choose_cpu
 from rtcp.realtime.statistics import percentiles
 from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.launcher import Running, StartOptions, start
-from rtcp.runtime.layout import RECORDS
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.paths import blackboard_file, runtime_directory
 from rtcp.telemetry.square import SPEED_M_S, place
@@ -174,7 +173,7 @@ def platform_round(
         at, parts, lost = observer.head, [], 0
         until = time.monotonic() + seconds
         while time.monotonic() < until:
-            time.sleep(min(0.25, RECORDS * cycle_us * 1e-6 / 4))
+            time.sleep(min(0.25, observer.records * cycle_us * 1e-6 / 4))
             records, missed = observer.since(at)
             at += len(records) + missed
             lost += missed

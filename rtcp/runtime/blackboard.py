@@ -36,7 +36,6 @@ from rtcp.runtime.layout import (
     LEASE_RENEWED_AT,
     MAGIC,
     PLANS,
-    RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
     SLAVES_AT,
@@ -46,6 +45,7 @@ from rtcp.runtime.layout import (
     TEXTS_AT,
     TEXTS_HEAD_AT,
     RecordLayout,
+    records_for,
 )
 from rtcp.runtime.plans import mark_in_use, place
 from rtcp.runtime.words import Words
@@ -64,7 +64,8 @@ class Blackboard:
     """
 
     def __init__(self, path: Path, joints: int, period_ns: int) -> None:
-        layout = RecordLayout(joints)
+        layout, records = RecordLayout(joints), records_for(period_ns)
+        size = layout.file_size(records)
         self.path = path
         self.joints = joints
         # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
@@ -72,15 +73,16 @@ class Blackboard:
         fresh.unlink(missing_ok=True)
         descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         try:
-            os.ftruncate(descriptor, layout.file_size)
-            self._map = mmap.mmap(descriptor, layout.file_size)
+            os.ftruncate(descriptor, size)
+            self._map = mmap.mmap(descriptor, size)
         finally:
             os.close(descriptor)
         HEADER.pack_into(
-            self._map, 0, MAGIC, joints, layout.size, RECORDS, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
+            self._map, 0, MAGIC, joints, layout.size, records, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
         )
         os.replace(fresh, path)
         self._record_size = layout.size
+        self._ring_mask = records - 1
         # The record without its first number, which is published last.
         self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
         self._words = Words(self._map)
@@ -91,13 +93,13 @@ class Blackboard:
         self._taken = 0
         self._text_lock = threading.Lock()
         # Every page is touched now, so that none is faulted in by the cycle.
-        for page in range(0, layout.file_size, mmap.PAGESIZE):
+        for page in range(0, size, mmap.PAGESIZE):
             self._map[page] = self._map[page]
 
     def publish(self, values: Sequence[float]) -> None:
         """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
         number = self._records + 1
-        at = RECORDS_AT + (number % RECORDS) * self._record_size
+        at = RECORDS_AT + (number & self._ring_mask) * self._record_size
         words = self._words
         words[at] = 0
         words.fence()

@@ -226,7 +226,7 @@ class BlackBox:
             began_ns=session.began_ns,
             event=fault.number,
             at=at,
-            notes=(*_lacking(records, at, self._observer.period_ns), *notes),
+            notes=(*_lacking(records, at), *notes),
             timeline=timeline,
         )
         return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
@@ -274,15 +274,14 @@ def _state(records: npt.NDArray[np.void], at: int) -> str:
     return TABLE[State(int(records["state"][max(at, 0)]))].words
 
 
-def _lacking(records: npt.NDArray[np.void], at: int, period_ns: int) -> list[str]:
+def _lacking(records: npt.NDArray[np.void], at: int) -> list[str]:
     """Return in sentences which cycles of the recording's time are not in it."""
     if not len(records):
         return ["the ring holds no cycle of it"]
     notes, instants, numbers = [], records["time_ns"], records["number"].astype(np.int64)
     held_s = float(instants[at] - instants[0]) * 1e-9
     if held_s < BEFORE_S - 0.01:
-        full = f"at {period_ns / 1000:g} us the ring holds no more"
-        why = "the platform had just started" if numbers[0] == 1 else full
+        why = "the platform had just started" if numbers[0] == 1 else "older cycles had been overwritten"
         notes.append(f"{held_s:.1f} s before the fault instead of {BEFORE_S:g} s: {why}")
     after_s = float(instants[-1] - instants[at]) * 1e-9
     if after_s < AFTER_S - 0.01:

@@ -16,6 +16,7 @@ Nothing here imports numpy: its threads would keep the loop's process from joini
 
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 
@@ -87,6 +88,9 @@ PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
 
 RECORDS_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
+"""The ring of a cycle of 366 us and longer; a shorter one has a longer ring, see `records_for`."""
+RING_S = 12.0
+"""Seconds that every ring holds: those that are written down before a fault, and until they have been read."""
 
 SCALARS = (
     ("number", "Q"),
@@ -134,6 +138,11 @@ FLAG_MOTION_ALLOWED = 32
 FLAG_ARM_HAS_STICK = 64
 
 
+def records_for(period_ns: int) -> int:
+    """Return how many cycle records the ring of a cycle has: a power of two, `RING_S` seconds at least."""
+    return max(RECORDS, 1 << (math.ceil(RING_S * 1e9 / period_ns) - 1).bit_length())
+
+
 @dataclass(frozen=True)
 class RecordLayout:
     """The cycle record for a number of joints, as a struct; readers make a numpy type of it (`observer`)."""
@@ -151,7 +160,6 @@ class RecordLayout:
         """Size of a record in the ring: a multiple of 64 bytes."""
         return (struct.calcsize(self.format) + 63) & ~63
 
-    @property
-    def file_size(self) -> int:
-        """Size of the whole blackboard."""
-        return RECORDS_AT + RECORDS * self.size
+    def file_size(self, records: int) -> int:
+        """Size of a whole blackboard with so many records."""
+        return RECORDS_AT + records * self.size

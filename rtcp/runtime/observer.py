@@ -41,7 +41,6 @@ from rtcp.runtime.layout import (
     LEASE_RENEWED_AT,
     MAGIC,
     PER_JOINT,
-    RECORDS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
     SCALARS,
@@ -55,6 +54,7 @@ from rtcp.runtime.layout import (
     TEXTS_AT,
     TEXTS_HEAD_AT,
     RecordLayout,
+    records_for,
 )
 from rtcp.runtime.plans import write_plan
 from rtcp.runtime.words import Words
@@ -155,22 +155,25 @@ class Observer:
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
         self._words = Words(self._map)
-        magic, joints, record_size, _, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
+        magic, joints, record_size, records, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
         # A number of joints that no record has would be a layout of gigabytes.
         layout = RecordLayout(joints) if magic == MAGIC and joints <= record_size else None
-        if layout is None or record_size != layout.size or size != layout.file_size:
+        whole = layout is not None and period > 0 and records == records_for(period)
+        if layout is None or not whole or record_size != layout.size or size != layout.file_size(records):
             self.close()
             raise BlackboardError(f"blackboard {path} is not of this version (magic 0x{magic:X}): start anew")
         self.joints = int(joints)
         self.period_ns = int(period)
         self.loop_pid = int(pid)
         self._dtype = record_type(layout)
-        self._records = np.frombuffer(self._map, dtype=self._dtype, count=RECORDS, offset=RECORDS_AT)
+        self.records = int(records)
+        """Cycle records that the ring holds."""
+        self._ring = np.frombuffer(self._map, dtype=self._dtype, count=self.records, offset=RECORDS_AT)
 
     def close(self) -> None:
         """Let go of the file."""
-        if hasattr(self, "_records"):
-            del self._records
+        if hasattr(self, "_ring"):
+            del self._ring
         self._words.close()
         self._map.close()
         os.close(self._descriptor)
@@ -198,13 +201,13 @@ class Observer:
         Lost are those overwritten before they were read, and torn ones.
         """
         head = self.head
-        first = max(number + 1, head - RECORDS + 64, 1)
+        first = max(number + 1, head - self.records + 64, 1)
         if head < first:
             return np.empty(0, dtype=self._dtype), 0
         numbers = np.arange(first, head + 1, dtype=np.uint64)
-        copied = self._records[(numbers % np.uint64(RECORDS)).astype(np.intp)]
+        copied = self._ring[(numbers % np.uint64(self.records)).astype(np.intp)]
         # What the writer reached meanwhile may be torn although both numbers agree: it is dropped.
-        overtaken = self.head - RECORDS + 1
+        overtaken = self.head - self.records + 1
         whole = (copied["number"] == numbers) & (copied["number_again"] == numbers) & (numbers > max(overtaken, 0))
         kept = copied[whole]
         return kept, int(head - max(number, 0)) - len(kept)

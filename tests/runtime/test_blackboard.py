@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import PER_JOINT, RECORDS, SCALARS
+from rtcp.runtime.layout import PER_JOINT, RECORDS, SCALARS, records_for
 from rtcp.runtime.observer import BlackboardError, LeaseRefused, Observer
 
 JOINTS = 6
@@ -68,6 +68,14 @@ def test_a_reader_that_comes_late_is_told_how_much_it_lost(board: Blackboard, ob
     assert lost >= 1000
     assert lost + len(records) == RECORDS + 1000
     assert [int(value) for value in records["cycle"]] == [int(value) for value in records["number"]]
+
+
+@pytest.mark.parametrize("period_us", [100, 125, 250, 366, 367, 500, 1000, 4000, 100_000])
+def test_the_ring_holds_twelve_seconds_of_every_cycle(period_us: int) -> None:
+    records = records_for(period_us * 1000)
+    assert records * period_us >= 12_000_000
+    assert records & records - 1 == 0
+    assert records == RECORDS or records * period_us < 24_000_000
 
 
 def test_a_writer_in_another_process_is_never_read_torn(path: Path) -> None:
