@@ -39,6 +39,7 @@ _SEGMENT_S = 60.0
 _LOOP_S = 60.0
 _GATEWAY_S = 60.0
 _STOP_S = 20.0
+_ENDING_S = 0.5
 _LOOP_END_S = 10.0
 """For a controlled stop, the drives' torque and the way to INIT: a loop that is killed leaves them to a watchdog."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -119,7 +120,7 @@ class Running:
         more += ["--control", str(self.segment_control)]
         child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
         self._keep_off(child.pid)
-        for line in _lines(reading, _SEGMENT_S, child):
+        for line in _lines(reading, _SEGMENT_S):
             if "pid" in line:
                 return line
         raise StartError(self._last_words("segment", child))
@@ -127,7 +128,7 @@ class Running:
     def start_loop(self, report: Report) -> None:
         """Start the loop; return when all slaves are in OP."""
         child, reading = self._spawn("loop", "rtcp.runtime.loop_process", "--directory", str(self.directory))
-        for line in _lines(reading, _LOOP_S, child):
+        for line in _lines(reading, _LOOP_S):
             if line["event"] == "phase":
                 report(line["text"])
             elif line["event"] == "error":
@@ -151,7 +152,7 @@ class Running:
     def await_gateway(self, reading: int) -> None:
         """Return when the gateway that was begun last says on its pipe that the control socket listens."""
         child = self._children[-1]
-        for _ in _lines(reading, _GATEWAY_S, child):
+        for _ in _lines(reading, _GATEWAY_S):
             return
         raise StartError(self._last_words("gateway", child))
 
@@ -169,8 +170,11 @@ class Running:
     def _last_words(self, name: str, child: subprocess.Popen[bytes]) -> str:
         path = self.directory / f"{name}.log"  # absent where the journal has it
         log = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
-        ended = child.poll()
-        fate = "did not become ready in time" if ended is None else f"ended with code {ended}"
+        try:
+            # Its pipe closes a moment before it can be waited for.
+            fate = f"ended with code {child.wait(_ENDING_S)}"
+        except subprocess.TimeoutExpired:
+            fate = "did not become ready in time"
         said = f": {log[-1]}" if log else ""
         return f"the {name} (process {child.pid}) {fate}{said}"
 
@@ -283,7 +287,7 @@ def undisturbed() -> Iterator[None]:
             signal.raise_signal(came[0])
 
 
-def _lines(reading: int, patience_s: float, child: subprocess.Popen[bytes]) -> Iterator[dict[str, Any]]:
+def _lines(reading: int, patience_s: float) -> Iterator[dict[str, Any]]:
     """Yield the JSON lines of a pipe until it ends or nothing comes for `patience_s`."""
     kept = b""
     with open(reading, "rb", buffering=0) as pipe:

@@ -205,6 +205,17 @@ def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Pat
     assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment
 
 
+def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
+    directory: Path, config: ArmConfig
+) -> None:
+    running = Running(directory, config, Processes())
+    running._children.append(subprocess.Popen(["sh", "-c", "sleep 0.2; exit 7"]))
+    reading, writing = os.pipe()
+    os.close(writing)
+    with pytest.raises(StartError, match="ended with code 7"):
+        running.await_gateway(reading)
+
+
 def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmConfig) -> None:
     (directory / "loop.log").write_text("what went wrong")
     (directory / "gateway.log").write_text("who asked")
