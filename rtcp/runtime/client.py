@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import socket
+import struct
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,6 +23,9 @@ ANSWER_TIMEOUT_S = 15.0
 
 LONGEST_SOCKET_PATH = 107
 """sun_path of unix(7): 108 bytes with the closing zero."""
+
+_PEER = struct.Struct("3i")
+"""Process, user and group at the other end (unix(7), SO_PEERCRED)."""
 
 _KINDS_ON_THE_WIRE = frozenset({"refused", "fault", "timeout", "invalid", "internal"})
 
@@ -115,7 +119,7 @@ class ControlClient:
         try:
             self._socket.sendall(line, socket.MSG_NOSIGNAL)
         except TimeoutError as error:
-            raise _silence(verb, self._socket.gettimeout()) from error
+            raise self._silence(verb, self._socket.gettimeout()) from error
         except OSError as error:
             raise ControlError(
                 "lost", f"the platform closed the connection before it took the request {verb!r}"
@@ -126,7 +130,7 @@ class ControlClient:
             try:
                 chunk = self._socket.recv(65536)
             except TimeoutError as error:
-                raise _silence(verb, timeout_s) from error
+                raise self._silence(verb, timeout_s) from error
             except OSError:
                 chunk = b""
             if not chunk:
@@ -141,6 +145,14 @@ class ControlClient:
         if not isinstance(reply, dict):
             raise ControlError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
         return reply
+
+    def _silence(self, verb: str, timeout_s: float | None) -> ControlError:
+        gateway, _, _ = _PEER.unpack(self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
+        return ControlError(
+            "timeout",
+            f"the platform has not answered {verb!r} for {timeout_s:g} s: if its gateway (process {gateway}) hangs, "
+            f"`kill -9 {gateway}` and `rtcp start` give the loop another, `rtcp stop` ends all of it",
+        )
 
 
 def _connect(path: Path) -> socket.socket:
@@ -174,10 +186,6 @@ def _who_runs(path: Path) -> str:
     if is_ours(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
     return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
-
-
-def _silence(verb: str, timeout_s: float | None) -> ControlError:
-    return ControlError("timeout", f"the platform has not answered {verb!r} for {timeout_s:g} s")
 
 
 def _refusal(verb: str, error: object) -> ControlError:

@@ -107,6 +107,7 @@ def test_silence_ends_in_a_timeout_that_names_the_verb(listener: socket.socket) 
     with ControlClient() as client, pytest.raises(ControlError, match=r"'reset' for 0\.05 s") as raised:
         client.call("reset", timeout_s=0.05)
     assert raised.value.kind == "timeout"
+    assert f"its gateway (process {os.getpid()})" in raised.value.message
 
 
 def test_a_socket_that_nobody_serves_is_not_running(listener: socket.socket, directory: Path) -> None:

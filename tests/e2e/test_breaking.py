@@ -9,9 +9,10 @@ import time
 import numpy as np
 import pytest
 
+from rtcp.runtime.client import ControlClient, ControlError
 from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.runtime.observer import Observer, record_type
-from rtcp.runtime.paths import blackboard_file, segment_control
+from rtcp.runtime.paths import blackboard_file, control_socket, segment_control
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import outputs
@@ -251,14 +252,13 @@ def test_a_killed_loop_leaves_the_drives_to_their_watchdog(running: Platform) ->
     assert running.status()["state"] == "ready"
 
 
-def test_a_killed_gateway_stops_the_motion_and_can_be_replaced(running: Platform) -> None:
+def test_a_gateway_that_hangs_stops_the_motion_is_named_and_can_be_killed_and_replaced(running: Platform) -> None:
     running.rtcp("enable")
     moving = running.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
     running.until_moving()
     observer = observe(running)
     before = running.pids()
-    kill(before["gateway"])
-    assert moving.wait() in (4, 5)
+    os.kill(before["gateway"], signal.SIGSTOP)
     end = time.monotonic() + 20
     while True:
         latest = observer.latest()
@@ -267,6 +267,13 @@ def test_a_killed_gateway_stops_the_motion_and_can_be_replaced(running: Platform
             break
         assert time.monotonic() < end
     observer.close()
+    with (
+        ControlClient(path=control_socket(running.directory)) as client,
+        pytest.raises(ControlError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
+    ):
+        client.call("status", timeout_s=0.5)
+    kill(before["gateway"])
+    assert moving.wait() in (4, 5)
     running.rtcp("start", "--detach")
     status = running.status()
     assert status["pids"]["loop"] == before["loop"]
