@@ -87,7 +87,7 @@ def left_behind(root: Path) -> list[Path]:
     units = root / "etc/systemd/system"
     enabled = sorted(units.glob("*.wants/rtcp@*.service"))
     changes = sorted(units.glob("rtcp@*.service.d"))
-    kept = [root / "etc/rtcp", root / "var/lib/rtcp"]
+    kept = [root / "etc/rtcp", root / "var/lib/rtcp", root / "run/rtcp"]
     return [*enabled, *changes, *(path for path in kept if path.exists())]
 
 

@@ -116,11 +116,13 @@ def test_uninstall_names_what_it_leaves(
     (wants / "rtcp@eth0.service").symlink_to(tmp_path / UNIT)
     configuration = tmp_path / "etc/rtcp"
     configuration.mkdir()
+    runtime = tmp_path / "run/rtcp"
+    runtime.mkdir(parents=True)
     shown = uninstall("--dry-run").out
     assert (tmp_path / UNIT).exists()
     done = uninstall()
     assert files(tmp_path) == {"etc/sysctl.d/80-rtcp.conf"}
-    for path in (edited, wants / "rtcp@eth0.service", configuration):
+    for path in (edited, wants / "rtcp@eth0.service", configuration, runtime):
         assert f"left {path}" in shown
         assert f"left {path}" in done.out
 
@@ -172,6 +174,29 @@ def test_where_it_may_not_write_uninstall_says_so_and_removes_nothing(
     assert done.code == 3
     assert f"{closed} may not be written to" in done.trouble
     assert files(tmp_path) == PLACES
+
+
+# -- what a service that died leaves --------------------------------------------------------------------------------
+
+
+def settings(unit: Path) -> dict[str, list[str]]:
+    """Return what the unit sets, each key's values in their order; systemd takes the last one of most."""
+    found: dict[str, list[str]] = {}
+    for line in unit.read_text().splitlines():
+        key, is_one, value = line.partition("=")
+        if is_one and not key.startswith("#"):
+            found.setdefault(key, []).append(value)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("RuntimeDirectoryPreserve", "yes"), ("RemoveIPC", "no"), ("OOMPolicy", "continue")]
+)
+def test_the_unit_leaves_the_next_start_what_it_records_a_death_from_and_outlives_its_gateway(
+    install: Callable[..., Any], tmp_path: Path, key: str, value: str
+) -> None:
+    install()
+    assert settings(tmp_path / UNIT).get(key) == [value]
 
 
 # -- what systemd says ----------------------------------------------------------------------------------------------
