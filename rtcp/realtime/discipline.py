@@ -6,7 +6,8 @@ That difference is tracked by a second-order filter (phase and rate), and the ne
 the reference's time, not steered by a controller: wake-up jitter then never enters the clocks, and there is no gain to
 tune against it. Residuals are bounded before they enter, so that one late frame moves the estimate by little, and a
 frame that is late by more than any clock drifts (its sender or its receiver was kept off the CPU) is left out, unless
-so many follow each other that it must be the clock.
+for so long so many more are late than in time that it must be the clock. A reference whose time stands although frames
+come back is no clock any more: it is not followed until it moves again.
 
 Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
 grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
@@ -24,7 +25,13 @@ _PHASE_GAIN = 0.02
 _RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
 _SHOWN_GAIN = 1 / 32
 _LATE_BEYOND_NS = 50_000.0
-_LATE_IN_A_ROW = 40
+UNHEARD_CYCLES = 200
+"""So many frames in a row with the same reference time: the rate that was found bridges them, and no more."""
+_LATE_MORE = 150
+"""So many more frames late than in time: beyond it they are the clock's. A host that takes the CPU away in bursts of
+tens of frames, fewer than half of all, does not come to it: with a count of 40 it does."""
+_LATE_MOST = 200
+"""The count goes further: where most are late all of those are taken in, instead of one left out for each in time."""
 _RATE_BOUND = 500e-6
 """No two oscillators differ by more: a bound that keeps a jump of the reference from winding the rate up."""
 
@@ -39,7 +46,7 @@ class Discipline:
 
     __slots__ = (
         "_base", "_difference", "_good_cycles", "_late", "_measured", "_period", "_phase", "_rate", "_reference",
-        "_seen", "aligned", "filtered_ns", "locked", "raw_ns",
+        "_seen", "_standing", "aligned", "filtered_ns", "locked", "raw_ns",
     )  # fmt: skip
 
     def __init__(self, period_ns: int, phase_ns: int) -> None:
@@ -54,6 +61,7 @@ class Discipline:
         self._seen = 0
         self._good_cycles = 0
         self._late = 0
+        self._standing = 0
         self.aligned = False
         self.locked = False
         self.raw_ns = 0
@@ -67,7 +75,12 @@ class Discipline:
         if reference_ns == self._reference:
             # The reference slave did not answer: what came back is what was sent.
             self.coast()
+            self._standing += 1
+            if self._standing == UNHEARD_CYCLES:
+                self.locked = False
+                self._good_cycles = 0
             return
+        self._standing = 0
         self._reference = reference_ns
         period = self._period
         offset = (reference_ns - self._phase) % period
@@ -83,10 +96,13 @@ class Discipline:
             self._base += whole
             residual -= whole
         if abs(residual) <= _LATE_BEYOND_NS:
-            self._late = 0
-        elif self._late < _LATE_IN_A_ROW:
-            self._late += 1
-            return
+            if self._late:
+                self._late -= 1
+        else:
+            if self._late < _LATE_MOST:
+                self._late += 1
+            if self._late <= _LATE_MORE:
+                return
         bounded = min(max(residual, -_RESIDUAL_BOUND_NS), _RESIDUAL_BOUND_NS)
         self._difference += _PHASE_GAIN * bounded
         limit = _RATE_BOUND * period

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Iterable
 from itertools import pairwise
 
 import pytest
 
-from rtcp.realtime.discipline import Discipline
+from rtcp.realtime.discipline import LOCK_CYCLES, UNHEARD_CYCLES, Discipline
 
 PERIOD = 500_000
 PHASE = PERIOD // 2
@@ -131,3 +132,107 @@ def test_a_reference_clock_that_jumps_for_good_is_not_taken_for_late_frames() ->
         if cycle == 2200:
             assert not discipline.locked
     assert discipline.locked
+
+
+class Line:
+    """A master that follows a clock frame by frame; each may be late, or bring the time of the one before it again."""
+
+    def __init__(self) -> None:
+        self.discipline = Discipline(PERIOD, PHASE)
+        self.reference = Reference(8.0, seed=11)
+        self.planned = 10**12
+        self.shown = 0
+
+    def frames(self, delays_ns: Iterable[int]) -> list[bool]:
+        """Let frames come, each so late; return after which of them the clock was followed."""
+        locked = []
+        for delay_ns in delays_ns:
+            self.shown = self.reference.seen_by_frame(self.planned + delay_ns)
+            locked.append(self._observe())
+        return locked
+
+    def standing(self, frames: int) -> list[bool]:
+        """Let frames come that bring the last reference time again."""
+        return [self._observe() for _ in range(frames)]
+
+    def silent(self, cycles: int) -> list[bool]:
+        """Let no frame come back."""
+        locked = []
+        for _ in range(cycles):
+            self.discipline.coast()
+            self.planned = self.discipline.next_wakeup(self.planned)
+            locked.append(self.discipline.locked)
+        return locked
+
+    def _observe(self) -> bool:
+        self.discipline.observe(self.planned, self.shown)
+        self.planned = self.discipline.next_wakeup(self.planned)
+        return self.discipline.locked
+
+
+@pytest.fixture
+def line() -> Line:
+    made = Line()
+    assert made.frames([0] * 2000)[-1]
+    return made
+
+
+def test_a_reference_time_that_stands_is_not_followed_and_is_again_when_it_moves(line: Line) -> None:
+    assert line.standing(UNHEARD_CYCLES) == [True] * (UNHEARD_CYCLES - 1) + [False]
+    assert not any(line.standing(5000))
+    again = line.frames([0] * 1000)
+    # By the usual way: so many good frames from the first one on, as after the start.
+    assert again.index(True) >= LOCK_CYCLES - 1
+    assert all(again[again.index(True) :])
+    assert abs(line.discipline.filtered_ns) < 5_000
+
+
+def test_a_reference_time_that_moves_now_and_then_is_followed(line: Line) -> None:
+    for _ in range(50):
+        assert all(line.standing(UNHEARD_CYCLES - 1))
+        assert all(line.frames([0]))
+    assert abs(line.discipline.filtered_ns) < 5_000
+
+
+def test_frames_that_are_lost_are_no_reference_that_stands(line: Line) -> None:
+    assert all(line.silent(10 * UNHEARD_CYCLES))
+    assert all(line.frames([0] * 100))
+
+
+def test_a_reference_that_stands_from_the_start_is_neither_measured_nor_followed() -> None:
+    line = Line()
+    line.frames([0] * 50)
+    line.standing(5000)
+    assert not line.discipline.aligned
+    locked = line.frames([0] * 1000)
+    assert not any(locked[:LOCK_CYCLES])
+    assert locked[-1]
+
+
+@pytest.mark.parametrize("in_time", [40, 8, 3])
+def test_a_clock_that_jumps_is_noticed_although_one_frame_in_a_few_is_in_time(line: Line, in_time: int) -> None:
+    locked = line.frames(0 if n % in_time == 0 else 120_000 for n in range(6000))
+    assert not all(locked)
+    # Most frames are the clock's: its new phase is followed.
+    assert locked[-1]
+    assert abs(line.discipline.filtered_ns) < 5_000
+    early = (line.reference.at(line.planned + 130_000) - PHASE + PERIOD // 2) % PERIOD - PERIOD // 2
+    assert abs(early) < 10_000
+
+
+@pytest.mark.parametrize("burst", [1, 10, 30])
+def test_bursts_of_late_frames_are_a_host_that_takes_the_cpu_away_while_fewer_than_half_are_late(
+    line: Line, burst: int
+) -> None:
+    draw, delays = line.reference.random, []
+    while len(delays) < 20_000:
+        delays += [60_000 + draw.randrange(3_000_000) for _ in range(burst)] + [0] * round(1.2 * burst + 0.5)
+    assert 0.3 < sum(delay > 0 for delay in delays) / len(delays) < 0.5
+    assert all(line.frames(delays))
+    assert abs(line.discipline.filtered_ns) < 5_000
+
+
+def test_two_bursts_of_late_frames_with_a_frame_in_time_between_them_do_not_unlock(line: Line) -> None:
+    burst = [200_000] * 35
+    delays = [*burst, 0, *burst, *[0] * 2 * len(burst)] * 20
+    assert all(line.frames(delays))
