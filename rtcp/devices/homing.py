@@ -77,7 +77,9 @@ class Homing:
     object's matter: the caller sees it, and calls `abandon`.
     """
 
-    __slots__ = ("_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "phase", "shown")
+    __slots__ = (
+        "_cycles", "_drive", "_latched", "_longest", "_mode_cycles", "_outcome", "_rest", "_turned", "phase", "shown",
+    )  # fmt: skip
 
     def __init__(self, period_s: float, longest_s: float = _LONGEST_S) -> None:
         """Make what homes one drive at a time.
@@ -92,6 +94,8 @@ class Homing:
         self._drive: Cia402Drive | None = None
         self._cycles = 0
         self._latched = False
+        self._turned = False
+        """Whether the drive has shown mode 6: until then it may still follow its target."""
         self._outcome = _P.STOPPED
         self.phase = _P.IDLE
         self.shown = 0
@@ -104,16 +108,17 @@ class Homing:
 
     @property
     def position(self) -> float:
-        """The joint's set-point, rad: where the drive is, and from its way back to CSP on where it was then."""
+        """The joint's set-point, rad: the last one until the drive is in mode 6, then where the drive is, and from its
+        way back to CSP on where it was then."""
         drive = self._drive
         if drive is None:
             return 0.0
-        return drive.target_position if self._latched else drive.position
+        return drive.position if self._turned and not self._latched else drive.target_position
 
     def start(self, drive: Cia402Drive) -> None:
         """Begin; `drive` is enabled, in CSP and at standstill."""
         self._drive = drive
-        self._latched = False
+        self._latched = self._turned = False
         self._outcome = _P.STOPPED
         self.shown = 0
         drive.mode = HOMING
@@ -136,6 +141,8 @@ class Homing:
         if drive is None or self.ended:
             return self.phase
         self._cycles += 1
+        if drive.mode_display == HOMING:
+            self._turned = True
         drive.controlword = ENABLE_OPERATION
         phase = self.phase
         if phase is _P.ENTERING:
@@ -185,7 +192,8 @@ class Homing:
         if drive is not None:
             drive.controlword = ENABLE_OPERATION
             drive.mode = CSP
-            drive.latch()
+            if self._turned:
+                drive.latch()
             self._latched = True
         self._outcome = outcome
         self._enter(_P.LEAVING)
