@@ -218,6 +218,14 @@ class TerminalFault:
 
 
 @dataclass(frozen=True)
+class InputsFrozen:
+    """Inputs and counter of an IO box keep their value, as if its processor hung; frames are answered as ever."""
+
+    name: ClassVar[str] = "input_frozen"
+    slave: Position
+
+
+@dataclass(frozen=True)
 class StickCode:
     """The joystick's six inputs show `value`, whatever the stick does; 63 is neutral, most values mean nothing."""
 
@@ -237,12 +245,13 @@ class Noise:
 
 Fault = (
     CableFault | PowerFault | AlRefuse | AlHang | AlFall | SdoLate | SdoAbort | Loss | Delay | Duplicate | Reorder
-    | Corrupt | Garble | WorkingCounter | DriveFault | Sync0Lost | ClockJump | ClockDrift | TerminalFault | StickCode
-    | Noise
+    | Corrupt | Garble | WorkingCounter | DriveFault | Sync0Lost | ClockJump | ClockDrift | TerminalFault
+    | InputsFrozen | StickCode | Noise
 )  # fmt: skip
 _KINDS: tuple[type[Fault], ...] = (
     CableFault, PowerFault, AlRefuse, AlHang, AlFall, SdoLate, SdoAbort, Loss, Delay, Duplicate, Reorder, Corrupt,
-    Garble, WorkingCounter, DriveFault, Sync0Lost, ClockJump, ClockDrift, TerminalFault, StickCode, Noise,
+    Garble, WorkingCounter, DriveFault, Sync0Lost, ClockJump, ClockDrift, TerminalFault, InputsFrozen, StickCode,
+    Noise,
 )  # fmt: skip
 FAULTS = MappingProxyType({kind.name: kind for kind in _KINDS})
 """Every kind of fault by the name that commands and scripts give it."""

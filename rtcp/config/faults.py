@@ -32,6 +32,7 @@ from rtcp.config.fault_kinds import (
     Duplicate,
     Fault,
     Garble,
+    InputsFrozen,
     Loss,
     Noise,
     PowerFault,
@@ -46,8 +47,9 @@ from rtcp.config.fault_kinds import (
 
 __all__ = [
     "FAULTS", "ONCE", "AlFall", "AlHang", "AlRefuse", "CableFault", "ClockDrift", "ClockJump", "Corrupt", "Delay",
-    "DriveFault", "Duplicate", "Fault", "Garble", "Loss", "Noise", "Planned", "PowerFault", "Reorder", "SdoAbort",
-    "SdoLate", "StickCode", "Sync0Lost", "TerminalFault", "WorkingCounter", "load_script", "parse", "sentence_of",
+    "DriveFault", "Duplicate", "Fault", "Garble", "InputsFrozen", "Loss", "Noise", "Planned", "PowerFault", "Reorder",
+    "SdoAbort", "SdoLate", "StickCode", "Sync0Lost", "TerminalFault", "WorkingCounter", "load_script", "parse",
+    "sentence_of",
 ]  # fmt: skip
 
 _BY_RATE = (Loss, Delay, Duplicate, Reorder, Corrupt, Garble, WorkingCounter)

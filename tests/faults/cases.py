@@ -48,6 +48,13 @@ CASES: tuple[Case, ...] = (
     Case("cable for 50 ms", [_fault("cable", after=3, lasts=0.05)], (GOES_ON, FAULT), watch_s=1.5),
     Case("power: IO box (reference clock)", [_fault("power", slave=BOX)], (FAULT,), reset_is_refused=True),
     Case("power: drive 3", [_fault("power", slave=DRIVE_3)], (FAULT,), reset_is_refused=True),
+    Case(
+        "power: drive 3, and the button is pressed",
+        [_fault("power", slave=DRIVE_3), _fault("input", number=10, how="low")],
+        (EMERGENCY,),
+        ("emergency stop",),
+        reset_is_refused=True,
+    ),
     Case("power: drive 6, the last", [_fault("power", slave=DRIVE_6)], (FAULT,), reset_is_refused=True),
     Case("power for 50 ms: drive 1", [_fault("power", slave=DRIVE_1, lasts=0.05)], (FAULT,)),
     Case("falls to SAFE-OP", [_fault("al_fall", slave=DRIVE_3)], (FAULT,)),
@@ -69,6 +76,7 @@ CASES: tuple[Case, ...] = (
     Case("SDOs aborted", [_fault("sdo_abort", slave=DRIVE_1)], (GOES_ON,), watch_s=0.7),
     Case("frames lost: 1 in 100", [_fault("loss", rate=0.01)], (GOES_ON,), watch_s=1.5),
     Case("frames lost: 20 in a row", [_fault("loss", burst=20)], (GOES_ON,), watch_s=1.0),
+    Case("frames lost: 4 in 5", [_fault("loss", rate=0.8)], (FAULT,), (LOST,)),
     Case("frames lost: all", [_fault("loss", rate=1.0)], (FAULT,), (LOST,), reset_is_refused=True),
     Case("answers 3 ms late: 1 in 50", [_fault("delay", ms=3, rate=0.02)], (GOES_ON,), watch_s=1.5),
     Case("answers 3 ms late: all", [_fault("delay", ms=3, rate=1.0)], (FAULT,), reset_is_refused=True),
@@ -133,6 +141,20 @@ CASES: tuple[Case, ...] = (
     Case("stick out of code", [_fault("stick_code", value=0)], (STOPS,), activities=(STICK,), watch_s=1.0),
     Case(
         "toggle bounces", [_fault("input", number=9, how="bounce", ms=20)], (STOPS,), activities=(STICK,), watch_s=1.0
+    ),
+    # Nobody notices, and that is the danger: the button and the stick behind such a box are dead.
+    Case(
+        "inputs frozen, then the emergency stop is pressed",
+        [_fault("input_frozen", slave=BOX), _fault("input", number=10, how="low")],
+        (GOES_ON,),
+        watch_s=1.0,
+    ),
+    Case(
+        "inputs frozen, then the stick shows neutral",
+        [_fault("input_frozen", slave=BOX), _fault("stick_code", value=63)],
+        (GOES_ON,),
+        activities=(STICK,),
+        watch_s=1.0,
     ),
     Case("noise of other protocols", [_fault("noise", rate_hz=500)], (GOES_ON,), watch_s=1.5),
 )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from types import MappingProxyType
+from typing import TypeVar
 
-from rtcp.config.faults import DriveFault, StickCode, TerminalFault
+from rtcp.config.faults import DriveFault, InputsFrozen, StickCode, TerminalFault
 from rtcp.virtual.device import Device
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
@@ -19,6 +20,7 @@ from rtcp.virtual.models.protection import (
     UNDER_VOLTAGE,
 )
 
+DeviceFault = DriveFault | TerminalFault | InputsFrozen | StickCode
 STICK = 0x3F
 """The joystick's lines: the six first inputs."""
 CODES = MappingProxyType({
@@ -28,21 +30,27 @@ CODES = MappingProxyType({
 })  # fmt: skip
 """Error codes (0x603F) by the names that faults give them."""
 
+_D = TypeVar("_D", bound=Device)
+
 
 class FaultRefused(Exception):
     """This segment cannot have this fault: a sentence."""
 
 
-def begin(devices: Sequence[Device], fault: DriveFault | TerminalFault | StickCode) -> Callable[[int], None]:
+def begin(devices: Sequence[Device], fault: DeviceFault) -> Callable[[int], None]:
     """Let `fault` begin in one of `devices` (in the order of the cable); return what ends it, called with an instant.
 
     Raises:
         FaultRefused: there is no such device.
     """
     if isinstance(fault, DriveFault):
-        drive, code = _drive(devices, fault.slave), CODES[fault.error]
+        drive, code = _at(devices, fault.slave, CubemarsDrive, "drive"), CODES[fault.error]
         drive.begin_fault(code)
         return lambda _: drive.end_fault(code)
+    if isinstance(fault, InputsFrozen):
+        frozen = _at(devices, fault.slave, DiewuIoBox, "IO box")
+        frozen.freeze_inputs()
+        return lambda _: frozen.thaw_inputs()
     box = next((device for device in devices if isinstance(device, DiewuIoBox)), None)
     if box is None:
         raise FaultRefused(f"there is no IO box on the segment: {fault.name} is a fault of its inputs")
@@ -51,12 +59,12 @@ def begin(devices: Sequence[Device], fault: DriveFault | TerminalFault | StickCo
     return lambda _: box.mend_terminals(broken)
 
 
-def _drive(devices: Sequence[Device], number: int) -> CubemarsDrive:
+def _at(devices: Sequence[Device], number: int, kind: type[_D], words: str) -> _D:
     if number > len(devices):
         raise FaultRefused(f"there is no slave {number}: the segment has slaves 1 to {len(devices)}")
     device = devices[number - 1]
-    if not isinstance(device, CubemarsDrive):
-        raise FaultRefused(f"slave {number} ({device.identity.name}) is no drive")
+    if not isinstance(device, kind):
+        raise FaultRefused(f"slave {number} ({device.identity.name}) is no {words}")
     return device
 
 

@@ -16,6 +16,7 @@ from rtcp.config.faults import (
     Corrupt,
     DriveFault,
     Fault,
+    InputsFrozen,
     PowerFault,
     SdoAbort,
     SdoLate,
@@ -266,7 +267,7 @@ def _drift(segment: Segment, fault: ClockDrift, t: int) -> SlaveUndo:
     return SlaveUndo(segment, lambda t: change(-fault.ppm, t))
 
 
-def _device(segment: Segment, fault: DriveFault | TerminalFault | StickCode, t: int) -> SlaveUndo:
+def _device(segment: Segment, fault: devices.DeviceFault, t: int) -> SlaveUndo:
     return SlaveUndo(segment, devices.begin([slave.device for slave in segment.slaves], fault))
 
 
@@ -285,5 +286,6 @@ _KINDS: MappingProxyType[type[Fault], Callable[[Segment, Any, int], SlaveUndo]] 
     ClockJump: _jump,
     ClockDrift: _drift,
     TerminalFault: _device,
+    InputsFrozen: _device,
     StickCode: _device,
 })  # fmt: skip

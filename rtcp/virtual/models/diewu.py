@@ -44,6 +44,7 @@ class DiewuIoBox:
         self._inputs = int(chosen["inputs"] or 0)
         self._turned = 0.0
         self._broken: list[BrokenTerminals] = []
+        self._freezes = 0
         self.emergencies: deque[Emergency] = deque()
         self.objects = objects = _build_objects(self.identity, self._inputs)
         self._outputs_valid = False
@@ -106,6 +107,14 @@ class DiewuIoBox:
         """Let them show the world again."""
         self._broken.remove(broken)
 
+    def freeze_inputs(self) -> None:
+        """Let inputs and counter show what they do now, whatever is at the terminals, until they are thawed."""
+        self._freezes += 1
+
+    def thaw_inputs(self) -> None:
+        """Let them show the world again; who froze them more than once thaws them as often."""
+        self._freezes -= 1
+
     def power_off(self) -> None:
         """The supply goes: the outputs are off."""
         self.set_outputs_valid(False)
@@ -127,6 +136,8 @@ class DiewuIoBox:
         levels = self._inputs & ~mask | self._levels_entry.value & mask
         for broken in self._broken:
             levels = broken.shown(levels, dt)
+        if self._freezes:
+            return
         self._input_entry.value = levels
         turned = self._turned + self.counter_rate * dt
         if turned:

@@ -40,6 +40,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "clock_jump": {"slave": 2, "us": 1},
     "clock_drift": {"slave": 2},
     "input": {"number": 3, "how": "bounce"},
+    "input_frozen": {"slave": 1},
     "stick_code": {"value": 9},
     "noise": {"rate_hz": 2000},
 }

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.config.faults import DriveFault, PowerFault, StickCode, TerminalFault
+from rtcp.config.faults import DriveFault, InputsFrozen, PowerFault, StickCode, TerminalFault
 from rtcp.virtual.faults import devices
 from rtcp.virtual.faults.slaves import FaultRefused, begin
 from rtcp.virtual.inprocess import InProcessBus
@@ -188,6 +188,28 @@ def test_the_joystick_s_lines_show_a_code_whatever_the_stick_does(box: DiewuIoBo
     assert seen(line) == 0xFFD5
     mend(line.now)
     assert seen(line) == 0xFFC0
+
+
+def test_frozen_inputs_keep_their_value_whatever_is_done_to_the_terminals(box: DiewuIoBox) -> None:
+    line = Line([box])
+    box.inputs = 0xFFFF
+    assert seen(line) == 0xFFFF
+    mends = [begin(line.segment, InputsFrozen(1), line.now) for _ in range(2)]
+    box.inputs = 0xFFC0
+    pressed = begin(line.segment, TerminalFault(10, "low"), line.now)
+    assert seen(line) == 0xFFFF
+    mends[0](line.now)
+    assert seen(line) == 0xFFFF
+    mends[1](line.now)
+    assert seen(line) == 0xFDC0
+    pressed(line.now)
+    assert seen(line) == 0xFFC0
+
+
+def test_only_an_io_box_has_inputs_to_freeze() -> None:
+    line = Line([create("cubemars-orh40")])
+    with pytest.raises(FaultRefused, match="is no IO box"):
+        begin(line.segment, InputsFrozen(1), line.now)
 
 
 def test_without_an_io_box_no_input_can_be_broken() -> None:
