@@ -113,7 +113,7 @@ class Blackboard:
         """Append an event: a code that readers put into words."""
         number = self._events + 1
         at = EVENTS_AT + (number % EVENTS) * EVENT.size
-        EVENT.pack_into(self._map, at, number, time.time_ns(), code, axis, value, limit)
+        EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), code, axis, value, limit)
         self._words.fence()
         self._words[EVENTS_HEAD_AT] = number
         self._events = number

@@ -23,7 +23,7 @@ from rtcp.runtime.blackbox_file import About, Moment, Recording, RecordingError,
 from rtcp.runtime.fault_events import AFTER_S, BEFORE_S, Fault, FaultEvents
 from rtcp.runtime.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
 from rtcp.runtime.machine import TABLE, State
-from rtcp.runtime.observer import Event, Observer, Text
+from rtcp.runtime.observer import Event, Observer
 from rtcp.runtime.sentences import Sentences
 from rtcp.runtime.session import Session
 
@@ -89,7 +89,7 @@ class BlackBox:
         self.look()
         self._dead = True
         if not self._end_wanted:
-            self._process_fault(time.time_ns(), _ENDED)
+            self._process_fault(time.monotonic_ns(), _ENDED)
 
     def loop_had_ended(self) -> None:
         """Take it that the loop's process ended while no gateway was there to see it."""
@@ -97,8 +97,8 @@ class BlackBox:
         latest = self._observer.latest()
         if latest is not None:
             sentence = f"the loop (process {self._observer.loop_pid}) {_ENDED}"
-            last_ns = int(latest["time_ns"][0]) - time.monotonic_ns() + time.time_ns()
-            self._writer.submit(self._make_up_for, [Fault(last_ns, sentence)])
+            last_ns = int(latest["time_ns"][0])
+            self._writer.submit(self._make_up_for, [Fault(_wall(last_ns), last_ns, sentence)])
 
     def finish(self) -> None:
         """Write what is still to be written and return when it is; a second time is harmless."""
@@ -112,7 +112,7 @@ class BlackBox:
         """Return the faults that events have begun since the last look."""
         events = self._observer.events_since(self._event)
         self._event = events[-1].number if events else self._event
-        if found := self._events.begun(events, time.time_ns()):
+        if found := self._events.begun(events, time.monotonic_ns()):
             self._since = time.monotonic()
         return found
 
@@ -126,19 +126,19 @@ class BlackBox:
                 self._say(f"the loop (process {self._observer.loop_pid}) publishes again")
         elif now - self._head_at > SILENT_S and not (self._silent or self._dead or self._end_wanted):
             self._silent = True
-            since_ns = time.time_ns() - round((now - self._head_at) * 1e9)
+            since_ns = time.monotonic_ns() - round((now - self._head_at) * 1e9)
             self._process_fault(since_ns, f"has published nothing for {SILENT_S:g} s; {_WATCHDOG}")
 
     def _machine_in_fault(self) -> bool:
         latest = self._observer.latest()
         return latest is not None and State(int(latest["state"][0])) in _IN_FAULT
 
-    def _process_fault(self, time_ns: int, what: str) -> None:
+    def _process_fault(self, monotonic_ns: int, what: str) -> None:
         sentence = f"the loop (process {self._observer.loop_pid}) {what}"
         self._say(sentence)
         if self._over.is_set():
             return
-        fault = Fault(time_ns, sentence)
+        fault = Fault(_wall(monotonic_ns), monotonic_ns, sentence)
         # Nothing comes after its end that would have to be kept apart from it.
         begun = [fault] if self._dead else self._events.met(fault)
         self._since = time.monotonic()
@@ -171,7 +171,7 @@ class BlackBox:
             self._defect("what no gateway saw was not recorded", error)
             return
         for fault in missing:
-            if len(ring) and int(ring["time_ns"][0]) > _monotonic(fault.time_ns):
+            if len(ring) and int(ring["time_ns"][0]) > fault.monotonic_ns:
                 log.info("black box: a fault that no gateway saw has left the ring: %s", fault.what)
             else:
                 self._record(fault)
@@ -180,10 +180,10 @@ class BlackBox:
         try:
             # At once: a short cycle's ring is soon written over.
             before, _ = self._observer.since(0)
-            ends_ns = fault.time_ns + round(AFTER_S * 1e9)
-            self._over.wait(0.0 if self._dead else min(max((ends_ns - time.time_ns()) * 1e-9, 0.0), AFTER_S))
+            ends_ns = fault.monotonic_ns + round(AFTER_S * 1e9)
+            self._over.wait(0.0 if self._dead else max((ends_ns - time.monotonic_ns()) * 1e-9, 0.0))
             after, _ = self._observer.since(int(before["number"][-1]) if len(before) else 0)
-            recording = self._recording(fault, before, after, min(ends_ns, time.time_ns()))
+            recording = self._recording(fault, before, after, min(ends_ns, time.monotonic_ns()))
             number, path = write(self._directory, recording)
         except RecordingError as error:
             self._say(f"black box: {error}")
@@ -204,10 +204,11 @@ class BlackBox:
     ) -> Recording:
         records = np.concatenate([before, after])
         at = _place(records, fault, len(before) - 1)
-        instants = records["time_ns"]
+        instants, silent_s = records["time_ns"], 0.0
         if len(records):
             kept = np.abs(instants - instants[at] - (AFTER_S - BEFORE_S) * 5e8) <= (BEFORE_S + AFTER_S) * 5e8
             at -= int(np.count_nonzero(~kept[:at]))
+            silent_s = _silent_s(records, int(np.argmax(kept)))
             records = records[kept]
         timeline, notes = self._timeline(fault, ends_ns)
         session = self._session
@@ -226,27 +227,27 @@ class BlackBox:
             began_ns=session.began_ns,
             event=fault.number,
             at=at,
-            notes=(*_lacking(records, at), *notes),
+            notes=(*_lacking(records, at, silent_s), *notes),
             timeline=timeline,
         )
         return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
 
     def _timeline(self, fault: Fault, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""
-        begins_ns = fault.time_ns - round(BEFORE_S * 1e9)
         events, texts = self._observer.events_since(0), self._observer.texts_since(0)
-        said = [Moment(event.time_ns, self._words(event)) for event in events]
-        said += [Moment(text.time_ns, text.sentence) for text in texts]
-        said += [Moment(fault.time_ns, fault.what)] if not fault.number else []
+        # Counted from the fault, however the wall clock is set meanwhile. A text has its wall time alone.
+        said = [(event.monotonic_ns - fault.monotonic_ns, self._words(event)) for event in events]
+        said += [(text.time_ns - fault.time_ns, text.sentence) for text in texts]
+        said += [(0, fault.what)] if not fault.number else []
+        begins_ns, ends_ns = -round(BEFORE_S * 1e9), ends_ns - fault.monotonic_ns
         notes = []
-        oldest: list[tuple[str, int, Event | Text]] = [("events", EVENTS, event) for event in events[:1]]
-        oldest += [("sentences", TEXTS, text) for text in texts[:1]]
-        for name, room, first in oldest:
-            if first.number > 1 and first.time_ns > begins_ns:
-                away_s = (first.time_ns - fault.time_ns) * 1e-9
-                notes.append(f"more than {room} {name} came: those before {away_s:+.1f} s are lost")
-        kept = [moment for moment in said if begins_ns <= moment.time_ns <= ends_ns]
-        return tuple(sorted(kept, key=lambda moment: moment.time_ns)), notes
+        oldest = [("events", EVENTS, one.number, one.monotonic_ns - fault.monotonic_ns) for one in events[:1]]
+        oldest += [("sentences", TEXTS, one.number, one.time_ns - fault.time_ns) for one in texts[:1]]
+        for name, room, number, away_ns in oldest:
+            if number > 1 and away_ns > begins_ns:
+                notes.append(f"more than {room} {name} came: those before {away_ns * 1e-9:+.1f} s are lost")
+        kept = sorted((one for one in said if begins_ns <= one[0] <= ends_ns), key=lambda one: one[0])
+        return tuple(Moment(fault.time_ns + away_ns, sentence) for away_ns, sentence in kept), notes
 
 
 def _place(records: npt.NDArray[np.void], fault: Fault, newest: int) -> int:
@@ -257,15 +258,15 @@ def _place(records: npt.NDArray[np.void], fault: Fault, newest: int) -> int:
         return max(newest, 0)
     codes = records["fault"].astype(np.int64)
     begins = np.flatnonzero((codes == fault.code) & (np.concatenate([[0], codes[:-1]]) != fault.code))
-    away = np.abs(records["time_ns"] - _monotonic(fault.time_ns))
+    away = np.abs(records["time_ns"] - fault.monotonic_ns)
     # An event that is no fault of the machine's state, or not its first, has no such cycle: the clock tells.
     own = len(begins) and not fault.later
     return int(begins[np.argmin(away[begins])]) if own else int(np.argmin(away))
 
 
-def _monotonic(realtime_ns: int) -> int:
-    """Return the instant on the clock of the cycle records."""
-    return realtime_ns - time.time_ns() + time.monotonic_ns()
+def _wall(monotonic_ns: int) -> int:
+    """Return what the wall clock, as it is set now, showed at an instant of CLOCK_MONOTONIC."""
+    return monotonic_ns - time.monotonic_ns() + time.time_ns()
 
 
 def _state(records: npt.NDArray[np.void], at: int) -> str:
@@ -274,14 +275,23 @@ def _state(records: npt.NDArray[np.void], at: int) -> str:
     return TABLE[State(int(records["state"][max(at, 0)]))].words
 
 
-def _lacking(records: npt.NDArray[np.void], at: int) -> list[str]:
-    """Return in sentences which cycles of the recording's time are not in it."""
+def _silent_s(records: npt.NDArray[np.void], first: int) -> float:
+    """Return how long nothing was published before the first record that is kept; 0 where none is known before it."""
+    if not first or int(records["number"][first - 1]) + 1 != int(records["number"][first]):
+        return 0.0
+    return float(records["time_ns"][first] - records["time_ns"][first - 1]) * 1e-9
+
+
+def _lacking(records: npt.NDArray[np.void], at: int, silent_s: float) -> list[str]:
+    """Return in sentences which cycles of the recording's time are not in it; `silent_s` passed before its first."""
     if not len(records):
         return ["the ring holds no cycle of it"]
     notes, instants, numbers = [], records["time_ns"], records["number"].astype(np.int64)
     held_s = float(instants[at] - instants[0]) * 1e-9
     if held_s < BEFORE_S - 0.01:
         why = "the platform had just started" if numbers[0] == 1 else "older cycles had been overwritten"
+        if silent_s > 1.0:
+            why = f"the loop had published nothing for {silent_s:.1f} s before them"
         notes.append(f"{held_s:.1f} s before the fault instead of {BEFORE_S:g} s: {why}")
     after_s = float(instants[-1] - instants[at]) * 1e-9
     if after_s < AFTER_S - 0.01:

@@ -20,7 +20,7 @@ import math
 import struct
 from dataclasses import dataclass
 
-MAGIC = 0x5254_4350_0000_0003
+MAGIC = 0x5254_4350_0000_0004
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -69,8 +69,8 @@ TEXT = struct.Struct("<QqH502s")
 TEXTS = 64
 
 EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size
-EVENT = struct.Struct("<QqIidd")
-"""number, CLOCK_REALTIME ns, code, axis, value, limit"""
+EVENT = struct.Struct("<QqqIidd")
+"""number, CLOCK_REALTIME ns, CLOCK_MONOTONIC ns, code, axis, value, limit"""
 EVENTS = 256
 
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT.size

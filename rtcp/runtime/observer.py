@@ -92,6 +92,9 @@ class Event:
 
     number: int
     time_ns: int
+    """CLOCK_REALTIME, for people: it may be set meanwhile, forwards and back."""
+    monotonic_ns: int
+    """CLOCK_MONOTONIC, as in the cycle records."""
     code: int
     axis: int
     value: float

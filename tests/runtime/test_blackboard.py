@@ -114,6 +114,15 @@ def test_events_and_texts_arrive_in_order(board: Blackboard, observer: Observer)
     assert [text.sentence for text in observer.texts_since(0)] == ["the drive's temperature is 91 °C"]
 
 
+def test_an_event_has_its_instant_on_both_clocks(board: Blackboard, observer: Observer) -> None:
+    wall, monotonic = time.time_ns(), time.monotonic_ns()
+    board.event(5, 3, 0.25, 1.5)
+    (event,) = observer.events_since(0)
+    assert wall <= event.time_ns <= time.time_ns()
+    assert monotonic <= event.monotonic_ns <= time.monotonic_ns()
+    assert (event.number, event.code, event.axis, event.value, event.limit) == (1, 5, 3, 0.25, 1.5)
+
+
 def test_a_long_text_is_cut_and_not_lost(board: Blackboard, observer: Observer) -> None:
     board.text("ä" * 1000)
     assert observer.texts_since(0)[0].sentence.startswith("ää")

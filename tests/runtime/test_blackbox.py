@@ -135,14 +135,20 @@ class Clock:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.s = 0.0
-        self._began_ns = time.time_ns()
-        monkeypatch.setattr(time, "time_ns", self.now_ns)
+        self.set_s = 0.0
+        """By how much the wall clock was set meanwhile."""
+        self._began_ns, self._wall_ns = time.monotonic_ns(), time.time_ns()
+        monkeypatch.setattr(time, "monotonic_ns", self.now_ns)
+        monkeypatch.setattr(time, "time_ns", self.wall_ns)
         monkeypatch.setattr(blackbox, "AFTER_S", 0.1)
         monkeypatch.setattr(fault_events, "AFTER_S", 0.1)
         monkeypatch.setattr(blackbox, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
 
     def now_ns(self) -> int:
         return self._began_ns + round(self.s * 1e9)
+
+    def wall_ns(self) -> int:
+        return self._wall_ns + round((self.s + self.set_s) * 1e9)
 
 
 def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_ten_seconds(
@@ -173,6 +179,74 @@ def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_
     # A new gateway divides them in the same way, and finds each of them written.
     played.watched().finish()
     assert len(played.recordings) == 5
+
+
+@pytest.mark.parametrize("set_s", [-3600.0, 3600.0])
+def test_a_wall_clock_that_is_set_neither_puts_a_recording_off_nor_brings_it_forward(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch, set_s: float
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+
+    def recorded_at(at_s: float, code: int = 0) -> list[int]:
+        clock.s = at_s
+        if code:
+            played.board.event(code)
+        box.look()
+        box._writer.submit(int).result()
+        return [recording.about.event for recording in played.recordings]
+
+    assert recorded_at(0.0, Code.BUS_LOST) == [1]
+    clock.set_s = set_s
+    assert recorded_at(9.0, Code.DRIVE_FAULT) == [1]
+    assert recorded_at(10.0) == [1, 2]
+    # The emergency stop half a minute into a fault, while its ten seconds are in the ring.
+    assert recorded_at(30.0, Code.PRESSED) == [1, 2, 3]
+    box.finish()
+    first, _, third = played.recordings
+    assert third.about.time_ns == first.about.time_ns + round((30.0 + set_s) * 1e9), "people are shown the wall clock"
+
+
+def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_set_forward(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    clock = Clock(monkeypatch)
+    played.fill(2000, fault_at=1000, ends_ns=clock.now_ns() + 500_000_000)
+    played.board.event(Code.BUS_LOST, value=5)
+    clock.s, clock.set_s = 0.25, 3600.0
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    clock.s = 2.0
+    played.watched().finish()
+    first, second = played.recordings
+    assert int(first.records["cycle"][first.about.at]) == 1000
+    assert first.about.time_ns == clock.wall_ns() - round((2.0 + 3600.0) * 1e9)
+    # No cycle shows the second fault's code: its own is the one of its instant, 0.25 s before the last.
+    assert int(second.records["cycle"][second.about.at]) == 1500
+
+
+def test_what_is_said_while_the_wall_clock_is_set_stands_where_it_was_said(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    played.board.event(Code.ARRIVED)
+    clock.s, clock.set_s = 5.0, -3600.0
+    played.board.event(Code.BUS_LOST, value=5)
+    clock.s, clock.set_s = 5.05, 3600.0
+    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    clock.s = 6.0
+    box.look()
+    box.finish()
+    (recording,) = played.recordings
+    about = recording.about
+    away_s = [(moment.time_ns - about.time_ns) * 1e-9 for moment in about.timeline]
+    assert away_s == pytest.approx([-5.0, 0.0, 0.05])
 
 
 def test_what_was_put_off_is_written_when_the_gateway_ends(
@@ -245,6 +319,19 @@ def test_cycles_that_were_overwritten_before_they_were_read_are_told(play: Calla
     box.finish()
     (recording,) = played.recordings
     note = "8.2 s before the fault instead of 10 s: older cycles had been overwritten"
+    assert note in recording.about.notes
+
+
+def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    now = time.monotonic_ns()
+    played.fill(1000, ends_ns=now - 13_000_000_000)
+    played.fill(600, fault_at=600, ends_ns=now)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.finish()
+    (recording,) = played.recordings
+    note = "0.3 s before the fault instead of 10 s: the loop had published nothing for 12.7 s before them"
     assert note in recording.about.notes
 
 
@@ -442,7 +529,7 @@ def test_a_fault_before_the_first_cycle_is_recorded_with_the_cycles_that_follow(
         return found
 
     monkeypatch.setattr(played.observer, "since", followed)
-    box._process_fault(time.time_ns(), "has published nothing")
+    box._process_fault(time.monotonic_ns(), "has published nothing")
     assert read_once.wait(60)
     played.fill(100)
     box.finish()
