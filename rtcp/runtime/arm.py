@@ -110,14 +110,16 @@ class Arm:
     def follow(self) -> None:
         """Let set-point and guard follow the drives that have no torque: their target is where they are.
 
-        A joint that stands outside its range is followed to the edge of it only; it is not enabled there.
+        The set-point of a joint that stands outside its range is the edge of it, so that every mode begins inside; from
+        where the joint is to there the guard leads its target, once the drive obeys it.
         """
         position, latch, limits = self.state.position, self.guard.latch, self.limits
         for i, drive in enumerate(self.drives):
             if drive.state not in _HOLDING:
                 low, high, here = limits.low[i], limits.high[i], drive.position
-                position[i] = drive.target_position = high if here > high else low if here < low else here
-                latch(i, drive.target_position)
+                position[i] = high if here > high else low if here < low else here
+                drive.target_position = here
+                latch(i, here)
         self.guards.latch(self.state)
         if self.gripper is not None:
             self.gripper.follow()
@@ -190,17 +192,29 @@ class Arm:
 
     def first_off_target(self) -> int:
         """Return the first joint that `follow` would take further than it can have turned since the last, or -1."""
-        position = self.state.position
+        followed = self.guard.last
         for axis, drive in enumerate(self.drives):
-            if drive.state not in _HOLDING and not abs(drive.position - position[axis]) <= FOLLOWED_RAD:
+            if drive.state not in _HOLDING and not abs(drive.position - followed[axis]) <= FOLLOWED_RAD:
                 return axis
         return len(self.drives) if self.gripper is not None and self.gripper.off_target else -1
 
     def followed_to(self, axis: int) -> float:
-        """Return where the set-point of a joint, or of the gripper, is: where its drive was followed to, rad."""
+        """Return where the drive of a joint, or of the gripper, was followed to, rad."""
         if axis < len(self.drives) or self.gripper is None:
-            return self.state.position[axis]
+            return self.guard.last[axis]
         return self.gripper.motion.position
+
+    def beyond_range(self, axis: int) -> float:
+        """Return how far beyond its range the target of a joint is, from where the guard leads it back, rad, or 0."""
+        last, limits = self.guard.last[axis], self.limits
+        return max(last - limits.high[axis], limits.low[axis] - last, 0.0)
+
+    def first_led_back(self) -> int:
+        """Return the first joint whose target the guard still leads back into its range, or -1."""
+        for axis in range(len(self.drives)):
+            if self.beyond_range(axis) > 0.0:
+                return axis
+        return -1
 
     def first_not_resting(self) -> int:
         """Return the first joint whose drive is in fault or enabled, or -1."""

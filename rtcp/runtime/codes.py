@@ -184,7 +184,13 @@ class Code(IntEnum):
     """A gripper with a drive came to rest; value: position, rad, limit: 1 where it holds something."""
     POSITION_JUMPED = 43
     """While being enabled; axis, value: where the drive says it is, limit: where it was followed to, rad."""
+    LED_BACK = 44
+    """Enabled a little beyond its range; axis, value: how far, rad, limit: how fast it is led back, rad/s."""
+    BUTTON_UNHEARD = 46
+    """In a fault the IO box has been out of OP for too long; value: s."""
     CAME_OUT = 38
     """The stick's code was none, or came back to one."""
+    STANDS_ELSEWHERE = 45
+    """After a reset; axis, value: where the joint stands, limit: where it was last heard before the fault, rad."""
     ENDED = 100
     """ENDED + `rtcp.motion.state.Reason`: a mode or a guard ended the motion."""

@@ -1,5 +1,8 @@
 """The way to Operation Enabled: target = actual until every drive is there, in the mode that was asked for.
 
+A joint that stands a little beyond its range is then led back to the edge before anything may move the arm: a motion,
+or another mode of the drives, begins with every target where its set-point is.
+
 A drive obeys its target some frames before it shows that it does, and what it is followed to no clamp cuts: a place to
 which it cannot have turned is not followed.
 """
@@ -8,11 +11,15 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.motion.guard import BACK_RAD_S
 from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.failing import Failing
+
+_TOLD_RAD = 0.001
+"""A joint that stands less beyond its range is led back without a word: it was at the edge, and sagged as it rested."""
 
 
 class Enabling:
@@ -33,6 +40,8 @@ class Enabling:
         """Cycles in a row in which a drive said that it is where it cannot be."""
         self._were_enabled = 0
         """Drives that were enabled since it began, a bit each."""
+        self._all_enabled = False
+        """Whether all were, in their mode: what is still to come is the way back into the range."""
         self._arm = arm
         self._watch = watch
         self._failing = failing
@@ -41,10 +50,11 @@ class Enabling:
     def begin(self) -> None:
         """Begin anew, in the cycle in which it is asked for."""
         self._false = self._were_enabled = 0
+        self._all_enabled = False
         self._count_anew()
 
     def lead(self, waited: int) -> bool:
-        """Do the part of a cycle in which the drives have answered; return whether all are enabled.
+        """Do the part of a cycle in which the drives have answered; return whether all are enabled and in their range.
 
         Args:
             waited: cycles since it began.
@@ -73,6 +83,11 @@ class Enabling:
         axis = arm.first_not_enabled()
         elsewhere = arm.first_in_another_mode() if axis < 0 else -1
         if axis < 0 and elsewhere < 0 and (arm.gripper is None or arm.gripper.enabled):
+            if not self._all_enabled:
+                self._all_enabled = True
+                self._tell_beyond()
+            if arm.first_led_back() >= 0:
+                return False
             self._end()
             return True
         if waited > self._patience:
@@ -100,6 +115,14 @@ class Enabling:
             return False
         self._failing.fail(Code.POSITION_JUMPED, axis, arm.all_drives[axis].position, arm.followed_to(axis))
         return True
+
+    def _tell_beyond(self) -> None:
+        """Say which joints are now led back into their range, from how far beyond it and how fast."""
+        arm = self._arm
+        for axis, fastest in enumerate(arm.limits.velocity):
+            beyond = arm.beyond_range(axis)
+            if beyond > _TOLD_RAD:
+                self._blackboard.event(Code.LED_BACK, axis, beyond, min(BACK_RAD_S, fastest))
 
     def _count_anew(self) -> None:
         self._watch.reset()

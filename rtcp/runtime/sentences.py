@@ -55,7 +55,7 @@ class Sentences:
         self._refusals |= motion_refusals(self._names)
         self._events: dict[int, Callable[[Matter], str]] = {
             Code.BUS_LOST: lambda m: (
-                f"process data lost: {number(m.value)} cycles in a row without the expected working counter "
+                f"process data lost: {_lost(m)} the expected working counter "
                 f"({self._lost_cycles()} in {file}): {stop(Code.BUS_LOST)}, `rtcp reset` goes on when the slaves answer"
             ),
             Code.DRIVE_LEFT_ENABLED: lambda m: (
@@ -96,7 +96,12 @@ class Sentences:
             ),
             Code.LEFT_RANGE: self._left_range,
             Code.POSITION_JUMPED: self._position_jumped,
-            Code.TORQUE_OFF: lambda _: "the torque is taken off; the fault stays until `rtcp reset`",
+            Code.STANDS_ELSEWHERE: lambda m: (
+                f"{joint(m.axis)} stands at {number(m.value)} rad, at the fault it stood at {number(m.limit)} rad: "
+                "where nobody moved it and it has not sunk, its drive has lost its zero: check that before "
+                "`rtcp enable`"
+            ),
+            Code.TORQUE_OFF: lambda _: "the drives are told to give up their torque; the fault stays until `rtcp reset`",
             Code.LEASE_ENDED: lambda _: (
                 f"the commander fell silent or gave up its lease: {self._names.end(Code.LEASE_ENDED)}"
             ),
@@ -108,9 +113,17 @@ class Sentences:
             Code.DISABLED: lambda _: "all drives are disabled",
             Code.RESET: lambda _: "reset: the fault is gone, drives are disabled",
             Code.ARRIVED: lambda _: "the move has arrived",
+            Code.BUTTON_UNHEARD: lambda m: (
+                f"the IO box has been out of OP for {number(m.value)} s, and with it the emergency stop (inputs."
+                f"emergency_stop in {file}) is not heard: it counts as pressed"
+            ),
             Code.STOPPED: lambda _: "the arm has stopped and holds",
             Code.DC_LOCKED: lambda _: "the cycle follows the reference clock",
             Code.DC_UNLOCKED: lambda _: "the cycle has lost the reference clock's phase",
+            Code.LED_BACK: lambda m: (
+                f"{joint(m.axis)} stands {m.value:.2g} rad beyond its range ({self._key(m)}.position in {file}, or "
+                f"`rtcp limits`): it is brought back to the edge at {number(m.limit)} rad/s"
+            ),
         } | motion_events(self._names)
 
     @property
@@ -196,7 +209,10 @@ class Sentences:
         return self._events[code](Matter(axis, value, limit))
 
 
-FAULTS = frozenset(
+EMERGENCIES = frozenset({Code.PRESSED, Code.OVER_SPEED, Code.OVER_TORQUE, Code.FOLLOWING_ERROR})
+"""Events that begin the emergency stop, also out of a fault."""
+
+FAULTS = EMERGENCIES | frozenset(
     {
         Code.BUS_LOST,
         Code.DRIVE_LEFT_ENABLED,
@@ -212,10 +228,12 @@ FAULTS = frozenset(
         Code.CLOCK_LOST,
         Code.LEFT_RANGE,
         Code.POSITION_JUMPED,
-        Code.PRESSED,
-        Code.OVER_SPEED,
-        Code.OVER_TORQUE,
-        Code.FOLLOWING_ERROR,
     }
 )
 """Events that are why the machine is in fault or in the emergency stop, whatever the ladder of stops says."""
+
+
+def _lost(m: Matter) -> str:
+    if m.value >= m.limit:
+        return f"{number(m.value)} cycles in a row without"
+    return f"{number(m.limit)} cycles more without than with"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
-from rtcp.motion.guard import Guard
+from rtcp.motion.guard import BACK_RAD_S, Guard
 from rtcp.motion.limits import Limits
 
 from .judge import ARM
@@ -108,13 +109,50 @@ def test_limits_that_change_are_those_that_count_from_then_on() -> None:
     drive.target_velocity = drive.target_torque = 99.0
     guard.check([drive])
     assert drive.target_velocity == pytest.approx(CHANGE)
-    # Step by step back into the range, at the new speed.
-    assert drive.target_position == pytest.approx(1.0 - 0.1 * PERIOD, abs=1e-9)
     assert drive.target_torque == 2.0
     for _ in range(200):
         drive.target_velocity = 99.0
         guard.check([drive])
     assert drive.target_velocity == 0.1
+    # Gently back into the range.
+    assert 1.0 - 200 * BACK_RAD_S * PERIOD <= drive.target_position <= 1.0 - 100 * BACK_RAD_S * PERIOD
+
+
+def led_back(last: float, wanted: float, velocity: float = 0.5) -> list[float]:
+    """The targets from `last`, outside the range, until they are inside."""
+    limits = Limits(CONFIG)
+    limits.apply(replace(limits.widest, velocity=(velocity,)))
+    guard, drive, targets = Guard(limits, PERIOD), Drive(position=last), [last]
+    guard.latch(0, last)
+    while not -1.0 <= targets[-1] <= 2.0:
+        drive.target_position = wanted
+        guard.check([drive])
+        targets.append(drive.target_position)
+        assert len(targets) < 10_000
+    return targets
+
+
+@pytest.mark.parametrize("wanted", [2.0, 2.02, 0.5, math.nan])
+@pytest.mark.parametrize(("last", "edge"), [(2.018, 2.0), (2.00001, 2.0), (-1.018, -1.0)])
+def test_a_target_beyond_the_range_begins_where_it_is_and_is_led_back_to_the_edge(
+    last: float, edge: float, wanted: float
+) -> None:
+    targets = led_back(last, wanted)
+    assert targets[1] == pytest.approx(last, abs=1e-12)
+    assert targets[-1] == edge
+    # The way at full pace, and what it takes to gain it and to lose it.
+    assert (len(targets) - 2) * PERIOD <= abs(last - edge) / BACK_RAD_S + BACK_RAD_S / JOINT.acceleration + 2 * PERIOD
+
+
+@pytest.mark.parametrize(("velocity", "bound"), [(0.5, BACK_RAD_S), (0.02, 0.02)])
+@given(st.floats(2.0, 2.05, exclude_min=True))
+def test_a_target_is_led_back_no_faster_than_gently_or_than_its_joint_may_and_under_its_acceleration(
+    velocity: float, bound: float, last: float
+) -> None:
+    targets = led_back(last, 2.0, velocity)
+    speeds = [0.0, *((after - before) / PERIOD for before, after in pairwise(targets)), 0.0]
+    assert max(map(abs, speeds)) <= bound + 1e-9
+    assert max(abs(after - before) for before, after in pairwise(speeds)) <= CHANGE + 1e-9
 
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.runtime.machine import Code, Command, State
+from rtcp.runtime.machine import Code, Command, Refusal, State
 
 from .bench import (
     CONFIG,
@@ -19,6 +19,7 @@ from .bench import (
     QUICK_STOP,
     SWITCH_ON,
     Bench,
+    move_numbers,
 )
 
 _INPUTS = struct.Struct("<Hiiib")
@@ -135,6 +136,87 @@ def test_a_drive_that_leaves_operation_enabled_while_others_are_on_their_way_is_
     bench.do(Command.RESET)
     bench.until(State.READY)
     bench.enable()
+
+
+def enable_beyond(bench: Bench, beyond: float = 0.018) -> Bench:
+    """Enable with the second joint so far beyond its range, up to the cycle in which all drives are enabled."""
+    bench.models[1].mechanics.position = CONFIG.joints[1].position.max + beyond
+    bench.start().do(Command.ENABLE)
+    bench.wait(lambda: all(said.statusword & 0x6F == 0x27 for said in bench.log[-1].drives))
+    return bench
+
+
+@pytest.mark.parametrize(("velocity", "told"), [(0.5, 0.05), (0.02, 0.02)])
+def test_a_joint_that_is_brought_back_into_its_range_is_told_with_how_far_and_how_fast(
+    bench: Bench, velocity: float, told: float
+) -> None:
+    limits = bench.arm.limits
+    limits.velocity[1] = velocity
+    bench.arm.guard.take(limits)
+    enable_beyond(bench).until(State.HOLDING)
+    assert bench.codes[-2:] == [Code.LED_BACK, Code.ENABLED]
+    assert bench.said[-2] == (
+        "joint2 stands 0.018 rad beyond its range (joints[1].position in assistive_arm.yaml, or `rtcp limits`): "
+        f"it is brought back to the edge at {told} rad/s"
+    )
+
+
+def test_what_a_joint_at_the_edge_sags_is_made_good_without_a_word(bench: Bench) -> None:
+    enable_beyond(bench, 0.0005).until(State.HOLDING)
+    assert Code.LED_BACK not in bench.codes
+    assert bench.log[-1].drives[1].target == 20000
+
+
+def test_no_motion_begins_before_a_joint_beyond_its_range_is_back(bench: Bench) -> None:
+    enable_beyond(bench)
+    began = len(bench.log)
+    while bench.state is State.ENABLING:
+        answer = bench.order(Command.MOVE, move_numbers(0.0, 1.0))
+    # The last was taken in the cycle that ended it.
+    assert (len(bench.log) - began) * PERIOD_S == pytest.approx(0.018 / 0.05, abs=0.04)
+    assert answer.refusal == Refusal.NOT_IN_THIS_STATE
+    assert bench.log[-1].drives[1].target == 20000
+    bench.move(0.0, 1.0)
+    bench.until(State.HOLDING)
+    assert bench.log[-1].drives[1].target == 10000
+
+
+def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew_where_it_is(bench: Bench) -> None:
+    enable_beyond(bench)
+    bench.run(0.1)
+    assert 20100 < bench.log[-1].drives[1].target < 20180
+    before = len(bench.log)
+    bench.do(Command.DISABLE)
+    bench.until(State.READY)
+    assert not [cycle for cycle in bench.log[before + 1 :] if cycle.drives[1].obeys_target]
+    bench.run(0.1)
+    before = len(bench.log)
+    bench.enable()
+    said = [cycle.drives[1] for cycle in bench.log[before:] if cycle.drives[1].controlword == ENABLE_OPERATION]
+    assert abs(said[0].target - said[0].position) <= 1
+    assert bench.log[-1].drives[1].target == 20000
+    assert bench.codes.count(Code.LED_BACK) == 2
+
+
+def test_a_drive_that_leaves_while_its_joint_is_brought_back_is_a_fault(bench: Bench) -> None:
+    enable_beyond(bench).run(0.1)
+    assert bench.state is State.ENABLING
+    bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    bench.until(State.FAULT, 5 * PERIOD_S)
+    assert (bench.codes[-1], bench.events[-1].axis) == (Code.DRIVE_LEFT_ENABLED, 1)
+
+
+def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not_by_the_edge(bench: Bench) -> None:
+    bench.models[1].mechanics.position = 2.015
+    end = falsify(until_told_to_enable(bench, 1), axis=1, word=SWITCHED_ON, position=1.98)
+    before = len(bench.log)
+    bench.run(4 * PERIOD_S)
+    end()
+    assert {cycle.drives[1].target for cycle in bench.log[before:]} == {20150}
+    falsify(bench, axis=1, word=SWITCHED_ON, position=1.98)
+    bench.until(State.FAULT, 2 * CONFIG.watch.cycles * PERIOD_S)
+    assert bench.codes[-1] is Code.POSITION_JUMPED
+    assert bench.said[-1].startswith("joint2 was followed to 2.015 rad while being enabled and is suddenly at 1.98 rad")
 
 
 def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(bench: Bench) -> None:

@@ -150,7 +150,7 @@ class Judge:
         bounds = self.bounds
         low, high = bounds.low[axis] * COUNTS - 1, bounds.high[axis] * COUNTS + 1
         self._judge_going_on(axis, joint, position, mode, now)
-        if not joint.mode and mode == CSP and abs(position - min(max(actual, low), high)) > LATCHED:
+        if not joint.mode and mode == CSP and abs(position - actual) > LATCHED:
             self._violation(now, axis, f"first target {position}, the joint stands at {actual}")
         if mode == CSP and not low - MARGIN <= position <= high + MARGIN:
             self._violation(now, axis, f"first target {position} outside {low:.0f}..{high:.0f}")

@@ -73,6 +73,18 @@ def test_a_sound_loop_is_not_blamed(mode: str) -> None:
         assert driver.judge.obeyed > 1000
 
 
+@pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
+def test_an_enabling_that_brings_a_joint_back_into_its_range_is_not_blamed(mode: str) -> None:
+    config = with_start(configuration(), PERIOD_US, mode)
+    driver = Driver(config, 1, [*START[:5], config.joints[5].position.max + 0.018])
+    try:
+        enable(driver)
+        assert driver.violations == []
+        assert driver.judge.obeyed > 400
+    finally:
+        driver.close()
+
+
 def test_a_target_beyond_the_joints_range_is_seen() -> None:
     with driver_in("csp") as driver:
         enable(driver)
