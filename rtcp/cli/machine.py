@@ -31,9 +31,12 @@ def _enable() -> None:
 
 
 def _disable() -> None:
-    """Disable the drives."""
-    ask("disable", "disable")
-    report("disabled: the drives are without torque")
+    """Disable the drives; done when they show that they are without torque."""
+    unseen = ask("disable", "disable").get("unseen")
+    report(
+        "disabled: the drives are without torque"
+        + (f"; told as well, but not in the cycle's records: {', '.join(unseen)}" if unseen else "")
+    )
 
 
 def _reset() -> None:

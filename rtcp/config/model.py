@@ -161,7 +161,7 @@ class BusConfig:
     receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
     """How long a frame is waited for, as a fraction of the period."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
-    """So many cycles in a row without a right working counter are a fault."""
+    """So many cycles in a row without a right working counter, or so many more than with one, are a fault."""
     virtual_patience: Annotated[float, Ge(1), Le(100)] = 25.0
     """So many times wider are limits on lost process data on the virtual bus alone; see `rtcp.config.virtual`."""
     send_phase: Fraction = 0.5

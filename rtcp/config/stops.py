@@ -19,7 +19,7 @@ class StopsConfig:
     """One key an event, its value the rung that the event takes."""
 
     lost_frames: HardStop = "quick_stop"
-    """`bus.lost_cycles` cycles in a row without a right working counter."""
+    """`bus.lost_cycles` cycles without a right working counter in a row, or so many more than with one."""
     slave_lost: HardStop = "quick_stop"
     """A slave has left OP, or is gone."""
     drive_fault: HardStop = "quick_stop"

@@ -38,6 +38,11 @@ class Switch:
         self._stable = -1
         self._restless = 0
 
+    def read_active(self, levels: int) -> None:
+        """Take the levels of a cycle, but not that what is active no longer is."""
+        if not self.active or bool(levels & self._bit) is not self._inverted:
+            self.read(levels)
+
     def read(self, levels: int) -> None:
         """Take the levels of all inputs of a cycle."""
         if not self._bit:

@@ -17,6 +17,7 @@ from rtcp.runtime.closing import TOLD_CYCLES, Closing
 from rtcp.runtime.emergency_stop import EmergencyStop
 from rtcp.runtime.enabling import Enabling
 from rtcp.runtime.failing import Failing
+from rtcp.runtime.faulted import Faulted
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.machine import TABLE, WITH_TORQUE, Code, Event, State
 from rtcp.runtime.operator import Operator
@@ -63,14 +64,15 @@ class Behaviour:
         watch = Watch(config, arm.limits)
         self.homing = HomingArm(arm, period_s)
         self._emergency = EmergencyStop(arm, service, blackboard, period_s)
-        failing = Failing(self, config, arm, operator, self.homing, self._emergency, watch, service, blackboard)
+        self._faults = Faulted(self, arm, operator, blackboard, period_s)
+        failing = Failing(
+            self, config, arm, operator, self.homing, self._faults, self._emergency, watch, service, blackboard
+        )
         self._failing = failing
         self._tracking = Tracking(self, arm, operator, self.homing, failing, blackboard)
         self._enables = Enabling(config, arm, watch, failing, blackboard)
-        self._resets = Resetting(config, arm, operator, service, failing)
-        self._closes = Closing(
-            arm, self.homing, operator, watch, blackboard, config.bus.lost_cycles, failing.rungs, period_s
-        )
+        self._resets = Resetting(config, arm, operator, service, failing, blackboard)
+        self._closes = Closing(arm, self.homing, operator, watch, blackboard, config, failing.rungs)
         self._disable_cycles = round(config.enable_timeout_s / period_s)
         self._mode_cycles = round(_MODE_S / period_s)
         self._since = 0
@@ -81,6 +83,9 @@ class Behaviour:
         """Instant of the cycle, ns of the loop's clock."""
         self.lost = 0
         """Cycles in a row without the expected working counter."""
+        self.lost_more = 0
+        """So many more cycles without it than with it, `bus.lost_cycles` at most."""
+        self._lost_limit = config.bus.lost_cycles
         self.fault = Code.NONE
         self.limit = Reason.NONE
         """Which limit the machine was stopped by last; NONE once it is reset."""
@@ -116,7 +121,14 @@ class Behaviour:
     def step(self, good: bool) -> None:
         """Do one cycle of the present state; `good`: the exchange had the expected working counter."""
         self.cycle += 1
-        self.lost = 0 if good else self.lost + 1
+        if good:
+            self.lost = 0
+            if self.lost_more:
+                self.lost_more -= 1
+        else:
+            self.lost += 1
+            if self.lost_more < self._lost_limit:
+                self.lost_more += 1
         self._arm.state.now_ns = self.now_ns
         operator = self._operator
         if good:
@@ -138,6 +150,9 @@ class Behaviour:
 
     def _enter(self, state: State) -> None:
         self.state = state
+        if state is State.READY:
+            # What was lost before slaves were in OP, or before a reset, is no part of what is lost from now on.
+            self.lost_more = 0
         self._told = 0
         self._since = self.cycle
         self.switching = False
@@ -146,6 +161,16 @@ class Behaviour:
     def clock_followed(self) -> bool:
         """Whether there is no reference clock to follow, or it is followed."""
         return self._discipline is None or self._discipline.locked
+
+    @property
+    def box_in_op(self) -> bool:
+        """Whether there is an IO box, and in OP."""
+        box = self._operator.box_position
+        return box > 0 and self._blackboard.in_op(box)
+
+    def hear_press(self) -> None:
+        """Take from the box of a cycle that was not good that the emergency stop is pressed, and nothing else."""
+        self._operator.hear_press()
 
     @property
     def _box_left_op(self) -> bool:
@@ -214,9 +239,15 @@ class Behaviour:
         self._arm.lead(DriveGoal.DISABLED)
         if good:
             self._arm.follow()
-            if service.all_op:
-                self._blackboard.event(Code.READY)
-                self.on(Event.ALL_IN_OP)
+        if not service.all_op:
+            # Frames are not yet whole: what is lost until all slaves are in OP counts for nothing.
+            self.lost_more = 0
+        elif good:
+            self._blackboard.event(Code.READY)
+            self.on(Event.ALL_IN_OP)
+        elif self._failing.bus_fails(good):
+            # Where no cycle was good the box was not heard, which is no press: what failed stays what is told.
+            self._operator.forget_press()
 
     def _ready(self, good: bool) -> None:
         arm = self._arm
@@ -319,10 +350,7 @@ class Behaviour:
             self._failing.fail_drive(Code.DISABLE_STUCK, axis)
 
     def _faulted(self, good: bool) -> None:
-        # Also without frames that come back: slaves that still hear must not go on with the last speed or torque.
-        self._arm.lead(DriveGoal.TORQUE_OFF if self.torque_off else DriveGoal.QUICK_STOPPED)
-        if good:
-            self._arm.follow()
+        self._faults.lead(good)
 
     def _in_emergency(self, good: bool) -> None:
         self._emergency.lead(good)
@@ -333,9 +361,11 @@ class Behaviour:
         elif self._resets.lead():
             self.fault = Code.NONE
             self._blackboard.event(Code.RESET)
+            # After it: what was said last is what `rtcp status` shows.
+            self._resets.tell_displaced()
             self.on(Event.RESET_DONE)
             return
-        self._resets.give_up(good, self._waited)
+        self._resets.give_up(good, self.clock_followed, self._waited)
 
     def _closing(self, good: bool) -> None:
         self.done = self._closes.lead(good, self.lost)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import ceil
 
+from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.envelope import Verdict
 from rtcp.motion.watch import Watch
@@ -12,13 +14,11 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.operator import Operator
-from rtcp.runtime.stops import Rung
+from rtcp.runtime.stops import Rung, quick_stop_s
 
 _CLOSING_S = 2.0
 TOLD_CYCLES = 5
 """What a drive shows is older than what it was told: so many cycles later it shows what it has made of it."""
-_FAREWELL_CYCLES = 20
-"""Frames with quick stop for slaves that still listen when the bus is given up."""
 
 
 class Closing:
@@ -30,9 +30,8 @@ class Closing:
         operator: knows whether the emergency stop is pressed.
         watch: of the joints; the gripper has its own.
         blackboard: where it is told that an emergency was met.
-        lost_limit: so many cycles in a row without frames give the bus up.
+        config: after how many lost cycles the bus is given up, and how long the drives are told to stop until then.
         rungs: how what goes wrong on the way is met.
-        period_s: the cycle, s.
     """
 
     def __init__(
@@ -42,16 +41,18 @@ class Closing:
         operator: Operator,
         watch: Watch,
         blackboard: Blackboard,
-        lost_limit: int,
+        config: ArmConfig,
         rungs: Mapping[Code, Rung],
-        period_s: float,
     ) -> None:
+        period_s = config.cycle.period_us * 1e-6
         self._arm = arm
         self._homing = homing
         self._operator = operator
         self._watch = watch
         self._blackboard = blackboard
-        self._lost_limit = lost_limit
+        self._lost_limit = config.bus.lost_cycles
+        self._farewell_cycles = ceil(quick_stop_s(config) / period_s) + TOLD_CYCLES
+        """Slaves that still listen are in OP until the joints stand: without outputs a drive's own fault stops it."""
         self._rungs = rungs
         self._patience = round(_CLOSING_S / period_s)
         self._cycles = 0
@@ -73,7 +74,7 @@ class Closing:
             return False
         if lost >= self._lost_limit:
             arm.lead(self._rungs[Code.BUS_LOST].goal)
-            return lost >= self._lost_limit + _FAREWELL_CYCLES
+            return lost >= self._lost_limit + self._farewell_cycles
         if self._cycles > self._patience:
             return True
         if not good:

@@ -6,11 +6,18 @@ import asyncio
 import time
 from typing import Any
 
+import numpy as np
+
 from rtcp.config.model import Joint
+from rtcp.devices.cia402 import STATES, DriveState
+from rtcp.fieldbus.alstatus import AlState
 from rtcp.motion.modes import DriveMode
+from rtcp.runtime.arm import WITH_TORQUE
 from rtcp.runtime.carrier import MOVING, POLL_S, Carrier, CommandFailed
+from rtcp.runtime.closing import TOLD_CYCLES
 from rtcp.runtime.codes import Code, MotionMode
 from rtcp.runtime.machine import Command, State
+from rtcp.runtime.stops import longest_s
 
 DRIVE_MODES: dict[str, int] = {mode.name.lower(): mode for mode in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST)}
 MOTION_MODES: dict[str, int] = {mode.name.lower(): mode for mode in MotionMode}
@@ -21,6 +28,10 @@ _DISABLING = frozenset(
 _RESETTING = frozenset({State.RESETTING})
 _HALTING = MOVING | {State.HOMING}
 _RESETTABLE = (State.FAULT, State.EMERGENCY_STOP, State.RESETTING)
+_PARKED = (AlState.INIT, AlState.PREOP)
+"""AL states in which a drive takes no process data: nothing gives it torque."""
+_CONFIRM_S = 2.0
+"""So much longer than the longest stop of the ladder a drive may take to show that its torque is gone."""
 _SERVICE_S = 5.0
 _GRIPPER_S = 5.0
 _THERE_RAD = 1e-3
@@ -46,12 +57,65 @@ class Commander:
         return {}
 
     async def disable(self, client: str) -> dict[str, Any]:
-        """Stop in a controlled way and take the torque off; needs no lease."""
+        """Stop in a controlled way and take the torque off, and see that it is; needs no lease.
+
+        `unseen` names the gripper's drive in a fault or an emergency stop: told as the others, but no record shows it.
+
+        Raises:
+            CommandFailed: refused; a fault came first; the drives do not show that they are without torque.
+        """
         broken = self._picture.state() in _RESETTABLE
         await self._carrier.give(0, Command.DISABLE)
         if not broken:
             await self._carrier.until(State.READY, _DISABLING, self._config.enable_timeout_s + 30.0, "disabling")
-        return {}
+        await self._until_without_torque()
+        unseen = self._config.axes[len(self._config.joints) :] if broken else ()
+        return {"unseen": [_drive(joint) for joint in unseen]}
+
+    async def _until_without_torque(self) -> None:
+        """Wait until a record of a cycle in which all slaves answered shows every joint's drive without torque.
+
+        In the emergency stop slaves are parked in PRE-OP and do not answer: what they showed last counts there.
+        """
+        observer = self._carrier.observer
+        seen, shown, parked = observer.head + TOLD_CYCLES, None, False
+        until = time.monotonic() + longest_s(self._config) + _CONFIRM_S
+        while True:
+            records, _ = observer.since(seen)
+            if len(records):
+                seen = int(records[-1]["number"])
+                parked = self._parked()
+                good = records if parked else records[records["wkc"] == records["wkc_expected"]]
+                shown = good[-1] if len(good) else shown
+                if shown is not None and not _with_torque(shown):
+                    return
+            if time.monotonic() > until:
+                raise CommandFailed("fault", self._unconfirmed(shown, parked))
+            self._carrier.check_loop()
+            await asyncio.sleep(POLL_S)
+
+    def _parked(self) -> bool:
+        """Whether every joint's drive is in an AL state in which it takes no process data."""
+        slaves = self._config.slaves
+        states = zip(slaves, self._carrier.observer.slaves(len(slaves)), strict=True)
+        found = {slave.name: al & 0x0F for slave, (al, _) in states}
+        return all(found[joint.slave] in _PARKED for joint in self._config.joints)
+
+    def _unconfirmed(self, shown: np.void | None, parked: bool) -> str:
+        """Say of which joints it is not known that they are without torque, and why; `shown`: what they showed last."""
+        latest, joints = self._carrier.observer.latest(), self._config.joints
+        names = ", ".join(_drive(joint) for joint in joints)
+        heard = parked or (latest is not None and latest[0]["lost"] < self._config.bus.lost_cycles)
+        if shown is not None and heard:
+            held = _with_torque(shown)
+            why = ", ".join(f"{_drive(joints[axis])} shows 0x{word:04X}, {state}" for axis, word, state in held)
+            why += "; the slaves are in PRE-OP since" if parked else ""
+        elif latest is None or latest[0]["wkc"] < 0:
+            why = f"no frame comes back, and nothing is known of {names}"
+        else:
+            found, expected = latest[0]["wkc"], latest[0]["wkc_expected"]
+            why = f"slaves are missing (working counter {found} of {expected}), and nothing is known of {names}"
+        return f"told to give up their torque, not confirmed: {why}"
 
     async def reset(self, client: str) -> dict[str, Any]:
         """Leave a fault or an emergency stop (the drives are then disabled), or a stop by a limit (the arm holds)."""
@@ -158,6 +222,22 @@ class Commander:
                     raise CommandFailed("timeout", "the loop's service thread did not answer within 5 s")
                 await asyncio.sleep(POLL_S)
         return answer
+
+
+def _with_torque(record: np.void) -> list[tuple[int, int, str]]:
+    """Return the joints that a record does not show without torque: number, statusword, its state in words."""
+    held = []
+    for axis, word in enumerate(record["statusword"].tolist()):
+        state = next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
+        if state in WITH_TORQUE:
+            held.append((axis, word, state.value))
+        elif state is DriveState.UNKNOWN:
+            held.append((axis, word, "a state that the standard does not know"))
+    return held
+
+
+def _drive(joint: Joint) -> str:
+    return f"{joint.name} ({joint.slave})"
 
 
 def _longest_s(joint: Joint) -> float:

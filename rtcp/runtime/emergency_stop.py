@@ -17,6 +17,8 @@ from rtcp.runtime.stops import Rung
 
 _STAND_S = 2.0
 """A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
+_UNHEARD_S = 0.5
+"""Without the right working counter nobody sees whether the arm stands: a quick stop has long ended by then."""
 _OFF_S = 1.0
 _FIRST_CYCLES = 10
 """What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
@@ -44,6 +46,9 @@ class EmergencyStop:
         self._blackboard = blackboard
         self._stand_cycles = round(_STAND_S / period_s)
         self._off_cycles = round(_OFF_S / period_s)
+        self._unheard_cycles = round(_UNHEARD_S / period_s)
+        self._unheard = 0
+        """Cycles of the step in which the drives did not answer."""
         self._step = _Step.QUICK_STOP
         self._cycles = 0
         self._off = DriveGoal.DISABLED
@@ -60,10 +65,16 @@ class EmergencyStop:
         """Do the cycle's part; `good`: the drives have answered."""
         arm = self._arm
         self._cycles += 1
+        if not good:
+            self._unheard += 1
         if self._step is _Step.QUICK_STOP:
             arm.lead(DriveGoal.QUICK_STOPPED)
             stands = good and self._cycles > _FIRST_CYCLES and arm.first_moving() < 0
-            if stands or self._cycles > self._stand_cycles:
+            unheard = self._unheard > self._unheard_cycles
+            if unheard:
+                # In which state the drives are is not known: from every one this takes their torque.
+                self._off = DriveGoal.TORQUE_OFF
+            if stands or unheard or self._cycles > self._stand_cycles:
                 self._next(_Step.TORQUE_OFF)
         elif self._step is _Step.TORQUE_OFF:
             arm.lead(self._off)
@@ -79,4 +90,4 @@ class EmergencyStop:
 
     def _next(self, step: _Step) -> None:
         self._step = step
-        self._cycles = 0
+        self._cycles = self._unheard = 0

@@ -14,6 +14,7 @@ from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.emergency_stop import EmergencyStop
+from rtcp.runtime.faulted import Faulted
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.machine import TABLE, Code, Event, State
 from rtcp.runtime.operator import Operator
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
+_FAILED = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 _CLOCK_S = 1.0
 
 
@@ -37,6 +39,7 @@ class Failing:
         arm: the joints.
         operator: the stick waits for neutral after a stop.
         homing: one that is under way is let go of.
+        faulted: leads the drives while a fault lasts.
         emergency: the emergency path.
         watch: of what is measured.
         service: knows which slave is lost.
@@ -50,6 +53,7 @@ class Failing:
         arm: Arm,
         operator: Operator,
         homing: HomingArm,
+        faulted: Faulted,
         emergency: EmergencyStop,
         watch: Watch,
         service: Service,
@@ -59,6 +63,7 @@ class Failing:
         self._arm = arm
         self._operator = operator
         self._homing = homing
+        self._faulted = faulted
         self._emergency = emergency
         self._watch = watch
         self._service = service
@@ -70,6 +75,10 @@ class Failing:
         """The rung of every event."""
         self.pending = Code.NONE
         """What ends in a fault as soon as the controlled stop that it began has come to rest."""
+        self.stood = [0.0] * len(config.joints)
+        """Where each joint was last heard before the fault or emergency stop, rad."""
+        self.turned = [0.0] * len(config.joints)
+        """How fast it turned there, rad/s."""
 
     def fail(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
         """Stop all drives for `code`, by its rung, and say why; what stands already holds by a quick stop."""
@@ -92,12 +101,22 @@ class Failing:
         """End the controlled stop that `pending` began in the fault that it is; the drives hold, or are let go."""
         self._break(self.pending, rung)
 
+    def _remember(self) -> None:
+        # Where what goes wrong begins: a slave that is lost was last heard before that. Not again until the reset, as
+        # by a press in the fault: its drive may be without supply by then, or back with another zero.
+        if self._behaviour.state not in _FAILED:
+            self.stood[:] = self._arm.state.actual
+            self.turned[:] = self._arm.state.speed
+
     def _break(self, code: Code, rung: Rung) -> None:
+        self._remember()
         behaviour = self._behaviour
         behaviour.fault = code
         self.pending = Code.NONE
         self._homing.abandon()
         behaviour.torque_off = rung is Rung.TORQUE_OFF
+        # Who asked for no torque is not left with an arm that holds.
+        self._faulted.begin(off_at_rest=behaviour.state is State.DISABLING)
         behaviour.all_enabled = False
         self._arm.hold_target()
         self._arm.lead(rung.goal)
@@ -108,6 +127,7 @@ class Failing:
         behaviour = self._behaviour
         if behaviour.state is State.EMERGENCY_STOP:
             return
+        self._remember()
         behaviour.fault = code
         self.pending = Code.NONE
         self._homing.abandon()
@@ -119,7 +139,8 @@ class Failing:
     def bus_fails(self, good: bool) -> bool:
         """Look at frames, slaves and clock; return whether what is lost ended in a fault."""
         behaviour = self._behaviour
-        if not good and behaviour.lost >= self._lost_limit:
+        # Not those in a row alone: one good cycle in ten would let an arm go on that hardly hears or is heard.
+        if not good and behaviour.lost_more >= self._lost_limit:
             self.fail(Code.BUS_LOST, -1, float(behaviour.lost), float(self._lost_limit))
             return True
         if self._service.lost_slave:

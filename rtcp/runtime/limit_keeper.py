@@ -13,6 +13,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.motion.limits import LEAST_PART, Corners, Limits, Values, rows
 from rtcp.runtime.carrier import Carrier, CommandFailed
 from rtcp.runtime.machine import Command
+from rtcp.runtime.paths import limits_file
 
 _JOINT_KEYS = {
     "min": "low",
@@ -40,7 +41,7 @@ class LimitKeeper:
         self._carrier = carrier
         self._config = carrier.config
         self._limits = limits
-        self._file = directory / "limits.json"
+        self._file = limits_file(directory)
         if kept := _read(self._file, carrier.observer.loop_pid):
             limits.apply(kept)
 

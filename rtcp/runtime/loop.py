@@ -93,6 +93,11 @@ class Loop:
             arm.decode(data)
             if self._box is not None:
                 self._box.decode(data.input(self._box_slot))
+        elif wkc > 0 and self._box is not None and behaviour.box_in_op:
+            # Another slave is missing, and which ones were in the frame is not known. SOEM gives what a slave did not
+            # fill in back as it was, so that the inputs are the box's, of now or of before.
+            self._box.decode(data.input(self._box_slot))
+            behaviour.hear_press()
         if self._command_waits():
             self._orders.take()
         if self._shutdown:

@@ -9,29 +9,35 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import math
 import os
 import signal
 import sys
 import time
 import traceback
-from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from rtcp.devices.cia402 import Cia402Drive, DriveGoal
-from rtcp.devices.codec import DeviceError
+from rtcp.config.model import ArmConfig, DeviceDescription
+from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, DriveGoal
+from rtcp.devices.codec import DeviceError, make_codec
 from rtcp.fieldbus.bus import BusError, ProcessData
+from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.realtime import scheduling
+from rtcp.runtime.arm import Arm
 from rtcp.runtime.assembly import assemble, discipline_of, position_of
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.ending import LEFT, write_end
 from rtcp.runtime.paths import blackboard_file
 from rtcp.runtime.service import Service
 from rtcp.runtime.session import Session, SessionError, read_session
+from rtcp.runtime.stops import quick_stop_s
 
 _DISABLE_CYCLES = 20
+_BLIND_WORDS = {DriveGoal.QUICK_STOPPED: QUICK_STOP, DriveGoal.DISABLED: DISABLE_VOLTAGE}
+"""What a drive is told whose driver raises."""
 
 
 class Report:
@@ -152,29 +158,51 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     scheduling.prepare(realtime, config.cycle.priority, config.cycle.cpu)
     try:
         loop.run()
+    except BaseException:
+        # A defect in the cycle: the drives come to rest before the bus goes away.
+        stop_blindly(data, config, parts.arm)
+        raise
+    else:
         if service.refused:
             raise BusError(*service.refused)
-    except BusError:
-        raise
-    except BaseException:
-        # A defect in the cycle: the drives are told to stop before the bus goes away.
-        _disable_blindly(data, parts.arm.pairs)
-        raise
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         service.finish()
         scheduling.release(realtime)
 
 
-def _disable_blindly(data: ProcessData, drives: Sequence[tuple[int, Cia402Drive]]) -> None:
-    for _ in range(_DISABLE_CYCLES):
-        for slot, drive in drives:
-            drive.decode(data.input(slot))
-            drive.advance(DriveGoal.DISABLED)
-            data.set_output(slot, drive.encode())
-        data.send()
-        data.receive()
-        time.sleep(0.001)
+def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
+    """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
+
+    Nothing else of the cycle is needed, and what raises for one drive or one frame keeps no other from being told.
+    """
+    period_s = config.cycle.period_us * 1e-6
+    drives = arm.pairs if arm.gripper is None else [*arm.pairs, (arm.gripper.slot, arm.gripper.drive)]
+    ramp_cycles = math.ceil(quick_stop_s(config) / period_s)
+    due = time.monotonic()
+    for goal, cycles in ((DriveGoal.QUICK_STOPPED, ramp_cycles), (DriveGoal.DISABLED, _DISABLE_CYCLES)):
+        for _ in range(cycles):
+            for slot, drive in drives:
+                with contextlib.suppress(Exception):
+                    data.set_output(slot, _outputs(drive, data, slot, goal, config.slaves[slot].device))
+            with contextlib.suppress(Exception):
+                data.send()
+                data.receive()
+            # At the cycle's pace: a drive that misses frames between its SYNC0 may leave OP.
+            due = max(due + period_s, time.monotonic())
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+
+def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: DriveGoal, device: DeviceDescription) -> bytes:
+    """Lead a drive one step; where its driver raises, its controlword alone is put where the description has it."""
+    try:
+        drive.decode(data.input(slot))
+        drive.advance(goal)
+        return drive.encode()
+    except Exception:
+        image = layout(device.rpdo)
+        control = image.find("controlword")
+        return make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
 
 
 if __name__ == "__main__":

@@ -106,7 +106,7 @@ TABLE: dict[State, Row] = {
         "starting",
         "drives disabled; targets follow the actual positions",
         _ANYWHERE,
-        {Event.ALL_IN_OP: State.READY, Event.SHUTDOWN: State.CLOSING},
+        {Event.ALL_IN_OP: State.READY, Event.BROKEN: State.FAULT, Event.SHUTDOWN: State.CLOSING},
     ),
     State.READY: Row(
         "ready",

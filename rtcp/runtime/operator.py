@@ -39,6 +39,8 @@ class Operator:
         self.arm_has_stick = False
         self.meant = self._outputs.meant
         """Numbers of the outputs that nobody switches by hand."""
+        self.has_button = box is not None and config.inputs.emergency_stop is not None
+        """Whether there is an emergency stop at the box."""
         self.has_gripper = box is not None and config.gripper is not None and config.gripper.output is not None
 
     @property
@@ -57,6 +59,13 @@ class Operator:
         self.emergency_stop = inputs.emergency_stop.active
         self.permitted = inputs.enabling_switch.active
         self.arm_has_stick = inputs.arm_toggle.active
+
+    def hear_press(self) -> None:
+        """Take from the box's inputs that the emergency stop is pressed; that it is released is not taken."""
+        if self._box is not None:
+            stop = self._inputs.emergency_stop
+            stop.read_active(self._box.inputs)
+            self.emergency_stop = stop.active
 
     @property
     def holds_grip(self) -> bool:

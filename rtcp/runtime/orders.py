@@ -137,6 +137,7 @@ class Orders:
         elif behaviour.state not in (State.READY, State.DISABLING, State.EMERGENCY_STOP):
             self._arm.stop()
             behaviour.on(Event.DISABLE)
+        # The emergency stop takes the torque by itself. Taken is not done: who asks looks at the drives.
         return DONE
 
     def _reset(self, lease: int, numbers: Sequence[float]) -> Verdict:

@@ -97,6 +97,11 @@ def stopping_mark(directory: Path) -> Path:
     return directory / "stopping"
 
 
+def limits_file(directory: Path) -> Path:
+    """Return the path of the file that keeps narrowed limits for a gateway that is started anew."""
+    return directory / "limits.json"
+
+
 def blackboard_file(directory: Path) -> Path:
     """Return the path of the blackboard: always in memory, so that a disk never holds up the cycle."""
     # A digest: two directories never share a name, however they are spelt.

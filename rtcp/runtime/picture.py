@@ -16,7 +16,7 @@ from rtcp.runtime.machine import TABLE, Code, State
 from rtcp.runtime.motion_sentences import STICK_MODES, motion_name
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.robot_status import robot_status
-from rtcp.runtime.sentences import Sentences
+from rtcp.runtime.sentences import EMERGENCIES, Sentences
 from rtcp.runtime.session import Processes, Session, is_ours
 
 MODE_NAMES = {8: "csp", 9: "csv", 10: "cst"}
@@ -132,7 +132,8 @@ class Picture:
             sentence = self._sentences.event(event.code, event.axis, event.value, event.limit)
             said.append((event.time_ns, sentence))
             if event.code in self._sentences.faults:
-                self.fault = self.fault or sentence
+                # An emergency stop out of a fault is what has to be ended first.
+                self.fault = sentence if event.code in EMERGENCIES else self.fault or sentence
                 self.last_fault = sentence
                 self.faults += 1
             elif event.code == Code.RESET:

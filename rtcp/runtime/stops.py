@@ -8,6 +8,7 @@ key there (a drive that does not enable, a generator that refuses, a reset that 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from enum import IntEnum
 from math import sqrt
 from types import MappingProxyType
@@ -23,6 +24,8 @@ _LATENCY_CYCLES = 3
 _DRIVE_S = 0.03
 """A joint comes to rest so long after the end of its drive's ramp, or of its set-points, at most."""
 _QUICK_STOP_DECELERATION = (0x6085, 0)
+_UNKNOWN_S = 2.0
+"""A quick stop at a rate that is not known is given so long: as the emergency stop gives it."""
 
 
 class Rung(IntEnum):
@@ -122,6 +125,21 @@ def unheard(config: ArmConfig) -> tuple[Bound, ...]:
         watchdog_s = 1e-3 * next(s.device.watchdog_ms for s in config.slaves if s.name == joint.slave)
         found.append(Bound(watchdog_s + stop.time_s, joint.velocity * watchdog_s + stop.way_rad))
     return tuple(found)
+
+
+def quick_stop_s(config: ArmConfig) -> float:
+    """Return within which time all that drives move, the gripper too, stands by a quick stop, s."""
+    try:
+        return max(bound.time_s for bound in bounds(replace(config, joints=config.axes), Rung.QUICK_STOP))
+    except ValueError:
+        return _UNKNOWN_S
+
+
+def longest_s(config: ArmConfig) -> float:
+    """Return the longest time of the ladder within which all that drives move stands, s."""
+    controlled = bounds(replace(config, joints=config.axes), Rung.CONTROLLED_STOP)
+    tool = tool_bounds(config, config.cartesian.speed, config.cartesian.angular_speed)
+    return max(quick_stop_s(config), *(bound.time_s for bound in (*controlled, *tool)))
 
 
 def tool_bounds(config: ArmConfig, speed: float, angular_speed: float) -> tuple[Bound, Bound]:

@@ -14,7 +14,7 @@ from rtcp.runtime.stops import Bound, Rung, bounds, tool_bounds, unheard
 
 HEADING = "## The ladder of stops"
 _EVENTS = {
-    "lost_frames": "`bus.lost_cycles` cycles in a row without a right working counter",
+    "lost_frames": "`bus.lost_cycles` lost cycles in a row, or so many more lost than good ones",
     "slave_lost": "a slave has left OP, or does not answer",
     "drive_fault": "a drive is in fault, or has left Operation Enabled by itself: the rung is that of all others",
     "clock_lost": "the cycle has not followed the reference clock for 1 s",
@@ -103,9 +103,17 @@ Which event takes which rung is the section `stops` of the arm's file:
 
 - **Hold** is the rung of every single cycle with a wrong working counter and cannot be chosen. Time stands still for
   the set-points, whatever the state and the mode, also where one slave alone is missing and all others have heard. In
-  CSP a joint stands at its last target. In CSV it runs on at its last speed, at most {on}; in CST the last torque
-  goes on, without the damping that is closed in the master, and the way follows what the joint turns. Where frames are
-  lost often, use CSP.
+  CSP a joint stands at its last target. In CSV it runs on at its last speed, at most {on} until the rung or the
+  next good cycle; in CST the last torque goes on, without the damping that is closed in the master, and the way follows
+  what the joint turns. Where frames are lost often, use CSP.
+- **Lost cycles are counted against good ones:** one more for each lost, one less for each good. `lost_frames` comes
+  where the count reaches `bus.lost_cycles`: at once after so many in a row, later where a few good ones are among them,
+  never where at least every second cycle is good.
+- **The emergency stop is heard while other slaves are missing:** that it is pressed is taken from every frame that some
+  slave answered, for as long as the IO box is in OP. Nothing else is taken from such frames: no release, no stick, no
+  permission, no position. Since nobody sees then whether the joints stand, their torque goes after 0.5 s. An IO box
+  that has been out of OP for 1 s takes the button with it: in the fault that this is, it counts as pressed, as its
+  broken wire does, and the torque goes.
 - **Torque off** beside a person: no drive holds its joint any more. The brakes close on whatever moves, and until they
   have closed a joint under weight sags: the arm may come down on what is below it. How far is the brakes' and the
   load's affair, not the configuration's: measure it before you choose it. It is the right rung where a drive that
@@ -118,6 +126,8 @@ Which event takes which rung is the section `stops` of the arm's file:
 - **Enabling** is watched as motion is (`stops.watch`), and a drive that leaves Operation Enabled before all are there
   is a `drive_fault`. A drive obeys some frames before it shows that it does, and until then its target is the place
   that it shows: a place more than 0.03 rad from the last is not followed, and after `watch.cycles` in a row a fault.
+- A fault while the arm is being disabled ramps the joints down by its rung; at standstill the torque goes, as was
+  asked.
 - A `disable` goes on to its end where the clock is lost under `controlled_stop`: the fault is then without torque.
 - Nothing goes on by itself. A drive that comes back, from another AL state or from a loss of its supply, is sent its
   own position and no enable until reset and enable. An IO box that leaves OP shows 0 at its outputs, and comes back

@@ -24,6 +24,15 @@ def test_a_plain_verb_is_passed_on_and_answered_with_a_sentence(
     assert platform.asked(verb) == [{}]
 
 
+def test_a_drive_whose_torque_is_not_looked_at_is_named_when_the_others_are_disabled(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    assert rtcp("disable").out == "disabled: the drives are without torque\n"
+    platform.answers["disable"] = {"unseen": ["finger (drive7)"]}
+    words = "disabled: the drives are without torque; told as well, but not in the cycle's records: finger (drive7)\n"
+    assert rtcp("disable").out == words
+
+
 @pytest.mark.parametrize(
     ("state", "words"),
     [

@@ -1,7 +1,8 @@
 """A look at the wire that shares nothing with the platform: its own frames, its own decoder.
 
-Usage: python wire.py SEGMENT_PID al | init POSITION | safeop POSITION | capture FILE
-The layout of the process image is that of the facts: an IO box (2 bytes out), then six drives (15 bytes out each).
+Usage: python wire.py SEGMENT_PID al | init POSITION | safeop POSITION | station POSITION ADDRESS | capture FILE
+The layout of the process image is that of the facts: an IO box (2 bytes out), then six drives (15 bytes out each); then
+what they bring back in the same order (6 bytes, and 15 each).
 """
 
 from __future__ import annotations
@@ -25,10 +26,11 @@ APRD = 1
 APWR = 2
 BRD = 7
 DRIVE = struct.Struct("<Hiiib")
-BOX_OUT = 2
+BOX_OUT, BOX_IN = 2, 6
 DRIVES = 6
 COUNTS_PER_RAD = 10_000
 AL_STATES = {"init": 1, "safeop": 4}
+STATION, AL_CONTROL = 0x0010, 0x0120
 ETH_P_ALL = 3
 """What a socket must be bound to for packet(7) to show it what leaves, too."""
 LEAVES = 0x8000
@@ -89,11 +91,11 @@ def al_words(interface: str, register: int) -> list[int]:
         return [int.from_bytes(ask(port, APRD, -position, register, 2)[0], "little") for position in range(count)]
 
 
-def to_state(interface: str, position: int, state: int) -> None:
-    """Send the slave at `position` (from 0) to a lower AL state, as if it had lost its way."""
+def write(interface: str, position: int, register: int, word: int) -> None:
+    """Write a register of the slave at `position` (from 0): a lower AL state as if it had lost its way, its station."""
     with socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE)) as port:
         port.bind((interface, ETHERTYPE))
-        port.send(frame(APWR, 0xDD, -position, 0x0120, struct.pack("<H", state)))
+        port.send(frame(APWR, 0xDD, -position, register, struct.pack("<H", word)))
 
 
 def capture(interface: str, path: str) -> None:
@@ -171,6 +173,27 @@ def outputs(path: Path) -> Iterator[tuple[int, list[Targets]]]:
                     yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
 
 
+@dataclass(frozen=True)
+class Actual:
+    """What one frame brings back of a drive, in counts."""
+
+    statusword: int
+    position: int
+    velocity: int
+    torque: int
+    mode: int
+
+
+def inputs(path: Path) -> Iterator[tuple[int, list[Actual]]]:
+    """Yield time (ns) and what the drives show in every process data frame that leaves the segment."""
+    first = BOX_OUT + DRIVES * DRIVE.size + BOX_IN
+    for when, leaves, got in frames(path):
+        if leaves:
+            for command, _, image, _ in datagrams(got):
+                if command == LRW:
+                    yield when, [Actual(*DRIVE.unpack_from(image, first + i * DRIVE.size)) for i in range(DRIVES)]
+
+
 def main() -> None:
     """Do what the command line says."""
     enter(int(sys.argv[1]))
@@ -179,7 +202,9 @@ def main() -> None:
     elif sys.argv[2] == "codes":
         print(json.dumps(al_words("ecat0", 0x0134)))
     elif sys.argv[2] in AL_STATES:
-        to_state("ecat0", int(sys.argv[3]), AL_STATES[sys.argv[2]])
+        write("ecat0", int(sys.argv[3]), AL_CONTROL, AL_STATES[sys.argv[2]])
+    elif sys.argv[2] == "station":
+        write("ecat0", int(sys.argv[3]), STATION, int(sys.argv[4], 0))
     else:
         capture("ecat0-seg", sys.argv[3])
 

@@ -76,6 +76,8 @@ class Segment:
         """Whether frames go out and come back."""
         self.deaf: dict[tuple[int, int], dict[int, int]] = {}
         """What a drive understands instead of what it is told: (drive from 0, object) -> {told: understood}."""
+        self.away: set[int] = set()
+        """Devices (from 0) that no frame reaches: what is in their place of the image stays."""
         self._rx = [PdoImage.from_assignment(device.objects, RX_ASSIGN) for device in self.devices]
         self._tx = [PdoImage.from_assignment(device.objects, TX_ASSIGN) for device in self.devices]
         self._outputs = [bytes(image.byte_length) for image in self._rx]
@@ -92,8 +94,9 @@ class Segment:
     def send(self) -> None:
         if not self.carries:
             return
-        for image, outputs in zip(self._rx, self._outputs, strict=True):
-            image.unpack(outputs)
+        for i, (image, outputs) in enumerate(zip(self._rx, self._outputs, strict=True)):
+            if i not in self.away:
+                image.unpack(outputs)
         for (axis, index), understood in self.deaf.items():
             entry = self.drives[axis].objects[index, 0]
             entry.value = understood.get(entry.value, entry.value)
@@ -104,7 +107,7 @@ class Segment:
             self._answer()
         for device in self.devices:
             device.step(PERIOD_S)
-        return self.expected_wkc if self.carries else -1
+        return self.expected_wkc - 3 * len(self.away) if self.carries else -1
 
     def input(self, index: int) -> bytes:
         return bytes(self._inputs[index])
@@ -117,8 +120,9 @@ class Segment:
         return self._outputs[index]
 
     def _answer(self) -> None:
-        for image, inputs in zip(self._tx, self._inputs, strict=True):
-            image.pack(inputs)
+        for i, (image, inputs) in enumerate(zip(self._tx, self._inputs, strict=True)):
+            if i not in self.away:
+                image.pack(inputs)
 
 
 class Said(NamedTuple):

@@ -4,18 +4,20 @@ models, cycle by cycle, without a bus and without a clock."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from itertools import pairwise, takewhile
 
 import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from rtcp.motion.guard import BACK_RAD_S
 from rtcp.motion.state import MotionState, Reason, Target
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, State
 from rtcp.runtime.observer import Observer
 from rtcp.runtime.sentences import FAULTS
+from rtcp.runtime.stops import Rung, bounds
 
 from .bench import (
     _WIRE,
@@ -428,13 +430,25 @@ def test_a_joint_that_was_turned_by_hand_is_enabled_where_it_stands_then(bench: 
     assert {said.target for said in told} == {5000}
 
 
-def test_a_joint_just_beyond_its_range_is_enabled_and_led_to_the_edge_within_its_speed(bench: Bench) -> None:
-    bench.models[1].mechanics.position = 2.015
-    bench.hold()
-    bench.run(0.5)
-    assert {cycle.drives[1].target for cycle in bench.log if cycle.drives[1].obeys_target} == {20000}
-    assert max(abs(cycle.drives[1].velocity) for cycle in bench.log) <= 1.2 * CONFIG.joints[1].velocity * COUNTS
-    assert bench.arm.drives[1].position == pytest.approx(2.0, abs=1e-3)
+@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_joint_just_beyond_its_range_is_enabled_where_it_stands_and_brought_back_gently(
+    bench: Bench, side: int, mode: int
+) -> None:
+    bench.models[1].mechanics.position = 2.018 * side
+    bench.hold(mode)
+    bench.run(1.0)
+    said = [cycle.drives[1] for cycle in bench.log if cycle.drives[1].controlword == ENABLE_OPERATION]
+    assert abs(said[0].target - said[0].position) <= 1
+    assert abs(said[0].position) == 20180
+    targets = [drive.target for drive in said]
+    for cycles in (1, 4, 16, 64):
+        # Both ends are rounded to counts.
+        allowed = BACK_RAD_S * cycles * PERIOD_S * COUNTS + 1
+        assert max(abs(after - before) for before, after in zip(targets, targets[cycles:], strict=False)) <= allowed
+    assert targets[-1] == 20000 * side
+    assert max(abs(drive.velocity) for drive in said) < 0.1 * COUNTS
+    assert bench.arm.drives[1].position == pytest.approx(2.0 * side, abs=2e-3)
 
 
 @pytest.mark.parametrize("mode", [CSV, CST])
@@ -506,11 +520,11 @@ def test_as_many_lost_cycles_as_are_allowed_do_not_end_a_move(bench: Bench) -> N
     assert bench.codes[-1] is Code.ARRIVED
 
 
-def test_lost_cycles_count_in_a_row_only(bench: Bench) -> None:
+def test_lost_cycles_are_made_up_for_by_as_many_good_ones(bench: Bench) -> None:
     bench.set_in_motion()
     for _ in range(5):
         lose(bench, LOST_CYCLES - 1)
-        bench.cycle()
+        bench.run((LOST_CYCLES - 1) * PERIOD_S)
     assert bench.state is State.MOVING
 
 
@@ -790,12 +804,37 @@ def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_th
     assert {said.controlword for said in moving} == {ENABLE_OPERATION, QUICK_STOP}
 
 
-def test_closing_without_frames_tells_all_drives_to_stop_for_20_cycles_and_ends(bench: Bench) -> None:
-    bench.bring_to(State.CLOSING)
-    bench.data.carries = False
+@pytest.mark.parametrize("period_us", [1000.0, 200.0])
+def test_closing_without_frames_tells_all_drives_to_stop_for_as_long_as_a_quick_stop_takes(
+    bench_board: tuple[Blackboard, Observer], period_us: float
+) -> None:
+    config = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=period_us))
+    bench = Bench(*bench_board, config=config)
+    try:
+        bench.start().run(0.1)
+        bench.enable()
+        bench.data.carries = False
+        bench.do(Command.SHUTDOWN)
+        bench.finish()
+    finally:
+        bench_board[1].release(bench.lease)
+    longest_s = max(bound.time_s for bound in bounds(config, Rung.QUICK_STOP))
+    told = list(takewhile(lambda cycle: {said.controlword for said in cycle.drives} == {QUICK_STOP}, bench.log[::-1]))
+    assert longest_s <= len(told) * period_us * 1e-6 <= longest_s + 0.02
+
+
+@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+def test_closing_without_one_of_the_slaves_ends_when_the_joints_of_the_others_stand(bench: Bench, mode: int) -> None:
+    for model in bench.models:
+        model.objects[0x6085, 0].value = 100_000  # as the start-up SDOs of the drive's description set it
+    bench.set_in_motion(mode)
+    receive = bench.data.receive
+    bench.data.receive = lambda: receive() - 3  # type: ignore[method-assign]
+    bench.do(Command.SHUTDOWN)
     bench.finish()
-    last = bench.log[-20:]
-    assert {said.controlword for cycle in last for said in cycle.drives} == {QUICK_STOP}
+    # Whoever ends the loop takes the slaves out of OP then.
+    assert [model.powered for model in bench.models] == [True, True]
+    assert all(abs(model.mechanics.velocity) < 0.01 for model in bench.models)
 
 
 def test_closing_ends_after_2_s_where_a_drive_does_not_disable(bench: Bench) -> None:

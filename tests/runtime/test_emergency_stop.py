@@ -247,7 +247,7 @@ def test_frames_that_stay_away_while_a_homing_is_ended_by_disabling_are_a_fault(
     bench.data.carries = False
     bench.run(1.0)
     assert bench.state is State.FAULT
-    assert bench.codes[-1] == Code.BUS_LOST
+    assert bench.codes[-2:] == [Code.BUS_LOST, Code.TORQUE_OFF]
 
 
 def test_the_button_counts_while_a_homing_is_ended_by_disabling(bench: Bench) -> None:

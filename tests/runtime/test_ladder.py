@@ -37,6 +37,7 @@ from .bench import (
 SWITCH_INPUT = 10
 """Channel of the enabling switch, from 0."""
 WITH_SWITCH = replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(SWITCH_INPUT + 1)))
+QUICK_STOP_DECELERATION = 0x6085
 CHOICES = {key: get_args(hint) for key, hint in get_type_hints(StopsConfig).items()}
 """The rungs of each key."""
 EVERY = [(key, rung) for key, rungs in CHOICES.items() for rung in rungs]
@@ -207,6 +208,24 @@ def test_after_a_rung_nothing_moves_by_itself_and_reset_and_enable_go_on(lived: 
             said.controlword != ENABLE_OPERATION for cycle in log[at + ramp : lived.mended] for said in cycle.drives
         )
     assert lived.bench.state is State.MOVING
+
+
+def test_a_joint_that_comes_to_rest_by_its_rung_is_not_said_to_stand_elsewhere(lived: Lived) -> None:
+    assert Code.STANDS_ELSEWHERE not in lived.bench.codes
+
+
+def test_nor_is_one_whose_drive_ramps_down_slowly(made: Callable[..., Bench]) -> None:
+    bench = made().set_in_motion()
+    for model in bench.models:
+        # 0.2 rad/s2.
+        model.objects[QUICK_STOP_DECELERATION, 0].value = 2000
+    stood = bench.arm.state.actual[0]
+    stop_for(bench, "slave_lost")
+    bench.run(2.0)
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    assert bench.arm.state.actual[0] - stood > 0.2
+    assert Code.STANDS_ELSEWHERE not in bench.codes
 
 
 @pytest.mark.parametrize("key", ENDS)

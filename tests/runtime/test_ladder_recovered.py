@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime.machine import Command, State
+from rtcp.runtime.machine import Code, Command, State
+from rtcp.runtime.sentences import Sentences
 from rtcp.virtual.inprocess_slave import InProcessSlave
 from rtcp.virtual.models import create
 from rtcp.virtual.registers import State as AlState
@@ -21,6 +22,10 @@ BENT = [0.0, -0.3, 1.2, 0.0, 0.9, 0.0]
 SLAVE = 4
 """Position of the drive of joint 3, which is lost and comes back."""
 AXIS = 2
+TURNED_TO = 1.05
+"""Where it comes back from a loss of supply, rad."""
+EMERGENCY_STOP_INPUT = 9
+"""Channel of the box, from 0."""
 OUTPUTS = struct.Struct("<Hiiib")
 """Controlword, target position, target velocity, target torque, mode (the facts' table)."""
 ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
@@ -82,7 +87,7 @@ def without_supply(simulation: Simulation) -> None:
     bus.request_state(AlState.INIT, [SLAVE])
     assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
     simulation.run(0.3)
-    slave.device = create("cubemars-orh70", load_inertia=0.8, load_mass_moment=1.0, initial_position=1.05)
+    slave.device = create("cubemars-orh70", load_inertia=0.8, load_mass_moment=1.0, initial_position=TURNED_TO)
     anew(slave)
     bus.request_state(AlState.PRE_OP, [SLAVE])
     slave.configure(CONFIG.slaves[SLAVE - 1], simulation.period_ns)
@@ -138,3 +143,88 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
     told = {sent[1] for _, sent, _, _ in seen.cycles if sent[0] == ENABLE_OPERATION}
     assert all(abs(target - 10500) <= 20 for target in told)
     assert told
+
+
+# -- what is said of where it stands --------------------------------------------------------------------------------
+
+
+def told(simulation: Simulation) -> list[str]:
+    """The sentences about joints that stand elsewhere than at the fault."""
+    sentences = Sentences(CONFIG)
+    return [
+        sentences.event(event.code, event.axis, event.value, event.limit)
+        for event in simulation.events
+        if event.code == Code.STANDS_ELSEWHERE
+    ]
+
+
+def reset(simulation: Simulation) -> None:
+    assert simulation.order(Command.RESET).refusal == 0
+    assert simulation.until(lambda: simulation.state is State.READY, 4.0)
+
+
+def press(simulation: Simulation) -> None:
+    """The emergency stop, until the slaves are parked; and released."""
+    assert simulation.box is not None
+    simulation.box.set_input(EMERGENCY_STOP_INPUT, False)
+    assert simulation.until(lambda: simulation.state is State.EMERGENCY_STOP, 1.0)
+    simulation.run(1.0)
+    simulation.box.set_input(EMERGENCY_STOP_INPUT, True)
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+def test_a_joint_that_comes_back_at_another_position_is_told_with_both_when_the_reset_is_done(
+    arm: Simulation, pressed: bool
+) -> None:
+    without_supply(arm)
+    arm.run(0.2)
+    if pressed:
+        # What it stands at now is not where it stood at the fault.
+        press(arm)
+    assert not told(arm)
+    reset(arm)
+    (said,) = told(arm)
+    assert said.startswith("joint3 stands at 1.05 rad, at the fault it stood at 1.2")
+    assert "its drive has lost its zero: check that before `rtcp enable`" in said
+    # It is what was said last: `rtcp status` shows it.
+    assert arm.events[-1].code == Code.STANDS_ELSEWHERE
+    # It is told once, and no refusal: it may have been turned by hand.
+    assert arm.order(Command.ENABLE).refusal == 0
+    assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
+    out_of_op(arm)
+    reset(arm)
+    assert len(told(arm)) == 1
+
+
+@pytest.mark.parametrize("comes_back", [out_of_op, press], ids=lambda way: way.__name__)
+def test_a_joint_that_comes_back_where_it_stood_is_not_told(
+    arm: Simulation, comes_back: Callable[[Simulation], None]
+) -> None:
+    comes_back(arm)
+    reset(arm)
+    assert not told(arm)
+
+
+@pytest.mark.parametrize("arm", ["moving"], indirect=True)
+def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_have_run_on_to(arm: Simulation) -> None:
+    arm.order(Command.STOP)
+    assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
+    fast = [0.0, -0.3, 2.4, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
+    assert arm.order(Command.MOVE, fast).refusal == 0
+    arm.run(1.6)
+    assert arm.parts.arm.state.speed[AXIS] > 0.4
+    stood = arm.parts.arm.state.actual[AXIS]
+    without_supply(arm)
+    reset(arm)
+    (said,) = told(arm)
+    assert said.startswith("joint3 stands at 1.05 rad")
+    assert stood - TURNED_TO > 0.55
+
+
+@pytest.mark.parametrize("arm", ["moving"], indirect=True)
+def test_joints_that_run_on_while_nothing_is_heard_are_not_told(arm: Simulation) -> None:
+    arm.data.lose(400, heard=False)
+    assert arm.until(lambda: arm.state is State.FAULT, 1.0)
+    arm.run(0.5)
+    reset(arm)
+    assert not told(arm)

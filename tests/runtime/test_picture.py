@@ -57,6 +57,15 @@ def bench(board: Blackboard, path: Path, monkeypatch: pytest.MonkeyPatch) -> Ite
     made.observer.close()
 
 
+def test_an_emergency_stop_out_of_a_fault_is_the_headline_and_not_the_fault(bench: Bench) -> None:
+    bench.publish(State.FAULT)
+    bench.board.event(Code.DRIVE_FAULT, 2, 0x0218)
+    assert "joint3" in bench.headline
+    bench.publish(State.EMERGENCY_STOP)
+    bench.board.event(Code.PRESSED)
+    assert bench.headline.startswith("the emergency stop was pressed")
+
+
 def test_an_emergency_that_says_no_error_is_a_message_and_never_the_headline(bench: Bench) -> None:
     bench.publish(State.READY)
     bench.board.text("something to know")
