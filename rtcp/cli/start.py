@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Annotated
 
 import typer
 
+from rtcp.cli.connection import connect
 from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
 from rtcp.cli.outcome import CommandError, ExitCode, code_of
 from rtcp.cli.output import report
+from rtcp.runtime.client import ControlError
 
+PATIENCE_S = 5.0
+"""For a machine that is still starting: its frames have to come back first, or to be missed for long enough."""
+_ASK_S = 0.02
+_NOT_WELL = frozenset({"starting", "fault", "emergency_stop"})
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
 
 
@@ -45,12 +52,37 @@ def _start(
     if detach:
         # The processes have sessions of their own: nothing needs to stay behind for them.
         launch(request, report)
-        report("ready: `rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop` ends it")
+        said, well = _outcome("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop` ends it")
+        if not well:
+            raise CommandError(said, ExitCode.FAULT)
+        report(said)
         return
-    ready = "ready: `rtcp enable` and `rtcp move` in another terminal; Ctrl-C or `rtcp stop` ends it"
-    ending = serve(request, report, lambda: report(ready))
+    ready = "`rtcp enable` and `rtcp move` in another terminal; Ctrl-C or `rtcp stop` ends it"
+    ending = serve(request, report, lambda: report(_outcome(ready)[0]))
     report("stopped" if ending == 0 else "the platform has ended")
     raise typer.Exit(ending)
+
+
+def _outcome(ready: str) -> tuple[str, bool]:
+    """Wait until the machine has left its start; return in a sentence what came of it, and whether that is well.
+
+    A loop that was only given its gateway back may be doing anything: that is no failed start, unless it is in a fault.
+    """
+    until = time.monotonic() + PATIENCE_S
+    try:
+        with connect("start") as client:
+            while (status := client.call("status"))["state"] == "starting" and time.monotonic() < until:
+                time.sleep(_ASK_S)
+    except ControlError as error:
+        return f"started, but: {error.message}", False
+    state, message = str(status["state"]), str(status["message"])
+    if state == "ready":
+        return f"ready: {ready}", True
+    if state == "starting":
+        message = f"not ready within {PATIENCE_S:g} s (`rtcp status`): {message}"
+    if state in _NOT_WELL:
+        return f"started, but: {message}", False
+    return f"{state.replace('_', ' ')}: {message}", True
 
 
 def _stop() -> None:

@@ -14,6 +14,8 @@ from rtcp.fieldbus.registers import attach_filter
 
 _SOEM_LAST_INDEX = 15
 _SDO_TIMEOUT_US = 700_000
+_ANSWER_US, _PATIENCE_US = 40_000, 500_000
+"""Until SOEM sends a frame again, and until it gives up. The cycle's frames have a time of their own."""
 
 
 def claim(interface: str) -> socket.socket:
@@ -42,9 +44,10 @@ def open_master(interface: str) -> tuple[Any, socket.socket]:
         BusError: the interface cannot be opened.
     """
     timeouts = pysoem.settings.timeouts
-    # A frame to one slave is sent again after 2 ms by default: a segment in software may be off its CPU for longer.
-    timeouts.ret = 6_000
-    timeouts.safe = 30_000
+    # By default an answer after 2 ms is one too late: a shared host, or a segment in software, may be off its CPU for
+    # longer. In a mailbox SOEM then takes the answer to one SDO for that to the next, and its map fails.
+    timeouts.ret = _ANSWER_US
+    timeouts.safe = timeouts.eeprom = _PATIENCE_US
     master = pysoem.Master()
     master.sdo_read_timeout = master.sdo_write_timeout = _SDO_TIMEOUT_US
     # The slaves are led through their states by us, so that a refusal is told with its code.

@@ -46,6 +46,11 @@ class Mailbox:
         """Bytes that a message to the slave may have behind its mailbox header."""
         return self._info.receive_size - _HEADER.size
 
+    @property
+    def patience_s(self) -> float:
+        """For how long a service whose messages get lost is tried again, s."""
+        return self._port.patience_s
+
     def send(self, content: bytes) -> bool:
         """Give the slave a CoE message; return False while its mailbox is still full.
 

@@ -41,6 +41,10 @@ class Command(IntEnum):
     BWR = 8
 
 
+_ANSWER_S = 0.02
+TRIES, PATIENT_TRIES = 3, 25
+"""Frames for a datagram: beside the cycle, where a quick answer counts, and before it, where half a second without any
+is no shared host's stall."""
 _BY_STATION = (Command.FPRD, Command.FPWR)
 _NOT_TAKEN = "{label} did not take what was written to register 0x{address:04X}"
 
@@ -104,6 +108,9 @@ def _answers(frame: bytes, sent: bytes, length: int) -> bool:
 class RegisterPort:
     """Single datagrams to one slave or to all of them. Its methods may be called from any thread."""
 
+    tries = TRIES
+    """Frames for a datagram of which no other number is asked for; all of them lost: the slave does not answer."""
+
     def __init__(self, interface: str) -> None:
         """Open the port; raises BusError where the interface cannot be opened."""
         self._socket = open_socket(interface, FIRST_INDEX, LAST_INDEX)
@@ -111,11 +118,18 @@ class RegisterPort:
         self._index = LAST_INDEX
 
     def exchange(
-        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
+        self,
+        command: Command,
+        station: int,
+        address: int,
+        data: bytes,
+        *,
+        timeout_s: float = _ANSWER_S,
+        tries: int | None = None,
     ) -> Answer:
         """Send a datagram and wait for it to come back; a lost frame is sent again, `tries` times in all."""
         with self._lock:
-            for _ in range(tries):
+            for _ in range(self.tries if tries is None else tries):
                 # A new index each time: a late answer to the former try is not taken for this one's.
                 self._index = FIRST_INDEX if self._index >= LAST_INDEX else self._index + 1
                 frame = build_frame(command, self._index, station, address, data)
@@ -140,8 +154,14 @@ class RegisterPort:
                 return Answer(frame[_DATA_AT:end], int.from_bytes(frame[end : end + 2], "little"))
         return None
 
-    def read(self, station: int, address: int, length: int, *, tries: int = 3) -> bytes | None:
+    @property
+    def patience_s(self) -> float:
+        """For how long a service of several datagrams is tried again; beside the cycle not for long: 0."""
+        return (self.tries - TRIES) * _ANSWER_S
+
+    def read(self, station: int, address: int, length: int, *, tries: int | None = None) -> bytes | None:
         """Return registers of the slave at configured address `station` (FPRD), None where it does not answer."""
+        tries = self.tries if tries is None else tries
         data, wkc = self.exchange(Command.FPRD, station, address, bytes(length), tries=tries)
         return data if wkc == 1 else None
 

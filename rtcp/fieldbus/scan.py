@@ -34,6 +34,8 @@ _EEPROM_CONFIG = 0x0500
 _SYNC_MANAGERS = 0x0800
 _DC_DELAY = 0x0928
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
+_EEPROM_US = 500_000
+"""For a word of it: a shared host may be off its CPU for longer than the 20 ms that pysoem gives it."""
 _SMALLEST_MAILBOX, _LARGEST_MAILBOX = 16, 1486
 """Bytes: headers and an SDO (ETG.1000.6, 5.6.2); what one datagram carries."""
 _PROTOCOLS = ("AoE", "EoE", "CoE", "FoE", "SoE", "VoE")
@@ -43,12 +45,12 @@ _SYNC_MANAGER = struct.Struct("<HHBBBB")
 
 def read_mailbox(slave: Any) -> MailboxInfo | None:
     """Return what the EEPROM of pysoem's `slave` says about its mailbox, None where it has none that can be."""
-    receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE))
-    send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND))
+    receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE, _EEPROM_US))
+    send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND, _EEPROM_US))
     send_size = send_size or receive_size
     if not _SMALLEST_MAILBOX <= min(receive_size, send_size) <= max(receive_size, send_size) <= _LARGEST_MAILBOX:
         return None
-    bits = slave.eeprom_read(_SII_PROTOCOLS)[0]
+    bits = slave.eeprom_read(_SII_PROTOCOLS, _EEPROM_US)[0]
     protocols = tuple(name for i, name in enumerate(_PROTOCOLS) if bits >> i & 1)
     return MailboxInfo(receive_start, receive_size, send_start, send_size, protocols)
 
@@ -63,7 +65,7 @@ def name_of(slave: Any) -> str:
 
 def read_serial(slave: Any) -> int:
     """Return the serial number in the EEPROM."""
-    return int.from_bytes(slave.eeprom_read(_SII_SERIAL), "little")
+    return int.from_bytes(slave.eeprom_read(_SII_SERIAL, _EEPROM_US), "little")
 
 
 def eeprom_to_device(port: RegisterPort, station: int) -> bool:

@@ -103,19 +103,22 @@ class SdoClient:
                 raise BusError(f"{where}, {what}: its mailbox is in use by others")
             yield
         try:
-            for tries_left in (1, 0):
+            until = time.monotonic() + self._mailbox.patience_s
+            tried_again = False
+            while True:
                 try:
                     return (yield from service(self._mailbox))
                 except SdoAborted as error:
                     raise SdoAborted(f"{where} refused the {what}: {error}", error.code) from error
                 except BusError as error:
-                    if not tries_left:
+                    # Its messages are sent and fetched once only each: of many frames that get lost some are theirs.
+                    if tried_again and time.monotonic() >= until:
                         raise BusError(f"{where}, {what}: {error}") from error
+                tried_again = True
                 # An immediate second try may fail where one a little later works (SOEM#825).
                 yield from pause(_RETRY_S)
         finally:
             self._lock.release()
-        raise AssertionError("a try either returns or raises")
 
     def _exchange(
         self, mailbox: Mailbox, request: bytes, specifier: int, address: tuple[int, int] | None

@@ -24,7 +24,7 @@ from rtcp.fieldbus.link import PromiscuousMode, check_interface
 from rtcp.fieldbus.mailboxes import Mailboxes
 from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.pdo import layout, layout_faults
-from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort
 from rtcp.fieldbus.restore import Restorer, take_set_up
 from rtcp.fieldbus.scan import describe, eeprom_to_device, name_of, parents, read_mailbox, read_serial
 from rtcp.fieldbus.sdo import SdoClient
@@ -32,6 +32,11 @@ from rtcp.fieldbus.steps import finish
 from rtcp.fieldbus.watcher import Watcher
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
+_MAP_TRIES = 3
+
+
+class _MisreadError(BusError):
+    """SOEM did not get the PDO mapping that the slave has: a frame got lost, or came when it was waited for no more."""
 
 
 class SoemBus:
@@ -106,6 +111,7 @@ class SoemBus:
         self._claim = claim(self.interface)
         try:
             self._port = RegisterPort(self.interface)
+            self._port.tries = PATIENT_TRIES
             self._fence = Fence(self.interface)
             self._promiscuous = PromiscuousMode(self.interface)
             self._master, self._socket = open_master(self.interface)
@@ -142,6 +148,34 @@ class SoemBus:
         faults = [fault for config in slaves for fault in layout_faults(config.device)]
         if faults:
             raise BusError(*dict.fromkeys(faults))
+        for tries_left in reversed(range(_MAP_TRIES)):
+            self._set_up(slaves, period_ns)
+            try:
+                self._map(slaves)
+                break
+            except _MisreadError:
+                # SOEM maps on from where it is: only from INIT on does it map anew.
+                if not tries_left:
+                    raise
+        start_clocks(self._master, self.port, slaves, period_ns)
+        data = self._process_data(period_ns)
+        # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
+        data.send()
+        data.receive()
+        self.request_state(AlState.SAFEOP)
+        if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
+            raise BusError(*refused)
+        set_ups = [
+            take_set_up(self.port, position, config.name, serial)
+            for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
+        ]
+        self._restorer = Restorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
+        # From here on a cycle runs, and slaves are watched beside it: what is lost is to be known soon.
+        self.port.tries = TRIES
+        return data
+
+    def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int) -> None:
+        """Lead the slaves from INIT to PRE-OP, each set up as the configuration says; raises BusError."""
         self.notes.clear()
         self._discover()
         faults = identity_faults(self._master.slaves, slaves)
@@ -157,21 +191,6 @@ class SoemBus:
                 faults += error.sentences
         if faults:
             raise BusError(*faults)
-        self._map(slaves)
-        start_clocks(self._master, self.port, slaves, period_ns)
-        data = self._process_data(period_ns)
-        # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
-        data.send()
-        data.receive()
-        self.request_state(AlState.SAFEOP)
-        if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
-            raise BusError(*refused)
-        set_ups = [
-            take_set_up(self.port, position, config.name, serial)
-            for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
-        ]
-        self._restorer = Restorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
-        return data
 
     def _discover(self) -> None:
         if self._master is None:
@@ -202,6 +221,7 @@ class SoemBus:
         return finish(configure_slave(self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), config, period_ns))
 
     def _map(self, slaves: Sequence[SlaveConfig]) -> None:
+        """Let SOEM read the mapping and make the process image of it; raises BusError, `_MisreadError` by chance."""
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
@@ -211,7 +231,8 @@ class SoemBus:
             if met:
                 # SOEM may meet the same one hundreds of times.
                 told = (f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
-                raise BusError(*dict.fromkeys(told)) from error
+                refused = any(isinstance(fault, pysoem.SdoError) for fault in met)
+                raise (BusError if refused else _MisreadError)(*dict.fromkeys(told)) from error
         faults = []
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             label = slave_label(i + 1, config.name)
@@ -220,7 +241,8 @@ class SoemBus:
                 if len(image) != (expected := layout(pdos).bytes):
                     faults.append(f"{label}: expected {expected} bytes of {key}, found {len(image)} bytes")
         if faults:
-            raise BusError(*faults)
+            # The slave's own mapping was compared before, entry by entry.
+            raise _MisreadError(*faults)
 
     def _process_data(self, period_ns: int) -> SoemProcessData:
         assert self._socket is not None

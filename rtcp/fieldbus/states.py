@@ -6,24 +6,21 @@ import time
 from collections.abc import Iterable, Mapping
 
 from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, refusal
-from rtcp.fieldbus.registers import RegisterPort
+from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort
 
 AL_CONTROL = 0x0120
 AL_STATUS = 0x0130
 """AL status (2 bytes), two bytes of nothing, AL status code (2 bytes)."""
 _POLL_S = 0.002
-_TRIES = 3
-_LAST_TRIES = 25
-"""Frames for the look that a slave is judged by: half a second in which none comes back is no shared host's stall."""
 
 
-def read_al(port: RegisterPort, station: int, tries: int = _TRIES) -> tuple[AlState, bool, int]:
+def read_al(port: RegisterPort, station: int, tries: int | None = None) -> tuple[AlState, bool, int]:
     """Return state, error indication and AL status code of a slave; state NONE where it does not answer.
 
     Args:
         port: the port to ask through.
         station: the slave's configured address.
-        tries: frames that may be lost before it counts as one that does not answer.
+        tries: frames that may be lost before it counts as one that does not answer; None: as many as the port's.
     """
     data = port.read(station, AL_STATUS, 6, tries=tries)
     if data is None:
@@ -74,7 +71,8 @@ def wait_for_state(
     while waiting:
         late = time.monotonic() >= deadline
         for station, label in tuple(waiting.items()):
-            found, error, code = read_al(port, station, _LAST_TRIES if late else _TRIES)
+            # The last look is the one that the slave is judged by.
+            found, error, code = read_al(port, station, PATIENT_TRIES if late else TRIES)
             if found is state and not error:
                 del waiting[station]
             elif error or late:

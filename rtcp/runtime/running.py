@@ -29,6 +29,7 @@ from rtcp.runtime.paths import (
     blackboard_file,
     control_socket,
     free_segment_control,
+    limits_file,
     listens,
     processes_file,
     stopping_mark,
@@ -38,6 +39,8 @@ from rtcp.runtime.session import NONE, Processes, end, forget_processes, identif
 _SEGMENT_S = 60.0
 _LOOP_S = 60.0
 _GATEWAY_S = 60.0
+_ANSWER_S = 3.0
+"""For the gateway to say how the platform is: one that does not hangs, and meanwhile the arm holds under torque."""
 _STOP_S = 20.0
 _ENDING_S = 0.5
 _LOOP_END_S = 10.0
@@ -225,7 +228,7 @@ class Running:
 
         Return, and tell `report`, in sentences what of that could not be done.
         """
-        left = end_platform(self.directory, self.processes)
+        left = end_platform(self.directory, self.processes, report)
         self._reap(2.0)
         if report is not None:
             for sentence in left:
@@ -256,7 +259,8 @@ def clear(directory: Path, found: Processes) -> None:
         end(pid, 5.0)
     forget_processes(directory)
     sockets = [path for path in directory.glob("segment*.sock") if not listens(path)]
-    for path in (control_socket(directory), blackboard_file(directory), *sockets):
+    # Narrowed limits are told apart by their loop's process, whose number may come again.
+    for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets):
         path.unlink(missing_ok=True)
 
 
@@ -264,6 +268,11 @@ def ask_gateway(directory: Path) -> Exception | None:
     """Let the gateway end the platform; return why it did not: the processes are then ended one by one."""
     try:
         with ControlClient("rtcp stop", control_socket(directory)) as client:
+            try:
+                client.call("status", timeout_s=_ANSWER_S)
+            except ControlError as error:
+                if error.kind == "timeout":
+                    return TimeoutError(f"it has not answered for {_ANSWER_S:g} s")
             client.call("stop", timeout_s=_STOP_S)
     except (ControlError, OSError) as error:
         return error

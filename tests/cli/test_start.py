@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from rtcp.cli import start
 from rtcp.runtime.session import Pid, Processes, identify
 
 
@@ -80,6 +82,69 @@ def test_a_runtime_directory_that_cannot_be_made_is_named(
         ended = rtcp(*arguments)
         assert ended.code == 2
         assert str(tmp_path / "file" / "run") in ended.trouble
+
+
+@pytest.fixture
+def launched(platform: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """A platform that `rtcp start` has brought up, as far as its processes are concerned."""
+    monkeypatch.setattr(start, "launch", lambda request, say: None)
+    platform.status |= {"state": "ready", "message": "all slaves are in OP"}
+    return platform
+
+
+def test_a_start_waits_until_the_machine_is_ready(rtcp: Callable[..., Any], launched: Any) -> None:
+    launched.status["state"] = "starting"
+    becomes_ready = threading.Timer(0.5, launched.status.update, [{"state": "ready"}])
+    becomes_ready.start()
+    ended = rtcp("start", "--detach")
+    becomes_ready.join()
+    assert ended.code == 0
+    assert ended.out.startswith("ready: `rtcp enable`")
+    assert len(launched.asked("status")) > 2
+
+
+@pytest.mark.parametrize("state", ["fault", "emergency_stop"])
+def test_a_start_that_ends_in_a_fault_says_why_and_leaves_the_platform_running(
+    rtcp: Callable[..., Any], launched: Any, state: str
+) -> None:
+    launched.status |= {"state": state, "message": "joint2: the drive is in fault"}
+    ended = rtcp("start", "--detach")
+    assert (ended.code, ended.out) == (5, "")
+    assert ended.trouble == "rtcp: started, but: joint2: the drive is in fault"
+    assert launched.asked("stop") == []
+
+
+def test_a_start_does_not_wait_for_ever(
+    rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(start, "PATIENCE_S", 0.2)
+    launched.status |= {"state": "starting", "message": "slave 3 is back"}
+    ended = rtcp("start", "--detach")
+    assert ended.code == 5
+    assert ended.trouble == "rtcp: started, but: not ready within 0.2 s (`rtcp status`): slave 3 is back"
+
+
+def test_a_loop_that_is_given_its_gateway_back_while_it_holds_is_no_failed_start(
+    rtcp: Callable[..., Any], launched: Any
+) -> None:
+    launched.status |= {"state": "holding", "message": "the arm has stopped and holds"}
+    ended = rtcp("start", "--detach")
+    assert (ended.code, ended.out) == (0, "holding: the arm has stopped and holds\n")
+
+
+def test_a_start_in_the_foreground_tells_what_came_of_it_and_runs_on(
+    rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def serve(request: object, say: Callable[[str], None], announce: Callable[[], None]) -> int:
+        announce()
+        say("it runs on")
+        return 0
+
+    monkeypatch.setattr(start, "serve", serve)
+    launched.status |= {"state": "fault", "message": "joint2: the drive is in fault"}
+    ended = rtcp("start")
+    assert ended.code == 0
+    assert ended.out.splitlines() == ["started, but: joint2: the drive is in fault", "it runs on", "stopped"]
 
 
 def test_a_demo_is_refused_while_a_platform_runs(rtcp: Callable[..., Any], loop: subprocess.Popen[bytes]) -> None:

@@ -26,7 +26,7 @@ from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
 from rtcp.fieldbus.namespace import enter
 from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.soem import SoemBus
+from rtcp.fieldbus.soem import SoemBus, _MisreadError
 
 ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
 INTERFACE = "ecat0"
@@ -160,6 +160,28 @@ def refused(bus: SoemBus, count: int, how: str) -> Any:
         slaves[1] = with_device(slaves[1], assign_activate=0x0100)
     bus.configure(slaves, 1_000_000)
     return None
+
+
+def up(bus: SoemBus, count: int) -> Any:
+    """All the way to SAFE-OP, as the loop's process goes it."""
+    bus.scan()
+    data = bus.configure(arm(count), 1_000_000)
+    return {"expected_wkc": data.expected_wkc, "tries": bus.port.tries}
+
+
+def misread(bus: SoemBus, count: int, times: int) -> Any:
+    """SOEM's map ends as after a lost frame, so many times, once it is made; then all the way to OP."""
+    make, left, tries = bus._map, iter(range(times)), []
+
+    def fails(slaves: Any) -> None:
+        make(slaves)
+        tries.append(len(slaves))
+        if next(left, None) is not None:
+            raise _MisreadError("slave 1: its PDO mapping could not be read: Unexpected frame returned")
+
+    bus._map = fails  # type: ignore[method-assign]
+    result = op(bus, count, 1_000_000)
+    return {"tries": len(tries), "states": result["states"], "wkcs": sorted(set(result["wkcs"]))}
 
 
 def optional(bus: SoemBus, count: int) -> Any:
@@ -311,6 +333,8 @@ SCENARIOS = {
         scan,
         op,
         refused,
+        up,
+        misread,
         optional,
         straight_to_op,
         sdo,

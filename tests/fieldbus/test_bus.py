@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import random
+import signal
+import threading
+import time
+
 import pytest
+
+from rtcp.virtual.faults.client import SegmentClient
 
 pytestmark = pytest.mark.alone
 
@@ -95,6 +102,61 @@ def test_what_differs_from_the_configuration_is_refused_in_sentences(segment, ho
     for part in parts:
         assert part in told
     assert answer["after"]["al_status"] == INIT
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("fault", [{"fault": "loss", "rate": 0.005}, {"fault": "delay", "rate": 0.02, "ms": 30}])
+def test_frames_that_get_lost_or_come_late_keep_no_segment_from_being_configured(start_segment, fault, seed):
+    segment = start_segment(7)
+    with SegmentClient(segment.control) as client:
+        client.fault({**fault, "seed": seed})
+    answer = segment.master("up")
+    assert answer.get("error") is None
+    assert answer["result"] == {"expected_wkc": 21, "tries": 3}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_segment_that_is_off_its_cpu_now_and_then_is_configured_all_the_same(start_segment, seed):
+    segment, chance, done = start_segment(7), random.Random(seed), threading.Event()
+
+    def stalls() -> None:
+        while not done.wait(chance.uniform(0.05, 0.4)):
+            segment.process.send_signal(signal.SIGSTOP)
+            time.sleep(0.08)
+            segment.process.send_signal(signal.SIGCONT)
+
+    host = threading.Thread(target=stalls)
+    host.start()
+    try:
+        answer = segment.master("up")
+    finally:
+        done.set()
+        host.join()
+    assert answer.get("error") is None
+    assert answer["result"] == {"expected_wkc": 21, "tries": 3}
+
+
+def test_a_map_that_soem_misread_is_made_anew_from_init(segment):
+    result = segment.master("misread", receive_fraction=0.5, times=2)["result"]
+    assert (result["tries"], result["states"]) == (3, ["OP"] * 3)
+    assert set(result["wkcs"]) <= {9, -1}
+    assert 9 in result["wkcs"]
+
+
+def test_a_map_that_soem_misreads_each_time_is_told(segment):
+    answer = segment.master("misread", times=9)
+    assert answer["error"] == ["slave 1: its PDO mapping could not be read: Unexpected frame returned"]
+    assert answer["after"]["al_status"] == INIT
+
+
+def test_a_slave_that_is_silent_while_it_is_configured_is_told(segment):
+    with SegmentClient(segment.control) as client:
+        client.fault({"fault": "sdo_late", "slave": 2, "ms": 60000})
+    began_s = time.monotonic()
+    (sentence,) = segment.master("refused", how="as it is")["error"]
+    assert time.monotonic() - began_s < 20
+    assert sentence.startswith("slave 2 (drive1), ")
+    assert sentence.endswith(": no answer in time")
 
 
 def test_an_optional_start_up_object_that_is_absent_becomes_a_note(segment):

@@ -3,10 +3,11 @@ from __future__ import annotations
 import os
 
 import pytest
+from pysoem import pysoem
 
 from rtcp.fieldbus import AlState, BusError
 from rtcp.fieldbus.namespace import enter
-from rtcp.fieldbus.soem import SoemBus
+from rtcp.fieldbus.soem import SoemBus, _MisreadError
 
 
 def test_an_interface_that_does_not_exist_is_told_with_those_that_do():
@@ -45,3 +46,20 @@ def test_a_closed_bus_refuses_everything_in_a_sentence():
                 lambda: bus.acknowledge(1), lambda: bus.sdo_read(1, 0x1000, 0)):  # fmt: skip
         with pytest.raises(BusError, match="the bus on nonsense0 is not open"):
             use()
+
+
+UNEXPECTED = pysoem.PacketError(2, 1)
+REFUSED = pysoem.SdoError(3, 0x1C12, 0, 0x08000020, "Data cannot be transferred")
+
+
+@pytest.mark.parametrize(("met", "by_chance"), [([UNEXPECTED], True), ([UNEXPECTED, REFUSED], False)])
+def test_a_map_is_misread_by_chance_only_where_no_slave_has_refused_an_object(met, by_chance):
+    class Master:
+        def config_map(self):
+            raise pysoem.ConfigMapError(met)
+
+    bus = SoemBus("nonsense0")
+    bus._master = Master()
+    with pytest.raises(BusError, match="slave 2: its PDO mapping could not be read: Unexpected frame") as told:
+        bus._map([])
+    assert isinstance(told.value, _MisreadError) is by_chance

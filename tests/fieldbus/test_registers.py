@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import socket
+import threading
 from collections.abc import Iterator
 
 import pytest
 
 from rtcp.fieldbus import registers
 from rtcp.fieldbus.bus import BusError
-from rtcp.fieldbus.registers import FIRST_INDEX, Answer, Command, RegisterPort, build_frame
+from rtcp.fieldbus.registers import FIRST_INDEX, PATIENT_TRIES, TRIES, Answer, Command, RegisterPort, build_frame
 
 STATUS = bytes((8, 0, 0, 0, 0, 0))
 
@@ -66,6 +67,24 @@ def test_an_interrupt_and_a_circulated_frame_are_no_other_answer(ends: tuple[Reg
     frame[24:26] = b"\x04\0"
     wire.send(frame)
     assert port.read(0x1005, 0x0130, 6, tries=1) == STATUS
+
+
+@pytest.mark.parametrize(("tries", "heard"), [(TRIES, False), (PATIENT_TRIES, True)])
+def test_a_datagram_is_sent_as_often_as_the_port_is_patient(
+    ends: tuple[RegisterPort, socket.socket], tries: int, heard: bool
+) -> None:
+    port, wire = ends
+    port.tries = tries
+
+    def answers_the_tenth() -> None:
+        for _ in range(10):
+            frame = bytearray(wire.recv(1518))
+        frame[26:34] = STATUS + b"\x01\0"
+        wire.send(frame)
+
+    slave = threading.Thread(target=answers_the_tenth, daemon=True)
+    slave.start()
+    assert port.read(0x1005, 0x0130, 6) == (STATUS if heard else None)
 
 
 def test_what_a_slave_does_not_take_is_told(ends: tuple[RegisterPort, socket.socket]) -> None:

@@ -16,6 +16,7 @@ class Script:
     """A slave that expects the requests of a list and gives its answers; None: it stays silent."""
 
     room = 26
+    patience_s = 0.0
 
     def __init__(self, *exchanges: tuple[str, str | None], first: bytes | None = None) -> None:
         self.exchanges = [(bytes.fromhex(a), None if b is None else bytes.fromhex(b)) for a, b in exchanges]
@@ -122,6 +123,20 @@ def test_an_abort_is_told_in_words_as_request_or_as_response(client_of, service)
 
 def test_a_silent_slave_is_asked_once_more(client_of):
     assert client_of(Script((READ, None), (READ, "0030 4b 4160 00 37020000"))).read(0x6041, 0) == b"\x37\x02"
+
+
+def test_messages_that_get_lost_are_sent_again_for_as_long_as_the_port_is_patient(client_of):
+    lost = [(READ, None)] * 6
+    script = Script(*lost, (READ, "0030 4b 4160 00 37020000"))
+    script.patience_s = 5.0
+    assert client_of(script).read(0x6041, 0) == b"\x37\x02"
+
+
+def test_an_abort_is_not_asked_for_again_however_patient_the_port_is(client_of):
+    script = Script((WRITE, "0020 80 4060 00 31000906"))
+    script.patience_s = 5.0
+    with pytest.raises(SdoAborted):
+        client_of(script).write(0x6040, 0, b"\x0f\x00")
 
 
 def test_a_slave_that_stays_silent_is_told(client_of):

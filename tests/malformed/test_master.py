@@ -59,7 +59,7 @@ class Eeprom:
         self._words = words
         self._name = name
 
-    def eeprom_read(self, word: int) -> bytes:
+    def eeprom_read(self, word: int, timeout: int) -> bytes:
         return self._words[word]
 
     @property
@@ -92,6 +92,7 @@ class Babbler:
     """A slave that answers an upload with its first message and segments with its last, or has one `endless`ly."""
 
     room = 122
+    patience_s = 0.0
 
     def __init__(self, line: Line, endless: bool, messages: list[str]) -> None:
         self._line = line

@@ -29,6 +29,7 @@ from .bench import (
     CSV,
     DEBOUNCE_S,
     EMERGENCIES,
+    EMERGENCY_STOP_INPUT,
     ENABLE_OPERATION,
     ENABLE_TIMEOUT_S,
     LONGEST_STEP,
@@ -403,6 +404,32 @@ def test_a_slave_that_leaves_op_before_the_machine_is_ready_is_brought_back_with
     bench.service.lost_slave, bench.service.all_op = 0, True
     bench.cycle()
     assert (asked, bench.state) == ([10], State.READY)
+
+
+def test_what_is_lost_from_when_all_slaves_are_in_op_is_a_fault_also_before_the_machine_was_ready(bench: Bench) -> None:
+    bench.models[0].mechanics.position = 0.7
+    bench.data.away.add(2)
+    bench.run(2 * LOST_CYCLES * PERIOD_S)
+    assert bench.state is State.STARTING
+    bench.service.all_op = True
+    took_s = bench.until(State.FAULT)
+    # Cycles before count for nothing. The box was not yet heard: nobody has pressed the emergency stop.
+    assert took_s == pytest.approx(LOST_CYCLES * PERIOD_S, abs=1.5 * PERIOD_S)
+    bench.run(0.1)
+    assert (bench.state, bench.codes) == (State.FAULT, [Code.DC_LOCKED, Code.BUS_LOST])
+    bench.data.away.clear()
+    bench.do(Command.RESET)
+    bench.until(State.READY)
+    # Nor were the joints: none of them stands elsewhere than before.
+    assert bench.codes[2:] == [Code.RESET]
+
+
+def test_an_emergency_stop_that_is_pressed_when_the_start_fails_is_heard(bench: Bench) -> None:
+    bench.data.devices[0].set_input(EMERGENCY_STOP_INPUT, False)
+    bench.data.away.add(2)
+    bench.service.all_op = True
+    bench.until(State.FAULT)
+    bench.until(State.EMERGENCY_STOP, 0.1)
 
 
 # -- enabling -------------------------------------------------------------------------------------------------------

@@ -17,12 +17,12 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime import launcher
+from rtcp.runtime import launcher, running
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.ending import end_of, forget_end, write_end
 from rtcp.runtime.layout import PER_JOINT, SCALARS
 from rtcp.runtime.lock import Busy, alone
-from rtcp.runtime.paths import blackboard_file, stopping_mark
+from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.runtime.running import Running, StartError
 from rtcp.runtime.session import Pid, Processes, Session, SessionError, identify, is_ours, read_processes, read_session
 
@@ -122,6 +122,27 @@ def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subproces
         assert told == ["another process starts or stops the platform: waiting for it, at most 30 s"]
     stopper.join()
     assert other.wait(timeout=60) == -signal.SIGTERM
+
+
+def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
+    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running, "_ANSWER_S", 0.2)
+    gateway = subprocess.Popen(["sleep", "600"])
+    Processes(loop=identify(other.pid), gateway=identify(gateway.pid)).write(directory)
+    told: list[tuple[str, int | None]] = []
+    began_s = time.monotonic()
+    # As one that is stopped: the kernel takes the connection, nobody the request.
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(control_socket(directory)))
+        listener.listen()
+        launcher.stop(lambda said: told.append((said, other.poll())))
+    ended_by = other.wait(), gateway.wait()
+    # Well under the 20 s that one is given that answers.
+    assert time.monotonic() - began_s < 10
+    said = "the gateway did not stop the platform: it has not answered for 0.2 s; its processes are ended one by one"
+    assert told == [(said, None)]
+    assert ended_by == (-signal.SIGTERM, -signal.SIGTERM)
 
 
 def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
