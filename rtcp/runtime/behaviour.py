@@ -5,6 +5,8 @@ What goes wrong is in `failing`, how an enabled arm moves on by a cycle in `trac
 
 from __future__ import annotations
 
+import math
+
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.modes import DriveMode
@@ -63,8 +65,8 @@ class Behaviour:
         self._discipline = discipline
         watch = Watch(config, arm.limits)
         self.homing = HomingArm(arm, period_s)
-        self._emergency = EmergencyStop(arm, service, blackboard, period_s)
-        self._faults = Faulted(self, arm, operator, blackboard, period_s)
+        self._emergency = EmergencyStop(arm, service, blackboard, config)
+        self._faults = Faulted(self, arm, operator, blackboard, config)
         failing = Failing(
             self, config, arm, operator, self.homing, self._faults, self._emergency, watch, service, blackboard
         )
@@ -95,7 +97,8 @@ class Behaviour:
         self.switching = False
         """Whether a mode change is under way."""
         self.torque_off = False
-        """Whether the torque is taken off in a fault: it was asked for, or is the rung of what failed."""
+        """Whether the torque is taken off in a fault, also while it is reset: it was asked for, or is the rung of what
+        failed, or an emergency stop took it."""
         self.wanted_mode = arm.mode
         """The mode to hold in: drives are enabled in CSP, where target = actual means standstill, and change then."""
         self.lease = 0
@@ -246,8 +249,9 @@ class Behaviour:
             self._blackboard.event(Code.READY)
             self.on(Event.ALL_IN_OP)
         elif self._failing.bus_fails(good):
-            # Where no cycle was good the box was not heard, which is no press: what failed stays what is told.
+            # Where no cycle was good the box was not heard, which is no press, and no joint stood anywhere.
             self._operator.forget_press()
+            self._failing.stood[:] = [math.nan] * len(self._failing.stood)
 
     def _ready(self, good: bool) -> None:
         arm = self._arm
@@ -315,7 +319,7 @@ class Behaviour:
 
     def _homing(self, good: bool) -> None:
         homing = self.homing
-        if self._tracking.track_homing(good) and homing.ended:
+        if self._tracking.track_homing(good) and homing.ended and homing.leads_back():
             self._blackboard.event(*homing.outcome)
             self.on(Event.HOMED if homing.homed else Event.STOPPED)
 
@@ -354,6 +358,7 @@ class Behaviour:
 
     def _in_emergency(self, good: bool) -> None:
         self._emergency.lead(good)
+        self.torque_off = self.torque_off or self._emergency.torque_goes
 
     def _resetting(self, good: bool) -> None:
         if not (good and self._service.all_op and self.clock_followed):

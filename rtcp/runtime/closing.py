@@ -14,6 +14,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.homing_arm import HomingArm
 from rtcp.runtime.operator import Operator
+from rtcp.runtime.standstill import Standstill
 from rtcp.runtime.stops import Rung, quick_stop_s
 
 _CLOSING_S = 2.0
@@ -60,6 +61,7 @@ class Closing:
         self._hard = False
         """Whether an emergency came: what still moves is stopped by its rung."""
         self._goal = DriveGoal.QUICK_STOPPED
+        self._standstill = Standstill(config, arm)
 
     def lead(self, good: bool, lost: int) -> bool:
         """Do the cycle's part; return whether all is done.
@@ -73,7 +75,7 @@ class Closing:
         if self._ramps_down(good):
             return False
         if lost >= self._lost_limit:
-            arm.lead(self._rungs[Code.BUS_LOST].goal)
+            arm.lead(self._goal if self._hard else self._rungs[Code.BUS_LOST].goal)
             return lost >= self._lost_limit + self._farewell_cycles
         if self._cycles > self._patience:
             return True
@@ -98,7 +100,12 @@ class Closing:
                 self._meet(*found)
             elif self._operator.emergency_stop:
                 self._meet(Code.PRESSED)
-        if not self._hard or arm.first_moving() < 0 or self._cycles > self._patience:
+        if not self._hard:
+            return False
+        self._standstill.reached(good)
+        if self._standstill.unheard:
+            self._goal = DriveGoal.TORQUE_OFF
+        if arm.first_moving() < 0 or self._cycles > self._patience:
             return False
         arm.lead(self._goal)
         if good:
@@ -110,6 +117,7 @@ class Closing:
         self._hard = True
         self._goal = self._rungs[code].goal
         self._cycles = 0
+        self._standstill.begin()
         self._homing.abandon()
         self._arm.hold_target()
         self._blackboard.event(code, axis, value, limit)

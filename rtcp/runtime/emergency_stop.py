@@ -8,17 +8,15 @@ from __future__ import annotations
 
 from enum import Enum
 
+from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.service import Service
+from rtcp.runtime.standstill import Standstill
 from rtcp.runtime.stops import Rung
 
-_STAND_S = 2.0
-"""A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
-_UNHEARD_S = 0.5
-"""Without the right working counter nobody sees whether the arm stands: a quick stop has long ended by then."""
 _OFF_S = 1.0
 _FIRST_CYCLES = 10
 """What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
@@ -37,18 +35,15 @@ class EmergencyStop:
         arm: the joints.
         service: takes the slaves to PRE-OP.
         blackboard: where it is told that they are there.
-        period_s: the cycle, s.
+        config: how long a quick stop takes, and the cycle.
     """
 
-    def __init__(self, arm: Arm, service: Service, blackboard: Blackboard, period_s: float) -> None:
+    def __init__(self, arm: Arm, service: Service, blackboard: Blackboard, config: ArmConfig) -> None:
         self._arm = arm
         self._service = service
         self._blackboard = blackboard
-        self._stand_cycles = round(_STAND_S / period_s)
-        self._off_cycles = round(_OFF_S / period_s)
-        self._unheard_cycles = round(_UNHEARD_S / period_s)
-        self._unheard = 0
-        """Cycles of the step in which the drives did not answer."""
+        self._standstill = Standstill(config, arm)
+        self._off_cycles = round(_OFF_S / (config.cycle.period_us * 1e-6))
         self._step = _Step.QUICK_STOP
         self._cycles = 0
         self._off = DriveGoal.DISABLED
@@ -58,23 +53,25 @@ class EmergencyStop:
         hard = rung is Rung.TORQUE_OFF
         self._off = DriveGoal.TORQUE_OFF if hard else DriveGoal.DISABLED
         self._next(_Step.TORQUE_OFF if hard else _Step.QUICK_STOP)
+        self._standstill.begin()
         self._arm.hold_target()
         self._arm.lead(rung.goal)
+
+    @property
+    def torque_goes(self) -> bool:
+        """Whether the quick stop is over, or there was none: the drives are told to give up their torque."""
+        return self._step is not _Step.QUICK_STOP
 
     def lead(self, good: bool) -> None:
         """Do the cycle's part; `good`: the drives have answered."""
         arm = self._arm
         self._cycles += 1
-        if not good:
-            self._unheard += 1
         if self._step is _Step.QUICK_STOP:
             arm.lead(DriveGoal.QUICK_STOPPED)
-            stands = good and self._cycles > _FIRST_CYCLES and arm.first_moving() < 0
-            unheard = self._unheard > self._unheard_cycles
-            if unheard:
-                # In which state the drives are is not known: from every one this takes their torque.
-                self._off = DriveGoal.TORQUE_OFF
-            if stands or unheard or self._cycles > self._stand_cycles:
+            if self._standstill.reached(good):
+                if self._standstill.unheard:
+                    # In which state the drives are is not known: from every one this takes their torque.
+                    self._off = DriveGoal.TORQUE_OFF
                 self._next(_Step.TORQUE_OFF)
         elif self._step is _Step.TORQUE_OFF:
             arm.lead(self._off)
@@ -90,4 +87,4 @@ class EmergencyStop:
 
     def _next(self, step: _Step) -> None:
         self._step = step
-        self._cycles = self._unheard = 0
+        self._cycles = 0

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rtcp.config.model import ArmConfig
-from rtcp.devices.cia402 import DriveState
+from rtcp.devices.cia402 import DriveGoal, DriveState
 from rtcp.motion.watch import Watch
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
@@ -114,12 +114,13 @@ class Failing:
         behaviour.fault = code
         self.pending = Code.NONE
         self._homing.abandon()
-        behaviour.torque_off = rung is Rung.TORQUE_OFF
-        # Who asked for no torque is not left with an arm that holds.
-        self._faulted.begin(off_at_rest=behaviour.state is State.DISABLING)
+        # Who asked for no torque is not left with an arm that holds, and a reset that fails gives none back.
+        fails = behaviour.state is State.RESETTING
+        behaviour.torque_off = rung is Rung.TORQUE_OFF or (fails and behaviour.torque_off)
+        self._faulted.begin(behaviour.state is State.DISABLING or (fails and self._faulted.off_at_rest))
         behaviour.all_enabled = False
         self._arm.hold_target()
-        self._arm.lead(rung.goal)
+        self._arm.lead(DriveGoal.TORQUE_OFF if behaviour.torque_off else rung.goal)
         behaviour.on(Event.BROKEN)
 
     def stop_in_emergency(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
@@ -132,6 +133,9 @@ class Failing:
         self.pending = Code.NONE
         self._homing.abandon()
         behaviour.all_enabled = False
+        # For a reset that begins before its torque is off.
+        behaviour.torque_off = self.rungs[code] is Rung.TORQUE_OFF
+        self._faulted.begin(off_at_rest=True)
         self._emergency.begin(self.rungs[code])
         self._blackboard.event(code, axis, value, limit)
         behaviour.on(Event.EMERGENCY)

@@ -4,21 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.operator import Operator
+from rtcp.runtime.standstill import Standstill
 
 if TYPE_CHECKING:
     from rtcp.runtime.behaviour import Behaviour
 
-_FIRST_CYCLES = 10
-"""What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
-_RAMP_S = 0.5
-"""Where nobody hears whether the joints stand: a quick stop has long ended by then."""
-_DEAF_S = 1.0
-"""The watcher brings back in a fraction of it what merely left OP."""
+_DEAF_S = 2.0
+"""The watcher brings back sooner what merely left OP, also what does so twice, which it lets wait for a second."""
 
 
 class Faulted:
@@ -29,33 +27,34 @@ class Faulted:
         arm: the joints.
         operator: whether there is a button.
         blackboard: where it is told that the torque goes.
-        period_s: the cycle, s.
+        config: how long a quick stop takes, and the cycle.
     """
 
     def __init__(
-        self, behaviour: Behaviour, arm: Arm, operator: Operator, blackboard: Blackboard, period_s: float
+        self, behaviour: Behaviour, arm: Arm, operator: Operator, blackboard: Blackboard, config: ArmConfig
     ) -> None:
         self._behaviour = behaviour
         self._arm = arm
         self._operator = operator
         self._blackboard = blackboard
-        self._ramp_cycles = round(_RAMP_S / period_s)
-        self._deaf_cycles = round(_DEAF_S / period_s)
-        self._cycles = 0
+        self._standstill = Standstill(config, arm)
+        self._deaf_cycles = round(_DEAF_S / (config.cycle.period_us * 1e-6))
         self._deaf = 0
         """Cycles in a row in which the emergency stop could not have been heard."""
-        self._off_at_rest = False
+        self.off_at_rest = False
+        """Whether the torque goes when the joints stand."""
 
     def begin(self, off_at_rest: bool) -> None:
         """Begin with a fault; `off_at_rest`: the torque goes when the joints stand, as it was to go before."""
-        self._cycles = self._deaf = 0
-        self._off_at_rest = off_at_rest
+        self._deaf = 0
+        self._standstill.begin()
+        self.off_at_rest = off_at_rest
 
     def lead(self, good: bool) -> None:
         """Do the cycle's part; `good`: the drives have answered."""
         behaviour, arm = self._behaviour, self._arm
-        self._cycles += 1
-        if not behaviour.torque_off and (self._rests(good) or self._is_deaf()):
+        rests = self._standstill.reached(good)
+        if not behaviour.torque_off and ((self.off_at_rest and rests) or self._is_deaf(good)):
             behaviour.torque_off = True
             self._blackboard.event(Code.TORQUE_OFF)
         # Also without frames that come back: slaves that still hear must not go on with the last speed or torque.
@@ -63,16 +62,9 @@ class Faulted:
         if good:
             arm.follow()
 
-    def _rests(self, good: bool) -> bool:
-        """Whether the torque was to go, and the joints stand."""
-        if not self._off_at_rest:
-            return False
-        stands = good and self._cycles > _FIRST_CYCLES and self._arm.first_moving() < 0
-        return stands or self._cycles > self._ramp_cycles
-
-    def _is_deaf(self) -> bool:
+    def _is_deaf(self, good: bool) -> bool:
         """Whether the emergency stop has not been heard for too long: it counts as pressed, as its broken wire does."""
-        if not self._operator.has_button or self._behaviour.box_in_op:
+        if good or not self._operator.has_button or self._behaviour.box_in_op:
             self._deaf = 0
             return False
         self._deaf += 1

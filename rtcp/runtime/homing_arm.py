@@ -39,9 +39,21 @@ class HomingArm:
         """Let go of the drive, which is led elsewhere."""
         self._homing.abandon()
 
+    def leads_back(self) -> bool:
+        """Lead a joint whose home is a little beyond its range back to the edge; return whether it is there."""
+        arm, axis = self._arm, self.axis
+        if arm.beyond_range(axis) > 0.0:
+            low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.position
+            position[axis] = min(max(position[axis], low), high)
+            arm.guards.latch(arm.state)
+            arm.command()
+        return arm.first_led_back() < 0
+
     def step(self) -> None:
         """Let the drive go on; its set-point is where it says it is, the other joints' stand, the gripper's go on."""
         arm, axis, homing = self._arm, self.axis, self._homing
+        if homing.ended:
+            return
         homing.step()
         arm.state.position[axis] = homing.position
         arm.guard.latch(axis, homing.position)

@@ -101,7 +101,9 @@ class Sentences:
                 "where nobody moved it and it has not sunk, its drive has lost its zero: check that before "
                 "`rtcp enable`"
             ),
-            Code.TORQUE_OFF: lambda _: "the drives are told to give up their torque; the fault stays until `rtcp reset`",
+            Code.TORQUE_OFF: lambda _: (
+                "the drives are told to give up their torque; the fault stays until `rtcp reset`"
+            ),
             Code.LEASE_ENDED: lambda _: (
                 f"the commander fell silent or gave up its lease: {self._names.end(Code.LEASE_ENDED)}"
             ),

@@ -111,9 +111,9 @@ Which event takes which rung is the section `stops` of the arm's file:
   never where at least every second cycle is good.
 - **The emergency stop is heard while other slaves are missing:** that it is pressed is taken from every frame that some
   slave answered, for as long as the IO box is in OP. Nothing else is taken from such frames: no release, no stick, no
-  permission, no position. Since nobody sees then whether the joints stand, their torque goes after 0.5 s. An IO box
-  that has been out of OP for 1 s takes the button with it: in the fault that this is, it counts as pressed, as its
-  broken wire does, and the torque goes.
+  permission, no position. Since nobody sees then whether the joints stand, their torque goes after 0.5 s, or after the
+  quick stop's time where that is longer. An IO box that has been out of OP for 2 s, with no good cycle, takes the
+  button with it: in the fault that this is, it counts as pressed, as its broken wire does, and the torque goes.
 - **Torque off** beside a person: no drive holds its joint any more. The brakes close on whatever moves, and until they
   have closed a joint under weight sags: the arm may come down on what is below it. How far is the brakes' and the
   load's affair, not the configuration's: measure it before you choose it. It is the right rung where a drive that

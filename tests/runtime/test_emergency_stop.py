@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
@@ -12,7 +13,7 @@ from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.machine import Code, Command, Refusal, State
 from rtcp.runtime.observer import Observer
 
-from .bench import CONFIG, COUNTS, LONGEST_STEP, QUICK_STOP, SPEED, Bench, move_numbers
+from .bench import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, QUICK_STOP, SPEED, Bench, move_numbers
 
 WITH_TORQUE = [State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.HOMING, State.STOPPED_BY_LIMIT]
 PRESSED_SAYS = (
@@ -206,6 +207,29 @@ def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(bench
 
 
 # -- homing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beyond", [-0.05, 0.015, 0.019])
+@pytest.mark.parametrize("speed", [0.1, 0.3, 0.5])
+def test_a_move_right_after_a_homing_beyond_the_range_begins_as_any_other(
+    bench: Bench, beyond: float, speed: float
+) -> None:
+    bench.hold()
+    high = bench.arm.limits.high[0]
+    bench.models[0].objects[0x6098, 0].value = 37
+    bench.models[0].objects[0x607C, 0].value = round((high + beyond) * COUNTS)
+    bench.do(Command.HOME, [0])
+    bench.until(State.HOLDING)
+    begun = len(bench.log) - 1
+    bench.move(high - 0.8, bench.arm.drives[1].position, speed=speed)
+    bench.run(1.2)
+    targets = [cycle.drives[0].target for cycle in bench.log[begun:]]
+    speeds = [(after - before) / COUNTS / PERIOD_S for before, after in pairwise(targets)]
+    faster = max(abs(after - before) for before, after in pairwise(speeds))
+    # The targets are whole counts.
+    rounding = 2 / COUNTS / PERIOD_S
+    assert faster <= CONFIG.joints[0].acceleration * PERIOD_S + rounding
+    assert max(map(abs, speeds)) <= speed * 1.01 + rounding
 
 
 def test_a_drive_is_homed_where_it_stands_and_the_others_hold(bench: Bench) -> None:
