@@ -1,4 +1,4 @@
-"""What onlookers cost the cycle: `python benchmarks/watched.py [--seconds N] [--rounds N] [--json FILE]`.
+"""What onlookers cost the cycle: `python benchmarks/watched.py [--seconds N] [--rounds N] [--ratio] [--json FILE]`.
 
 In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and nobody looking; with
 the watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`; and, as the
@@ -133,6 +133,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=8.0, help="length of one measurement")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--ratio", action="store_true", help="only the two measurements that the ratio is made of")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -144,16 +145,18 @@ def main() -> int:
     found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
-        runs: dict[tuple[str, int], list[Round]] = {(kind, spin): [] for spin in (0, 40) for kind in WATCH_MS}
-        for _ in range(given.rounds):
-            for (kind, spin), rounds in runs.items():
-                rounds.append(measure(Path(directory), kind, spin, given.seconds))
+        spins, kinds = ((0,), ("alone", "watched")) if given.ratio else ((0, 40), tuple(WATCH_MS))
+        runs: dict[tuple[str, int], list[Round]] = {(kind, spin): [] for spin in spins for kind in kinds}
+        for turn in range(given.rounds):
+            # To and fro: what the host does to whoever comes first hits each of them as often.
+            for kind, spin in list(runs)[:: -1 if turn % 2 else 1]:
+                runs[kind, spin].append(measure(Path(directory), kind, spin, given.seconds))
     table = Table(title=f"500 us cycle, {given.rounds} rounds of {given.seconds:g} s, joint motion; us")
     for heading in ("", "p50", "p99", "p99.9", "max", "p99 over the rounds"):
         table.add_column(heading, justify="left" if not heading else "right")
-    for spin in (0, 40):
+    for spin in spins:
         for what in ("wakeup", "exchange", "compute"):
-            for kind in WATCH_MS:
+            for kind in kinds:
                 samples = [getattr(run, what) for run in runs[kind, spin]]
                 numbers = figures(samples)
                 found[f"{what}, {kind}, spin_us {spin}"] = numbers
