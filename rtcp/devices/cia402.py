@@ -113,6 +113,11 @@ _WITH_SPEED = (CSP, _CSV)
 _ENABLED = DriveState.OPERATION_ENABLED
 
 
+def state_of(statusword: int) -> DriveState:
+    """Return the state that a statusword shows; UNKNOWN where the standard knows none."""
+    return _STATE_OF[statusword & _STATE_BITS]
+
+
 class Cia402Drive:
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 

@@ -5,8 +5,6 @@ What goes wrong is in `failing`, how an enabled arm moves on by a cycle in `trac
 
 from __future__ import annotations
 
-import math
-
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import DriveGoal
 from rtcp.motion.modes import DriveMode
@@ -179,7 +177,7 @@ class Behaviour:
     def _box_left_op(self) -> bool:
         """Whether the IO box is not in OP; where it left first, until the reset, however soon it was back."""
         box = self._operator.box_position
-        return box > 0 and (self._service.lost_slave == box or not self._blackboard.in_op(box))
+        return box > 0 and (self._service.lost_slave == box or not self.box_in_op)
 
     @property
     def _waited(self) -> int:
@@ -249,9 +247,8 @@ class Behaviour:
             self._blackboard.event(Code.READY)
             self.on(Event.ALL_IN_OP)
         elif self._failing.bus_fails(good):
-            # Where no cycle was good the box was not heard, which is no press, and no joint stood anywhere.
+            # Where no cycle was good the box was not heard, which is no press.
             self._operator.forget_press()
-            self._failing.stood[:] = [math.nan] * len(self._failing.stood)
 
     def _ready(self, good: bool) -> None:
         arm = self._arm

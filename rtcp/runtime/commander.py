@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rtcp.config.model import Joint
-from rtcp.devices.cia402 import STATES, DriveState
+from rtcp.devices.cia402 import DriveState, state_of
 from rtcp.fieldbus.alstatus import AlState
 from rtcp.motion.modes import DriveMode
 from rtcp.runtime.arm import WITH_TORQUE
@@ -228,7 +228,7 @@ def _with_torque(record: np.void) -> list[tuple[int, int, str]]:
     """Return the joints that a record does not show without torque: number, statusword, its state in words."""
     held = []
     for axis, word in enumerate(record["statusword"].tolist()):
-        state = next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
+        state = state_of(word)
         if state in WITH_TORQUE:
             held.append((axis, word, state.value))
         elif state is DriveState.UNKNOWN:

@@ -14,12 +14,10 @@ from rtcp.runtime.arm import Arm
 from rtcp.runtime.blackboard import Blackboard
 from rtcp.runtime.codes import Code
 from rtcp.runtime.service import Service
-from rtcp.runtime.standstill import Standstill
+from rtcp.runtime.standstill import FIRST_CYCLES, Standstill
 from rtcp.runtime.stops import Rung
 
 _OFF_S = 1.0
-_FIRST_CYCLES = 10
-"""What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
 
 
 class _Step(Enum):
@@ -75,7 +73,7 @@ class EmergencyStop:
                 self._next(_Step.TORQUE_OFF)
         elif self._step is _Step.TORQUE_OFF:
             arm.lead(self._off)
-            off = good and self._cycles > _FIRST_CYCLES and arm.first_with_torque() < 0
+            off = good and self._cycles > FIRST_CYCLES and arm.first_with_torque() < 0
             if off or self._cycles > self._off_cycles:
                 self._next(_Step.PARKED)
                 self._service.park()

@@ -6,6 +6,7 @@ back; it comes back to Operation Enabled only by reset and enable.
 
 from __future__ import annotations
 
+from math import nan
 from typing import TYPE_CHECKING
 
 from rtcp.config.model import ArmConfig
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
-_FAILED = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
+_NOT_REMEMBERED = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 _CLOCK_S = 1.0
 
 
@@ -75,8 +76,8 @@ class Failing:
         """The rung of every event."""
         self.pending = Code.NONE
         """What ends in a fault as soon as the controlled stop that it began has come to rest."""
-        self.stood = [0.0] * len(config.joints)
-        """Where each joint was last heard before the fault or emergency stop, rad."""
+        self.stood = [nan] * len(config.joints)
+        """Where each joint was last heard before the fault or emergency stop, rad; NaN: nowhere."""
         self.turned = [0.0] * len(config.joints)
         """How fast it turned there, rad/s."""
 
@@ -103,8 +104,9 @@ class Failing:
 
     def _remember(self) -> None:
         # Where what goes wrong begins: a slave that is lost was last heard before that. Not again until the reset, as
-        # by a press in the fault: its drive may be without supply by then, or back with another zero.
-        if self._behaviour.state not in _FAILED:
+        # by a press in the fault: its drive may be without supply by then, or back with another zero. Nor in a start,
+        # in which perhaps no joint has been heard.
+        if self._behaviour.state not in _NOT_REMEMBERED:
             self.stood[:] = self._arm.state.actual
             self.turned[:] = self._arm.state.speed
 

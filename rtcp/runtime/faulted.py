@@ -53,8 +53,7 @@ class Faulted:
     def lead(self, good: bool) -> None:
         """Do the cycle's part; `good`: the drives have answered."""
         behaviour, arm = self._behaviour, self._arm
-        rests = self._standstill.reached(good)
-        if not behaviour.torque_off and ((self.off_at_rest and rests) or self._is_deaf(good)):
+        if not behaviour.torque_off and ((self.off_at_rest and self._standstill.reached(good)) or self._is_deaf(good)):
             behaviour.torque_off = True
             self._blackboard.event(Code.TORQUE_OFF)
         # Also without frames that come back: slaves that still hear must not go on with the last speed or torque.

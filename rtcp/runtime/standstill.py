@@ -10,7 +10,7 @@ _STAND_S = 2.0
 """A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
 _UNHEARD_S = 0.5
 """So much longer than the quick stop of a usual arm that a late begin of it does not matter."""
-_FIRST_CYCLES = 10
+FIRST_CYCLES = 10
 """What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
 
 
@@ -47,5 +47,5 @@ class Standstill:
         self._cycles += 1
         if not good:
             self._unheard += 1
-        stands = good and self._cycles > _FIRST_CYCLES and self._arm.first_moving() < 0
+        stands = good and self._cycles > FIRST_CYCLES and self._arm.first_moving() < 0
         return stands or self.unheard or self._cycles > self._stand_cycles

@@ -65,6 +65,13 @@ class Played:
     def watched(self) -> BlackBox:
         return BlackBox(self.observer, self.session, self.directory, self.told.append)
 
+    def lost(self, box: BlackBox) -> Recording:
+        """Let frames be lost; return the one recording that there is once the box has finished."""
+        self.board.event(Code.BUS_LOST, value=5)
+        box.finish()
+        (recording,) = self.recordings
+        return recording
+
     @property
     def recordings(self) -> list[Recording]:
         return [read(one.path) for one in listed(self.directory)]
@@ -315,9 +322,7 @@ def test_cycles_that_were_overwritten_before_they_were_read_are_told(play: Calla
     played.fill(16_410, fault_at=16_410)
     for number in range(1, 11):
         played.observer._ring[number]["number_again"] = 0
-    played.board.event(Code.BUS_LOST, value=5)
-    box.finish()
-    (recording,) = played.recordings
+    recording = played.lost(box)
     note = "8.2 s before the fault instead of 10 s: older cycles had been overwritten"
     assert note in recording.about.notes
 
@@ -328,9 +333,7 @@ def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(play: Cal
     now = time.monotonic_ns()
     played.fill(1000, ends_ns=now - 13_000_000_000)
     played.fill(600, fault_at=600, ends_ns=now)
-    played.board.event(Code.BUS_LOST, value=5)
-    box.finish()
-    (recording,) = played.recordings
+    recording = played.lost(box)
     note = "0.3 s before the fault instead of 10 s: the loop had published nothing for 12.7 s before them"
     assert note in recording.about.notes
 
@@ -342,9 +345,7 @@ def test_torn_records_are_told_and_not_taken(play: Callable[..., Played]) -> Non
     for number in (10, 11, 500):
         slot = played.observer._ring[number % played.observer.records]
         slot["number_again"] = 0
-    played.board.event(Code.BUS_LOST, value=5)
-    box.finish()
-    (recording,) = played.recordings
+    recording = played.lost(box)
     assert "3 cycles were overwritten before they were read, or torn" in recording.about.notes
     assert len(recording.records["cycle"]) == 997
     assert int(recording.records["cycle"][recording.about.at]) == 900
@@ -356,9 +357,7 @@ def test_events_that_the_ring_no_longer_holds_are_told(play: Callable[..., Playe
     played.fill(100, fault_at=90)
     for _ in range(EVENTS):
         played.board.event(Code.ARRIVED)
-    played.board.event(Code.BUS_LOST, value=5)
-    box.finish()
-    (recording,) = played.recordings
+    recording = played.lost(box)
     assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
 
 
