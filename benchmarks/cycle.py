@@ -32,12 +32,12 @@ from rich.table import Table
 
 from rtcp.config.find import find_config
 from rtcp.config.schema import load
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import blackboard_file, runtime_directory
+from rtcp.launch.launcher import Running, StartOptions, start
 from rtcp.realtime.scheduling import choose_cpu
 from rtcp.realtime.statistics import percentiles
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.launcher import Running, StartOptions, start
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, runtime_directory
 from rtcp.telemetry.square import SPEED_M_S, place
 
 THESIS = {

@@ -34,8 +34,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 from cycle import Round, figures, platform_round, spread
 
 from rtcp.config.find import find_config
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, runtime_directory, segment_control
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import blackboard_file, runtime_directory, segment_control
 from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
 
 WATCH_MS = {"alone": 1000, "watched": 10, "setting up": 10}

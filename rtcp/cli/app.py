@@ -15,7 +15,7 @@ from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, machine, motio
 from rtcp.cli.outcome import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.errors import ConfigError
-from rtcp.runtime.client import ControlError
+from rtcp.ipc.client import ControlError
 
 app = typer.Typer(
     name="rtcp",

@@ -11,8 +11,8 @@ from rtcp.cli.connection import connect
 from rtcp.cli.launch import refuse_a_second_platform
 from rtcp.cli.outcome import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.config.virtual import VIRTUAL
-from rtcp.runtime import offline
-from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.launch import offline
 
 
 class BusAccess(Protocol):

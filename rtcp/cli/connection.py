@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.cli.output import complain
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.paths import runtime_directory
-from rtcp.runtime.session import is_ours, read_processes
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.paths import runtime_directory
+from rtcp.ipc.session import is_ours, read_processes
 
 _PATIENCE_S = 10.0
 """For a gateway that somebody else is starting."""
@@ -59,8 +59,8 @@ def _is_our_loop(directory: Path) -> bool:
 
 
 def _replace_gateway(directory: Path, error: ControlError) -> None:
-    from rtcp.runtime.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
-    from rtcp.runtime.running import StartError
+    from rtcp.launch.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
+    from rtcp.launch.running import StartError
 
     try:
         if process := replace_gateway(directory):

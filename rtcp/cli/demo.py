@@ -19,12 +19,12 @@ from rtcp.cli.motion import arrival, move
 from rtcp.cli.options import BusName, ConfigFile
 from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import report, show
-from rtcp.runtime import offline
-from rtcp.runtime.client import ControlClient
+from rtcp.ipc.client import ControlClient
+from rtcp.launch import offline
 
 if TYPE_CHECKING:
     from rtcp.config.model import Joint
-    from rtcp.runtime.launcher import StartOptions
+    from rtcp.launch.launcher import StartOptions
 
 REACH = 0.35
 """How far a pose lies from where the arm stood, rad; less where a limit is nearer."""
@@ -68,7 +68,7 @@ def _demo(
     refuse_a_second_platform()
     arm = offline.configuration(config)
     drive = demo_square.prepare(arm, square, picture) if square is not None else None
-    from rtcp.runtime.launcher import StartOptions
+    from rtcp.launch.launcher import StartOptions
 
     options = StartOptions(config=config, bus=bus, mode="csp")
     try:

@@ -11,7 +11,7 @@ from rtcp.cli.output import report
 
 if TYPE_CHECKING:
     from rtcp.config.model import ArmConfig
-    from rtcp.runtime.client import ControlClient
+    from rtcp.ipc.client import ControlClient
     from rtcp.telemetry.square import Driven, Square
 
 ENDINGS = (".png", ".svg", ".pdf")
@@ -60,7 +60,7 @@ class SquareDrive:
             ControlError: as the platform ended a motion.
             CommandError: nothing moved.
         """
-        from rtcp.runtime.paths import blackboard_file, runtime_directory
+        from rtcp.ipc.paths import blackboard_file, runtime_directory
         from rtcp.telemetry.recording import recording
         from rtcp.telemetry.square import SPEED_M_S, NoSquare, judge
 

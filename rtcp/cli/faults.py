@@ -12,7 +12,7 @@ from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit_json, report, show
 
 if TYPE_CHECKING:
-    from rtcp.runtime.blackbox_file import Listed
+    from rtcp.gateway.blackbox_file import Listed
 
 SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
 """Of the service and of root; `systemd/` has it as StateDirectory=."""
@@ -44,7 +44,7 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
 
         show(table(found))
     else:
-        from rtcp.runtime.blackbox_file import faults_directory
+        from rtcp.gateway.blackbox_file import faults_directory
 
         report(f"no fault has been recorded ({faults_directory()}){_elsewhere()}")
 
@@ -61,7 +61,7 @@ def _show(
     if plot is not None and plot.suffix.lower() not in PICTURES:
         raise CommandError(f"--plot {plot}: the ending {plot.suffix!r} is none of {', '.join(PICTURES)}")
     path = _path(number)
-    from rtcp.runtime.blackbox_file import RecordingError, read
+    from rtcp.gateway.blackbox_file import RecordingError, read
 
     try:
         recording = read(path)
@@ -90,7 +90,7 @@ def _show(
 
 
 def _listed() -> list[Listed]:
-    from rtcp.runtime.blackbox_file import RecordingError, faults_directory, listed
+    from rtcp.gateway.blackbox_file import RecordingError, faults_directory, listed
 
     try:
         return listed(faults_directory())
@@ -104,7 +104,7 @@ def _path(number: int) -> Path:
     Raises:
         CommandError: there is none; it says which there are.
     """
-    from rtcp.runtime.blackbox_file import RecordingError, faults_directory, files
+    from rtcp.gateway.blackbox_file import RecordingError, faults_directory, files
 
     directory = faults_directory()
     try:
@@ -119,7 +119,7 @@ def _path(number: int) -> Path:
 
 def _elsewhere() -> str:
     """Return where the service records, of which another user has an empty list of their own."""
-    from rtcp.runtime.blackbox_file import faults_directory
+    from rtcp.gateway.blackbox_file import faults_directory
 
     if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
         return ""

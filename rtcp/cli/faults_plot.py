@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from rtcp.cli.faults_summary import Mark, marks, seconds
-from rtcp.runtime.blackbox_file import Recording
+from rtcp.gateway.blackbox_file import Recording
 
 COLOURS = ("#1c6dd0", "#e07a1f", "#2f9e44", "#d1322d", "#7b4fb3", "#8a5a33", "#d264a6", "#6b7280", "#a39b1e", "#1fa5b5")
 """One a joint."""

@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rtcp.runtime.blackbox_file import Listed, Recording
-from rtcp.runtime.machine import TABLE
-from rtcp.runtime.steps import target_steps
+from rtcp.gateway.blackbox_file import Listed, Recording
+from rtcp.ipc.machine import TABLE
+from rtcp.telemetry.steps import target_steps
 
 _WORDS = {int(state): row.words for state, row in TABLE.items()}
 

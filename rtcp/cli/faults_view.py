@@ -11,7 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from rtcp.runtime.blackbox_file import Listed
+from rtcp.gateway.blackbox_file import Listed
 
 JOINT_COLUMNS = (("position", "rad"), ("target", "rad"), ("velocity", "rad/s"), ("torque", "Nm"))
 

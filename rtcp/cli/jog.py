@@ -19,7 +19,7 @@ from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
 from rtcp.cli.renewal import Renewal
 from rtcp.config.plain_number import plain_number
-from rtcp.runtime.client import ControlClient
+from rtcp.ipc.client import ControlClient
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
 TURN_S = 0.05

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from rtcp.cli.outcome import CommandError, ExitCode, code_of, interruption_code, orderly_signals
 from rtcp.config.errors import ConfigError
-from rtcp.runtime.paths import runtime_directory
+from rtcp.ipc.paths import runtime_directory
 
 if TYPE_CHECKING:
-    from rtcp.runtime.launcher import StartOptions
-    from rtcp.runtime.running import Running
+    from rtcp.launch.launcher import StartOptions
+    from rtcp.launch.running import Running
 
 
 def refuse_a_second_platform() -> None:
@@ -20,7 +20,7 @@ def refuse_a_second_platform() -> None:
     Raises:
         CommandError: with the process that runs.
     """
-    from rtcp.runtime.session import is_ours, read_processes
+    from rtcp.ipc.session import is_ours, read_processes
 
     loop = read_processes(runtime_directory()).loop
     if is_ours(loop):
@@ -36,8 +36,8 @@ def launch(options: StartOptions, report: Callable[[str], None]) -> Running:
     Raises:
         CommandError: with the launcher's sentence or the configuration's mistakes, or when a signal ended the start.
     """
-    from rtcp.runtime import launcher
-    from rtcp.runtime.running import StartError
+    from rtcp.launch import launcher
+    from rtcp.launch.running import StartError
     from rtcp.virtual.check import check_segment
 
     try:

@@ -13,7 +13,7 @@ from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, joint_values, pose_values, posi
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import report
 from rtcp.cli.progress import progress, stopping
-from rtcp.runtime.client import ControlClient
+from rtcp.ipc.client import ControlClient
 
 SILENCE_S = 10.0
 """A move that says nothing for so long is given up; progress comes several times a second."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from rtcp.cli.outcome import SUSPENDING, CommandError, interruption_code, orderly_signals
 from rtcp.cli.output import console, report
-from rtcp.runtime.client import ControlClient
+from rtcp.ipc.client import ControlClient
 
 Follow = Callable[[Mapping[str, Any]], None]
 

@@ -12,7 +12,7 @@ import typer
 from rtcp.cli.options import Poll
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report
-from rtcp.runtime.paths import listens, runtime_directory, segment_control
+from rtcp.ipc.paths import listens, runtime_directory, segment_control
 
 if TYPE_CHECKING:
     from rtcp.virtual.faults.client import SegmentClient

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import report
-from rtcp.runtime.paths import (
+from rtcp.ipc.paths import (
     RuntimeDirectoryError,
     free_segment_control,
     prepare,

@@ -42,9 +42,9 @@ def _soak(
     if seed < 0:
         raise CommandError(f"--seed {seed} is not allowed: 0 or more")
     refuse_a_second_platform()
-    from rtcp.runtime.launcher import StartOptions
-    from rtcp.runtime.paths import runtime_directory
-    from rtcp.runtime.session import read_processes, read_session
+    from rtcp.ipc.paths import runtime_directory
+    from rtcp.ipc.session import read_processes, read_session
+    from rtcp.launch.launcher import StartOptions
     from rtcp.telemetry.trials.bench import Bench
     from rtcp.telemetry.trials.soak import Soak
 

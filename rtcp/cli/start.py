@@ -13,7 +13,7 @@ from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
 from rtcp.cli.outcome import CommandError, ExitCode, code_of
 from rtcp.cli.output import report
-from rtcp.runtime.client import ControlError
+from rtcp.ipc.client import ControlError
 
 PATIENCE_S = 5.0
 """For a machine that is still starting: its frames have to come back first, or to be missed for long enough."""
@@ -46,7 +46,7 @@ def _start(
         raise CommandError(f"--mode {mode} is not known: {', '.join(MODES)}")
     if cycle_us is not None and not (math.isfinite(cycle_us) and cycle_us > 0):
         raise CommandError(f"--cycle-us {cycle_us:g} is not allowed: a number of us above 0")
-    from rtcp.runtime.launcher import StartOptions
+    from rtcp.launch.launcher import StartOptions
 
     request = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
     if detach:
@@ -87,8 +87,8 @@ def _outcome(ready: str) -> tuple[str, bool]:
 
 def _stop() -> None:
     """Stop the platform: drives disabled, slaves in INIT, processes ended."""
-    from rtcp.runtime import launcher
-    from rtcp.runtime.running import StartError
+    from rtcp.launch import launcher
+    from rtcp.launch.running import StartError
 
     try:
         left = launcher.stop(report)

@@ -12,7 +12,7 @@ import typer
 from rtcp.cli.connection import connect, loop_lives
 from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import console, emit, emit_json, show
-from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, ControlError
 
 REFRESH_S = 0.1
 """Time between two pictures of `--watch` on a terminal, and between two lines of JSON."""

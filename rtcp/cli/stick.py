@@ -15,7 +15,7 @@ from rtcp.cli.numbers import positive
 from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import emit, report
 from rtcp.cli.renewal import Renewal
-from rtcp.runtime.client import ControlClient
+from rtcp.ipc.client import ControlClient
 
 TURN_S = 0.08
 HOLD_S = 0.4

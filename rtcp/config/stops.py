@@ -1,4 +1,4 @@
-"""Which event takes which rung of the ladder of stops; what each rung does is in `rtcp.runtime.stops`.
+"""Which event takes which rung of the ladder of stops; what each rung does is in `rtcp.ipc.stops`.
 
 The first rung, to hold the last targets, is every lost cycle's up to `bus.lost_cycles` and nobody's choice. As `model`,
 this module imports nothing heavy.

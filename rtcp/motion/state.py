@@ -48,7 +48,7 @@ class Target:
 
 
 class Reason(IntEnum):
-    """Why a mode ended a motion by itself, or slows it; `rtcp.runtime.sentences` says it."""
+    """Why a mode ended a motion by itself, or slows it; `rtcp.ipc.messages` says it."""
 
     NONE = 0
     STREAM_ENDED = 1

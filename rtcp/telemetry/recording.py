@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.observer import Observer
 
 Array = npt.NDArray[np.float64]
 

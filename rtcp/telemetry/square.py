@@ -18,9 +18,9 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig
 from rtcp.config.motion_points import Stop
+from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import PlanRefused, plan_lines
-from rtcp.motion.zones import Zones
 from rtcp.telemetry.recording import Recording
 
 Array = npt.NDArray[np.float64]

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.assembly import position_of
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.service import Service
+from rtcp.control.assembly import position_of
+from rtcp.control.service import Service
+from rtcp.ipc.blackboard import Blackboard
 from rtcp.virtual.inprocess import InProcessBus
 from rtcp.virtual.registers import State
 

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
-from rtcp.runtime.assembly import assemble, discipline_of
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
-from rtcp.runtime.machine import State as MachineState
-from rtcp.runtime.observer import Answer, Event, Observer
+from rtcp.control.assembly import assemble, discipline_of
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
+from rtcp.ipc.machine import State as MachineState
+from rtcp.ipc.observer import Answer, Event, Observer
 from rtcp.virtual.inline_service import InlineService
 from rtcp.virtual.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create

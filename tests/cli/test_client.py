@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, ControlError
 
 
 @pytest.fixture

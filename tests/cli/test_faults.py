@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from rtcp.cli import faults
-from rtcp.runtime.blackbox_file import About, Moment, Recording, faults_directory, write
-from rtcp.runtime.layout import FLAG_ENABLED, RecordLayout
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import record_type
+from rtcp.gateway.blackbox_file import About, Moment, Recording, faults_directory, write
+from rtcp.ipc.layout import FLAG_ENABLED, RecordLayout
+from rtcp.ipc.machine import State
+from rtcp.ipc.observer import record_type
 
 JOINTS, PERIOD_NS, CYCLES, AT = 3, 1_000_000, 1200, 800
 WHEN_NS = 1_790_000_000_250_000_000

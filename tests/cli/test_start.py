@@ -13,13 +13,13 @@ from typing import Any
 import pytest
 
 from rtcp.cli import start
-from rtcp.runtime.session import Pid, Processes, identify
+from rtcp.ipc.session import Pid, Processes, identify
 
 
 @pytest.fixture
 def loop(directory: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A process that the runtime directory names as the loop."""
-    program = "import time; time.sleep(600)  # stands for rtcp.runtime.loop_process"
+    program = "import time; time.sleep(600)  # stands for rtcp.control.process"
     process = subprocess.Popen([sys.executable, "-c", program])
     Processes(loop=identify(process.pid)).write(directory)
     yield process

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.session import Processes, identify
+from rtcp.ipc.session import Processes, identify
 
 
 def test_status_shows_state_joints_slaves_times_and_clocks(platform: Any, rtcp: Callable[..., Any]) -> None:

@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 
 from rtcp.config.find import default_config
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.paths import control_socket
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.paths import control_socket
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"

@@ -9,10 +9,10 @@ import time
 import numpy as np
 import pytest
 
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
-from rtcp.runtime.observer import Observer, record_type
-from rtcp.runtime.paths import blackboard_file, control_socket, segment_control
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
+from rtcp.ipc.observer import Observer, record_type
+from rtcp.ipc.paths import blackboard_file, control_socket, segment_control
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import inputs, outputs
@@ -306,8 +306,8 @@ def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(p
     hook.mkdir()
     (hook / "sitecustomize.py").write_text(
         "import sys\n"
-        "if 'rtcp.runtime.loop_process' in sys.orig_argv:\n"
-        "    from rtcp.runtime.record import Recorder\n"
+        "if 'rtcp.control.process' in sys.orig_argv:\n"
+        "    from rtcp.control.record import Recorder\n"
         "    publish = Recorder.publish\n"
         "    def defective(self, *given):\n"
         "        publish(self, *given)\n"

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.paths import segment_control
-from rtcp.runtime.session import read_session
+from rtcp.ipc.paths import segment_control
+from rtcp.ipc.session import read_session
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, kill, lives
 

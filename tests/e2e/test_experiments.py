@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime.client import ControlClient
-from rtcp.runtime.paths import blackboard_file, control_socket
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.paths import blackboard_file, control_socket
 from rtcp.telemetry.recording import recording
 from rtcp.telemetry.square import SPEED_M_S, judge, place
 from tests.e2e.conftest import Platform

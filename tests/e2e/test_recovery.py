@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtcp.runtime.client import ControlError
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, segment_control
+from rtcp.ipc.client import ControlError
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import blackboard_file, segment_control
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import outputs

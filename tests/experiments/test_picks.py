@@ -11,8 +11,8 @@ import pytest
 
 from kinematics import InverseKinematics, Pose, forward
 from rtcp.config import default_config, load
-from rtcp.runtime.codes import Command, MotionMode
-from rtcp.runtime.machine import State
+from rtcp.ipc.codes import Command, MotionMode
+from rtcp.ipc.machine import State
 from rtcp.virtual.simulation import Simulation
 
 BASE_ABOVE_GROUND_M = 0.45

@@ -9,8 +9,8 @@ import pytest
 
 from kinematics import forward
 from rtcp.config import default_config, load
-from rtcp.runtime.codes import Code, Command, MotionMode
-from rtcp.runtime.machine import State
+from rtcp.ipc.codes import Code, Command, MotionMode
+from rtcp.ipc.machine import State
 from rtcp.virtual.simulation import Simulation
 
 from .test_picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from rtcp.runtime.session import read_session
+from rtcp.ipc.session import read_session
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.trial import GOES_ON as GOING_ON
 from rtcp.telemetry.trials.trial import LARGEST_STEP, Outcome, carry_out

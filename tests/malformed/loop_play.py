@@ -9,7 +9,7 @@ from dataclasses import replace
 from random import Random
 
 from rtcp.config import default_config, load
-from rtcp.runtime.machine import Command, State
+from rtcp.ipc.machine import Command, State
 from rtcp.virtual.simulation import Frame, Simulation
 from tests.malformed.mutate import EDGES
 from tests.malformed.segment_play import Found, Memory

@@ -19,13 +19,13 @@ from rtcp.config.faults import load_script
 from rtcp.config.kinematics import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
-from rtcp.runtime.limit_keeper import _read as read_kept_limits
-from rtcp.runtime.observer import BlackboardError, Observer
-from rtcp.runtime.paths import blackboard_file, processes_file, starts_file
-from rtcp.runtime.session import Pid, Processes, Session, SessionError, identify, read_processes, read_session
-from rtcp.runtime.zero import read_zeros, store_zero, zero_file
+from rtcp.config.zero import read_zeros, store_zero, zero_file
+from rtcp.gateway.limit_keeper import _read as read_kept_limits
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
+from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.paths import blackboard_file, processes_file, starts_file
+from rtcp.ipc.session import Pid, Processes, Session, SessionError, identify, read_processes, read_session
 from rtcp.virtual.server import make_segment
 from tests.malformed.files import damaged
 
@@ -248,7 +248,7 @@ def test_a_gateway_that_finds_a_damaged_file_says_so_without_a_traceback(tmp_pat
     damage = file if name == "blackboard" else tmp_path / name
     damage.write_bytes(b"{")
     done = subprocess.run(
-        [sys.executable, "-m", "rtcp.runtime.gateway", "--directory", str(tmp_path), "--ready-fd", "1"],
+        [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(tmp_path), "--ready-fd", "1"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     file.unlink(missing_ok=True)

@@ -7,8 +7,8 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config import default_config, load
-from rtcp.motion.envelope import SetPointGuard, Verdict
-from rtcp.motion.jog import JogMode
+from rtcp.motion.controllers.jog import JogMode
+from rtcp.motion.guards.envelope import SetPointGuard, Verdict
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import MotionState, Phase
 

@@ -9,7 +9,7 @@ from math import isfinite
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.config.operation import Box, KeepOut
-from rtcp.motion.envelope import SetPointGuard, Verdict
+from rtcp.motion.guards.envelope import SetPointGuard, Verdict
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import MotionState, Target
 

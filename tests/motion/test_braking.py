@@ -9,9 +9,9 @@ from hypothesis import assume, event, given, settings
 from hypothesis import strategies as st
 
 from kinematics.forward import frames
-from rtcp.motion.braking import fastest_stoppable, touched, travel
+from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
+from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
-from rtcp.motion.zones import Zones
 
 from .judge import ARM, with_boxes
 from .reference import Point, depth, points

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.braking import fastest_stoppable
-from rtcp.motion.envelope import SetPointGuard, Verdict
-from rtcp.motion.generator import JointGenerator
+from rtcp.motion.controllers.generator import JointGenerator
+from rtcp.motion.controllers.velocity import VelocityMode
+from rtcp.motion.guards.braking import fastest_stoppable
+from rtcp.motion.guards.envelope import SetPointGuard, Verdict
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import Phase, Reason, Target
-from rtcp.motion.velocity import VelocityMode
 
 from .judge import JOINTS_ONLY, Judge
 

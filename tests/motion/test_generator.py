@@ -7,7 +7,7 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.generator import JointGenerator
+from rtcp.motion.controllers.generator import JointGenerator
 from rtcp.motion.state import MotionState, Phase, Reason
 
 PERIOD = 0.0005

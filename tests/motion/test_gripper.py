@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
-from rtcp.motion.gripper import GripperMotion
+from rtcp.motion.controllers.gripper import GripperMotion
 from rtcp.motion.state import Target
 
 DT = 0.0005

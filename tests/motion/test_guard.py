@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
-from rtcp.motion.guard import BACK_RAD_S, Guard
+from rtcp.motion.guards.guard import BACK_RAD_S, Guard
 from rtcp.motion.limits import Limits
 
 from .judge import ARM

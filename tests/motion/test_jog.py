@@ -10,7 +10,7 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.jacobian import jacobian, singularity_distances
 from rtcp.config import default_config, load
-from rtcp.motion.jog_inverse import JogInverse
+from rtcp.motion.controllers.jog_inverse import JogInverse
 from rtcp.motion.state import Phase, Reason
 
 MODEL = load(default_config()).arm

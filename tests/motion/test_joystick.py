@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from rtcp.config.operation import JogConfig
-from rtcp.motion.joystick import Joystick
+from rtcp.motion.controllers.joystick import Joystick
 
 SPEED, TURN = 0.1, 0.3
 X, Y, Z, RX, RY, RZ = range(6)

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.operation import WatchConfig
+from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED, TORQUE, Found, Watch
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import MotionState
-from rtcp.motion.watch import FOLLOWING_ERROR, SPEED, TORQUE, Found, Watch
 
 from .judge import JOINTS_ONLY
 

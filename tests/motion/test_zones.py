@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.motion.braking import touched
-from rtcp.motion.envelope import Verdict
+from rtcp.motion.guards.braking import touched
+from rtcp.motion.guards.envelope import Verdict
+from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import Reason
-from rtcp.motion.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 
 from .judge import ARM, MODEL, Judge, with_boxes
 from .reference import Point, depth, points
@@ -149,7 +149,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
         looked.append(q)
         return frames(model, q)
 
-    monkeypatch.setattr("rtcp.motion.braking.frames", counted)
+    monkeypatch.setattr("rtcp.motion.guards.braking.frames", counted)
     chance, most, dt = Random(1), 0, 0.0005
     for _ in range(3000):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
@@ -218,7 +218,7 @@ def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction:
 
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
-    monkeypatch.setattr("rtcp.motion.envelope.frames", lambda *given: counted.append(1) or frames(*given))
+    monkeypatch.setattr("rtcp.motion.guards.envelope.frames", lambda *given: counted.append(1) or frames(*given))
     judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
     driven(judge, [0.5] * 6, 200)
     assert len(counted) <= 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kinematics.forward import frames
-from rtcp.motion.envelope import Verdict
+from rtcp.motion.guards.envelope import Verdict
 
 from .judge import ARM, MODEL, Judge, with_boxes
 

@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
+from rtcp.control.assembly import assemble
+from rtcp.control.service import Service
 from rtcp.fieldbus.alstatus import AlState
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Answer, Event, Observer
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
-from rtcp.runtime.assembly import assemble
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Answer, Event, Observer
-from rtcp.runtime.sentences import Sentences
-from rtcp.runtime.service import Service
 from rtcp.virtual.models import CubemarsDrive, create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 

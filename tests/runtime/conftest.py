@@ -14,11 +14,11 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.client import ControlClient
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, control_socket
-from rtcp.runtime.session import Session
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.session import Session
 from tests.runtime.bench import CONFIG, PERIOD_S, Bench
 from tests.runtime.played_loop import Loop
 
@@ -75,7 +75,7 @@ def gateway_loop(gateway_directory: Path) -> Iterator[Loop]:
     made = Loop(blackboard_file(directory))
     reading, writing = os.pipe()
     gateway = subprocess.Popen(
-        [sys.executable, "-m", "rtcp.runtime.gateway", "--directory", str(directory), "--ready-fd", str(writing)],
+        [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(directory), "--ready-fd", str(writing)],
         pass_fds=(writing,),
         env={**os.environ, "RTCP_STATE_DIR": str(directory / "state")},
     )

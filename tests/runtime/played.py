@@ -12,15 +12,15 @@ from typing import Any, TypeVar
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.arguments import Arguments
-from rtcp.runtime.carrier import CommandFailed
-from rtcp.runtime.codes import MotionMode
-from rtcp.runtime.held import Caller
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import Session
-from rtcp.runtime.verbs import Verbs
+from rtcp.gateway.arguments import Arguments
+from rtcp.gateway.carrier import CommandFailed
+from rtcp.gateway.held import Caller
+from rtcp.gateway.picture import Picture
+from rtcp.gateway.verbs import Verbs
+from rtcp.ipc.codes import MotionMode
+from rtcp.ipc.machine import State
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.session import Session
 from tests.runtime.played_loop import Loop
 
 T = TypeVar("T")

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.codes import MotionMode
-from rtcp.runtime.layout import PER_JOINT, PLAN_COLUMNS, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
-from rtcp.runtime.machine import Command, State
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import MotionMode
+from rtcp.ipc.layout import PER_JOINT, PLAN_COLUMNS, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
+from rtcp.ipc.machine import Command, State
 
 JOINTS = 6
 _FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS

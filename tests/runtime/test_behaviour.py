@@ -11,13 +11,13 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.guard import BACK_RAD_S
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.messages import FAULTS
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.stops import Rung, bounds
+from rtcp.motion.guards.guard import BACK_RAD_S
 from rtcp.motion.state import MotionState, Reason, Target
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.sentences import FAULTS
-from rtcp.runtime.stops import Rung, bounds
 
 from .bench import (
     _WIRE,

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import PER_JOINT, RECORDS, SCALARS, records_for
-from rtcp.runtime.observer import BlackboardError, LeaseRefused, Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import PER_JOINT, RECORDS, SCALARS, records_for
+from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
 
 JOINTS = 6
 FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS

@@ -15,16 +15,17 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime import blackbox, fault_events, launcher
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.blackbox import BlackBox
-from rtcp.runtime.blackbox_file import Recording, listed, read
-from rtcp.runtime.codes import Code, Command
-from rtcp.runtime.layout import EVENTS, PER_JOINT, SCALARS
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import stopping_mark
-from rtcp.runtime.session import Pid, Processes, Session, identify
+from rtcp.gateway import blackbox, fault_events
+from rtcp.gateway.blackbox import BlackBox
+from rtcp.gateway.blackbox_file import Recording, listed, read
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Code, Command
+from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
+from rtcp.ipc.machine import State
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import stopping_mark
+from rtcp.ipc.session import Pid, Processes, Session, identify
+from rtcp.launch import launcher
 from rtcp.virtual.simulation import Simulation
 
 JOINTS = 6

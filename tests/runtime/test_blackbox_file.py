@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rtcp.runtime import blackbox_file
-from rtcp.runtime.blackbox_file import About, Moment, Recording, RecordingError, files, listed, read, write
-from rtcp.runtime.layout import RecordLayout
-from rtcp.runtime.observer import record_type
+from rtcp.gateway import blackbox_file
+from rtcp.gateway.blackbox_file import About, Moment, Recording, RecordingError, files, listed, read, write
+from rtcp.ipc.layout import RecordLayout
+from rtcp.ipc.observer import record_type
 
 CYCLES = 50
 
@@ -70,7 +70,7 @@ def test_numbers_rise_and_none_is_given_twice_even_when_files_are_removed(tmp_pa
 
 def test_two_writers_at_once_share_the_numbers(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from rtcp.runtime.blackbox_file import write\n"
+        "import sys; from pathlib import Path; from rtcp.gateway.blackbox_file import write\n"
         "from tests.runtime.test_blackbox_file import recording\n"
         "for _ in range(15): print(write(Path(sys.argv[1]), recording())[0])"
     )
@@ -96,7 +96,7 @@ def test_the_oldest_go_and_what_an_interrupted_writer_left(tmp_path: Path, monke
 def test_a_disk_that_is_full_is_a_sentence_and_leaves_nothing_of_the_file(tmp_path: Path) -> None:
     program = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from rtcp.runtime.blackbox_file import RecordingError, write\n"
+        "from rtcp.gateway.blackbox_file import RecordingError, write\n"
         "from tests.runtime.test_blackbox_file import recording\n"
         "made = recording()\n"
         "made.records['position'][:] = __import__('numpy').random.default_rng(1).random((50, 2))\n"

@@ -9,9 +9,9 @@ import pytest
 
 from rtcp.config.model import GripperConfig
 from rtcp.fieldbus.alstatus import ERROR_BIT, AlState
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Command, State
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Command, State
+from rtcp.ipc.observer import Observer
 
 from .bench import CONFIG, Bench
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.ipc.machine import Code, Command, State
 from rtcp.realtime.discipline import UNHEARD_CYCLES
-from rtcp.runtime.machine import Code, Command, State
 from rtcp.virtual.simulation import Frame, Simulation
 
 CONFIG = load(default_config())

@@ -10,12 +10,12 @@ import pytest
 
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
 from rtcp.fieldbus.alstatus import AlState
-from rtcp.runtime import commander
-from rtcp.runtime.carrier import Carrier, CommandFailed
-from rtcp.runtime.commander import Commander
-from rtcp.runtime.machine import Code, State
-from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import Session
+from rtcp.gateway import commander
+from rtcp.gateway.carrier import Carrier, CommandFailed
+from rtcp.gateway.commander import Commander
+from rtcp.gateway.picture import Picture
+from rtcp.ipc.machine import Code, State
+from rtcp.ipc.session import Session
 
 from .bench import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, Bench
 

@@ -13,10 +13,10 @@ from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.operation import InputConfig
 from rtcp.config.segment import SegmentSlave
-from rtcp.runtime.codes import Code, Command, Refusal
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import Event
-from rtcp.runtime.sentences import Sentences
+from rtcp.ipc.codes import Code, Command, Refusal
+from rtcp.ipc.machine import State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Event
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.simulation import Frame, Simulation
 

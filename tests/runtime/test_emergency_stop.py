@@ -9,9 +9,9 @@ from itertools import pairwise
 import pytest
 
 from rtcp.config.operation import InputConfig
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Code, Command, Refusal, State
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Code, Command, Refusal, State
+from rtcp.ipc.observer import Observer
 
 from .bench import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, QUICK_STOP, SPEED, Bench, move_numbers
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.runtime.machine import Code, Command, Refusal, State
+from rtcp.ipc.machine import Code, Command, Refusal, State
 
 from .bench import (
     CONFIG,

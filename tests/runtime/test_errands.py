@@ -10,15 +10,15 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.control.errands import Errands
 from rtcp.fieldbus.bus import BusError, SdoAborted
 from rtcp.fieldbus.steps import Steps
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.carrier import Carrier, CommandFailed
-from rtcp.runtime.commander import Commander
-from rtcp.runtime.errands import Errands
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import Session
+from rtcp.gateway.carrier import Carrier, CommandFailed
+from rtcp.gateway.commander import Commander
+from rtcp.gateway.picture import Picture
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.session import Session
 
 
 class Bus:

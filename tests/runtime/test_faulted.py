@@ -9,9 +9,9 @@ import pytest
 
 from rtcp.config.model import ArmConfig
 from rtcp.fieldbus.alstatus import AlState
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.observer import Observer
 
 from .bench import CONFIG, COUNTS, CSP, CST, CSV, QUICK_STOP, UNDER_VOLTAGE, VOLTAGE_OFF, Bench
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.machine import Command
-from rtcp.runtime.paths import control_socket
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.machine import Command
+from rtcp.ipc.paths import control_socket
 from tests.runtime.played_loop import JOINTS, Loop
 
 LINE_LIMIT = 65536

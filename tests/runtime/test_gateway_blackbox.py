@@ -15,12 +15,12 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime import gateway
-from rtcp.runtime.blackbox_file import About, listed
-from rtcp.runtime.client import ControlClient
-from rtcp.runtime.codes import Code
-from rtcp.runtime.paths import blackboard_file, control_socket
-from rtcp.runtime.session import Session
+from rtcp.gateway import server as gateway
+from rtcp.gateway.blackbox_file import About, listed
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.codes import Code
+from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.session import Session
 from tests.runtime.played_loop import Loop
 
 
@@ -36,7 +36,7 @@ class Gateways:
 
     def start(self) -> subprocess.Popen[bytes]:
         reading, writing = os.pipe()
-        module = [sys.executable, "-m", "rtcp.runtime.gateway"]
+        module = [sys.executable, "-m", "rtcp.gateway.server"]
         process = subprocess.Popen(
             [*module, "--directory", str(self.directory), "--ready-fd", str(writing)],
             pass_fds=(writing,),

@@ -9,7 +9,7 @@ PROGRAM = """
 import asyncio, os, signal
 from asyncio import selector_events
 from pathlib import Path
-from rtcp.runtime import gateway
+from rtcp.gateway import server as gateway
 
 class Served:
     def __init__(self, directory):

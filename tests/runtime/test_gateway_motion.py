@@ -11,11 +11,11 @@ import pytest
 
 from kinematics.forward import forward
 from rtcp.config import default_config, load
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.codes import Code, JogFrame, MotionMode, Refusal
+from rtcp.ipc.machine import Command, State
+from rtcp.ipc.paths import control_socket
 from rtcp.motion.state import Reason
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.codes import Code, JogFrame, MotionMode, Refusal
-from rtcp.runtime.machine import Command, State
-from rtcp.runtime.paths import control_socket
 from tests.runtime.played_loop import JOINTS, Loop
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.8, 0.0]

@@ -9,9 +9,9 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
+from rtcp.control.gripper import DrivenGripper, gripper_of
 from rtcp.devices.cia402 import DriveGoal, DriveState
-from rtcp.motion.watch import FOLLOWING_ERROR, SPEED
-from rtcp.runtime.gripper import DrivenGripper, gripper_of
+from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.runtime.codes import Code, Command, Refusal
+from rtcp.ipc.codes import Code, Command, Refusal
 from tests.runtime.played import Played, played
 
 from .test_gripper import DRIVEN

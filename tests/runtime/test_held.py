@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from rtcp.runtime.carrier import CommandFailed
-from rtcp.runtime.codes import MotionMode, Refusal
-from rtcp.runtime.held import Caller
-from rtcp.runtime.machine import Command, State
+from rtcp.gateway.carrier import CommandFailed
+from rtcp.gateway.held import Caller
+from rtcp.ipc.codes import MotionMode, Refusal
+from rtcp.ipc.machine import Command, State
 from tests.runtime.played import Played, played
 
 Q = [0.0, 0.2, 1.0, 0.0, 0.4, 0.0]

@@ -13,12 +13,12 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime import keeper
-from rtcp.runtime.keeper import GatewayKeeper
-from rtcp.runtime.lock import Busy, alone
-from rtcp.runtime.paths import stopping_mark
-from rtcp.runtime.running import Running
-from rtcp.runtime.session import Pid, Processes, identify, is_ours, read_processes
+from rtcp.ipc.lock import Busy, alone
+from rtcp.ipc.paths import stopping_mark
+from rtcp.ipc.session import Pid, Processes, identify, is_ours, read_processes
+from rtcp.launch import keeper
+from rtcp.launch.keeper import GatewayKeeper
+from rtcp.launch.running import Running
 
 
 class Kept:

@@ -10,11 +10,11 @@ import pytest
 
 from rtcp.config.operation import InputConfig
 from rtcp.config.stops import StopsConfig
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import TABLE, Code, Command, Event, State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.sentences import Sentences
-from rtcp.runtime.stops import KEYS
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import TABLE, Code, Command, Event, State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.stops import KEYS
 
 from .bench import (
     CONFIG,

@@ -15,9 +15,9 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.machine import Command, State
-from rtcp.runtime.stops import Bound, Rung, bounds, tool_bounds, unheard
-from rtcp.runtime.stops_page import section
+from rtcp.ipc.machine import Command, State
+from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
+from rtcp.telemetry.stops_page import section
 from rtcp.virtual.simulation import NAME, Frame, Simulation
 
 CONFIG = load(default_config())
@@ -273,5 +273,5 @@ def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
 
 
 def test_the_section_in_the_docs_is_printed_from_the_table_and_the_bounds() -> None:
-    # `python -m rtcp.runtime.stops_page` prints it anew.
+    # `python -m rtcp.telemetry.stops_page` prints it anew.
     assert section(load(default_config())) in FAULTS_PAGE.read_text()

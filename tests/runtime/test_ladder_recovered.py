@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.sentences import Sentences
+from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.messages import Sentences
 from rtcp.virtual.inprocess_slave import InProcessSlave
 from rtcp.virtual.models import create
 from rtcp.virtual.registers import State as AlState

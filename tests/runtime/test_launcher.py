@@ -17,14 +17,14 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.runtime import launcher, running
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.ending import end_of, forget_end, write_end
-from rtcp.runtime.layout import PER_JOINT, SCALARS
-from rtcp.runtime.lock import Busy, alone
-from rtcp.runtime.paths import blackboard_file, control_socket, stopping_mark
-from rtcp.runtime.running import Running, StartError
-from rtcp.runtime.session import Pid, Processes, Session, SessionError, identify, is_ours, read_processes, read_session
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.ending import end_of, forget_end, write_end
+from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.lock import Busy, alone
+from rtcp.ipc.paths import blackboard_file, control_socket, stopping_mark
+from rtcp.ipc.session import Pid, Processes, Session, SessionError, identify, is_ours, read_processes, read_session
+from rtcp.launch import launcher, running
+from rtcp.launch.running import Running, StartError
 
 JOINTS = 6
 

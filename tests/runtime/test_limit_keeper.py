@@ -8,9 +8,9 @@ from math import inf, nan
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.gateway.carrier import CommandFailed
+from rtcp.gateway.limit_keeper import changed
 from rtcp.motion.limits import Values
-from rtcp.runtime.carrier import CommandFailed
-from rtcp.runtime.limit_keeper import changed
 
 CONFIG = load(default_config())
 WIDEST = Values.configured(CONFIG)

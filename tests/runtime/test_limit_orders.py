@@ -8,13 +8,13 @@ from math import nan
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.control.arm import Arm
+from rtcp.control.limit_orders import LimitOrders
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import Code, Command, Refusal, State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Answer, Observer
 from rtcp.motion.limits import Values, rows
-from rtcp.runtime.arm import Arm
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.limit_orders import LimitOrders
-from rtcp.runtime.machine import Code, Command, Refusal, State
-from rtcp.runtime.observer import Answer, Observer
-from rtcp.runtime.sentences import Sentences
 
 from .bench import CONFIG, COUNTS, PERIOD_S, Bench, move_numbers
 

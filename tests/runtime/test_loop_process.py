@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.control.assembly import drives_of
+from rtcp.control.process import stop_blindly
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.fieldbus.pdo import layout
-from rtcp.runtime.assembly import drives_of
-from rtcp.runtime.loop_process import stop_blindly
 
 from .bench import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, Bench
 

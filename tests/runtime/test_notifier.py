@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.layout import PER_JOINT, SCALARS
-from rtcp.runtime.machine import State
-from rtcp.runtime.notifier import Notifier
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.machine import State
+from rtcp.launch.notifier import Notifier
 
 JOINTS = 6
 STATE = [name for name, _ in SCALARS[1:]].index("state")

@@ -8,9 +8,9 @@ from math import inf, nan
 
 import pytest
 
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.machine import ALLOWED, WITHOUT_LEASE, Command, Refusal, State
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.machine import ALLOWED, WITHOUT_LEASE, Command, Refusal, State
+from rtcp.ipc.observer import Observer
 
 from .bench import CONFIG, COUNTS, CSP, CST, CSV, PERIOD_S, SPEED, Bench, move_numbers
 

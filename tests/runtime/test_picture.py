@@ -11,14 +11,14 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.fieldbus.emergency import Emergency
-from rtcp.runtime import picture
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.codes import Code
-from rtcp.runtime.layout import FLAG_DC_LOCKED, PER_JOINT, SCALARS
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.picture import Picture
-from rtcp.runtime.session import Processes, Session
+from rtcp.gateway import picture
+from rtcp.gateway.picture import Picture
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Code
+from rtcp.ipc.layout import FLAG_DC_LOCKED, PER_JOINT, SCALARS
+from rtcp.ipc.machine import State
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.session import Processes, Session
 
 JOINTS = 6
 AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}

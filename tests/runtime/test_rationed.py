@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.runtime import rationed
-from rtcp.runtime.rationed import Rationed
+from rtcp.control import rationed
+from rtcp.control.rationed import Rationed
 
 
 class Bench:

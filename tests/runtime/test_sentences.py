@@ -6,9 +6,9 @@ import pytest
 
 from rtcp.config.find import default_config
 from rtcp.config.schema import load
+from rtcp.ipc.machine import ALLOWED, Code, Command, Refusal, State
+from rtcp.ipc.messages import Sentences
 from rtcp.motion.state import Reason
-from rtcp.runtime.machine import ALLOWED, Code, Command, Refusal, State
-from rtcp.runtime.sentences import Sentences
 
 SENTENCES = Sentences(load(default_config()))
 

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 
+from rtcp.control.service import Service
 from rtcp.fieldbus.alstatus import AlState
 from rtcp.fieldbus.bus import BusError, SlaveState
 from rtcp.fieldbus.charges import Charge
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.port_errors import PortErrors
 from rtcp.fieldbus.steps import Steps
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.observer import Health, Observer
-from rtcp.runtime.service import Service
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.observer import Health, Observer
 
 
 class Watching:

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.runtime.carrier import CommandFailed
-from rtcp.runtime.machine import State
-from rtcp.runtime.stick_forcer import forced
+from rtcp.gateway.carrier import CommandFailed
+from rtcp.gateway.stick_forcer import forced
+from rtcp.ipc.machine import State
 from tests.runtime.played import Played, played
 
 Q = [0.0] * 6

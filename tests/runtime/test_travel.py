@@ -11,10 +11,10 @@ import pytest
 
 from kinematics.forward import forward
 from rtcp.config.motion_points import Stop
+from rtcp.gateway.planner import Planner
+from rtcp.ipc.codes import Code, MotionMode, Refusal
+from rtcp.ipc.machine import Command
 from rtcp.motion.limits import Limits
-from rtcp.runtime.codes import Code, MotionMode, Refusal
-from rtcp.runtime.machine import Command
-from rtcp.runtime.planner import Planner
 from tests.runtime.played import Played, played
 
 BENT = [0.0, 0.2, math.pi / 2, 0.0, 0.4, 0.0]

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
-from rtcp.runtime.launcher import StartOptions, _configured
-from rtcp.runtime.zero import read_zeros, state_directory, store_zero, zero_file
+from rtcp.config.zero import read_zeros, state_directory, store_zero, zero_file
+from rtcp.launch.launcher import StartOptions, _configured
 
 ARM = load(default_config())
 
@@ -275,7 +275,7 @@ def test_the_file_is_readable_for_all_and_writable_for_its_owner() -> None:
 CHILD = """
 import os, signal, sys
 from rtcp.config import default_config, load
-from rtcp.runtime.zero import store_zero
+from rtcp.config.zero import store_zero
 when, at, count = sys.argv[1], int(sys.argv[2]), 0
 def watched(name):
     real = getattr(os, name)
@@ -357,7 +357,7 @@ def test_the_new_file_is_on_the_disk_before_it_takes_the_olds_name_and_the_name_
 def test_two_writers_wait_for_each_other(state: Path) -> None:
     store_zero(ARM, 0, 0.0)
     code = (
-        "import sys; from rtcp.config import default_config, load; from rtcp.runtime.zero import store_zero\n"
+        "import sys; from rtcp.config import default_config, load; from rtcp.config.zero import store_zero\n"
         "config, axis = load(default_config()), int(sys.argv[1])\n"
         "for i in range(40): store_zero(config, axis, i / 64)\n"
     )

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.runtime.codes import Refusal
-from rtcp.runtime.machine import Command
-from rtcp.runtime.zero import read_zeros, state_directory, zero_file
+from rtcp.config.zero import read_zeros, state_directory, zero_file
+from rtcp.ipc.codes import Refusal
+from rtcp.ipc.machine import Command
 from tests.runtime.played import Played, played
 
 from .test_gripper import DRIVEN

@@ -7,13 +7,13 @@ from math import sqrt
 from random import Random
 
 from kinematics import forward
+from rtcp.ipc.machine import Command, State
 from rtcp.motion.limits import Values
-from rtcp.runtime.machine import Command, State
 from tests.sessions.driver import NONSENSE, STICK, Driver, configuration, is_free
 
 COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
-"""Column 19 of a plan's row (`rtcp.motion.rows`)."""
+"""Column 19 of a plan's row (`rtcp.motion.planning.rows`)."""
 HOLD_S = 0.2
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from random import Random
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.machine import Command, State
+from rtcp.ipc.machine import Command, State
 from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
     DRIVE_MODES,

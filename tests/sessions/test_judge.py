@@ -9,7 +9,7 @@ from math import pi
 import pytest
 
 from kinematics import forward
-from rtcp.runtime.machine import Command, State
+from rtcp.ipc.machine import Command, State
 from tests.sessions.driver import Driver, configuration, is_free, with_start
 from tests.sessions.geometry import depth, points
 from tests.sessions.judge import CSP, CST, CSV, ENABLE_OPERATION, WIRE

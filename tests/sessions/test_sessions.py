@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from rtcp.runtime.machine import Command, State
+from rtcp.ipc.machine import Command, State
 from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
     DRIVE_MODES,

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rtcp.ipc.machine import Command, State
 from rtcp.motion.limits import Values
-from rtcp.runtime.machine import Command, State
 from rtcp.virtual.simulation import Frame
 from tests.e2e.wire import DRIVE, HEAD, LEAVES, LRW, frame
 from tests.sessions.driver import Driver, configuration, with_start

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcp.runtime.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, ControlError
 
 NAME = "a random session"
 PATIENCE_S = 30.0

@@ -13,8 +13,8 @@ from kinematics import forward
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.config.operation import Box
-from rtcp.runtime.layout import RecordLayout
-from rtcp.runtime.observer import record_type
+from rtcp.ipc.layout import RecordLayout
+from rtcp.ipc.observer import record_type
 from rtcp.telemetry.recording import Recording
 from rtcp.telemetry.square import PLANES, SIDE_M, NoSquare, Square, distance_from, draw, judge, place
 

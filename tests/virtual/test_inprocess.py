@@ -15,8 +15,8 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.emergency import Emergency as FieldbusEmergency
-from rtcp.runtime.machine import Code, Command
-from rtcp.runtime.machine import State as MachineState
+from rtcp.ipc.machine import Code, Command
+from rtcp.ipc.machine import State as MachineState
 from rtcp.virtual.inprocess import Emergency, InProcessBus, SlaveFacts, SlaveState
 from rtcp.virtual.inprocess_data import InProcessData
 from rtcp.virtual.inprocess_slave import InProcessError

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.paths import control_socket
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.paths import control_socket
 from rtcp.telemetry.trials.bench import NAME, Bench, TrialFailed
 
 START = (0.0, 0.2, 1.57, 0.0, 0.4, 0.0)

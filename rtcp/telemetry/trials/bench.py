@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.client import ControlClient, ControlError
-from rtcp.runtime.machine import State
-from rtcp.runtime.observer import Observer
-from rtcp.runtime.paths import blackboard_file, control_socket, segment_control
-from rtcp.runtime.sentences import Sentences
-from rtcp.runtime.session import read_session
-from rtcp.runtime.steps import target_steps
+from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.machine import State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.paths import blackboard_file, control_socket, segment_control
+from rtcp.ipc.session import read_session
+from rtcp.telemetry.steps import target_steps
 from rtcp.virtual.faults.client import SegmentClient
 
 POLL_S = 0.02

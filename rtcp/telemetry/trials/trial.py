@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.runtime.client import ControlError
-from rtcp.runtime.stops import Rung, bounds, unheard
+from rtcp.ipc.client import ControlError
+from rtcp.ipc.stops import Rung, bounds, unheard
 from rtcp.telemetry.trials.activities import ACTIVITIES, START, Activity
 from rtcp.telemetry.trials.bench import Bench
 

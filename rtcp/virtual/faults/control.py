@@ -20,7 +20,7 @@ from typing import Any
 
 from rtcp.config.checking import shown, unknown_key
 from rtcp.config.faults import FAULTS, parse, sentence_of
-from rtcp.runtime.paths import listens
+from rtcp.ipc.paths import listens
 from rtcp.virtual.faults.book import Book
 from rtcp.virtual.faults.slaves import FaultRefused
 from rtcp.virtual.faults.truth import Truth

@@ -13,7 +13,7 @@ import pytest
 
 from rtcp.config import load
 from rtcp.config.model import ArmConfig
-from rtcp.motion.envelope import SetPointGuard, Verdict
+from rtcp.motion.guards.envelope import SetPointGuard, Verdict
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import Mode, MotionState, Phase, Target
 

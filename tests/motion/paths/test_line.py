@@ -13,10 +13,10 @@ import pytest
 
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
-from rtcp.motion.line import LineMode
+from rtcp.motion.controllers.line import LineMode
 from rtcp.motion.planning import Stop, plan_lines
-from rtcp.motion.rows import COLUMNS, KIND, Wrong
-from rtcp.motion.slerp import quaternion, turn_between
+from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
+from rtcp.motion.planning.slerp import quaternion, turn_between
 from rtcp.motion.state import Phase, Reason
 
 PERIOD = 0.0005

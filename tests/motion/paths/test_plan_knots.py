@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from rtcp.motion.controllers.trajectory import TrajectoryMode
 from rtcp.motion.planning import Plan, PlanRefused, Point, plan_trajectory
-from rtcp.motion.rows import CUBIC, KIND, QUINTIC
+from rtcp.motion.planning.rows import CUBIC, KIND, QUINTIC
 from rtcp.motion.state import Phase
-from rtcp.motion.trajectory import TrajectoryMode
 
 PERIOD = 0.0005
 ZERO = (0.0,) * 6

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from kinematics import forward
+from rtcp.motion.controllers.line import LineMode
 from rtcp.motion.limits import Limits
-from rtcp.motion.line import LineMode
 from rtcp.motion.planning import Plan, PlanRefused, Stop, plan_lines
-from rtcp.motion.rows import LINE
+from rtcp.motion.planning.rows import LINE
 from rtcp.motion.state import Reason
 
 PERIOD = 0.0005

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtcp.motion.controllers.stream import TIMEOUT_S, StreamMode
 from rtcp.motion.state import Phase, Reason
-from rtcp.motion.stream import TIMEOUT_S, StreamMode
 
 PERIOD = 0.0005
 ZERO = [0.0] * 6

@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinematics.model import LinkMass
-from rtcp.motion.envelope import SetPointGuard
+from rtcp.motion.controllers.torque import TorqueMode
+from rtcp.motion.guards.envelope import SetPointGuard
 from rtcp.motion.limits import Limits
 from rtcp.motion.modes import TorqueLaw
 from rtcp.motion.state import MotionState, Phase, Reason
-from rtcp.motion.torque import TorqueMode
 
 PERIOD = 0.0005
 MASS, ARM_M, G = 3.0, 0.4, 9.80665

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.runtime.blackboard import Blackboard
-from rtcp.runtime.codes import Refusal
-from rtcp.runtime.machine import Code, Command, State
-from rtcp.runtime.observer import Observer
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Refusal
+from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.observer import Observer
 from tests.runtime.bench import CONFIG, CST, PERIOD_S, Bench
 
 TORQUE_MODE = 5.0

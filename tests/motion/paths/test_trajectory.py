@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtcp.motion.controllers.trajectory import TrajectoryMode
 from rtcp.motion.planning import PlanRefused, Point, plan_trajectory
-from rtcp.motion.rows import COLUMNS, KIND, Wrong
+from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
 from rtcp.motion.state import MotionState, Phase, Reason
-from rtcp.motion.trajectory import TrajectoryMode
 
 PERIOD = 0.0005
 ZERO = (0.0,) * 6

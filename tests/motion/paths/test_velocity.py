@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, RuckigError
 
+from rtcp.motion.controllers.velocity import VelocityMode
 from rtcp.motion.state import Phase, Reason
-from rtcp.motion.velocity import VelocityMode
 
 PERIOD = 0.0005
 NONE = [0.0] * 6

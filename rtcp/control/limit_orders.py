@@ -1,0 +1,57 @@
+"""The command that changes limits while the arm runs: one transaction, taken whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rtcp.control.arm import Arm
+from rtcp.control.verdict import DONE, Verdict
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Code, Refusal
+from rtcp.ipc.layout import PLANS
+from rtcp.motion.limits import Wrong, read
+
+MOST_ROWS = 64
+"""Six joints and more boxes than an arm is configured with: all are looked at in one cycle."""
+_REFUSALS = {
+    Wrong.NO_LIMIT: Refusal.LIMITS_WRONG,
+    Wrong.FASTER: Refusal.LIMITS_WRONG,
+    Wrong.WIDER: Refusal.LIMITS_NARROW,
+    Wrong.OUTSIDE: Refusal.LIMITS_OUTSIDE,
+}
+
+
+class LimitOrders:
+    """Takes new limits from the plan area.
+
+    Args:
+        arm: the joints.
+        blackboard: where the numbers are, and who is told.
+    """
+
+    def __init__(self, arm: Arm, blackboard: Blackboard) -> None:
+        self._arm = arm
+        self._blackboard = blackboard
+
+    def take(self, lease: int, numbers: Sequence[float]) -> Verdict:
+        """Put the limits of the plan area into force: [slot, rows]; or say why not, and nothing has changed."""
+        arm, slot, count = self._arm, numbers[0], numbers[1]
+        if slot not in range(PLANS) or count not in range(1, MOST_ROWS + 1):
+            return Refusal.LIMITS_WRONG, -1, count, float(MOST_ROWS)
+        new = read(self._blackboard.plan(int(slot)), int(count))
+        if new is None:
+            return Refusal.LIMITS_WRONG, -1, count, float(MOST_ROWS)
+        refused = arm.guards.refuses(arm.state, new)
+        if refused is not None:
+            return _REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
+        limits = arm.limits
+        if arm.first_with_torque() >= 0:
+            for axis, held in enumerate(arm.state.torque):
+                most = new.torque[axis]
+                if most < limits.torque[axis] and abs(held) > most:
+                    return Refusal.LIMITS_WEAK, axis, abs(held), most
+        limits.apply(new)
+        arm.guard.take(limits)
+        arm.motions.generator.set_limits(limits.velocity, limits.acceleration, limits.jerk)
+        self._blackboard.event(Code.LIMITS)
+        return DONE

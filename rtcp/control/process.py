@@ -1,0 +1,219 @@
+"""The loop's process: from a session file to a bus in INIT again, with the cycle between.
+
+It reports on a pipe, a JSON object a line: `phase` sentences, then `ready` with the facts of the start, or `error`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import os
+import signal
+import sys
+import time
+import traceback
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rtcp.config.model import ArmConfig, DeviceDescription
+from rtcp.control.arm import Arm
+from rtcp.control.assembly import assemble, discipline_of, position_of
+from rtcp.control.service import Service
+from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, DriveGoal
+from rtcp.devices.codec import DeviceError, make_codec
+from rtcp.fieldbus.bus import BusError, ProcessData
+from rtcp.fieldbus.pdo import layout
+from rtcp.fieldbus.soem import SoemBus
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.ending import LEFT, write_end
+from rtcp.ipc.paths import blackboard_file
+from rtcp.ipc.session import Session, SessionError, read_session
+from rtcp.ipc.stops import quick_stop_s
+from rtcp.realtime import scheduling
+
+_DISABLE_CYCLES = 20
+_BLIND_WORDS = {DriveGoal.QUICK_STOPPED: QUICK_STOP, DriveGoal.DISABLED: DISABLE_VOLTAGE}
+"""What a drive is told whose driver raises."""
+
+
+class Report:
+    """Tells the launcher how the start goes; silent once nobody listens."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+
+    def tell(self, event: str, **facts: Any) -> None:
+        """Write one line; a launcher that has gone is no error."""
+        if self._descriptor < 0:
+            return
+        line = json.dumps({"event": event, **facts}).encode() + b"\n"
+        try:
+            os.write(self._descriptor, line)
+        except OSError:
+            self._descriptor = -1
+
+    def close(self) -> None:
+        """Close the pipe: nothing more is told."""
+        if self._descriptor >= 0:
+            with contextlib.suppress(OSError):
+                os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def main() -> int:
+    """Run the loop's process.
+
+    Return 0 after an orderly end, `LEFT` where slaves did not come to INIT then, 2 where the bus refused, 1 after a
+    defect of ours.
+    """
+    parser = argparse.ArgumentParser(prog="rtcp.control.process")
+    parser.add_argument("--directory", type=Path, required=True)
+    parser.add_argument("--ready-fd", type=int, required=True)
+    given = parser.parse_args()
+    report = Report(given.ready_fd)
+    try:
+        session = read_session(given.directory / "session.pickle")
+    except SessionError as error:
+        report.tell("error", sentences=[str(error)])
+        sys.stderr.write(f"{error}\n")
+        return 2
+    # Until the cycle runs, SIGTERM unwinds what was opened; then it asks for a controlled stop.
+    signal.signal(signal.SIGTERM, _leave)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    fraction = session.config.bus.receive_fraction
+    bus = SoemBus(session.interface, fraction, namespace_pid=session.segment_pid or None)
+    left: list[str] = []
+    try:
+        bus.open()
+        _work(bus, session, given.directory, report)
+    except (BusError, DeviceError) as error:
+        sentences = list(error.sentences) if isinstance(error, BusError) else [str(error)]
+        report.tell("error", sentences=sentences)
+        sys.stderr.write("\n".join(sentences) + "\n")
+        return 2
+    finally:
+        before = len(bus.notes)
+        bus.close()
+        left += bus.notes[before:]
+        write_end(given.directory, os.getpid(), left)
+        sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
+    return LEFT if left else 0
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> None:
+    config = session.config
+    period_ns = round(config.cycle.period_us * 1000)
+    found = bus.scan()
+    report.tell("phase", text=f"{len(found)} slaves on {session.interface}")
+    (directory / "scan.json").write_text(json.dumps([dataclasses.asdict(slave) for slave in found]))
+    data = bus.configure(config.slaves, period_ns)
+    for note in bus.notes:
+        report.tell("phase", text=note)
+    report.tell("phase", text="all slaves in SAFE-OP")
+    discipline = discipline_of(config)
+    blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
+    cpu = scheduling.choose_cpu(config.cycle.cpu)
+    scheduling.share_interpreter_quickly()
+    service = Service(
+        bus,
+        blackboard,
+        [position_of(config, joint) for joint in config.axes],
+        [joint.name for joint in config.axes],
+        config.bus.op_timeout_s,
+        cpu,
+        config.cycle.priority,
+        config.bus.watch_ms * 1e-3,
+    )
+    parts = assemble(config, data, blackboard, service, discipline)
+    loop = parts.loop
+    realtime = scheduling.Realtime()
+
+    def started() -> None:
+        facts = {
+            "realtime": {
+                "scheduler": realtime.scheduler,
+                "memory_locked": realtime.memory_locked,
+                "cpu": realtime.cpu,
+                "notes": realtime.notes,
+            },
+            "start_to_op_s": round((time.monotonic_ns() - session.began_ns) * 1e-9, 3),
+        }
+        (directory / "started.json").write_text(json.dumps(facts))
+        report.tell("ready", pid=os.getpid(), **facts)
+        report.close()
+
+    service.on_op = started
+    service.clock_followed = lambda: discipline is None or discipline.locked
+    service.on_refused = loop.shut_down
+    service.start()
+    signal.signal(signal.SIGTERM, lambda number, frame: loop.shut_down())
+    scheduling.prepare(realtime, config.cycle.priority, config.cycle.cpu)
+    try:
+        loop.run()
+    except BaseException:
+        # A defect in the cycle: the drives come to rest before the bus goes away.
+        stop_blindly(data, config, parts.arm)
+        raise
+    else:
+        if service.refused:
+            raise BusError(*service.refused)
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        service.finish()
+        scheduling.release(realtime)
+
+
+def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
+    """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
+
+    Nothing else of the cycle is needed, and what raises for one drive or one frame keeps no other from being told.
+    """
+    period_s = config.cycle.period_us * 1e-6
+    drives = arm.pairs if arm.gripper is None else [*arm.pairs, (arm.gripper.slot, arm.gripper.drive)]
+    ramp_cycles = math.ceil(quick_stop_s(config) / period_s)
+    due = time.monotonic()
+    for goal, cycles in ((DriveGoal.QUICK_STOPPED, ramp_cycles), (DriveGoal.DISABLED, _DISABLE_CYCLES)):
+        for _ in range(cycles):
+            for slot, drive in drives:
+                with contextlib.suppress(Exception):
+                    data.set_output(slot, _outputs(drive, data, slot, goal, config.slaves[slot].device))
+            with contextlib.suppress(Exception):
+                data.send()
+                data.receive()
+            # At the cycle's pace: a drive that misses frames between its SYNC0 may leave OP.
+            due = max(due + period_s, time.monotonic())
+            time.sleep(max(due - time.monotonic(), 0.0))
+
+
+def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: DriveGoal, device: DeviceDescription) -> bytes:
+    """Lead a drive one step; where its driver raises, its controlword alone is put where the description has it."""
+    try:
+        drive.decode(data.input(slot))
+        drive.advance(goal)
+        return drive.encode()
+    except Exception:
+        image = layout(device.rpdo)
+        control = image.find("controlword")
+        return make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
+
+
+if __name__ == "__main__":
+    try:
+        code = main()
+    except SystemExit as ending:
+        code = ending.code if isinstance(ending.code, int) else 1
+    except BaseException:
+        # A defect of ours: told whole, for the log.
+        traceback.print_exc()
+        code = 1
+    sys.stderr.flush()
+    # Past the interpreter's own end: with the collector off, ruckig's objects would be reported as leaked there.
+    os._exit(code)

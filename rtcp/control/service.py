@@ -1,0 +1,235 @@
+"""The ordinary thread beside the cycle: the way to OP, the slave watcher's turns, emergencies, SDO errands.
+
+It shares a few plain attributes with the cycle (one writer each) and never holds the interpreter while it waits.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+
+from rtcp.control.errands import Errands
+from rtcp.control.rationed import Rationed
+from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.bus import BusError, SlaveState, WatchedBus
+from rtcp.fieldbus.charges import Charge
+from rtcp.fieldbus.watcher import Watcher
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.realtime.scheduling import thread_beside
+
+_TELL_S = 0.1
+"""Slave states and counters go to the blackboard, and emergencies are looked for, so often."""
+_LOCK_S = 15.0
+_MOST_COMPLAINTS, _MOST_EMERGENCIES = 8, 4
+"""So many different sentences are said in 10 s: of all that failed, and of each slave's emergencies."""
+_ERROR_BIT = 0x10
+
+
+def _nothing() -> None:
+    pass
+
+
+def _always() -> bool:
+    return True
+
+
+class Service(threading.Thread):
+    """Watches the slaves and does for the cycle what takes time.
+
+    Args:
+        bus: the configured bus.
+        blackboard: where slave states and sentences go and requests come from.
+        drive_positions: position on the cable of each joint's drive.
+        joint_names: their names.
+        op_timeout_s: how long the slaves may take from SAFE-OP to OP.
+        cycle_cpu: CPU of the cycle, which this thread keeps off.
+        cycle_priority: the cycle's; this thread's is one below, so that nobody else's work holds it up in mid-turn.
+        watch_s: how long it rests between two turns.
+    """
+
+    def __init__(
+        self,
+        bus: WatchedBus,
+        blackboard: Blackboard,
+        drive_positions: Sequence[int],
+        joint_names: Sequence[str],
+        op_timeout_s: float,
+        cycle_cpu: int,
+        cycle_priority: int,
+        watch_s: float = 0.01,
+    ) -> None:
+        super().__init__(name="service", daemon=True)
+        self._bus = bus
+        self._blackboard = blackboard
+        self._errands = Errands(bus, blackboard)
+        self._watcher: Watcher | None = None
+        self._drive_positions = drive_positions
+        self._joint_names = joint_names
+        self._op_timeout_s = op_timeout_s
+        self._cycle_cpu = cycle_cpu
+        self._cycle_priority = cycle_priority
+        self._watch_s = watch_s
+        self._tell_turns = max(round(_TELL_S / watch_s), 1)
+        self._op_wanted = False
+        self._asked = 0
+        """What the cycle asked last, counted up: odd to park, even to recover."""
+        self._done = 0
+        self._explain = [False] * len(joint_names)
+        self._complaints = Rationed(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
+        self._emergencies: dict[int, Rationed] = {}
+        self._end = threading.Event()
+        self.all_op = False
+        """Whether every slave is in OP, and was since the start or the last `recover`; read by the cycle."""
+        self.lost_slave = 0
+        """Position of a slave that has left OP; 0: none. It stays until `recover`, however soon the slave is back."""
+        self.refused: tuple[str, ...] = ()
+        """Why OP was not reached at the start; the cycle then ends."""
+        self.clock_followed: Callable[[], bool] = _always
+        """Whether the cycle follows the reference clock; slaves that were lost wait in SAFE-OP for it."""
+        self.on_op: Callable[[], None] = _nothing
+        """Called once, from this thread, when all slaves are in OP for the first time."""
+        self.on_refused: Callable[[], None] = _nothing
+        """Called once, from this thread, when the start has failed or the thread cannot go on."""
+
+    # -- what the cycle asks: a plain store each ----------------------------------------------------------------
+
+    def want_op(self) -> None:
+        """Ask for OP; may be said every cycle."""
+        self._op_wanted = True
+
+    def recover(self) -> None:
+        """Ask for the slaves that left OP to be brought back; of this and `park` the last one counts."""
+        self._asked = (self._asked | 1) + 1
+        self.all_op = False
+
+    def park(self) -> None:
+        """Ask for all slaves to be taken to PRE-OP, as an emergency stop ends; `recover` brings them back."""
+        self._asked = (self._asked + 1) | 1
+        self.all_op = False
+
+    def explain_drive(self, axis: int) -> None:
+        """Ask for the drive's error code to be read and put into words; several drives may fail at once."""
+        self._explain[axis] = True
+
+    def finish(self) -> None:
+        """End the thread and wait for it."""
+        self._end.set()
+        if self.is_alive():
+            self.join(timeout=3.0)
+
+    # -- the thread ---------------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Take turns until `finish`. A defect in here ends the loop: nobody would watch the slaves."""
+        try:
+            self._take_turns()
+        except Exception as error:
+            sentence = f"the service thread met a defect ({type(error).__name__}: {error}): the loop ends"
+            self._blackboard.text(sentence)
+            self.refused = (sentence,)
+            self.on_refused()
+            raise
+
+    def _take_turns(self) -> None:
+        thread_beside(self._cycle_cpu, self._cycle_priority - 1)
+        turn = 0
+        while not self._end.wait(self._watch_s):
+            turn += 1
+            # Each part by itself: what one of them meets keeps none of the others from its turn.
+            for part in (self._watch, self._run_errands, self._listen):
+                try:
+                    part(turn)
+                except BusError as error:
+                    self._complain(error)
+        try:
+            self._tell_states(self._bus.read_states())
+        except BusError as error:
+            self._complain(error)
+
+    def _complain(self, error: BusError) -> None:
+        """Say what failed; what fails again in every turn, as where the interface is gone, is said now and then."""
+        for sentence in error.sentences:
+            self._complaints.say(sentence)
+
+    def _watch(self, turn: int) -> None:
+        watcher = self._watcher
+        if watcher is None:
+            if not self.refused:
+                self._start(turn)
+            return
+        asked = self._asked
+        parked = asked & 1 == 1
+        if asked != self._done:
+            self._done = asked
+            self.all_op = False
+            if parked:
+                watcher.park()
+            else:
+                self.lost_slave = 0
+                # After a reset the next fault is told whole, however soon it comes.
+                self._emergencies.clear()
+                watcher.resume()
+        watcher.op_allowed = self.clock_followed()
+        was_well = watcher.all_op
+        left = watcher.turn()
+        if left and self.all_op:
+            self.lost_slave = left
+            self.all_op = False
+        elif watcher.all_op and not (self.lost_slave or parked):
+            self.all_op = True
+        if self._asked != asked:
+            # The cycle asked meanwhile: what was seen was before that.
+            self.all_op = False
+        if turn % self._tell_turns == 0 or not (was_well and watcher.all_op):
+            self._tell_health(watcher)
+
+    def _start(self, turn: int) -> None:
+        if self._op_wanted:
+            self._bus.request_state(AlState.OP)
+            self.refused = self._bus.wait_for_state(AlState.OP, self._op_timeout_s)
+            self._tell_states(self._bus.read_states())
+            if not self.refused:
+                self._watcher = self._bus.watcher(self._blackboard.text)
+                self.all_op = True
+                self.on_op()
+        elif turn * self._watch_s > _LOCK_S:
+            self.refused = (
+                f"the cycle did not lock onto the reference clock within {_LOCK_S:g} s: the frames come too unevenly "
+                "or do not come back (see `rtcp status`, bus.send_phase)",
+            )
+        elif turn % self._tell_turns == 0:
+            self._tell_states(self._bus.read_states())
+        if self.refused:
+            self.on_refused()
+
+    def _run_errands(self, turn: int) -> None:
+        if True in self._explain and not self._errands.explaining:
+            axis = self._explain.index(True)
+            self._explain[axis] = False
+            self._errands.explain(self._joint_names[axis], self._drive_positions[axis])
+        self._errands.take_steps()
+
+    def _listen(self, turn: int) -> None:
+        if turn % self._tell_turns:
+            return
+        for rationed in (self._complaints, *self._emergencies.values()):
+            rationed.tell()
+        if self._watcher is not None and self._watcher.silent:
+            return
+        for emergency in self._bus.emergencies():
+            position = emergency.position
+            if position not in self._emergencies:
+                what = f"emergency messages of slave {position}"
+                self._emergencies[position] = Rationed(self._blackboard.text, _MOST_EMERGENCIES, what)
+            self._emergencies[position].say(emergency.sentence())
+
+    def _tell_states(self, states: Iterable[SlaveState | Charge]) -> None:
+        for slave in states:
+            self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
+
+    def _tell_health(self, watcher: Watcher) -> None:
+        self._tell_states(watcher.slaves)
+        for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
+            self._blackboard.health(
+                slave.position, slave.lost, slave.recovered, errors.rx, errors.forwarded, errors.links
+            )

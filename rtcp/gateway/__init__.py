@@ -1,0 +1,1 @@
+"""The control socket, planning outside the cycle, the black box."""

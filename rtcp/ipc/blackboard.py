@@ -1,0 +1,196 @@
+"""The loop's end of the blackboard: it writes cycle records, events and texts, and takes commands.
+
+Writers and readers share no lock. A record carries its number at both ends, the first written last: a reader that
+finds two different numbers, or another than it wanted, knows that the record is torn or gone.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import struct
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from rtcp.fieldbus.alstatus import AlState
+from rtcp.ipc.layout import (
+    ANSWER,
+    ANSWER_AT,
+    ANSWER_NUMBER_AT,
+    COMMAND,
+    COMMAND_HEAD_AT,
+    COMMAND_TAKEN_AT,
+    COMMANDS,
+    COMMANDS_AT,
+    EVENT,
+    EVENTS,
+    EVENTS_AT,
+    EVENTS_HEAD_AT,
+    HEADER,
+    HEALTH_AT,
+    HEALTH_SIZE,
+    LEASE_DURATION_AT,
+    LEASE_ID_AT,
+    LEASE_RENEWED_AT,
+    MAGIC,
+    PLANS,
+    RECORDS_AT,
+    RECORDS_HEAD_AT,
+    SLAVES_AT,
+    SLAVES_MAX,
+    TEXT,
+    TEXTS,
+    TEXTS_AT,
+    TEXTS_HEAD_AT,
+    RecordLayout,
+    records_for,
+)
+from rtcp.ipc.plans import mark_in_use, place
+from rtcp.ipc.words import Words
+
+_U16, _U32 = 0xFFFF, 0xFFFF_FFFF
+_AL_STATE = 0x0F
+
+
+class Blackboard:
+    """Written by the loop's process alone, but for the lease and the command ring.
+
+    Args:
+        path: file to make, on a memory file system; an older one is replaced.
+        joints: number of joints.
+        period_ns: the cycle.
+    """
+
+    def __init__(self, path: Path, joints: int, period_ns: int) -> None:
+        layout, records = RecordLayout(joints), records_for(period_ns)
+        size = layout.file_size(records)
+        self.path = path
+        self.joints = joints
+        # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
+        fresh = path.with_name(path.name + f".{os.getpid()}")
+        fresh.unlink(missing_ok=True)
+        descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
+        try:
+            os.ftruncate(descriptor, size)
+            self._map = mmap.mmap(descriptor, size)
+        finally:
+            os.close(descriptor)
+        HEADER.pack_into(
+            self._map, 0, MAGIC, joints, layout.size, records, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
+        )
+        os.replace(fresh, path)
+        self._record_size = layout.size
+        self._ring_mask = records - 1
+        # The record without its first number, which is published last.
+        self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
+        self._words = Words(self._map)
+        self._plans = [place(self._map, slot) for slot in range(PLANS)]
+        self._records = 0
+        self._events = 0
+        self._texts = 0
+        self._taken = 0
+        self._text_lock = threading.Lock()
+        # Every page is touched now, so that none is faulted in by the cycle.
+        for page in range(0, size, mmap.PAGESIZE):
+            self._map[page] = self._map[page]
+
+    def publish(self, values: Sequence[float]) -> None:
+        """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
+        number = self._records + 1
+        at = RECORDS_AT + (number & self._ring_mask) * self._record_size
+        words = self._words
+        words[at] = 0
+        words.fence()
+        self._pack_record(self._map, at + 8, *values, number)
+        words.fence()
+        words[at] = number
+        words[RECORDS_HEAD_AT] = number
+        self._records = number
+
+    def event(self, code: int, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        """Append an event: a code that readers put into words."""
+        number = self._events + 1
+        at = EVENTS_AT + (number % EVENTS) * EVENT.size
+        EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), code, axis, value, limit)
+        self._words.fence()
+        self._words[EVENTS_HEAD_AT] = number
+        self._events = number
+
+    def text(self, sentence: str) -> None:
+        """Append a sentence. Not for the cycle; any other thread of the loop's process may call it."""
+        encoded = sentence.encode()[:502]
+        with self._text_lock:
+            number = self._texts + 1
+            at = TEXTS_AT + (number % TEXTS) * TEXT.size
+            TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), encoded)
+            self._words.fence()
+            self._words[TEXTS_HEAD_AT] = number
+            self._texts = number
+
+    def slave(self, position: int, al_status: int, al_status_code: int) -> None:
+        """Note the state of the slave at `position` (from 1)."""
+        if 1 <= position <= SLAVES_MAX:
+            self._words[SLAVES_AT + (position - 1) * 8] = al_status | al_status_code << 16
+
+    def in_op(self, position: int) -> bool:
+        """Whether the slave at `position` was in OP when its state was last noted; beyond what is noted: always."""
+        at = SLAVES_AT + (position - 1) * 8
+        return position > SLAVES_MAX or self._words[at] & _AL_STATE == AlState.OP
+
+    def health(self, position: int, lost: int, recovered: int, rx: int, forwarded: int, links: int) -> None:
+        """Note how often the slave at `position` left OP and came back, and what its ports have counted."""
+        if 1 <= position <= SLAVES_MAX:
+            at = HEALTH_AT + (position - 1) * HEALTH_SIZE
+            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | min(links, _U32) << 32
+            self._words[at + 8] = min(rx, _U32) | min(forwarded, _U32) << 32
+
+    def lease(self) -> tuple[int, int, int]:
+        """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""
+        words = self._words
+        return words[LEASE_ID_AT], words[LEASE_RENEWED_AT], words[LEASE_DURATION_AT]
+
+    def command_waits(self) -> bool:
+        """Whether a command waits to be taken."""
+        return self._words[COMMAND_HEAD_AT] != self._taken
+
+    def take_command(self) -> tuple[float, ...]:
+        """Take the next command: number, lease id, kind, twelve numbers. Only when `command_waits`."""
+        number = self._taken + 1
+        found = COMMAND.unpack_from(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size)
+        self._taken = number
+        self._words[COMMAND_TAKEN_AT] = number
+        return found
+
+    def answer(self, number: int, refusal: int = 0, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
+        """Answer the command `number`: accepted (0) or the code of a refusal with what it is about."""
+        # The number goes in last: a reader that finds its own number finds the whole answer.
+        ANSWER.pack_into(self._map, ANSWER_AT, refusal, axis, value, limit)
+        self._words.fence()
+        self._words[ANSWER_NUMBER_AT] = number
+
+    @property
+    def memory(self) -> mmap.mmap:
+        """The mapped file, for the service thread's own part."""
+        return self._map
+
+    @property
+    def words(self) -> Words:
+        """The same by words."""
+        return self._words
+
+    def plan(self, slot: int) -> memoryview[float]:
+        """Return the doubles of a place for plans, row by row."""
+        return self._plans[slot]
+
+    def use_plan(self, slot: int) -> None:
+        """Say which place is being read from, so that the next plan goes into another; -1: none."""
+        mark_in_use(self._words, slot)
+
+    def close(self) -> None:
+        """Unmap; the file stays for those who read what happened last."""
+        for view in self._plans:
+            view.release()
+        self._words.close()
+        self._map.close()

@@ -1,0 +1,366 @@
+"""The other end of the blackboard: reading what the loop publishes, and commanding it under a lease."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import mmap
+import os
+import struct
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.ipc.layout import (
+    ANSWER,
+    ANSWER_AT,
+    ANSWER_NUMBER_AT,
+    COMMAND,
+    COMMAND_HEAD_AT,
+    COMMAND_NUMBERS,
+    COMMAND_TAKEN_AT,
+    COMMANDS,
+    COMMANDS_AT,
+    EVENT,
+    EVENTS,
+    EVENTS_AT,
+    EVENTS_HEAD_AT,
+    HEADER,
+    HEALTH_AT,
+    HEALTH_SIZE,
+    LEASE_DURATION_AT,
+    LEASE_HOLDER_AT,
+    LEASE_HOLDER_SIZE,
+    LEASE_ID_AT,
+    LEASE_RENEWED_AT,
+    MAGIC,
+    PER_JOINT,
+    RECORDS_AT,
+    RECORDS_HEAD_AT,
+    SCALARS,
+    SERVICE_LENGTH_AT,
+    SERVICE_STATE_AT,
+    SERVICE_TEXT_AT,
+    SERVICE_TEXT_SIZE,
+    SLAVES_AT,
+    TEXT,
+    TEXTS,
+    TEXTS_AT,
+    TEXTS_HEAD_AT,
+    RecordLayout,
+    records_for,
+)
+from rtcp.ipc.plans import write_plan
+from rtcp.ipc.words import Words
+
+_NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
+                "d": "<f8"}  # fmt: skip
+
+
+def record_type(layout: RecordLayout) -> np.dtype[np.void]:
+    """Return the numpy type of a cycle record: the layout's fields, padded to its size."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [(name, _NUMPY_CODES[code]) for name, code in SCALARS]
+    fields += [(name, _NUMPY_CODES[code], (layout.joints,)) for name, code in PER_JOINT]
+    fields.append(("number_again", "<u8"))
+    padding = layout.size - struct.calcsize(layout.format)
+    if padding:
+        fields.append(("padding", "u1", (padding,)))
+    return np.dtype(fields)
+
+
+class BlackboardError(Exception):
+    """The blackboard is not there or is none of ours: a sentence."""
+
+
+class LeaseRefused(Exception):
+    """Another commander holds the lease; `holder` names it."""
+
+    def __init__(self, holder: str) -> None:
+        super().__init__(f"the arm is commanded by {holder}: wait until it has finished, or stop it")
+        self.holder = holder
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in the cycle: a code (see `rtcp.ipc.messages`) and what it is about."""
+
+    number: int
+    time_ns: int
+    """CLOCK_REALTIME, for people: it may be set meanwhile, forwards and back."""
+    monotonic_ns: int
+    """CLOCK_MONOTONIC, as in the cycle records."""
+    code: int
+    axis: int
+    value: float
+    limit: float
+
+
+@dataclass(frozen=True)
+class Text:
+    """A sentence of the loop's service thread."""
+
+    number: int
+    time_ns: int
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Health:
+    """What a slave has been through since the start: how often it left OP and came back, what its ports counted."""
+
+    lost: int
+    recovered: int
+    rx: int
+    """Damaged frames that came in over its own cables."""
+    forwarded: int
+    """Damaged frames that slaves before it had counted."""
+    links: int
+    """Lost links."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The loop's answer to a command: `refusal` 0 is acceptance."""
+
+    refusal: int
+    axis: int
+    value: float
+    limit: float
+
+
+_LOCK_TURNS, _LOCK_WAIT_S = 50, 0.002
+
+
+class Observer:
+    """Reads and commands a blackboard.
+
+    Args:
+        path: the blackboard's file.
+
+    Raises:
+        BlackboardError: where it cannot be opened or is of another version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+        except OSError as error:
+            raise BlackboardError(f"blackboard {path} cannot be opened: {error.strerror}") from error
+        size = os.fstat(self._descriptor).st_size
+        if size < RECORDS_AT or size % 8:
+            os.close(self._descriptor)
+            raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
+        self._map = mmap.mmap(self._descriptor, size)
+        self._words = Words(self._map)
+        magic, joints, record_size, records, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
+        # A number of joints that no record has would be a layout of gigabytes.
+        layout = RecordLayout(joints) if magic == MAGIC and joints <= record_size else None
+        whole = layout is not None and period > 0 and records == records_for(period)
+        if layout is None or not whole or record_size != layout.size or size != layout.file_size(records):
+            self.close()
+            raise BlackboardError(f"blackboard {path} is not of this version (magic 0x{magic:X}): start anew")
+        self.joints = int(joints)
+        self.period_ns = int(period)
+        self.loop_pid = int(pid)
+        self._dtype = record_type(layout)
+        self.records = int(records)
+        """Cycle records that the ring holds."""
+        self._ring = np.frombuffer(self._map, dtype=self._dtype, count=self.records, offset=RECORDS_AT)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if hasattr(self, "_ring"):
+            del self._ring
+        self._words.close()
+        self._map.close()
+        os.close(self._descriptor)
+
+    # -- records ------------------------------------------------------------------------------------------------
+
+    @property
+    def head(self) -> int:
+        """Number of the last record published; 0 before the first."""
+        return self._words[RECORDS_HEAD_AT]
+
+    def latest(self) -> npt.NDArray[np.void] | None:
+        """Return the last record, shape (1,), or None before the first."""
+        for _ in range(100):
+            found, _ = self.since(self.head - 1)
+            if len(found):
+                return found[-1:]
+            if self.head == 0:
+                return None
+        return None
+
+    def since(self, number: int) -> tuple[npt.NDArray[np.void], int]:
+        """Return the records after `number`, oldest first, and how many of them were lost to this reader.
+
+        Lost are those overwritten before they were read, and torn ones.
+        """
+        head = self.head
+        first = max(number + 1, head - self.records + 64, 1)
+        if head < first:
+            return np.empty(0, dtype=self._dtype), 0
+        numbers = np.arange(first, head + 1, dtype=np.uint64)
+        copied = self._ring[(numbers % np.uint64(self.records)).astype(np.intp)]
+        # What the writer reached meanwhile may be torn although both numbers agree: it is dropped.
+        overtaken = self.head - self.records + 1
+        whole = (copied["number"] == numbers) & (copied["number_again"] == numbers) & (numbers > max(overtaken, 0))
+        kept = copied[whole]
+        return kept, int(head - max(number, 0)) - len(kept)
+
+    # -- events and texts ---------------------------------------------------------------------------------------
+
+    def events_since(self, number: int) -> list[Event]:
+        """Return the events after `number`, oldest first."""
+        head = self._words[EVENTS_HEAD_AT]
+        found = []
+        for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
+            values = EVENT.unpack_from(self._map, EVENTS_AT + (wanted % EVENTS) * EVENT.size)
+            if values[0] == wanted:
+                found.append(Event(*values))
+        return found
+
+    def texts_since(self, number: int) -> list[Text]:
+        """Return the sentences after `number`, oldest first."""
+        head = self._words[TEXTS_HEAD_AT]
+        found = []
+        for wanted in range(max(number + 1, head - TEXTS + 1, 1), head + 1):
+            made, when, length, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
+            if made == wanted:
+                found.append(Text(made, when, text[:length].decode(errors="replace")))
+        return found
+
+    def slaves(self, count: int) -> list[tuple[int, int]]:
+        """Return AL status and AL status code of the first `count` slaves."""
+        found = [self._words[SLAVES_AT + i * 8] for i in range(count)]
+        return [(word & 0xFFFF, word >> 16 & 0xFFFF) for word in found]
+
+    def health(self, count: int) -> list[Health]:
+        """Return what the first `count` slaves have been through."""
+        found = []
+        for at in range(HEALTH_AT, HEALTH_AT + count * HEALTH_SIZE, HEALTH_SIZE):
+            life, errors = self._words[at], self._words[at + 8]
+            found.append(
+                Health(life & 0xFFFF, life >> 16 & 0xFFFF, errors & 0xFFFF_FFFF, errors >> 32, life >> 32)
+            )  # fmt: skip
+        return found
+
+    # -- the lease ----------------------------------------------------------------------------------------------
+
+    def holder(self) -> str:
+        """Return the name of who holds a lease that has not run out, or an empty string."""
+        if self._words[LEASE_ID_AT] == 0 or self._run_out():
+            return ""
+        name = bytes(self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE])
+        shown = "".join(letter for letter in name.decode(errors="replace") if letter.isprintable())
+        return shown or "an unnamed commander"
+
+    def _run_out(self) -> bool:
+        return time.monotonic_ns() - self._words[LEASE_RENEWED_AT] > self._words[LEASE_DURATION_AT]
+
+    @contextlib.contextmanager
+    def _alone(self) -> Iterator[None]:
+        for turn in range(_LOCK_TURNS):
+            try:
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if turn == _LOCK_TURNS - 1:
+                    raise BlackboardError("the lease is locked by another process that does not let go") from None
+                time.sleep(_LOCK_WAIT_S)
+        try:
+            yield
+        finally:
+            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+
+    def acquire(self, name: str, duration_s: float) -> int:
+        """Take the lease for `name`; return its id.
+
+        Raises:
+            LeaseRefused: while another holds it.
+        """
+        with self._alone():
+            if holder := self.holder():
+                raise LeaseRefused(holder)
+            words, now = self._words, time.monotonic_ns()
+            words[LEASE_ID_AT] = 0
+            encoded = name.encode()[:LEASE_HOLDER_SIZE].ljust(LEASE_HOLDER_SIZE, b"\0")
+            self._map[LEASE_HOLDER_AT : LEASE_HOLDER_AT + LEASE_HOLDER_SIZE] = encoded
+            words[LEASE_DURATION_AT] = int(duration_s * 1e9)
+            words[LEASE_RENEWED_AT] = now
+            words.fence()
+            words[LEASE_ID_AT] = now
+            return now
+
+    def renew(self, lease: int) -> bool:
+        """Renew the lease; return False where it is no longer this one or has run out."""
+        with self._alone():
+            if self._words[LEASE_ID_AT] != lease or self._run_out():
+                return False
+            self._words[LEASE_RENEWED_AT] = time.monotonic_ns()
+            return True
+
+    def release(self, lease: int) -> None:
+        """Give the lease back; does nothing where it is another's by now."""
+        with self._alone():
+            if self._words[LEASE_ID_AT] == lease:
+                self._words[LEASE_ID_AT] = 0
+
+    # -- commands -----------------------------------------------------------------------------------------------
+
+    def command(self, lease: int, kind: int, numbers: Sequence[float] = ()) -> int:
+        """Put a command into the ring; return its number. The lease's holder is the only writer.
+
+        Raises:
+            BlackboardError: where the loop takes no commands any more (the ring is full).
+        """
+        number = self._words[COMMAND_HEAD_AT] + 1
+        if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
+            raise BlackboardError("the loop takes no commands: its process hangs or is gone")
+        padded = [*numbers, *([0.0] * (COMMAND_NUMBERS - len(numbers)))]
+        COMMAND.pack_into(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size, number, lease, kind, *padded)
+        self._words.fence()
+        self._words[COMMAND_HEAD_AT] = number
+        return number
+
+    def write_plan(self, rows: Sequence[Sequence[float]]) -> int:
+        """Write a plan, rows of up to 20 numbers, for a command that names the slot which is returned.
+
+        Raises:
+            PlanTooLong: where it does not fit.
+        """
+        return write_plan(self._map, self._words, rows)
+
+    def answer(self, number: int) -> Answer | None:
+        """Return the loop's answer to the command `number`, or None while there is none."""
+        if self._words[ANSWER_NUMBER_AT] != number:
+            return None
+        return Answer(*ANSWER.unpack_from(self._map, ANSWER_AT))
+
+    # -- the service thread -------------------------------------------------------------------------------------
+
+    def ask_service(self, request: dict[str, Any]) -> None:
+        """Leave a request for the service thread. One at a time: the caller sees to it."""
+        text = json.dumps(request).encode()
+        if len(text) > SERVICE_TEXT_SIZE:
+            raise BlackboardError(f"the request is {len(text)} bytes long, at most {SERVICE_TEXT_SIZE} fit")
+        self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(text)] = text
+        self._words[SERVICE_LENGTH_AT] = len(text)
+        self._words.fence()
+        self._words[SERVICE_STATE_AT] = 1
+
+    def service_answer(self) -> dict[str, Any] | None:
+        """Return the service thread's answer, or None while there is none."""
+        if self._words[SERVICE_STATE_AT] != 2:
+            return None
+        length = self._words[SERVICE_LENGTH_AT]
+        found: dict[str, Any] = json.loads(bytes(self._map[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
+        self._words[SERVICE_STATE_AT] = 0
+        return found

@@ -1,0 +1,1 @@
+"""Motion controllers: what moves the set-points on by a cycle."""

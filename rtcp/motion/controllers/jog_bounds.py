@@ -1,0 +1,265 @@
+"""What holds a jogged tool back: joint ranges, boxes and singularities, as bounds of the tool velocity.
+
+A bound is a row r and a speed b >= 0: r . (vx, vy, vz, wx, wy, wz) <= b. Where one is passed, the part of the motion
+that passes it is taken away and the rest slides along (`slide`); singularities halt the whole of it instead (`halt`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+
+from kinematics.pose import Pose
+from rtcp.motion.controllers.jog_inverse import JogInverse, Row
+from rtcp.motion.guards.envelope import SetPointGuard
+from rtcp.motion.guards.zones import ELBOW, TOOL, Clearance
+from rtcp.motion.limits import Limits
+
+STANDOFF_M = 0.008
+"""The points of the arm come so near to a box; what the guard's own stop needs beside it is less."""
+_GUARD_M = 0.003
+JOINT_MARGIN_RAD = 2e-4
+_BRAKES = 0.5
+"""Part of a joint's acceleration that its braking envelope uses: the rest is for following the path."""
+_WITHIN_M = 0.13
+_FASTEST_POINT_M_S = 2.0
+_PASSES = 6
+_TOLERANCE = 1e-9
+
+
+class JogBounds:
+    """Bounds of one arm at one configuration.
+
+    Args:
+        limits: of the joints and where the boxes are; read every cycle.
+        guards: its zones tell the clearances.
+        inverse: what the joints do at this configuration.
+        braking: deceleration before a box, m/s^2.
+        singularity: nearest distances, m, rad, rad; 0: none.
+        dt: the cycle, s.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        guards: SetPointGuard,
+        inverse: JogInverse,
+        braking: float,
+        singularity: Sequence[float],
+        dt: float,
+    ) -> None:
+        self._limits, self._inverse, self._dt = limits, inverse, dt
+        self._zones = guards.zones
+        self._braking = braking
+        self._nearest = tuple(singularity)
+        self.near: Sequence[Clearance] = ()
+        self._idle = 0
+        self._boxes: object = None
+        self._turn2 = 1.0 / inverse.length**2
+        self.axis = self.box = self.singular = -2
+        """What held the motion back in this cycle: joint, box (-1: the inner one), singularity; -2: none."""
+
+    def look(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
+        """Find the boundaries that are near. They are looked for again when a point can have come near to one."""
+        self.axis = self.box = self.singular = -2
+        self._position = position
+        zones, limits = self._zones, self._limits
+        self.watched = zones is not None and zones.any
+        if zones is None or not self.watched:
+            self.near = ()
+            return
+        boxes = (limits.box, limits.keep_out)
+        self._idle -= 1
+        if self._idle > 0 and not jumped and boxes == self._boxes:
+            return
+        self._boxes = boxes
+        self.near = zones.clearances(poses, _WITHIN_M)
+        self._idle = 0
+        if not self.near:
+            self._idle = int((zones.distance(poses)[0] - _WITHIN_M) / (_FASTEST_POINT_M_S * self._dt))
+
+    def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
+        """Return whether `twist`, with its joint speeds, passes a bound: `slide` is for that."""
+        if self.near or self._inverse.lost:
+            return True
+        limits, q = self._limits, self._position
+        low, high, acceleration = limits.low, limits.high, limits.acceleration
+        for i in range(6):
+            v = speeds[i]
+            room = (high[i] - q[i] if v > 0.0 else q[i] - low[i]) - JOINT_MARGIN_RAD
+            # v^2 > 2 a room, with room for the steps of time
+            if v * v > 1.8 * _BRAKES * acceleration[i] * room and v:
+                return True
+        return False
+
+    def slide(self, poses: Sequence[Pose], twist: list[float], moves: bool, turns: bool) -> bool:
+        """Take away from `twist` what the bounds do not allow; return False where nothing is left: the tool stands.
+
+        A motion that only moves the tool is not made one that turns it, nor the other way round.
+
+        Args:
+            poses: `frames` of the configuration.
+            twist: vx, vy, vz, wx, wy, wz along the base's axes; changed.
+            moves: whether positions may be changed.
+            turns: whether directions may.
+        """
+        weight = (1.0 if moves else 0.0, self._turn2 if turns else 0.0)
+        basis: list[Sequence[float]] = []
+        for row in self._inverse.lost:
+            along = _along(row, twist)
+            if (along > _TOLERANCE or along < -_TOLERANCE) and not _taken(twist, row, along, weight, basis):
+                return False
+        for _ in range(_PASSES):
+            worst, excess = self._worst(poses, twist)
+            if worst is None:
+                return True
+            if not _taken(twist, worst, excess, weight, basis):
+                return False
+        return self._worst(poses, twist)[0] is None
+
+    def _worst(self, poses: Sequence[Pose], twist: Sequence[float]) -> tuple[Row | None, float]:
+        """Return the bound that is passed most, and by how much; m/s and rad/s count alike."""
+        limits, dt = self._limits, self._dt
+        low, high, acceleration, fastest = limits.low, limits.high, limits.acceleration, limits.velocity
+        a, b, c, d, e, f = twist
+        q = self._position
+        worst: Row | None = None
+        most = _TOLERANCE
+        for i, row in enumerate(self._inverse.rows):
+            r0, r1, r2, r3, r4, r5 = row
+            speed = r0 * a + r1 * b + r2 * c + r3 * d + r4 * e + r5 * f
+            if speed > 0.0:
+                room = high[i] - JOINT_MARGIN_RAD - q[i]
+            else:
+                room = q[i] - low[i] - JOINT_MARGIN_RAD
+                speed = -speed
+                r0, r1, r2, r3, r4, r5 = -r0, -r1, -r2, -r3, -r4, -r5
+            rate = _BRAKES * acceleration[i]
+            if room * rate * 2.0 > fastest[i] * fastest[i] * 1.1:
+                continue
+            excess = speed - stopping(room, rate, dt)
+            if excess > most:
+                worst, most, self.axis = (r0, r1, r2, r3, r4, r5), excess, i
+        for clearance in self.near:
+            row = self._approach(poses, clearance)
+            excess = _along(row, twist) - stopping(clearance.distance - STANDOFF_M, self._braking, dt)
+            if excess > most:
+                worst, most, self.box = row, excess, clearance.box
+        return worst, most
+
+    def _approach(self, poses: Sequence[Pose], clearance: Clearance) -> Row:
+        """Return the row of the speed with which a point comes nearer to a boundary."""
+        x, y, z = clearance.normal
+        x, y, z = -x, -y, -z
+        if clearance.point == TOOL:
+            return x, y, z, 0.0, 0.0, 0.0
+        if clearance.point != ELBOW:
+            ox, oy, oz = self._inverse.to_centre
+            return x, y, z, oy * z - oz * y, oz * x - ox * z, ox * y - oy * x
+        px, py, pz = poses[ELBOW][0]
+        total = [0.0] * 6
+        for i in (0, 1):
+            k = _lever(poses[i], px, py, pz, x, y, z)
+            row = self._inverse.rows[i]
+            for j in range(6):
+                total[j] += k * row[j]
+        a, b, c, d, e, f = total
+        return a, b, c, d, e, f
+
+    def halt(self, twist: Sequence[float]) -> float:
+        """Return the part of `twist`, 0 to 1, with which it comes to rest before a singularity."""
+        share = 1.0
+        inverse, limits = self._inverse, self._limits
+        for which in range(3):
+            nearest = self._nearest[which]
+            distance = inverse.distance[which]
+            if nearest == 0.0 or inverse.locked[which] or distance > 6.0 * nearest + 0.2:
+                continue
+            approach = -_along(inverse.rate[which], twist)
+            if approach <= _TOLERANCE:
+                continue
+            # The envelope begins at three times the nearest distance with the greatest speed there is.
+            greatest, rate = 0.25, 0.25
+            if which:
+                joint = 2 * which
+                greatest, rate = limits.velocity[joint], 0.35 * limits.acceleration[joint]
+            slow = 0.25 * greatest * greatest / nearest
+            allowed = stopping(distance - nearest, slow if slow < rate else rate, self._dt)
+            if approach * share > allowed:
+                share = allowed / approach
+                self.singular = which
+        return share
+
+    def stoppable(self, poses: Sequence[Pose], speeds: Sequence[float]) -> float:
+        """Return the part of the joint speeds, 0 to 1, from which each joint's own stop stays out of the boxes.
+
+        That stop bends away from the tool's line. To first order a point is displaced by its lever times v^2 / 2a of
+        each joint; those that lead towards the box are summed up.
+        """
+        share = 1.0
+        acceleration = self._limits.acceleration
+        for clearance in self.near:
+            point = clearance.point
+            x, y, z = clearance.normal
+            px, py, pz = poses[point][0]
+            travel = 0.0
+            for i in range(2 if point == ELBOW else 4 if point != TOOL else 6):
+                v = speeds[i]
+                towards = -_lever(poses[i], px, py, pz, x, y, z) * v
+                if towards > 0.0:
+                    travel += towards * (v if v > 0.0 else -v) / acceleration[i]
+            travel *= 0.5
+            distance = clearance.distance
+            room = max(distance - _GUARD_M, 0.4 * distance)
+            if room > 0.0 and travel * share * share > room:
+                share = sqrt(room / travel)
+                self.box = clearance.box
+        return share
+
+
+def stopping(room: float, rate: float, dt: float) -> float:
+    """Return the speed from which one comes to rest within `room` with the deceleration `rate`, in steps of `dt`."""
+    if room <= 0.0:
+        return 0.0
+    half = 0.5 * rate * dt
+    return sqrt(half * half + 2.0 * rate * room) - half
+
+
+def _lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:
+    """Return the speed along (x, y, z) of a point for 1 rad/s about the axis of a frame."""
+    (ox, oy, oz), (_, _, ax, _, _, ay, _, _, az) = pose
+    rx, ry, rz = px - ox, py - oy, pz - oz
+    return (ay * rz - az * ry) * x + (az * rx - ax * rz) * y + (ax * ry - ay * rx) * z
+
+
+def _along(row: Row, twist: Sequence[float]) -> float:
+    a, b, c, d, e, f = row
+    g, h, i, j, k, m = twist
+    return a * g + b * h + c * i + d * j + e * k + f * m
+
+
+def _taken(
+    twist: list[float], row: Row, excess: float, weight: tuple[float, float], basis: list[Sequence[float]]
+) -> bool:
+    """Take `excess` along a row from the twist and leave what was taken before as it is; False where that cannot be."""
+    move, turn = weight
+    a, b, c, d, e, f = row
+    g, h, i, j, k, m = move * a, move * b, move * c, turn * d, turn * e, turn * f
+    whole = a * g + b * h + c * i + d * j + e * k + f * m
+    for other in basis:
+        part = _along(row, other)
+        g, h, i = g - part * other[0], h - part * other[1], i - part * other[2]
+        j, k, m = j - part * other[3], k - part * other[4], m - part * other[5]
+    left = a * g + b * h + c * i + d * j + e * k + f * m
+    if left <= 1e-6 * whole or left <= 1e-12:
+        return False
+    part = excess / left
+    twist[0] -= part * g
+    twist[1] -= part * h
+    twist[2] -= part * i
+    twist[3] -= part * j
+    twist[4] -= part * k
+    twist[5] -= part * m
+    n = 1.0 / sqrt(left)
+    basis.append((g * n, h * n, i * n, j * n, k * n, m * n))
+    return True

@@ -1,0 +1,196 @@
+"""The guard's own stop: how far it can carry the arm, and whether it touches a box.
+
+From the mean speeds w of a cycle on, each joint's speed falls by u = a dt a cycle; where less than u is left, to 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import inf, sqrt
+
+from kinematics.forward import frames
+from kinematics.pose import Pose
+from rtcp.motion.guards.zones import INNER_BOX, Gap, Zones, inside, outside
+from rtcp.motion.limits import Corners
+
+_MOST_SAMPLES = 16
+"""A way that needs more, beside a box at full speed, counts as touching it: a cycle has no time for all of them."""
+_ROUNDING_M = 1e-12
+_INSIDE_SAMPLES = 8
+
+
+def fastest_stoppable(room: float, u: float, dt: float) -> float:
+    """Return the greatest mean speed of a cycle after which the stop ends within `room` of where the cycle began.
+
+    With n = floor(w / u) the cycle and its stop travel ((n + 1) w - u n (n + 1) / 2) dt, which is solved for w.
+
+    Args:
+        room: rad; nothing is left of it below 0.
+        u: what the speed falls by in a cycle, rad/s.
+        dt: the cycle, s.
+    """
+    if room <= 0.0:
+        return 0.0
+    n = int(0.5 * (sqrt(1.0 + 8.0 * room / (u * dt)) - 1.0))
+    return room / ((n + 1) * dt) + 0.5 * n * u
+
+
+def travel(
+    mean: Sequence[float], acceleration: Sequence[float], reach: Sequence[float], dt: float
+) -> tuple[float, float]:
+    """Return how far any watched point moves at most, m: in a cycle with these mean speeds, and with its stop."""
+    step = stop = 0.0
+    for i, w in enumerate(mean):
+        if w:
+            step += (w if w > 0.0 else -w) * reach[i]
+            stop += w * w / acceleration[i] * reach[i]
+    step *= dt
+    return step, step + 0.5 * stop
+
+
+def touched(
+    zones: Zones,
+    before: Sequence[Pose],
+    poses: Sequence[Pose],
+    q: Sequence[float],
+    mean: Sequence[float],
+    acceleration: Sequence[float],
+    dt: float,
+) -> tuple[int, float] | None:
+    """Return the box that a cycle and the stop after it would touch, with a signed distance (m), or None.
+
+    Between two samples a point is no farther from its chord than `_Stop.bend`: it passes no face of a box that both
+    ends are so far in front of. A point that is inside a box, or nearer to it than a cycle's bend, may only come out.
+
+    Args:
+        zones: the boxes.
+        before: `frames` of what is commanded now.
+        poses: `frames` of `q`.
+        q: what is to be commanded, rad.
+        mean: mean speeds of the cycle that leads there, rad/s.
+        acceleration: of each joint, rad/s^2.
+        dt: the cycle, s.
+    """
+    step, whole = travel(mean, acceleration, zones.reach, dt)
+    gaps = zones.gaps(before, whole)
+    if not gaps:
+        return None
+    stop = _Stop(q, mean, acceleration, zones.reach, dt)
+    gaps, bad = _next(gaps, poses, stop.bend(dt), step, True)
+    if bad is not None:
+        return bad.box, bad.distance
+    time, left, length = 0.0, stop.left(0.0), 0.0
+    for _ in range(_MOST_SAMPLES):
+        if time >= stop.duration or min([gap.distance for gap in gaps]) > left:
+            return None
+        length = min(length or stop.stride(gaps), stop.duration - time)
+        once = length < 1.5 * dt
+        ahead = stop.left(time + length)
+        after, bad = _next(gaps, frames(zones.model, stop.at(time + length)), stop.bend(length), left - ahead, once)
+        if bad is None:
+            gaps, time, left, length = after, time + length, ahead, 0.0
+        elif once or bad.distance < 0.0:
+            return bad.box, bad.distance
+        else:
+            length = max(int(0.5 * length / dt), 1) * dt
+    nearest = min(gaps)
+    return nearest.box, nearest.distance
+
+
+def _next(
+    gaps: Sequence[Gap], poses: Sequence[Pose], bend: float, length: float, once: bool
+) -> tuple[list[Gap], Gap | None]:
+    """Return the gaps at the next sample, at most `length` (m) along the way, and the first that is not free."""
+    after: list[Gap] = []
+    for gap in gaps:
+        near, number, point, corners, place = gap
+        there = poses[point][0]
+        x, y, z = there
+        if number == INNER_BOX:
+            distance = inside(x, y, z, corners)
+            free, out = near >= bend and distance >= bend, True
+        else:
+            distance = outside(x, y, z, corners)
+            free = near + distance > length or _before_one_face(place, there, corners, bend)
+            # Nor is it out that a thin box lies between: who was outside stays before the same face.
+            out = near < -_ROUNDING_M or _before_one_face(place, there, corners, -_ROUNDING_M)
+        new = Gap(distance, number, point, corners, there)
+        if not free and not (out and distance >= near - _ROUNDING_M and (near < 0.0 or (once and near < bend))):
+            return after, new
+        after.append(new)
+    return after, None
+
+
+def _before_one_face(
+    one: tuple[float, float, float], other: tuple[float, float, float], corners: Corners, bend: float
+) -> bool:
+    """Return whether both points are at least `bend` in front of the same face of a box."""
+    for axis in range(3):
+        low, high, p, q = corners[axis] - bend, corners[axis + 3] + bend, one[axis], other[axis]
+        if (p <= low and q <= low) or (p >= high and q >= high):
+            return True
+    return False
+
+
+class _Stop:
+    """The way of a stop from `q` (rad) with the mean speeds `mean` (rad/s); times from its beginning, s."""
+
+    def __init__(
+        self,
+        q: Sequence[float],
+        mean: Sequence[float],
+        acceleration: Sequence[float],
+        reach: Sequence[float],
+        dt: float,
+    ) -> None:
+        self._dt = dt
+        self._q = q
+        self._moving = []
+        self.duration = bound = speeds = swept = 0.0
+        for i, w in enumerate(mean):
+            if w:
+                speed, rate = abs(w), acceleration[i]
+                ends = int(speed / (rate * dt)) * dt
+                self._moving.append((i, speed, 1.0 if w > 0.0 else -1.0, rate, ends, reach[i]))
+                self.duration = max(self.duration, ends)
+                bound += rate * reach[i]
+                speeds += speed
+                swept += speed * reach[i]
+        self._bound = bound + speeds * swept
+        """No watched point's second derivative is greater, m/s^2."""
+
+    def at(self, time: float) -> list[float]:
+        """Return where the joints are."""
+        q, dt = list(self._q), self._dt
+        for i, speed, sign, rate, ends, _ in self._moving:
+            t = time if time < ends else ends
+            q[i] += sign * (speed - 0.5 * rate * (t + dt)) * t
+        return q
+
+    def left(self, time: float) -> float:
+        """Return how far any watched point still moves at most, m."""
+        left, dt = 0.0, self._dt
+        for _, speed, _, rate, ends, reach in self._moving:
+            if time < ends:
+                left += reach * ((speed - 0.5 * rate * (ends + dt)) * ends - (speed - 0.5 * rate * (time + dt)) * time)
+        return left
+
+    def bend(self, length: float) -> float:
+        """Return how far a point is from the chord of a piece so long (s) at most, m.
+
+        A speed that jumps by up to u / 2 where a joint comes to rest counts as well: u length / 8.
+        """
+        return 0.125 * self._bound * length * (length + self._dt)
+
+    def stride(self, gaps: Sequence[Gap]) -> float:
+        """Return how far to go to the next sample, s: whole cycles, in which no point bends by half of its distance."""
+        dt, least, most = self._dt, inf, self.duration
+        for gap in gaps:
+            if gap.distance < 0.0:
+                most = self.duration / _INSIDE_SAMPLES
+            elif gap.distance < least:
+                least = gap.distance
+        # A joint whose axis goes through the tool moves no point: nothing bends.
+        if least < inf and self._bound > 0.0:
+            most = min(most, sqrt(0.25 * dt * dt + 4.0 * least / self._bound) - 0.5 * dt)
+        return max(int(most / dt), 1) * dt

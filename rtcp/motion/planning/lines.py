@@ -1,0 +1,243 @@
+"""Plans of straight lines: every point in reach on one branch, off singularities, inside limits and zones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import ceil, hypot, inf, isfinite, sqrt
+from typing import TYPE_CHECKING
+
+from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
+
+from kinematics.forward import forward
+from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import singularity_distances
+from kinematics.model import ArmModel
+from kinematics.pose import Pose
+from rtcp.config.operation import CartesianConfig
+from rtcp.motion.planning.plan import Plan, PlanRefused, Stop, ZoneAt
+from rtcp.motion.planning.rows import LINE
+from rtcp.motion.planning.slerp import Quaternion, quaternion, rotation, turn_between, turned_by
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Limits
+
+MOST_PIECES = 4096
+SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
+"""A line is looked at whenever the tool has moved or turned so far."""
+_JUMP_RAD = 0.3
+"""A joint that moves by more between two samples changes its branch, or is at a singularity."""
+_NO_WAY_M, _NO_WAY_RAD = 1e-6, 1e-6
+_OF_LIMIT = 0.95
+"""Of a joint's limits a line uses so much: between the samples they hold too."""
+_SAME_RAD = 1e-3
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A straight piece, the joints along it, and where it stands in the list of stops."""
+
+    number: int
+    start: Pose
+    end: Pose
+    turns: tuple[Quaternion, Quaternion]
+    length: float
+    angle: float
+    joints: list[tuple[float, ...]]
+    speed: float
+
+
+def plan_lines(
+    model: ArmModel,
+    limits: Limits,
+    cartesian: CartesianConfig,
+    q_now: Sequence[float],
+    stops: Sequence[Stop],
+    *,
+    speed: float | None = None,
+    zone_at: ZoneAt | None = None,
+) -> Plan:
+    """Return the plan of straight lines for `LineMode`, from where the arm is to each stop in turn, at rest at each.
+
+    Args:
+        model: the arm.
+        limits: of the joints; where a line would break them it is slowed down.
+        cartesian: speeds, accelerations and jerks of the tool, and how near to a singularity it may come.
+        q_now: where the arm is commanded, at rest, rad, shape (6,).
+        stops: at least one; a stop where the tool is already is passed over.
+        speed: m/s, where a stop has none of its own; None: that of `cartesian`.
+        zone_at: looked at in every sample.
+
+    Raises:
+        PlanRefused: with the stop, the distance along its line, what was found and what is allowed.
+    """
+    if not stops:
+        raise PlanRefused("the path has no poses, at least one is needed")
+    if len(stops) > MOST_PIECES:
+        raise PlanRefused(f"the path has {len(stops)} poses, at most {MOST_PIECES} are allowed")
+    inverse = InverseKinematics(model)
+    rows: list[tuple[float, ...]] = []
+    here, q = forward(model, q_now), tuple(q_now)
+    length = 0.0
+    slowed = 1.0
+    for number, stop in enumerate(stops, 1):
+        where = f"the line to pose {number}" if len(stops) > 1 else "the line"
+        goal = _goal(model, stop, where)
+        fast = _speed(stop, speed, cartesian, where)
+        turns = quaternion(here.rotation), quaternion(goal.rotation)
+        way = hypot(*(b - a for a, b in zip(here.position, goal.position, strict=True)))
+        _, angle = turn_between(*turns)
+        if way > _NO_WAY_M or angle > _NO_WAY_RAD:
+            joints = _follow(inverse, limits, cartesian, here, goal, q, where, zone_at)
+            piece = _Piece(number, here, goal, turns, way, angle, joints, fast)
+            row, part = _timed(piece, limits, cartesian, where)
+            rows.append(row)
+            length, slowed = length + way, min(slowed, part)
+            q, here = joints[-1], goal
+        _same_branch(stop, q, where, model)
+    if not rows:
+        raise PlanRefused("the tool is already where the path leads, there is nothing to move")
+    duration = 0.0
+    for at in range(len(rows) - 1, -1, -1):
+        duration += rows[at][18]
+        rows[at] = (*rows[at][:18], duration, rows[at][19])
+    return Plan(tuple(rows), duration, length, slowed, q)
+
+
+def _goal(model: ArmModel, stop: Stop, where: str) -> Pose:
+    given = stop.pose if stop.q is None else stop.q
+    if given is None or (stop.pose is not None and stop.q is not None):
+        raise PlanRefused(f"{where}: either a pose or joint positions are needed")
+    if len(given) != 6:
+        raise PlanRefused(f"{where}: found {len(given)} numbers, 6 are needed")
+    for number in given:
+        if not isfinite(number):
+            raise PlanRefused(f"{where}: found {number} in its end, numbers are needed")
+    return Pose.from_xyzrpy(*given) if stop.q is None else forward(model, given)
+
+
+def _speed(stop: Stop, of_path: float | None, cartesian: CartesianConfig, where: str) -> float:
+    speed = stop.speed if stop.speed is not None else of_path if of_path is not None else cartesian.speed
+    if not isfinite(speed) or not 0.0 < speed <= cartesian.speed:
+        raise PlanRefused(
+            f"{where}: found a speed of {speed:g} m/s, allowed is more than 0 and at most {cartesian.speed:g} m/s "
+            f"(cartesian.speed)"
+        )
+    return speed
+
+
+def _follow(
+    inverse: InverseKinematics,
+    limits: Limits,
+    cartesian: CartesianConfig,
+    start: Pose,
+    end: Pose,
+    q: tuple[float, ...],
+    where: str,
+    zone_at: ZoneAt | None,
+) -> list[tuple[float, ...]]:
+    """Return the joints along the line, looked at in every sample."""
+    from_q, to_q = quaternion(start.rotation), quaternion(end.rotation)
+    axis, angle = turn_between(from_q, to_q)
+    way = [b - a for a, b in zip(start.position, end.position, strict=True)]
+    length = hypot(*way)
+    count = max(8, ceil(length / SAMPLE_M), ceil(angle / SAMPLE_RAD))
+    turned = rotation(from_q)
+    found: list[tuple[float, ...]] = []
+    names = inverse.model.joint_names
+    for k in range(count + 1):
+        x = k / count
+        place = f"{where} at {x * length:.3f} m of {length:.3f} m" if length > 1e-4 else (
+            f"{where} at {x * angle:.3f} rad of {angle:.3f} rad"
+        )  # fmt: skip
+        px, py, pz = (a + x * w for a, w in zip(start.position, way, strict=True))
+        pose = Pose((px, py, pz), turned_by(turned, axis, x * angle))
+        near = inverse.solve_near(pose, q)
+        if near.q is None:
+            raise PlanRefused(f"{place}: {near.reason}")
+        _check_singular(inverse.model, near.q, cartesian, place)
+        for i, (before, after) in enumerate(zip(q, near.q, strict=True)):
+            if abs(after - before) > _JUMP_RAD:
+                raise PlanRefused(f"{place}: {names[i]} would have to jump from {before:.3f} to {after:.3f} rad")
+            if not limits.low[i] <= after <= limits.high[i]:
+                raise PlanRefused(
+                    f"{place}: {names[i]} would be at {after:.4f} rad, allowed is "
+                    f"{limits.low[i]:g} to {limits.high[i]:g} rad"
+                )
+        if zone_at is not None and (box := zone_at(near.q)) is not None:
+            raise PlanRefused(f"{place}: the arm would be in {box}")
+        q = near.q
+        found.append(q)
+    return found
+
+
+def _check_singular(model: ArmModel, q: Sequence[float], cartesian: CartesianConfig, place: str) -> None:
+    distances = singularity_distances(model, q)
+    allowed = cartesian.singularity
+    for what, unit, found, least in (
+        ("shoulder", "m", distances.shoulder, allowed.shoulder),
+        ("elbow", "rad", distances.elbow, allowed.elbow),
+        ("wrist", "rad", distances.wrist, allowed.wrist),
+    ):
+        if found is not None and found < least:
+            raise PlanRefused(
+                f"{place}: the {what} is {found:.4f} {unit} from its singularity, allowed is at least {least:g} {unit} "
+                f"(cartesian.singularity.{what})"
+            )
+
+
+def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str) -> tuple[tuple[float, ...], float]:
+    """Return the row of a piece, and the part of its speed that the joints allow."""
+    length, angle = piece.length, piece.angle
+
+    def both(linear: float, angular: float) -> float:
+        return min(linear / length if length > _NO_WAY_M else inf, angular / angle if angle > _NO_WAY_RAD else inf)
+
+    wanted = speed = both(piece.speed, cartesian.angular_speed)
+    acceleration = both(cartesian.acceleration, cartesian.angular_acceleration)
+    jerk = both(cartesian.jerk, cartesian.angular_jerk)
+    joints = piece.joints
+    count = len(joints) - 1
+    bends = []
+    for k in range(1, count):
+        for i, (before, here, after) in enumerate(zip(joints[k - 1], joints[k], joints[k + 1], strict=True)):
+            # dq/ds by the steeper side, d2q/ds2 by the second difference; s is the fraction.
+            first = count * max(abs(here - before), abs(after - here))
+            second = count * count * abs(after - 2.0 * here + before)
+            bends.append((i, first, second))
+            if first > 0.0:
+                speed = min(speed, _OF_LIMIT * limits.velocity[i] / first)
+            if second > 0.0:
+                speed = min(speed, sqrt(0.5 * _OF_LIMIT * limits.acceleration[i] / second))
+    for i, first, second in bends:
+        if first > 0.0:
+            left = _OF_LIMIT * limits.acceleration[i] - second * speed * speed
+            acceleration = min(acceleration, left / first)
+    row = (
+        *piece.start.position, *piece.turns[0], *piece.end.position, *piece.turns[1],
+        speed, acceleration, jerk, length, _duration(speed, acceleration, jerk, where), LINE,
+    )  # fmt: skip
+    return row, speed / wanted
+
+
+def _duration(speed: float, acceleration: float, jerk: float, where: str) -> float:
+    way, found = InputParameter(1), Trajectory(1)
+    way.target_position = [1.0]
+    way.max_velocity, way.max_acceleration, way.max_jerk = [speed], [acceleration], [jerk]
+    try:
+        if Ruckig(1, 0.001).calculate(way, found) >= 0:
+            return float(found.duration)
+    except (RuckigError, ValueError):
+        pass
+    raise PlanRefused(f"{where}: no motion along it was found")
+
+
+def _same_branch(stop: Stop, q: Sequence[float], where: str, model: ArmModel) -> None:
+    if stop.q is None:
+        return
+    for name, wanted, found in zip(model.joint_names, stop.q, q, strict=True):
+        if abs(wanted - found) > _SAME_RAD:
+            raise PlanRefused(
+                f"{where}: it ends with {name} at {found:.3f} rad, not at {wanted:.3f} rad: a straight line does not "
+                f"change the branch; move there by the joints"
+            )
