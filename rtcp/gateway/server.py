@@ -27,6 +27,7 @@ from rtcp.gateway.held import Caller
 from rtcp.gateway.picture import Picture
 from rtcp.gateway.verbs import Verb, Verbs
 from rtcp.ipc.ending import end_of
+from rtcp.ipc.journal import log_format
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.paths import blackboard_file, control_socket, stopping_mark
 from rtcp.ipc.session import (
@@ -39,7 +40,6 @@ from rtcp.ipc.session import (
     read_session,
     wait_gone,
 )
-from rtcp.ipc.journal import log_format
 
 _FOLLOW_S = 0.02
 _COMPLAINT_S = 10.0

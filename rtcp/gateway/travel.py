@@ -15,7 +15,7 @@ from rtcp.ipc.codes import MotionMode
 from rtcp.ipc.layout import COMMAND_NUMBERS
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.plans import PlanTooLong
-from rtcp.motion.planning import Plan
+from rtcp.motion.planning.plan import Plan
 
 _SAME_RAD, _SAME_PLANNED_RAD = 1e-9, 1e-4
 """How near the commanded end is to what was asked for: of a move exactly, of a plan as the loop's own sums have it."""

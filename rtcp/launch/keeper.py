@@ -14,10 +14,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+from rtcp.ipc.journal import place_of_log
 from rtcp.ipc.lock import Busy, alone
 from rtcp.ipc.paths import stopping_mark
 from rtcp.ipc.session import is_ours, read_processes
-from rtcp.ipc.journal import place_of_log
 
 if TYPE_CHECKING:
     from rtcp.launch.running import Running

@@ -21,6 +21,7 @@ from typing import Any, Literal
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.ending import LEFT, end_of
+from rtcp.ipc.journal import open_log
 from rtcp.ipc.paths import (
     blackboard_file,
     control_socket,
@@ -31,7 +32,6 @@ from rtcp.ipc.paths import (
     stopping_mark,
 )
 from rtcp.ipc.session import NONE, Processes, end, forget_processes, identify, is_ours, read_processes
-from rtcp.ipc.journal import open_log
 from rtcp.launch.keeper import GatewayKeeper
 from rtcp.launch.notifier import Notifier
 from rtcp.realtime.scheduling import available_cpus, choose_cpu

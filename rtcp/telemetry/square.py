@@ -20,7 +20,8 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.motion_points import Stop
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
-from rtcp.motion.planning import PlanRefused, plan_lines
+from rtcp.motion.planning.lines import plan_lines
+from rtcp.motion.planning.plan import PlanRefused
 from rtcp.telemetry.recording import Recording
 
 Array = npt.NDArray[np.float64]

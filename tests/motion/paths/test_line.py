@@ -14,7 +14,8 @@ import pytest
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
 from rtcp.motion.controllers.line import LineMode
-from rtcp.motion.planning import Stop, plan_lines
+from rtcp.motion.planning.lines import plan_lines
+from rtcp.motion.planning.plan import Stop
 from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
 from rtcp.motion.planning.slerp import quaternion, turn_between
 from rtcp.motion.state import Phase, Reason

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from rtcp.motion.controllers.trajectory import TrajectoryMode
-from rtcp.motion.planning import Plan, PlanRefused, Point, plan_trajectory
+from rtcp.motion.planning.knots import plan_trajectory
+from rtcp.motion.planning.plan import Plan, PlanRefused, Point
 from rtcp.motion.planning.rows import CUBIC, KIND, QUINTIC
 from rtcp.motion.state import Phase
 

@@ -13,7 +13,8 @@ import pytest
 from kinematics import forward
 from rtcp.motion.controllers.line import LineMode
 from rtcp.motion.limits import Limits
-from rtcp.motion.planning import Plan, PlanRefused, Stop, plan_lines
+from rtcp.motion.planning.lines import plan_lines
+from rtcp.motion.planning.plan import Plan, PlanRefused, Stop
 from rtcp.motion.planning.rows import LINE
 from rtcp.motion.state import Reason
 

@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtcp.motion.controllers.trajectory import TrajectoryMode
-from rtcp.motion.planning import PlanRefused, Point, plan_trajectory
+from rtcp.motion.planning.knots import plan_trajectory
+from rtcp.motion.planning.plan import PlanRefused, Point
 from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
 from rtcp.motion.state import MotionState, Phase, Reason
 
