@@ -1,5 +1,1 @@
-"""The command `rtcp`: one file a group of commands; `main` is the entry point."""
-
-from rtcp.cli.app import main
-
-__all__ = ["main"]
+"""The command `rtcp`: one file for each group of commands; `__main__` joins them."""

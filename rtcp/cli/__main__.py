@@ -1,5 +1,129 @@
-"""`python -m rtcp.cli`: the same as the command `rtcp`."""
+"""The command line put together, and the one place where an exception becomes a sentence and an exit code."""
 
-from rtcp.cli import main
+from __future__ import annotations
 
-raise SystemExit(main())
+import errno
+import os
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+
+import rtcp
+from rtcp.cli import (
+    arm,
+    bus,
+    demo,
+    doctor,
+    faults,
+    jog,
+    joystick,
+    limits,
+    machine,
+    motion,
+    platform,
+    service,
+    soak,
+    status,
+)
+from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
+from rtcp.cli.output import complain, emit, mute
+from rtcp.config.errors import ConfigError
+from rtcp.ipc.client import ControlError
+
+app = typer.Typer(
+    name="rtcp",
+    help="Run a six-axis arm of EtherCAT drives at a fixed cycle, on hardware or on a segment in software.",
+    epilog="Exit codes: 0 done, 1 internal, 2 usage or configuration, 3 refused, 4 not running, 5 fault or timeout.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        emit(f"rtcp {rtcp.__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def _root(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
+    if context.invoked_subcommand is None:
+        _print_help(context)
+
+
+def _print_help(context: typer.Context) -> None:
+    text = context.get_help()  # with rich it is printed by this call, and nothing is left to print
+    if text.strip():
+        emit(text.rstrip())
+
+
+for _group in (platform, status, machine, motion, jog, limits, joystick, arm, bus, demo, service, doctor, soak, faults):
+    _group.register(app)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code; a user's mistake ends in a sentence, never in a traceback.
+
+    Args:
+        arguments: the command line without the program's name; that of the process when None.
+    """
+    _open_what_is_closed()
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")  # a terminal without UTF-8 loses a letter, not the answer
+    try:
+        app(args=None if arguments is None else list(arguments), prog_name="rtcp")
+    except SystemExit as ending:
+        return _flushed(ending.code if isinstance(ending.code, int) else ExitCode.DONE)
+    except ControlError as error:
+        complain(error.message)
+        return _flushed(code_of(error.kind))
+    except ConfigError as error:
+        complain(str(error))
+        return _flushed(ExitCode.USAGE)
+    except CommandError as error:
+        complain(error.message)
+        return _flushed(error.code)
+    except KeyboardInterrupt as error:
+        return _flushed(interruption_code(error))
+    except OSError as error:
+        where = f": {error.filename}" if error.filename else " (standard output)" if error.errno == errno.ENOSPC else ""
+        complain(f"{error.strerror or error}{where}")
+        return _flushed(ExitCode.INTERNAL)
+    except Exception as error:
+        if os.environ.get("RTCP_TRACEBACK"):
+            import traceback
+
+            traceback.print_exc()
+        complain(f"internal error: {type(error).__name__}: {error} (RTCP_TRACEBACK=1 shows where)")
+        return _flushed(ExitCode.INTERNAL)
+    return _flushed(ExitCode.DONE)
+
+
+def _open_what_is_closed() -> None:
+    """Give a command that was started without standard output, as by `>&-`, one that leads nowhere."""
+    if sys.stdout is None:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w")  # noqa: SIM115
+
+
+def _flushed(code: int) -> int:
+    """Flush standard output here, where a reader that has gone is no reason for a message at exit."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        mute()
+    return int(code)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report, show
 from rtcp.config.plain_number import plain_number
 

@@ -7,10 +7,10 @@ from typing import Annotated
 import typer
 
 from rtcp.cli import sdo_value, segment
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.bus_access import bus_access, position_of
-from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.errors import CommandError
 from rtcp.cli.options import BusName, ConfigFile, ObjectIndex, SlaveName
-from rtcp.cli.outcome import CommandError
 from rtcp.cli.output import emit, emit_json, report, show
 
 SDO_WRITE_OPTIONS = ("--type", "--bus", "--config", "--help", "-h")

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rtcp.cli.connection import connect
+from rtcp.cli.errors import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.cli.launch import refuse_a_second_platform
-from rtcp.cli.outcome import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.config.virtual import VIRTUAL
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.launch import offline

@@ -14,10 +14,10 @@ import typer
 
 from rtcp.cli import demo_square
 from rtcp.cli.connection import connect
+from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.launch import launch, refuse_a_second_platform
 from rtcp.cli.motion import arrival, move
 from rtcp.cli.options import BusName, ConfigFile
-from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import report, show
 from rtcp.ipc.client import ControlClient
 from rtcp.launch import offline

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.motion import SILENCE_S, arrival, move
-from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import report
 
 if TYPE_CHECKING:

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.options import ConfigFile
-from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit_json
 from rtcp.config.virtual import VIRTUAL
 from rtcp.realtime.doctor import Case, Finding, Host, Severity, examine

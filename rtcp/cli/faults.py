@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit_json, report, show
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from typing import Annotated
 
 import typer
 
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, positive, refuse_options
 from rtcp.cli.connection import connect
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.keys import ESCAPE, HeldKey, Keys
-from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, positive, refuse_options
-from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
 from rtcp.cli.renewal import Renewal

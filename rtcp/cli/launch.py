@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from rtcp.cli.outcome import CommandError, ExitCode, code_of, interruption_code, orderly_signals
+from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code, orderly_signals
 from rtcp.config.errors import ConfigError
 from rtcp.ipc.paths import runtime_directory
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
 from rtcp.cli.connection import ask
-from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, refuse_options
-from rtcp.cli.outcome import CommandError
+from rtcp.cli.errors import CommandError
 from rtcp.cli.output import emit_json, report, show
 from rtcp.config.plain_number import plain_number
 

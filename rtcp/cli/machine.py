@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.connection import ask, connect
-from rtcp.cli.outcome import CommandError
+from rtcp.cli.errors import CommandError
 from rtcp.cli.output import report
 from rtcp.cli.progress import stopping
 

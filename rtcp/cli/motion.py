@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, joint_values, pose_values, positive, refuse_options
 from rtcp.cli.connection import connect
-from rtcp.cli.numbers import NUMBERS_AS_WRITTEN, joint_values, pose_values, positive, refuse_options
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import report
 from rtcp.cli.progress import progress, stopping
 from rtcp.ipc.client import ControlClient
@@ -38,8 +38,8 @@ def _move(
     line: Annotated[
         bool, typer.Option("--line", help="With --pose: on a straight line; else the joints move, nearest solution.")
     ] = False,
-    each: Annotated[
-        bool, typer.Option("--each", help="Each joint as fast as it can; else all arrive together.")
+    unsynchronized: Annotated[
+        bool, typer.Option("--unsynchronized", help="Each joint arrives as early as it can; else all arrive together.")
     ] = False,
     speed: Annotated[
         float | None,
@@ -50,9 +50,9 @@ def _move(
     positive("--speed", speed, "m/s" if line else "rad/s")
     if line and not pose:
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
-    if each and pose:
-        raise CommandError("--each is for joint positions, not for --pose")
-    known = ("--pose", "--line", "--each", "--speed", "--help", "-h")
+    if unsynchronized and pose:
+        raise CommandError("--unsynchronized is for joint positions, not for --pose")
+    known = ("--pose", "--line", "--unsynchronized", "--speed", "--help", "-h")
     if pose:
         from rtcp.config.geometry import angle
 
@@ -62,7 +62,7 @@ def _move(
     else:
         refuse_options(numbers, known)
         verb, target = "move", joint_values(numbers)
-        arguments = {"q": target, "speed": speed} | ({"each": True} if each else {})
+        arguments = {"q": target, "speed": speed} | ({"each": True} if unsynchronized else {})
     with stopping(client := connect("move")):
         if not pose:
             _same_number(target, client.call("status"))

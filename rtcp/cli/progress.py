@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from rtcp.cli.outcome import SUSPENDING, CommandError, interruption_code, orderly_signals
+from rtcp.cli.errors import SUSPENDING, CommandError, interruption_code, orderly_signals
 from rtcp.cli.output import console, report
 from rtcp.ipc.client import ControlClient
 

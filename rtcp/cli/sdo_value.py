@@ -6,7 +6,7 @@ import math
 import re
 import struct
 
-from rtcp.cli.outcome import CommandError
+from rtcp.cli.errors import CommandError
 from rtcp.config.plain_number import plain_number
 
 INTEGER_TYPES = {

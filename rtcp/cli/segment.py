@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import refuse_old_name
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.options import Poll
-from rtcp.cli.outcome import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report
 from rtcp.ipc.paths import listens, runtime_directory, segment_control
 
@@ -30,7 +31,8 @@ def register(app: typer.Typer) -> None:
     segment = typer.Typer(invoke_without_command=True)
     segment.callback()(_segment)
     segment.command("fault")(_fault)
-    segment.command("mend")(_mend)
+    segment.command("clear")(_clear)
+    refuse_old_name(segment, "mend", "rtcp segment clear")
     segment.command("faults")(_faults)
     segment.command("kinds")(_kinds)
     app.add_typer(segment, name="segment")
@@ -60,7 +62,7 @@ def _segment(
             raise CommandError(f"{wrong[0]} is an option of a segment that starts, not of {context.invoked_subcommand}")
         return
     if config is None:
-        raise CommandError("--config FILE is missing: the slaves in the order of the cable (or: fault, mend, faults)")
+        raise CommandError("--config FILE is missing: the slaves in the order of the cable (or: fault, clear, faults)")
     from rtcp.cli.segment_run import run_segment
 
     run_segment(config, interface, poll, cpu, script)
@@ -70,7 +72,7 @@ def _fault(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Kind of the fault: `rtcp segment kinds` lists them.")],
     pairs: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE..", help="As after=3, code=0x1A.")] = None,
     lasts: Annotated[
-        float | None, typer.Option("--lasts", metavar="S", help="How long, s; else until it is mended.")
+        float | None, typer.Option("--lasts", metavar="S", help="How long, s; else until it is cleared.")
     ] = None,
     segment: ControlPath = None,
 ) -> None:
@@ -91,21 +93,21 @@ def _fault(
     if isinstance(planned.fault, ONCE) or not active:
         report(f"{said}: it has happened")
         return
-    until = "until it is mended" if planned.lasts is None else f"for {planned.lasts:g} s"
+    until = "until it is cleared" if planned.lasts is None else f"for {planned.lasts:g} s"
     if getattr(planned.fault, "burst", None) is not None:
         until = "until its burst has passed"
     where = "" if segment is None else f" --segment {segment}"
-    report(f"{said}, {until}; to mend it: rtcp segment mend {number}{where}")
+    report(f"{said}, {until}; to clear it: rtcp segment clear {number}{where}")
 
 
-def _mend(
+def _clear(
     number: Annotated[int | None, typer.Argument(metavar="ID", help="The fault's number; else all faults.")] = None,
     segment: ControlPath = None,
 ) -> None:
-    """Mend a fault, or all of them."""
+    """Clear a fault, or all of them."""
     with _client(segment) as client:
         mended = client.mend(number)
-    report(f"mended: {', '.join(f'fault {each}' for each in mended)}" if mended else "no fault is active")
+    report(f"cleared: {', '.join(f'fault {each}' for each in mended)}" if mended else "no fault is active")
 
 
 def _faults(

@@ -7,7 +7,7 @@ import signal
 import tempfile
 from pathlib import Path
 
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import report
 from rtcp.ipc.paths import (
     RuntimeDirectoryError,

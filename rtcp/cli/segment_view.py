@@ -50,6 +50,6 @@ def named(fault: Mapping[str, Any]) -> str:
 
 def line_of(active: Mapping[str, Any]) -> str:
     """Return the line of an active fault: its number, what it is, since when, for how long, what it has done."""
-    left = "until it is mended" if active["left_s"] is None else f"{active['left_s']:.1f} s to come"
+    left = "until it is cleared" if active["left_s"] is None else f"{active['left_s']:.1f} s to come"
     done = "".join(f", {count} {what.replace('_', ' ')}" for what, count in active["counts"].items())
     return f"fault {active['id']}: {named(active['fault'])}, for {active['since_s']:.1f} s, {left}{done}"

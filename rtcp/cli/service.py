@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit
 from rtcp.cli.service_files import Found, ServiceFile, hidden_by_the_unit, left_behind, service_files
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rtcp.cli.errors import CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.launch import launch, refuse_a_second_platform
 from rtcp.cli.options import ConfigFile
-from rtcp.cli.outcome import CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import emit, report, show
 from rtcp.config.virtual import VIRTUAL
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.connection import connect, loop_lives
-from rtcp.cli.outcome import CommandError, ExitCode
+from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import console, emit, emit_json, show
 from rtcp.ipc.client import ControlClient, ControlError
 

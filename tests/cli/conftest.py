@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.cli import main
+from rtcp.cli.__main__ import main
 from rtcp.config import default_config
 
 JOINTS = 6

@@ -365,7 +365,8 @@ def test_every_facet_has_four_corners() -> None:
 def test_only_a_picture_loads_what_draws_it() -> None:
     heavy = ("matplotlib", "numpy")
     program = (
-        "import sys; from rtcp.cli import main; main(['arm', 'fk', *['0'] * 6]); main(['arm', 'ik', *['0.3'] * 6]); "
+        "import sys; from rtcp.cli.__main__ import main\n"
+        "main(['arm', 'fk', *['0'] * 6]); main(['arm', 'ik', *['0.3'] * 6]); "
         f"main(['arm', 'urdf']); print([name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.cli.outcome import CommandError
+from rtcp.cli.errors import CommandError
 from rtcp.cli.sdo_value import INTEGER_TYPES, decode, encode, parse_object
 
 

@@ -63,7 +63,7 @@ def test_an_error_that_nobody_foresaw_is_one_line(rtcp: Callable[..., Any], monk
     def broken(**options: Any) -> None:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("rtcp.cli.app.app", broken)
+    monkeypatch.setattr("rtcp.cli.__main__.app", broken)
     ended = rtcp("status")
     assert ended.code == 1
     assert ended.err == "rtcp: internal error: RuntimeError: a bug (RTCP_TRACEBACK=1 shows where)\n"
@@ -71,7 +71,7 @@ def test_an_error_that_nobody_foresaw_is_one_line(rtcp: Callable[..., Any], monk
 
 def test_status_loads_nothing_that_starts_slowly() -> None:
     heavy = ("numpy", "pydantic", "pysoem", "ruckig", "yaml", "pyroute2", "asyncio")
-    program = f"import sys, rtcp.cli.app; print(*[name for name in {heavy!r} if name in sys.modules])"
+    program = f"import sys, rtcp.cli.__main__; print(*[name for name in {heavy!r} if name in sys.modules])"
     assert subprocess.check_output([sys.executable, "-c", program], text=True).split() == []
 
 
@@ -87,3 +87,19 @@ def test_what_only_python_takes_for_a_number_is_none(rtcp: Callable[..., Any], w
         ended = rtcp(*command)
         assert ended.code == 2
         assert "is not a number" in ended.trouble
+
+
+@pytest.mark.parametrize(
+    ("arguments", "now"),
+    [
+        (("stick", "forward"), "stick is now `rtcp joystick`"),
+        (("segment", "mend", "1"), "mend is now `rtcp segment clear`"),
+        (("move", *"000000", "--each"), "--each is now --unsynchronized"),
+    ],
+)
+def test_an_old_name_is_refused_with_the_new_one(
+    rtcp: Callable[..., Any], arguments: tuple[str, ...], now: str
+) -> None:
+    ended = rtcp(*arguments)
+    assert (ended.code, ended.out) == (2, "")
+    assert now in ended.trouble

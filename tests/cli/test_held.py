@@ -1,4 +1,4 @@
-"""`rtcp jog` and `rtcp stick`: what lasts only as long as a key, or as a time."""
+"""`rtcp jog` and `rtcp joystick`: what lasts only as long as a key, or as a time."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def suspend(process: Any, seconds: float, meanwhile: Callable[[], None] = lambda
     ("command", "verb", "last", "words"),
     [
         (("jog", "joint1", "0.1"), "jog", "halt", "the arm had stopped, and stays so"),
-        (("stick", "forward"), "stick", "stick", "it had been let go, and stays so"),
+        (("joystick", "forward"), "stick", "stick", "it had been let go, and stays so"),
     ],
 )
 def test_what_was_suspended_ends_and_moves_nothing_again(
@@ -190,7 +190,7 @@ def test_keys_that_were_typed_while_the_process_was_suspended_move_nothing(
 def test_arrows_that_were_typed_while_the_process_was_suspended_are_no_stick(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
-    keyboard = terminal("stick")
+    keyboard = terminal("joystick")
     wait_until(lambda: bool(platform.asked("stick")))
     counts: list[int] = []
 
@@ -251,7 +251,7 @@ def test_a_jog_that_is_none_is_refused_in_a_sentence(
 
 
 @pytest.mark.parametrize(
-    ("command", "words"), [(("jog", "x", "0.1"), "give --seconds N"), (("stick",), "give a position")]
+    ("command", "words"), [(("jog", "x", "0.1"), "give --seconds N"), (("joystick",), "give a position")]
 )
 def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
     platform: Any, rtcp_process: Callable[..., Any], command: tuple[str, ...], words: str
@@ -265,11 +265,11 @@ def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
 def test_a_stick_that_would_be_suspended_is_let_go_and_ended(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
-    held = rtcp_process("stick", "forward", "--seconds", "50")
+    held = rtcp_process("joystick", "forward", "--seconds", "50")
     wait_until(lambda: bool(platform.asked("stick")))
     held.send_signal(signal.SIGTSTP)
     _, trouble = held.communicate()
-    assert (held.returncode, trouble) == (148, "rtcp: interrupted: the stick is let go\n")
+    assert (held.returncode, trouble) == (148, "rtcp: interrupted: the joystick is released\n")
 
 
 def test_an_interrupted_jog_closes_its_connection_and_says_that_the_arm_stops(
@@ -333,8 +333,8 @@ def test_a_key_that_is_held_when_the_command_is_ended_moves_no_further(
 def test_a_position_is_held_for_a_time_by_saying_it_again(
     platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], pressed: list[str], byte: int | None
 ) -> None:
-    ended = rtcp("stick", *words, "--seconds", "0.4")
-    assert (ended.code, ended.out) == (0, "the stick is let go\n")
+    ended = rtcp("joystick", *words, "--seconds", "0.4")
+    assert (ended.code, ended.out) == (0, "the joystick is released\n")
     asked = platform.asked("stick")
     assert 4 <= len(asked) <= 7
     assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "t": one["t"]} for one in asked)
@@ -354,7 +354,7 @@ def test_a_position_is_held_for_a_time_by_saying_it_again(
 def test_what_is_no_position_is_refused(
     platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], sentence: str
 ) -> None:
-    ended = rtcp("stick", *words)
+    ended = rtcp("joystick", *words)
     assert (ended.code, platform.requests) == (2, [])
     assert sentence in ended.trouble
 
@@ -362,7 +362,7 @@ def test_what_is_no_position_is_refused(
 def test_arrows_are_the_stick_and_letters_its_switches(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
-    keyboard = terminal("stick")
+    keyboard = terminal("joystick")
 
     def last() -> list[str]:
         asked = platform.asked("stick")
@@ -389,7 +389,7 @@ def test_arrows_are_the_stick_and_letters_its_switches(
 def test_a_stick_that_is_killed_is_gone_with_its_connection(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
-    playing = rtcp_process("stick", "forward", "--seconds", "50")
+    playing = rtcp_process("joystick", "forward", "--seconds", "50")
     wait_until(lambda: bool(platform.asked("stick")))
     playing.kill()
     playing.wait()

@@ -68,7 +68,7 @@ def test_each_kind_of_error_has_its_exit_code(platform: Any, rtcp: Callable[...,
         ("move", *HOME),
         ("move", "--pose", *HOME),
         ("jog", "x", "0.1", "--seconds", "1"),
-        ("stick", "forward"),
+        ("joystick", "forward"),
         ("limits", "show"),
         ("limits", "set", "joint1.max", "1"),
         ("output", "3", "on"),
@@ -333,7 +333,10 @@ WRONG = {
     "a length as a fraction of pi": (("move", "--pose", "pi", *POSE[1:]), "x: 'pi' is not a number (m)"),
     "an angle that is not finite": (("move", "--pose", *POSE[:5], "inf"), "rz: inf is not finite"),
     "a line without a pose": (("move", "--line", *HOME), "--line is for a pose"),
-    "each joint at its best for a pose": (("move", "--each", "--pose", *POSE), "--each is for joint positions"),
+    "each joint at its best for a pose": (
+        ("move", "--unsynchronized", "--pose", *POSE),
+        "--unsynchronized is for joint positions",
+    ),
     "a misspelt option": (("move", "--pose", *POSE, "--lin"), "did you mean --line?"),
     "a speed of a line": (("move", "--pose", *POSE, "--line", "--speed", "0"), "--speed 0 is not allowed: a finite"),
 }
@@ -349,7 +352,7 @@ def test_a_pose_that_is_none_is_refused(
 
 
 def test_each_joint_at_its_best_is_passed_on(platform: Any, rtcp: Callable[..., Any]) -> None:
-    assert rtcp("move", *HOME, "--each").code == 0
+    assert rtcp("move", *HOME, "--unsynchronized").code == 0
     assert platform.asked("move")[0]["each"] is True
 
 

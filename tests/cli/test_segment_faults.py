@@ -51,9 +51,9 @@ def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
 
     made = rtcp("segment", "fault", "cable", "after=1")
     assert (made.code, made.err) == (0, "")
-    assert made.out == "fault 1: cable after=1, until it is mended; to mend it: rtcp segment mend 1\n"
+    assert made.out == "fault 1: cable after=1, until it is cleared; to clear it: rtcp segment clear 1\n"
     assert rtcp("segment", "fault", "sdo_abort", "slave=2", "code=0x06090030", "--lasts", "60").out == (
-        "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to mend it: rtcp segment mend 2\n"
+        "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to clear it: rtcp segment clear 2\n"
     )
     assert "until its burst has passed" in rtcp("segment", "fault", "loss", "burst=5").out
     assert rtcp("segment", "fault", "clock_jump", "slave=2", "us=-50.5").out == (
@@ -63,18 +63,18 @@ def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
     listed = json.loads(rtcp("segment", "faults", "--json").out)
     assert [(each["id"], each["fault"]["fault"]) for each in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
     lines = rtcp("segment", "faults").out.splitlines()
-    assert re.fullmatch(r"fault 1: cable after=1, for \d+\.\d s, until it is mended", lines[0])
+    assert re.fullmatch(r"fault 1: cable after=1, for \d+\.\d s, until it is cleared", lines[0])
     assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s to come", lines[1])
     assert lines[2].endswith("0 lost before, 0 lost behind")
 
-    assert rtcp("segment", "mend", "1").out == "mended: fault 1\n"
-    assert rtcp("segment", "mend").out == "mended: fault 2, fault 3\n"
-    assert rtcp("segment", "mend").out == rtcp("segment", "faults").out == "no fault is active\n"
+    assert rtcp("segment", "clear", "1").out == "cleared: fault 1\n"
+    assert rtcp("segment", "clear").out == "cleared: fault 2, fault 3\n"
+    assert rtcp("segment", "clear").out == rtcp("segment", "faults").out == "no fault is active\n"
 
     refused = rtcp("segment", "fault", "drive", "slave=1", "error=encoder")
     assert refused.code == 3
     assert "is no drive" in refused.trouble
-    again = rtcp("segment", "mend", "1")
+    again = rtcp("segment", "clear", "1")
     assert (again.code, again.trouble) == (3, "rtcp: fault 1 is not active any more")
 
     process.terminate()
@@ -94,7 +94,7 @@ def test_a_second_segment_has_a_socket_of_its_own_and_has_to_be_chosen(
     assert unclear.code == 2
     assert f"--segment {directory / 'segment.sock'} or {own}" in unclear.trouble
     made = rtcp("segment", "fault", "cable", "after=1", "--segment", str(own))
-    assert made.out.endswith(f"to mend it: rtcp segment mend 1 --segment {own}\n")
+    assert made.out.endswith(f"to clear it: rtcp segment clear 1 --segment {own}\n")
     assert len(json.loads(rtcp("segment", "faults", "--json", "--segment", str(own)).out)) == 1
     assert json.loads(rtcp("segment", "faults", "--json", "--segment", str(directory / "segment.sock")).out) == []
 
@@ -110,7 +110,7 @@ def test_where_the_runtime_directory_cannot_be_made_the_socket_is_elsewhere(
     assert rtcp("segment", "faults", "--segment", str(own)).out == "no fault is active\n"
 
 
-@pytest.mark.parametrize("command", [("fault", "cable", "after=1"), ("mend",), ("mend", "3"), ("faults",)])
+@pytest.mark.parametrize("command", [("fault", "cable", "after=1"), ("clear",), ("clear", "3"), ("faults",)])
 def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: Path, command: tuple[str, ...]) -> None:
     ended = rtcp("segment", *command)
     assert ended.code == 4
@@ -142,7 +142,7 @@ def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: P
         (("fault", "clock_jump", "slave=1", "us=3", "--lasts", "1"), "clock_jump happens once and is over"),
         (("--config", "x.yaml", "faults"), "--config is an option of a segment that starts, not of faults"),
         ((), "--config FILE is missing"),
-        (("mend", "x"), "unable to parse string as an integer"),
+        (("clear", "x"), "unable to parse string as an integer"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_a_sentence_and_exit_code_2(rtcp: Rtcp, command: tuple[str, ...], sentence: str) -> None:

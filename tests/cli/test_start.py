@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.cli import start
+from rtcp.cli import platform as start
 from rtcp.ipc.session import Pid, Processes, identify
 
 

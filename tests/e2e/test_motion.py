@@ -152,7 +152,7 @@ def test_an_object_that_does_not_come_is_a_timeout_and_one_that_is_refused_a_ref
         done = bent.rtcp("sdo", "read", "drive1", "0x6041", "--type", "uint16", check=5)
         assert "no answer in time" in done.stderr
     finally:
-        bent.rtcp("segment", "mend")
+        bent.rtcp("segment", "clear")
     bent.rtcp("sdo", "read", "drive2", "0x5FFF", "--type", "uint16", check=3)
 
 
@@ -216,7 +216,7 @@ def test_the_stick_moves_the_arm_and_silence_lets_it_go(bent: Platform, client: 
 def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> None:
     moving = bent.background("move", "0.9", *NUMBERS[1:], "--speed", "0.05")
     bent.until_moving()
-    bent.rtcp("stick", "estop", "--seconds", "0.3")
+    bent.rtcp("joystick", "estop", "--seconds", "0.3")
     _, trouble = moving.communicate(timeout=20)
     assert moving.returncode == 5
     assert "emergency stop" in trouble

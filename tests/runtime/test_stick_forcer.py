@@ -100,8 +100,8 @@ def test_nothing_pressed_holds_the_stick_neutral_and_leaves_the_other_inputs_alo
 
 def test_only_who_holds_the_stick_can_let_it_go(arm: Played) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61}, "rtcp stick (pid 7)", connection=1)
-        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp stick \(pid 7\)"):
+        await arm.call("stick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
+        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp joystick \(pid 7\)"):
             await arm.call("stick", {}, "another", connection=2)
 
     arm.run(force)
@@ -134,8 +134,8 @@ def test_what_is_not_said_again_is_let_go_after_its_time(arm: Played) -> None:
 
 def test_a_second_client_is_refused_with_the_name_of_who_holds_the_stick(arm: Played) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61}, "rtcp stick (pid 7)", connection=1)
-        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp stick \(pid 7\)"):
+        await arm.call("stick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
+        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp joystick \(pid 7\)"):
             await arm.call("stick", {"byte": 62}, "another", connection=2)
 
     arm.run(force)

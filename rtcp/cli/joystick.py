@@ -1,4 +1,4 @@
-"""`rtcp stick`: a joystick in the terminal, or its positions by name, for the virtual IO box."""
+"""`rtcp joystick`: a joystick in the terminal, or its positions by name, for the virtual IO box."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import positive, refuse_old_name
 from rtcp.cli.connection import connect
+from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.keys import ESCAPE, HeldKey, Keys
-from rtcp.cli.numbers import positive
-from rtcp.cli.outcome import SUSPENDING, CommandError, ExitCode, interruption_code, orderly_signals
 from rtcp.cli.output import emit, report
 from rtcp.cli.renewal import Renewal
 from rtcp.ipc.client import ControlClient
@@ -46,10 +46,11 @@ QUITS = ("q", ESCAPE, "\x04")
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
-    app.command("stick")(_stick)
+    app.command("joystick")(_joystick)
+    refuse_old_name(app, "stick", "rtcp joystick")
 
 
-def _stick(
+def _joystick(
     words: Annotated[
         list[str] | None,
         typer.Argument(
@@ -64,19 +65,19 @@ def _stick(
     if not words:
         if not sys.stdin.isatty():
             raise CommandError(f"there is no terminal to play in: give a position, as {', '.join(NAMES)}, byte N")
-        with connect("stick") as client:
+        with connect("joystick") as client:
             _play(client)
         return
     pressed, byte = _position(words)
     try:
-        with orderly_signals(*SUSPENDING), connect("stick") as client:
+        with orderly_signals(*SUSPENDING), connect("joystick") as client:
             if words == ["release"]:
                 _force(client, [], None, HOLD_S, time.monotonic())
             else:
                 _hold(client, pressed, byte, seconds)
     except KeyboardInterrupt as interruption:
-        raise CommandError("interrupted: the stick is let go", interruption_code(interruption)) from None
-    report("the stick is let go")
+        raise CommandError("interrupted: the joystick is released", interruption_code(interruption)) from None
+    report("the joystick is released")
 
 
 def _position(words: Sequence[str]) -> tuple[list[str], int | None]:

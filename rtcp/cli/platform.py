@@ -9,9 +9,9 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.connection import connect
+from rtcp.cli.errors import CommandError, ExitCode, code_of
 from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
-from rtcp.cli.outcome import CommandError, ExitCode, code_of
 from rtcp.cli.output import report
 from rtcp.ipc.client import ControlError
 

@@ -7,7 +7,9 @@ import math
 import re
 from collections.abc import Sequence
 
-from rtcp.cli.outcome import CommandError
+import typer
+
+from rtcp.cli.errors import CommandError
 from rtcp.config.plain_number import plain_number
 
 NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
@@ -15,7 +17,19 @@ NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
 
 POSE = ("x", "y", "z", "rx", "ry", "rz")
 
+RENAMED_OPTIONS = {"--each": "--unsynchronized"}
+"""Options of version 0.1 -> their successors."""
+
 _LOOKS_LIKE_A_NUMBER = re.compile(r"-(\d|\.\d|inf|nan)", re.IGNORECASE)
+
+
+def refuse_old_name(app: typer.Typer, old: str, new: str) -> None:
+    """Answer a command's name of version 0.1 with its new one; exit code 2."""
+
+    def refuse() -> None:
+        raise CommandError(f"{old} is now `{new}`")
+
+    app.command(old, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(refuse)
 
 
 def refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
@@ -29,6 +43,8 @@ def refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
             option = value.split("=", 1)[0]
             if option in known:
                 raise CommandError(f"{option} stands behind --, which ends the options: write it before")
+            if option in RENAMED_OPTIONS:
+                raise CommandError(f"{option} is now {RENAMED_OPTIONS[option]}")
             near = difflib.get_close_matches(option, known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
             raise CommandError(f"no such option: {option} ({hint})")
