@@ -1,0 +1,98 @@
+"""An `ArmConfig` as JSON values and back, without the validator: how the launcher hands it to the loop.
+
+Fields keep their names, tuples become lists, paths and enum members their text. Round trips are exact.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from rtcp.config.model import ArmConfig
+
+T = TypeVar("T")
+_hints = cache(get_type_hints)
+
+
+def to_json(config: ArmConfig) -> dict[str, Any]:
+    """Return a configuration as dicts, lists, texts, numbers, booleans and None; floats may be infinite."""
+    form: dict[str, Any] = plain(config)
+    return form
+
+
+def from_json(data: object) -> ArmConfig:
+    """Return the configuration that `to_json` wrote.
+
+    Types are checked, ranges are not: the writer has validated them.
+
+    Raises:
+        ValueError: a key is missing or unknown, or a value has another type; the message names the key.
+    """
+    return typed(ArmConfig, data)
+
+
+def plain(value: object) -> Any:
+    """Return the JSON form of a dataclass, tuple, path, enum member or scalar."""
+    if is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple | list):
+        return [plain(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value.value if isinstance(value, Enum) else value
+
+
+def typed(kind: type[T], data: object, where: str = "") -> T:
+    """Return the object of this type that `plain` gave this form; `where` names it in the message of a ValueError."""
+    made: T = _typed(kind, data, where or kind.__name__)
+    return made
+
+
+def _typed(kind: Any, data: object, where: str) -> Any:
+    if is_dataclass(kind):
+        return _dataclass(kind, data, where)
+    origin, choices = get_origin(kind), get_args(kind)
+    if hasattr(kind, "_fields") and isinstance(data, list) and len(data) == len(kind._fields):
+        hints = _hints(kind)
+        return kind(
+            *(_typed(hints[name], entry, f"{where}.{name}") for name, entry in zip(kind._fields, data, strict=True))
+        )
+    if origin is tuple and isinstance(data, list):
+        if choices[-1] is Ellipsis:
+            return tuple(_typed(choices[0], entry, f"{where}[{i}]") for i, entry in enumerate(data))
+        if len(choices) == len(data):
+            entries = zip(choices, data, strict=True)
+            return tuple(_typed(choice, entry, f"{where}[{i}]") for i, (choice, entry) in enumerate(entries))
+    elif origin in (Union, types.UnionType):
+        if data is None and type(None) in choices:
+            return None
+        (inner,) = (choice for choice in choices if choice is not type(None))
+        return _typed(inner, data, where)
+    elif origin is Literal:
+        if data in choices:
+            return data
+    elif isinstance(kind, type) and issubclass(kind, Path | Enum):
+        if isinstance(data, str | int):
+            return kind(data)
+    elif kind is float:
+        # JSON of other writers has no difference between 1 and 1.0.
+        if isinstance(data, float | int) and not isinstance(data, bool):
+            return float(data)
+    elif type(data) is kind:
+        return data
+    raise ValueError(f"{where}: found {data!r:.60}, which is no {getattr(kind, '__name__', kind)}")
+
+
+def _dataclass(kind: Any, data: object, where: str) -> Any:
+    hints = _hints(kind)
+    names = [field.name for field in fields(kind)]
+    if not isinstance(data, Mapping) or isinstance(data, Sequence):
+        raise ValueError(f"{where}: found {data!r:.60}, which is no mapping")
+    if wrong := set(names) ^ set(data):
+        raise ValueError(f"{where}: missing or unknown keys: {', '.join(sorted(map(str, wrong)))}")
+    return kind(**{name: _typed(hints[name], data[name], f"{where}.{name}") for name in names})
