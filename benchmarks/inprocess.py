@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from rtcp.config import default_config, load
 from rtcp.ipc.machine import Command, State
-from rtcp.virtual.simulation import Simulation
+from rtcp.launch.simulation import Simulation
 
 START = [0.3, 0.2, 0.9, 0.2, 0.6, 0.1]
 TARGET = [1.3, -0.4, 1.5, 1.2, -0.4, 1.1]

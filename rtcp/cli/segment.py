@@ -106,8 +106,8 @@ def _clear(
 ) -> None:
     """Clear a fault, or all of them."""
     with _client(segment) as client:
-        mended = client.mend(number)
-    report(f"cleared: {', '.join(f'fault {each}' for each in mended)}" if mended else "no fault is active")
+        cleared = client.clear(number)
+    report(f"cleared: {', '.join(f'fault {each}' for each in cleared)}" if cleared else "no fault is active")
 
 
 def _faults(

@@ -256,4 +256,4 @@ _KINDS: tuple[type[Fault], ...] = (
 FAULTS = MappingProxyType({kind.name: kind for kind in _KINDS})
 """Every kind of fault by the name that commands and scripts give it."""
 ONCE = (AlFall, ClockJump)
-"""Faults that happen and are over: they do not last and cannot be mended."""
+"""Faults that happen and are over: they do not last and cannot be cleared."""

@@ -1,6 +1,6 @@
 """What can go wrong on the virtual segment: the form in which commands and scripts name a fault, and its reader.
 
-A fault is a mapping: `fault` names it, `lasts` says for how many seconds (left out: until it is mended), the other
+A fault is a mapping: `fault` names it, `lasts` says for how many seconds (left out: until it is cleared), the other
 keys are the fault's own. `{fault: cable, after: 3, lasts: 1.5}` breaks the cable between slaves 3 and 4 for 1.5 s. In a
 script (`faults:`, a list) each has `at` as well, seconds from the segment's start.
 
@@ -63,7 +63,7 @@ class Planned:
     fault: Fault
     at: float = 0.0
     lasts: float | None = None
-    """s; None: until it is mended (for a burst: until it has passed)."""
+    """s; None: until it is cleared (for a burst: until it has passed)."""
 
     def as_mapping(self) -> dict[str, Any]:
         """Return the form that commands and scripts give it; `parse` makes the same of it again."""

@@ -7,6 +7,7 @@ from rtcp.virtual.esc import Esc
 from rtcp.virtual.mailbox_service import MailboxService
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 from rtcp.virtual.registers import ERROR_FLAG, STATE_MASK, Register, State
+from rtcp.virtual.slave_faults import SlaveFaults
 from rtcp.virtual.statemachine import (
     HELD,
     INPUTS,
@@ -21,7 +22,6 @@ from rtcp.virtual.statemachine import (
 )
 from rtcp.virtual.synchronisation import SyncMonitor
 from rtcp.virtual.syncmanager import SyncManager
-from rtcp.virtual.trouble import Trouble
 
 OP_TIMEOUT = 1_000_000_000
 """How long, in ns, a slave asked for OP waits in SAFE-OP for its first outputs and SYNC0 before it refuses."""
@@ -37,11 +37,11 @@ class Application:
     Instants are ns of the host's monotonic clock.
     """
 
-    def __init__(self, esc: Esc, device: Device, trouble: Trouble, t: int) -> None:
+    def __init__(self, esc: Esc, device: Device, faults: SlaveFaults, t: int) -> None:
         self.esc = esc
         self.device = device
         self._parts = Parts(esc, device)
-        self._trouble = trouble
+        self._faults = faults
         self._mailbox: MailboxService | None = None
         self._rx = self._tx = PdoImage(())
         self._latched = b""
@@ -69,7 +69,7 @@ class Application:
         if esc.sync_managers_written:
             esc.sync_managers_written = False
             self._recheck()
-        if esc.al_control_written and not self._trouble.hangs:
+        if esc.al_control_written and not self._faults.hangs:
             esc.al_control_written = False
             self._control(esc.get(Register.AL_CONTROL, 2), t)
         if esc.mailbox_touched:
@@ -98,7 +98,7 @@ class Application:
             self._error = False
             self._lock_process_data(self.state < State.SAFE_OP)
         self._op_wanted_at = None
-        refusal = self._trouble.refusal(wanted) if wanted > self.state else 0
+        refusal = self._faults.refusal(wanted) if wanted > self.state else 0
         code = refusal or judge(self.state, wanted, self._parts)
         if code:
             self._refuse(code)
@@ -128,7 +128,7 @@ class Application:
             self._lock(False, MAILBOX_OUT, MAILBOX_IN)
             managers = self.esc.sync_managers
             out, in_ = managers[MAILBOX_OUT], managers[MAILBOX_IN]
-            self._mailbox = MailboxService(self.device, out, in_, self._trouble)
+            self._mailbox = MailboxService(self.device, out, in_, self._faults)
         if before < State.SAFE_OP <= wanted:
             self._start_process_data()
 
@@ -175,7 +175,7 @@ class Application:
     def _try_op(self, t: int) -> None:
         """Go to OP as soon as outputs and SYNC0 are there; give up after a while."""
         asked = self._op_wanted_at
-        if asked is None or self._trouble.hangs:
+        if asked is None or self._faults.hangs:
             return
         have_outputs = self._received or not self._rx.byte_length
         have_sync = self.sync.running or not self.sync.active

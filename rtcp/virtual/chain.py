@@ -10,7 +10,7 @@ from rtcp.virtual.slave import Slave
 class Chain:
     """Cable n lies behind slave n (0: between the master and slave 1); slaves count from 1.
 
-    What is broken twice must be mended twice.
+    What is broken twice must be joined twice.
     """
 
     def __init__(self, slaves: Sequence[Slave]) -> None:
@@ -26,7 +26,7 @@ class Chain:
         self._follow()
 
     def join(self, cable: int) -> None:
-        """Mend a cable."""
+        """Join a cable again."""
         self._cuts[cable] -= 1
         self._follow()
 

@@ -10,7 +10,7 @@ from rtcp.virtual.abort import AbortCode
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.objects import ObjectDictionary, SdoAbort
 from rtcp.virtual.sdo_access import check_download, read, write
-from rtcp.virtual.trouble import Trouble
+from rtcp.virtual.slave_faults import SlaveFaults
 
 MAILBOX_AND_COE_HEADER = 8
 """Bytes of a mailbox message before the SDO: six of the mailbox header, two of the CoE header."""
@@ -98,10 +98,10 @@ class SdoServer:
     MINIMUM_REQUEST = 10
     """Bytes of the shortest request, CoE header included."""
 
-    def __init__(self, objects: ObjectDictionary, send_size: int, trouble: Trouble | None = None) -> None:
+    def __init__(self, objects: ObjectDictionary, send_size: int, faults: SlaveFaults | None = None) -> None:
         """Serve `objects` through a send mailbox of `send_size` bytes."""
         self._objects = objects
-        self._trouble = Trouble() if trouble is None else trouble
+        self._faults = SlaveFaults() if faults is None else faults
         self._segment_size = send_size - MAILBOX_AND_COE_HEADER - 1
         self._normal_size = send_size - MAILBOX_AND_COE_HEADER - _SDO.size
         self._transfer: _Upload | _Download | None = None
@@ -124,7 +124,7 @@ class SdoServer:
         else:
             self._transfer = None
         try:
-            if specifier != Request.ABORT and (code := self._trouble.sdo_abort(index)):
+            if specifier != Request.ABORT and (code := self._faults.sdo_abort(index)):
                 raise SdoAbort(code)
             if specifier == Request.UPLOAD:
                 return self._upload(command, index, subindex, state)

@@ -10,7 +10,7 @@ from rtcp.virtual.coe import ABORT, CoeService, SdoServer, emergency_message
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.objects import ObjectDictionary
 from rtcp.virtual.sdo_info import SdoInformation
-from rtcp.virtual.trouble import Trouble
+from rtcp.virtual.slave_faults import SlaveFaults
 
 _HEADER = struct.Struct("<HHBB")
 _ERROR_REPLY = struct.Struct("<HH")
@@ -60,7 +60,7 @@ class Mailbox:
         emergencies: deque[Emergency],
         receive_size: int,
         send_size: int,
-        trouble: Trouble | None = None,
+        faults: SlaveFaults | None = None,
     ) -> None:
         """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes.
 
@@ -72,8 +72,8 @@ class Mailbox:
                 raise ValueError(f"the {name} mailbox has {size} bytes, allowed are {MINIMUM_SIZE} and more")
         self._emergencies = emergencies
         self._receive_size = receive_size
-        self._trouble = Trouble() if trouble is None else trouble
-        self._sdo = SdoServer(objects, send_size, self._trouble)
+        self._faults = SlaveFaults() if faults is None else faults
+        self._sdo = SdoServer(objects, send_size, self._faults)
         self._information = SdoInformation(objects, send_size)
         self._waiting: deque[tuple[MailboxType, int, bytes, int]] = deque()
         self._master_counter = 0
@@ -160,7 +160,7 @@ class Mailbox:
         if answer is not None:
             # An abort is a request of the server's to the client (ETG.1000.6, 5.6.2.7): masters tell it by that.
             service = CoeService.SDO_REQUEST if answer[0] == ABORT else CoeService.SDO_RESPONSE
-            self._waiting.append((MailboxType.COE, address, service.header + answer, t + self._trouble.sdo_delay()))
+            self._waiting.append((MailboxType.COE, address, service.header + answer, t + self._faults.sdo_delay()))
 
     def _sdo_information(self, address: int, content: bytes) -> None:
         if len(content) < SdoInformation.MINIMUM_REQUEST:

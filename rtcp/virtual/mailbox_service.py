@@ -6,19 +6,19 @@ from collections import deque
 
 from rtcp.virtual.device import Device
 from rtcp.virtual.mailbox import Mailbox
+from rtcp.virtual.slave_faults import SlaveFaults
 from rtcp.virtual.syncmanager import SyncManager
-from rtcp.virtual.trouble import Trouble
 
 
 class MailboxService:
     """Carries messages between sync managers and `Mailbox`, and repeats the last one when the master lost it."""
 
-    def __init__(self, device: Device, out: SyncManager, in_: SyncManager, trouble: Trouble) -> None:
+    def __init__(self, device: Device, out: SyncManager, in_: SyncManager, faults: SlaveFaults) -> None:
         """`out` is SM0, which the master writes, `in_` is SM1, which it reads; both configured by now."""
         self._out = out
         self._in = in_
         device.emergencies.clear()
-        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length, trouble)
+        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length, faults)
         self._outbox: deque[bytes] = deque()
         self._present: bytes | None = None
         self._last: bytes | None = None

@@ -18,10 +18,10 @@ from types import FrameType
 
 from rtcp.config.faults import Planned, load_script
 from rtcp.config.segment import SegmentConfig, load_segment
-from rtcp.virtual.faults.book import Book
 from rtcp.virtual.faults.control import Control, control_socket
 from rtcp.virtual.faults.frames import FOR_EVER
-from rtcp.virtual.faults.truth import Truth
+from rtcp.virtual.faults.ground_truth import GroundTruth
+from rtcp.virtual.faults.registry import FaultRegistry
 from rtcp.virtual.frame import ETHERTYPE
 from rtcp.virtual.models import create
 from rtcp.virtual.network import NetworkError, private_pair, public_pair
@@ -95,9 +95,9 @@ class StopRequest:
 
 
 class Server:
-    """Answers frames on one interface, but for what the faults of its `book` do to them."""
+    """Answers frames on one interface, but for what the faults of its `registry` do to them."""
 
-    def __init__(self, segment: Segment, interface: str, truth: Truth, script: Sequence[Planned] = ()) -> None:
+    def __init__(self, segment: Segment, interface: str, truth: GroundTruth, script: Sequence[Planned] = ()) -> None:
         self.segment = segment
         self._truth = truth
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
@@ -105,7 +105,7 @@ class Server:
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
         self._socket.bind((interface, ETHERTYPE))
-        self.book = Book(segment, self._send, time.monotonic_ns(), script, _complain)
+        self.registry = FaultRegistry(segment, self._send, time.monotonic_ns(), script, _complain)
 
     def close(self) -> None:
         """Close the socket."""
@@ -118,8 +118,8 @@ class Server:
 
     def serve(self, stop: StopRequest, poll: bool, control: Control | None = None) -> None:
         """Answer frames until `stop` came; with `poll` sleep no longer than it takes not to be throttled."""
-        segment, book, truth = self.segment, self.book, self._truth
-        frames = book.frames
+        segment, registry, truth = self.segment, self.registry, self._truth
+        frames = registry.frames
         frame = bytearray(BUFFER)
         view = memoryview(frame)
         receive, send = self._socket.recvmsg_into, self._socket.send
@@ -146,8 +146,8 @@ class Server:
                     awake_from = monotonic() + min((arrived - before) // REST_SHARE, LONGEST_REST)
                 continue
             now = monotonic()
-            if book.due <= now:
-                book.tick(now)
+            if registry.due <= now:
+                registry.tick(now)
             due = segment.next_event
             if due <= now:
                 segment.tick(now)
@@ -160,15 +160,15 @@ class Server:
                 if truth.watching and stepped is not None:
                     truth.look(stepped, now)
             elif now < awake_from:
-                wait(descriptors, (), (), max(0, min(due, book.due, awake_from) - now) * 1e-9)
+                wait(descriptors, (), (), max(0, min(due, registry.due, awake_from) - now) * 1e-9)
             elif now - arrived > SILENCE:
-                wait(descriptors, (), (), max(0, min(due, book.due) - now) * 1e-9)
+                wait(descriptors, (), (), max(0, min(due, registry.due) - now) * 1e-9)
 
     def _answer_disturbed(self, frame: bytearray, size: int, arrived: int) -> None:
         """Answer a frame while a fault does something to those that pass."""
-        if self.book.frames.arrives() and self.segment.process(frame, size, arrived):
+        if self.registry.frames.arrives() and self.segment.process(frame, size, arrived):
             if time.monotonic_ns() - arrived < STALE:
-                self.book.answers(bytes(frame[:size]), arrived)
+                self.registry.answers(bytes(frame[:size]), arrived)
             self.segment.settle(arrived)
 
 
@@ -236,10 +236,10 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         listener = None if control_path is None else kept.enter_context(control_socket(control_path))
         pair = private_pair() if interface is None else public_pair(interface)
         master_end, segment_end = kept.enter_context(pair)
-        truth = Truth(segment, [slave.model for slave in config.slaves])
+        truth = GroundTruth(segment, [slave.model for slave in config.slaves])
         server = Server(segment, segment_end, truth, script)
         kept.callback(server.close)
-        control = None if listener is None else Control(listener, server.book, truth)
+        control = None if listener is None else Control(listener, server.registry, truth)
         if control is not None:
             kept.callback(control.close)
         _prefer()

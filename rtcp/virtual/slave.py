@@ -10,7 +10,7 @@ from rtcp.virtual.device import Device
 from rtcp.virtual.esc import Esc
 from rtcp.virtual.pdo import SyncManagerLayout
 from rtcp.virtual.sii import build_sii
-from rtcp.virtual.trouble import Trouble
+from rtcp.virtual.slave_faults import SlaveFaults
 
 FIRST_LOCAL_TIME = 1_000_000_000
 """Slave n shows n times this at the start, as if powered one second after its neighbour: no clocks agree by chance."""
@@ -19,18 +19,18 @@ FIRST_LOCAL_TIME = 1_000_000_000
 class Slave:
     """A controller with its firmware and its place on the wire: `delay` ns after the master's port."""
 
-    __slots__ = ("_drift_ppm", "application", "clock", "delay", "device", "esc", "queued_until", "trouble")
+    __slots__ = ("_drift_ppm", "application", "clock", "delay", "device", "esc", "faults", "queued_until")
 
     def __init__(self, device: Device, eeprom: bytes, drift_ppm: float, start: int, delay: int, turnaround: int | None,
                  t: int) -> None:  # fmt: skip
         """Power on at instant `t`, the clock showing `start` ns; `turnaround`: see `Esc`."""
         self.device = device
         self.delay = delay
-        self.trouble = Trouble()
+        self.faults = SlaveFaults()
         self._drift_ppm = drift_ppm
         self.clock: Clock | None = Clock(drift_ppm, start, t) if device.supports_dc else None
         self.esc = Esc(eeprom, self.clock, turnaround, (True, turnaround is not None))
-        self.application = Application(self.esc, device, self.trouble, t)
+        self.application = Application(self.esc, device, self.faults, t)
         self.queued_until: int | None = None
         """Instant up to which the device is to be stepped; None while it does not wait for that."""
 
@@ -45,13 +45,13 @@ class Slave:
         self._restart(t)
 
     def _restart(self, t: int) -> None:
-        self.clock = Clock(self._drift_ppm + self.trouble.drift_ppm, 0, t) if self.device.supports_dc else None
+        self.clock = Clock(self._drift_ppm + self.faults.drift_ppm, 0, t) if self.device.supports_dc else None
         # The collector of garbage is off in a segment's process: no ring of references may be left.
         self.esc.detach()
         self.esc = Esc(bytes(self.esc.eeprom.image), self.clock, None, (False, False))
-        if self.esc.dc is not None and self.trouble.sync0_losses:
+        if self.esc.dc is not None and self.faults.sync0_losses:
             self.esc.dc.sync0.suspend()
-        self.application = Application(self.esc, self.device, self.trouble, t)
+        self.application = Application(self.esc, self.device, self.faults, t)
 
 
 def make_slaves(devices: Sequence[Device], drifts_ppm: Sequence[float], delays: Sequence[int],

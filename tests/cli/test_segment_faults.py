@@ -1,4 +1,4 @@
-"""`rtcp segment fault`, `mend`, `faults` and `kinds` on a real segment that `rtcp segment` runs."""
+"""`rtcp segment fault`, `clear`, `faults` and `kinds` on a real segment that `rtcp segment` runs."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ def segment(shared: Platform) -> Iterator[SegmentClient]:
     """The segment of the shared platform; its faults are mended afterwards, and the arm is ready."""
     with SegmentClient(segment_control(shared.directory)) as client:
         yield client
-        client.mend()
+        client.clear()
     well(shared)
     if shared.status()["state"] == "fault":
         shared.call("reset")
@@ -154,7 +154,7 @@ def test_a_reset_while_a_slave_is_still_away_fails_and_a_later_one_does_not(
         enabled.call("reset")
     assert enabled.status()["state"] == "fault"
     assert enabled.status()["slaves"][6]["state"] == "no answer"
-    segment.mend(away)
+    segment.clear(away)
     assert well(enabled)["state"] == "fault"
     reset_and_enable(enabled)
 

@@ -13,7 +13,7 @@ from kinematics import InverseKinematics, Pose, forward
 from rtcp.config import default_config, load
 from rtcp.ipc.codes import Command, MotionMode
 from rtcp.ipc.machine import State
-from rtcp.virtual.simulation import Simulation
+from rtcp.launch.simulation import Simulation
 
 BASE_ABOVE_GROUND_M = 0.45
 NEUTRAL, FORWARD, BACKWARD, LEFT, RIGHT, PADDLE_UP = 63, 62, 61, 59, 55, 47

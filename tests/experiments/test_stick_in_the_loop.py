@@ -11,7 +11,7 @@ from kinematics import forward
 from rtcp.config import default_config, load
 from rtcp.ipc.codes import Code, Command, MotionMode
 from rtcp.ipc.machine import State
-from rtcp.virtual.simulation import Simulation
+from rtcp.launch.simulation import Simulation
 
 from .test_picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
 

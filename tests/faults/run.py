@@ -30,7 +30,7 @@ def play(bench: Bench, case: Case, activity: str) -> tuple[Outcome | None, list[
     try:
         outcome = carry_out(bench, case.faults, activity, case.watch_s, reset_first=case.reset_is_refused)
     except TrialFailed as failure:
-        bench.segment.mend()
+        bench.segment.clear()
         return None, [str(failure)]
     return outcome, faults_of(case, outcome)
 

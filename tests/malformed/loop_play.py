@@ -10,7 +10,7 @@ from random import Random
 
 from rtcp.config import default_config, load
 from rtcp.ipc.machine import Command, State
-from rtcp.virtual.simulation import Frame, Simulation
+from rtcp.launch.simulation import Frame, Simulation
 from tests.malformed.mutate import EDGES
 from tests.malformed.segment_play import Found, Memory
 

@@ -26,7 +26,7 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.paths import stopping_mark
 from rtcp.ipc.session import Pid, Processes, Session, identify
 from rtcp.launch import launcher
-from rtcp.virtual.simulation import Simulation
+from rtcp.launch.simulation import Simulation
 
 JOINTS = 6
 AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}

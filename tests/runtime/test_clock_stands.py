@@ -10,8 +10,8 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.ipc.machine import Code, Command, State
+from rtcp.launch.simulation import Frame, Simulation
 from rtcp.realtime.discipline import UNHEARD_CYCLES
-from rtcp.virtual.simulation import Frame, Simulation
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))

@@ -17,8 +17,8 @@ from rtcp.ipc.codes import Code, Command, Refusal
 from rtcp.ipc.machine import State
 from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Event
+from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
-from rtcp.virtual.simulation import Frame, Simulation
 
 SHIPPED = load(default_config())
 PERIOD_S = 0.002

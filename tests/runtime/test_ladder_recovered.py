@@ -11,10 +11,10 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.messages import Sentences
-from rtcp.virtual.inprocess_slave import InProcessSlave
+from rtcp.launch.inprocess_slave import InProcessSlave
+from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create
 from rtcp.virtual.registers import State as AlState
-from rtcp.virtual.simulation import Frame, Simulation
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))

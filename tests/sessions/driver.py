@@ -11,8 +11,8 @@ from math import inf, nan
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.machine import Command, State
+from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.limits import Values, rows
-from rtcp.virtual.simulation import Frame, Simulation
 from tests.sessions.geometry import Box, depth, points
 from tests.sessions.judge import COUNTS, Bounds, Judge
 

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from rtcp.virtual.simulation import Frame
+from rtcp.launch.simulation import Frame
 from tests.sessions.geometry import REACH, Box, depth, points
 
 WIRE = struct.Struct("<Hiiib")

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from rtcp.ipc.machine import Command, State
+from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Values
-from rtcp.virtual.simulation import Frame
 from tests.e2e.wire import DRIVE, HEAD, LEAVES, LRW, frame
 from tests.sessions.driver import Driver, configuration, with_start
 from tests.sessions.wire_frames import EXPECTED_WKC, FENCE_INDEX, NOP, exchanges

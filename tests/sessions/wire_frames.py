@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 
-from rtcp.virtual.simulation import Frame
+from rtcp.launch.simulation import Frame
 from tests.e2e.wire import BOX_OUT, DRIVE, DRIVES, LRW, datagrams, frames
 
 NOP = 0

@@ -17,12 +17,12 @@ from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.emergency import Emergency as FieldbusEmergency
 from rtcp.ipc.machine import Code, Command
 from rtcp.ipc.machine import State as MachineState
-from rtcp.virtual.inprocess import Emergency, InProcessBus, SlaveFacts, SlaveState
-from rtcp.virtual.inprocess_data import InProcessData
-from rtcp.virtual.inprocess_slave import InProcessError
+from rtcp.launch.inprocess import Emergency, InProcessBus, SlaveFacts, SlaveState
+from rtcp.launch.inprocess_data import InProcessData
+from rtcp.launch.inprocess_slave import InProcessError
+from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 from rtcp.virtual.registers import State
-from rtcp.virtual.simulation import Frame, Simulation
 
 PERIOD_NS = 1_000_000
 MS = 1_000_000

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
+from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.frame import Command, Datagram
-from rtcp.virtual.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.registers import State
 from tests.virtual.line import MS, OP, SAFE_OP, Line, fmmu, start_sync0

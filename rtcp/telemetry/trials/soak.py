@@ -156,7 +156,7 @@ class Soak:
             summary.failures.append(f"{where}: {error}")
             self._report(f"{where}: {error}")
             with contextlib.suppress(SegmentRefused, SegmentAway, OSError):
-                bench.segment.mend()
+                bench.segment.clear()
             return
         finally:
             account.injected += bench.injected - before

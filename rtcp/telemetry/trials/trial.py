@@ -140,7 +140,7 @@ def _break(
     said = tuple(bench.said_since(mark))
     with contextlib.suppress(ControlError):
         doing.end()
-    by_itself = _mend(bench, watched=state not in GOES_ON)
+    by_itself = _clear(bench, watched=state not in GOES_ON)
     mended = time.monotonic()
     resets, refusal = bench.bring_up()
     recovery_s = time.monotonic() - mended
@@ -158,10 +158,10 @@ def _positions(bench: Bench) -> list[float]:
     return [drive["position_rad"] for drive in bench.drives()]
 
 
-def _mend(bench: Bench, *, watched: bool) -> str:
+def _clear(bench: Bench, *, watched: bool) -> str:
     """Mend everything; where the machine stands in a fault, return what moved or got torque by itself afterwards."""
     before, state = bench.drives(), bench.state()
-    bench.segment.mend()
+    bench.segment.clear()
     if not watched:
         return ""
     bench.until(lambda: False, _MENDED_S)

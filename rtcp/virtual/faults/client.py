@@ -54,13 +54,13 @@ class SegmentClient:
         """Let a fault begin, as `{"fault": "cable", "after": 3, "lasts": 1.5}`; return its number."""
         return int(self._ask({"do": "fault", "fault": dict(fault)})["id"])
 
-    def mend(self, number: int | None = None) -> list[int]:
+    def clear(self, number: int | None = None) -> list[int]:
         """End a fault, or all of them; return the numbers of those that were active."""
-        request = {"do": "mend"} if number is None else {"do": "mend", "id": number}
-        return list(self._ask(request)["mended"])
+        request = {"do": "clear"} if number is None else {"do": "clear", "id": number}
+        return list(self._ask(request)["cleared"])
 
     def faults(self) -> list[dict[str, Any]]:
-        """Return the active faults: `id`, `fault`, `since_s`, `left_s` (None: until it is mended), `counts`."""
+        """Return the active faults: `id`, `fault`, `since_s`, `left_s` (None: until it is cleared), `counts`."""
         return list(self._ask({"do": "faults"}))
 
     def truth(self) -> dict[str, Any]:

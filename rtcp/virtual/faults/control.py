@@ -1,4 +1,4 @@
-"""The control socket of a segment: faults begun and mended, and questions, by other processes while it runs.
+"""The control socket of a segment: faults begun and cleared, and questions, by other processes while it runs.
 
 A Unix socket of packets, one JSON object each: `{"do": "fault", "fault": {...}}` is answered by `{"ok": true, "result":
 ...}` or by `{"ok": false, "error": "a sentence"}`. Frames come first: nothing here waits for a client.
@@ -20,10 +20,9 @@ from typing import Any
 
 from rtcp.config.checking import shown, unknown_key
 from rtcp.config.faults import FAULTS, parse, sentence_of
-from rtcp.ipc.paths import listens
-from rtcp.virtual.faults.book import Book
+from rtcp.virtual.faults.ground_truth import GroundTruth
+from rtcp.virtual.faults.registry import FaultRegistry
 from rtcp.virtual.faults.slaves import FaultRefused
-from rtcp.virtual.faults.truth import Truth
 
 LONGEST_REQUEST = 1024
 MOST_KEYS = 10
@@ -62,7 +61,7 @@ def _make_room(path: Path) -> None:
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
             raise ValueError(f"the control socket {path} cannot be made: there is a file that is no socket")
-        if listens(path):
+        if _in_use(path):
             raise ValueError(f"the control socket {path} is in use by a segment that runs: choose another path")
         path.unlink()
     except FileNotFoundError:
@@ -71,18 +70,31 @@ def _make_room(path: Path) -> None:
         raise ValueError(f"the control socket {path} cannot be made: {error.strerror or error}") from error
 
 
+def _in_use(path: Path) -> bool:
+    """Whether a process listens at the socket `path`."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect(str(path))
+        except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError):
+            return False
+        except OSError:
+            pass  # a full queue or the socket of another user
+    return True
+
+
 class Control:
     """Answers one request a look, so that a client that floods takes no more of the time than one that asks."""
 
-    def __init__(self, listener: socket.socket, book: Book, truth: Truth) -> None:
+    def __init__(self, listener: socket.socket, registry: FaultRegistry, truth: GroundTruth) -> None:
         self._listener = listener
-        self._book = book
+        self._registry = registry
         self._truth = truth
         self._clients: dict[int, socket.socket] = {}
         self._epoll = select.epoll()
         self._epoll.register(listener, select.EPOLLIN)
         self._verbs: MappingProxyType[str, Callable[[dict[str, Any], int], Any]] = MappingProxyType({
-            "fault": self._fault, "mend": self._mend, "faults": self._faults, "truth": self._tell_truth,
+            "fault": self._fault, "clear": self._clear, "faults": self._faults, "truth": self._tell_truth,
             "clear_peaks": self._clear_peaks,
         })  # fmt: skip
         for name in FAULTS:
@@ -164,18 +176,18 @@ class Control:
             raise FaultRefused("; ".join(map(sentence_of, findings)))
         if planned.at:
             raise FaultRefused("at: a fault that is asked for begins at once; only a script has times")
-        return {"id": self._book.begin(planned, now)}
+        return {"id": self._registry.begin(planned, now)}
 
-    def _mend(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
+    def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
         _only(request, "id")
         number = request.get("id")
         if number is not None and type(number) is not int:
             raise FaultRefused(f"id: found {shown(number)}, allowed is the number of a fault, or none for all")
-        return {"mended": self._book.mend(number, now)}
+        return {"cleared": self._registry.clear(number, now)}
 
     def _faults(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
         _only(request)
-        return self._book.listing(now)
+        return self._registry.listing(now)
 
     def _tell_truth(self, request: dict[str, Any], now: int) -> dict[str, Any]:
         _only(request)

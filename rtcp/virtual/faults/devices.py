@@ -56,7 +56,7 @@ def begin(devices: Sequence[Device], fault: DeviceFault) -> Callable[[int], None
         raise FaultRefused(f"there is no IO box on the segment: {fault.name} is a fault of its inputs")
     broken = _terminals(box, fault)
     box.break_terminals(broken)
-    return lambda _: box.mend_terminals(broken)
+    return lambda _: box.release_terminals(broken)
 
 
 def _at(devices: Sequence[Device], number: int, kind: type[_D], words: str) -> _D:

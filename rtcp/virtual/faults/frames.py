@@ -5,13 +5,13 @@ from __future__ import annotations
 import heapq
 
 from rtcp.config.faults import Fault, Noise
-from rtcp.virtual.faults.troubles import MOST_AT_ONCE, TROUBLES, NoiseSource, Send, Trouble
+from rtcp.virtual.faults.frame_faults import FRAME_FAULT_KINDS, MOST_AT_ONCE, FrameFault, NoiseSource, Send
 
 FOR_EVER = 1 << 63
 """An instant that does not come."""
 MOST_UNDER_WAY = 10_000
 """Late answers that are kept; a cable holds no more either."""
-_ORDER = tuple(TROUBLES)
+_ORDER = tuple(FRAME_FAULT_KINDS)
 FRAME_FAULTS = (*_ORDER, Noise)
 """The faults that are made here."""
 
@@ -19,23 +19,23 @@ FRAME_FAULTS = (*_ORDER, Noise)
 class FrameUndo:
     """Ends one of these faults; tells what it has done."""
 
-    def __init__(self, frames: Frames, trouble: Trouble | NoiseSource) -> None:
+    def __init__(self, frames: Frames, fault: FrameFault | NoiseSource) -> None:
         self._frames = frames
-        self._trouble = trouble
+        self._fault = fault
 
     @property
     def over(self) -> bool:
         """Whether its burst has passed."""
-        return self._trouble.over
+        return self._fault.over
 
     @property
     def counts(self) -> dict[str, int]:
         """How many frames it has struck, by what was done to them."""
-        return dict(self._trouble.counts)
+        return dict(self._fault.counts)
 
     def __call__(self, t: int) -> None:
         """End it; answers that are late already come when they are due."""
-        self._frames.end(self._trouble)
+        self._frames.end(self._fault)
 
 
 class Frames:
@@ -49,32 +49,32 @@ class Frames:
         self.active = False
         self.due = FOR_EVER
         self._send = send
-        self._troubles: list[tuple[int, Trouble]] = []
+        self._faults: list[tuple[int, FrameFault]] = []
         self._noises: list[NoiseSource] = []
         self._under_way: list[tuple[int, int, bytes]] = []
         self._number = 0
 
     def begin(self, fault: Fault, t: int) -> FrameUndo:
         """Let a fault begin at instant `t`."""
-        trouble: Trouble | NoiseSource
+        made: FrameFault | NoiseSource
         if isinstance(fault, Noise):
-            trouble = NoiseSource(fault, t)
-            self._noises.append(trouble)
+            made = NoiseSource(fault, t)
+            self._noises.append(made)
         else:
             kind = type(fault)
-            trouble = TROUBLES[kind](fault, self._later)
-            self._troubles.append((_ORDER.index(kind), trouble))
-            self._troubles.sort(key=lambda each: each[0])
+            made = FRAME_FAULT_KINDS[kind](fault, self._later)
+            self._faults.append((_ORDER.index(kind), made))
+            self._faults.sort(key=lambda each: each[0])
         self._look_ahead()
-        return FrameUndo(self, trouble)
+        return FrameUndo(self, made)
 
-    def end(self, trouble: Trouble | NoiseSource) -> None:
+    def end(self, fault: FrameFault | NoiseSource) -> None:
         """Let a fault end; what it has kept goes to the master."""
-        if isinstance(trouble, NoiseSource):
-            self._noises = [each for each in self._noises if each is not trouble]
+        if isinstance(fault, NoiseSource):
+            self._noises = [each for each in self._noises if each is not fault]
         else:
-            self._troubles = [each for each in self._troubles if each[1] is not trouble]
-            for frame in trouble.end():
+            self._faults = [each for each in self._faults if each[1] is not fault]
+            for frame in fault.end():
                 self._send(frame)
         self._look_ahead()
 
@@ -85,8 +85,8 @@ class Frames:
 
     def _look_ahead(self) -> None:
         """Forget bursts that have passed; find what is next."""
-        self._troubles = [each for each in self._troubles if not each[1].over]
-        self.active = bool(self._troubles)
+        self._faults = [each for each in self._faults if not each[1].over]
+        self.active = bool(self._faults)
         due = self._under_way[0][0] if self._under_way else FOR_EVER
         for each in self._noises:
             due = min(due, each.due)
@@ -95,9 +95,9 @@ class Frames:
     def arrives(self) -> bool:
         """Whether the frame that has come reaches the segment."""
         arrives = True
-        for _, trouble in self._troubles:
+        for _, fault in self._faults:
             # Each is asked, so that what one fault does is the same whether there are others or not.
-            if not trouble.arrives():
+            if not fault.arrives():
                 arrives = False
         if not arrives:
             self._look_ahead()
@@ -106,8 +106,8 @@ class Frames:
     def answers(self, frame: bytes, t: int) -> None:
         """Send, keep or lose the answer to a frame that came at `t`."""
         passing = [frame]
-        for _, trouble in self._troubles:
-            passing = trouble.answer(passing, t)
+        for _, fault in self._faults:
+            passing = fault.answer(passing, t)
         for each in passing:
             self._send(each)
         self._look_ahead()

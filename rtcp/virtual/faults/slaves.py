@@ -28,7 +28,7 @@ from rtcp.config.faults import (
 from rtcp.virtual.clock import Clock, SyncGenerator
 from rtcp.virtual.faults import devices
 from rtcp.virtual.faults.devices import FaultRefused
-from rtcp.virtual.faults.strikes import Strikes
+from rtcp.virtual.faults.selector import FrameSelector
 from rtcp.virtual.registers import State
 from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
@@ -78,7 +78,7 @@ class _Counted:
         self.count = 0
         self.when_passed: Callable[[], object] | None = None
         """Called when the burst has passed: it costs nothing any more."""
-        self._strikes = Strikes(fault)
+        self._strikes = FrameSelector(fault)
 
     @property
     def passed(self) -> bool:
@@ -157,7 +157,7 @@ def _power(segment: Segment, fault: PowerFault, t: int) -> SlaveUndo:
 
 
 def _refuse(segment: Segment, fault: AlRefuse, t: int) -> SlaveUndo:
-    refusals = _slave(segment, fault.slave).trouble.refusals
+    refusals = _slave(segment, fault.slave).faults.refusals
     state = State[fault.state.replace("-", "_")]
     refusals.append((state, fault.code))
     return SlaveUndo(segment, lambda _: refusals.remove((state, fault.code)))
@@ -167,10 +167,10 @@ def _hang(segment: Segment, fault: AlHang, t: int) -> SlaveUndo:
     slave = _slave(segment, fault.slave)
 
     def go_on(t: int) -> None:
-        slave.trouble.hangs -= 1
+        slave.faults.hangs -= 1
         slave.application.attend(t)
 
-    slave.trouble.hangs += 1
+    slave.faults.hangs += 1
     return SlaveUndo(segment, go_on)
 
 
@@ -184,14 +184,14 @@ def _fall(segment: Segment, fault: AlFall, t: int) -> SlaveUndo:
 
 
 def _late(segment: Segment, fault: SdoLate, t: int) -> SlaveUndo:
-    delays = _slave(segment, fault.slave).trouble.sdo_delays
+    delays = _slave(segment, fault.slave).faults.sdo_delays
     delay = round(fault.ms * 1e6)
     delays.append(delay)
     return SlaveUndo(segment, lambda _: delays.remove(delay))
 
 
 def _abort(segment: Segment, fault: SdoAbort, t: int) -> SlaveUndo:
-    aborts = _slave(segment, fault.slave).trouble.sdo_aborts
+    aborts = _slave(segment, fault.slave).faults.sdo_aborts
     aborts.append((fault.index, fault.code))
     return SlaveUndo(segment, lambda _: aborts.remove((fault.index, fault.code)))
 
@@ -209,7 +209,7 @@ def _miscount(segment: Segment, fault: WorkingCounter, t: int) -> SlaveUndo:
 
 
 def _list(segment: Segment, listed: list[_T], entry: _T, strikes: _Counted) -> SlaveUndo:
-    """Put `entry`, which calls `strikes`, on a list of the segment until its burst has passed or it is mended."""
+    """Put `entry`, which calls `strikes`, on a list of the segment until its burst has passed or it is cleared."""
 
     def leave() -> None:
         listed.remove(entry)
@@ -236,11 +236,11 @@ def _lose_sync0(segment: Segment, fault: Sync0Lost, t: int) -> SlaveUndo:
     slave, _ = _clock(segment, fault.slave)
 
     def resume(t: int) -> None:
-        slave.trouble.sync0_losses -= 1
-        if not slave.trouble.sync0_losses and (sync0 := _sync0(slave)) is not None:
+        slave.faults.sync0_losses -= 1
+        if not slave.faults.sync0_losses and (sync0 := _sync0(slave)) is not None:
             sync0.resume(t)
 
-    slave.trouble.sync0_losses += 1
+    slave.faults.sync0_losses += 1
     if (sync0 := _sync0(slave)) is not None:
         sync0.suspend()
     return SlaveUndo(segment, resume)
@@ -258,7 +258,7 @@ def _drift(segment: Segment, fault: ClockDrift, t: int) -> SlaveUndo:
     slave, _ = _clock(segment, fault.slave)
 
     def change(ppm: float, t: int) -> None:
-        slave.trouble.drift_ppm += ppm
+        slave.faults.drift_ppm += ppm
         # Not the clock of before: the supply may have been away meanwhile.
         if slave.clock is not None:
             slave.clock.change_drift(ppm, t)

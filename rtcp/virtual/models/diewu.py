@@ -100,10 +100,10 @@ class DiewuIoBox:
         self._turned += edges
 
     def break_terminals(self, broken: BrokenTerminals) -> None:
-        """Let input terminals show something else than the world, whatever is forced over the bus, until `mend`."""
+        """Let input terminals show something else than the world, whatever is forced over the bus, until `clear`."""
         self._broken.append(broken)
 
-    def mend_terminals(self, broken: BrokenTerminals) -> None:
+    def release_terminals(self, broken: BrokenTerminals) -> None:
         """Let them show the world again."""
         self._broken.remove(broken)
 

@@ -71,7 +71,7 @@ def begin_segment(three_slaves: Path) -> Iterator[BeginSegment]:
 
 @pytest.fixture(scope="module")
 def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
-    """One segment for all tests of a file; what one of them breaks it mends."""
+    """One segment for all tests of a file; what one of them breaks it ends."""
     control = tmp_path_factory.mktemp("control") / "segment.sock"
     process = start(three_slaves, "--control", str(control))
     try:

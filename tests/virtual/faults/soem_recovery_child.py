@@ -63,7 +63,7 @@ def main() -> None:
         found["broken"] = cycle(master, 0.3)
         found["links"] = [register(slave, 0x0110, 2) >> 4 & 3 for slave in master.slaves[:3]]
         found["watched"] = [each["reachable"] for each in segment.truth()["slaves"]]
-        segment.mend(number)
+        segment.clear(number)
         found["lost_links"] = [register(slave, 0x0310, 2) for slave in master.slaves]
         cycle(master, 0.02)
         master.read_state()
@@ -71,11 +71,11 @@ def main() -> None:
         for slave in master.slaves[3:]:
             slave.state = pysoem.SAFEOP_STATE + pysoem.STATE_ACK
             slave.write_state()
-        found["mended"] = to_op(master), cycle(master, 0.02)[-5:]
+        found["cleared"] = to_op(master), cycle(master, 0.02)[-5:]
 
         number = segment.fault({"fault": "power", "slave": 7})
         found["dark"] = cycle(master, 0.05)[-5:]
-        segment.mend(number)
+        segment.clear(number)
         last = master.slaves[6]
         found["back"] = cycle(master, 0.05)[-5:]
         found["recovered"] = last.recover()
@@ -85,7 +85,7 @@ def main() -> None:
         # Process data that this machine delays count as lost: only what answers came with is looked at.
         number = segment.fault({"fault": "wkc", "slave": 3, "rate": 1.0})
         found["not_counted"] = cycle(master, 0.02)[-5:]
-        segment.mend(number)
+        segment.clear(number)
         segment.fault({"fault": "corrupt", "after": 4, "burst": 5})
         found["damaged"] = cycle(master, 0.02)
         found["errors"] = [register(slave, 0x0300, 1) + 256 * register(slave, 0x0308, 1) for slave in master.slaves]
@@ -94,7 +94,7 @@ def main() -> None:
             master.slaves[2].sdo_read(0x6041, 0)
         except pysoem.SdoError as error:
             found["abort"] = error.abort_code
-        segment.mend()
+        segment.clear()
         segment.fault({"fault": "al_fall", "slave": 2, "code": 0x1234})
         found["fallen"] = cycle(master, 0.02)[-5:]
         master.read_state()

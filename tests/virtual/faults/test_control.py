@@ -37,7 +37,7 @@ def whole(segment: Running) -> Iterator[None]:
     """After each test nothing is broken."""
     yield
     with segment.client() as client:
-        client.mend()
+        client.clear()
 
 
 def indices(came: list[tuple[int, bytes]]) -> list[int]:
@@ -70,7 +70,7 @@ def test_slaves_see_what_is_lost_behind_them_and_not_what_is_lost_before(
         client.fault({"fault": "loss", "rate": 1.0, "seed": seed})
         assert exchange([build(Datagram(Command.APWR, 0, 0xFFFF, 0x0010, address))]).came == []
         assert client.faults()[0]["counts"][lost] == 1
-        client.mend()
+        client.clear()
     (_, answer), *_ = exchange([build(Datagram(Command.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).came
     assert next(parse(answer)).counter == written
 
@@ -122,7 +122,7 @@ def test_a_cable_broken_by_command_is_seen_by_the_master_until_it_is_mended(
         number = client.fault({"fault": "cable", "after": 1})
         assert counter() == 1
         assert [slave["reachable"] for slave in client.truth()["slaves"]] == [True, False, False]
-        assert client.mend(number) == [number]
+        assert client.clear(number) == [number]
         assert counter() == 3
 
 
@@ -152,12 +152,12 @@ def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
         (b"9" * 1000, f"found {'9' * 40}"),
         (b"x" * (LONGEST_REQUEST + 1), f"a request has at most {LONGEST_REQUEST} bytes"),
         (b"[1, 2]", "found a list, allowed is an object with the key do"),
-        ({}, "do: found nothing, allowed is one of fault, mend, faults, truth, clear_peaks"),
+        ({}, "do: found nothing, allowed is one of fault, clear, faults, truth, clear_peaks"),
         ({"do": "dance"}, 'do: found the text "dance", allowed is one of fault'),
         ({"do": ["fault"]}, "do: found a list, allowed is one of fault"),
         ({"do": "truth", "slave": 1}, "slave: this key is not known here; allowed are do"),
-        ({"do": "mend", "id": True}, "id: found true, allowed is the number of a fault, or none for all"),
-        ({"do": "mend", "id": 99999}, "there was no fault 99999; active now: none"),
+        ({"do": "clear", "id": True}, "id: found true, allowed is the number of a fault, or none for all"),
+        ({"do": "clear", "id": 99999}, "there was no fault 99999; active now: none"),
         ({"do": "fault"}, "found nothing, allowed is a mapping with the key `fault`"),
         ({"do": "fault", "fault": dict.fromkeys("abcdefghijk", 1)}, "a fault has at most 10 keys, found 11"),
         ({"do": "fault", "fault": {"fault": "cabel"}}, "fault: this fault is not known here; did you mean cable?"),

@@ -126,7 +126,7 @@ def test_an_answer_comes_after_the_one_that_follows_it(cable: Cable) -> None:
     cable.send(1, 2, 3)
     assert cable.numbers() == [2, 1]
     undo(0)
-    assert cable.numbers() == [3], "what it kept comes when it is mended"
+    assert cable.numbers() == [3], "what it kept comes when it is cleared"
 
 
 def test_a_burst_of_one_is_not_over_before_the_answer_that_it_keeps_has_come(cable: Cable) -> None:

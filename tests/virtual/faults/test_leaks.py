@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from rtcp.config.faults import FAULTS, ONCE, load_script, parse
-from rtcp.virtual.faults.book import Book
 from rtcp.virtual.faults.control import Control, control_socket
+from rtcp.virtual.faults.ground_truth import GroundTruth
+from rtcp.virtual.faults.registry import FaultRegistry
 from rtcp.virtual.faults.slaves import FaultRefused
-from rtcp.virtual.faults.truth import Truth
 from rtcp.virtual.frame import Command, Datagram, build
 from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
 
@@ -48,44 +48,44 @@ BY_RATE = [name for name, keys in KINDS.items() if "rate" in keys]
 WRONG: list[bytes] = [
     b'{"do":"fault","fault":{"fault":"corupt","after":1}}', b'{"do":"fault","fault":{"fault":"corrupt","after":"x"}}',
     b'{"do":"fault","fault":{"fault":"corrupt","after":1,"rate":2,"way":7}}', b'{"do":"fault"}',
-    b'{"do":"mend","id":9999}',
+    b'{"do":"clear","id":9999}',
     b'{"do":"fault","fault":{"fault":"drive","slave":1,"error":"encoder"}}', b"{", b"[]", b"\xff", b'{"do":"dance"}',
     b'{"do":"faults","x":1}', b"[" * 900, b'{"do":"fault","fault":{"fault":"cable","after":99,"lasts":1e99}}',
 ]  # fmt: skip
 
 
 class Bench:
-    """The shipped segment in OP, its book, and a master's frames through both, as the server leads them."""
+    """The shipped segment in OP, its registry, and a master's frames through both, as the server leads them."""
 
     def __init__(self) -> None:
         self.line = Line()
         self.line.start(OP)
         self.sent = 0
-        self.book = Book(self.line.segment, self._send, self.line.now)
+        self.registry = FaultRegistry(self.line.segment, self._send, self.line.now)
         self._frame = build(Datagram(Command.LRW, 0, 0, 0, bytes(184)), Datagram(Command.BRD, 0, 0, 0x0130, bytes(2)))
 
     def _send(self, frame: bytes) -> None:
         self.sent += 1
 
     def frames(self, count: int) -> None:
-        line, book = self.line, self.book
+        line, registry = self.line, self.registry
         for _ in range(count):
             line.pass_time(MS)
-            if book.due <= line.now:
-                book.tick(line.now)
+            if registry.due <= line.now:
+                registry.tick(line.now)
             size = len(self._frame)
             line.buffer[:size] = self._frame
-            if not book.frames.active:
+            if not registry.frames.active:
                 line.segment.process(line.buffer, size, line.now)
                 line.segment.settle(line.now)
-            elif book.frames.arrives() and line.segment.process(line.buffer, size, line.now):
-                book.answers(bytes(line.buffer[:size]), line.now)
+            elif registry.frames.arrives() and line.segment.process(line.buffer, size, line.now):
+                registry.answers(bytes(line.buffer[:size]), line.now)
                 line.segment.settle(line.now)
 
     def begin(self, name: str, **more: Any) -> int:
         planned, findings = parse({"fault": name, **KINDS[name], **more})
         assert planned is not None, findings
-        return self.book.begin(planned, self.line.now)
+        return self.registry.begin(planned, self.line.now)
 
     def again_in_op(self) -> None:
         for state in (ACK | SAFE_OP, OP):
@@ -132,13 +132,13 @@ def test_a_fault_that_is_mended_or_ends_at_its_time_leaves_nothing_to_collect(be
         number = bench.begin(name)
         bench.frames(3)
         if not once and name != "drive":
-            bench.book.mend(number, bench.line.now)
+            bench.registry.clear(number, bench.line.now)
             bench.begin(name, lasts=0.002)
             bench.frames(4)
         elif name == "drive":
             bench.begin(name, lasts=0.002)
             bench.frames(4)
-        assert bench.book.listing(bench.line.now) == []
+        assert bench.registry.listing(bench.line.now) == []
 
     assert left_by(play) == 0
 
@@ -148,7 +148,7 @@ def test_damage_on_either_way_leaves_nothing_to_collect(bench: Bench, way: str) 
     def play() -> None:
         number = bench.begin("corrupt", way=way)
         bench.frames(3)
-        bench.book.mend(number, bench.line.now)
+        bench.registry.clear(number, bench.line.now)
 
     assert left_by(play) == 0
 
@@ -160,9 +160,9 @@ def test_a_burst_that_has_passed_leaves_nothing_to_collect(bench: Bench, name: s
     assert planned is not None
 
     def play() -> None:
-        bench.book.begin(planned, bench.line.now)
+        bench.registry.begin(planned, bench.line.now)
         bench.frames(5)
-        assert bench.book.listing(bench.line.now) == []
+        assert bench.registry.listing(bench.line.now) == []
 
     assert left_by(play) == 0
 
@@ -174,17 +174,19 @@ def test_a_script_leaves_nothing_to_collect(bench: Bench, tmp_path: Path) -> Non
     planned = load_script(script, len(bench.line.segment.slaves))
 
     def play() -> None:
-        bench.book = Book(bench.line.segment, bench._send, bench.line.now, planned)
+        bench.registry = FaultRegistry(bench.line.segment, bench._send, bench.line.now, planned)
         bench.frames(3)
         # All but what is over at once: the drive's single occurrence, the clock's jump.
-        assert len(bench.book.mend(None, bench.line.now)) == len(entries) - 2
+        assert len(bench.registry.clear(None, bench.line.now)) == len(entries) - 2
 
     assert left_by(play) == 0
 
 
 def test_what_is_refused_leaves_nothing_to_collect(bench: Bench, tmp_path: Path) -> None:
     with control_socket(tmp_path / "segment.sock") as listener:
-        control = Control(listener, bench.book, Truth(bench.line.segment, ["x"] * len(bench.line.segment.slaves)))
+        control = Control(
+            listener, bench.registry, GroundTruth(bench.line.segment, ["x"] * len(bench.line.segment.slaves))
+        )
         assert left_by(lambda: [control._answer(packet)["ok"] for packet in WRONG].index(False)) == 0
         assert not any(control._answer(packet)["ok"] for packet in WRONG)
         control.close()
@@ -198,6 +200,6 @@ def test_a_book_that_is_full_leaves_nothing_to_collect(bench: Bench) -> None:
                 bench.begin("corrupt")
             except FaultRefused:
                 refused = True
-        bench.book.mend(None, bench.line.now)
+        bench.registry.clear(None, bench.line.now)
 
     assert left_by(play) == 0

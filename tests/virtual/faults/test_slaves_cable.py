@@ -42,23 +42,23 @@ def exchange_for(line: Line, ns: int) -> list[int]:
 
 def test_frames_turn_round_at_a_broken_cable_and_only_the_slaves_before_it_count() -> None:
     line = in_op()
-    mend = cut(line, 2)
+    end = cut(line, 2)
     assert count(line) == 2
     assert line.one(Command.APRD, 0, 0x0130, bytes(2)).counter == 1
     assert line.one(Command.APRD, -2 & 0xFFFF, 0x0130, bytes(2)).counter == 0
     assert line.one(Command.FPRD, STATION + 2, 0x0130, bytes(2)).counter == 0
     assert line.one(Command.BRD, 0, 0, bytes(1)).address == 2
     assert exchange_for(line, 20 * MS) == [6] * 20
-    mend(line.now)
+    end(line.now)
     assert count(line) == 4
 
 
 def test_mended_at_once_the_slaves_behind_go_on_in_op_with_their_addresses() -> None:
     line = in_op()
-    mend = cut(line, 1)
+    end = cut(line, 1)
     exchange_for(line, 20 * MS)
     assert line.devices[1].out.value == 0
-    mend(line.now)
+    end(line.now)
     assert line.exchange(10, 20, 30, 40)[1] == 12
     assert line.exchange(10, 20, 30, 40) == ([11, 21, 31, 41], 12)
     assert [line.al(n) for n in range(4)] == [(OP, 0)] * 4
@@ -66,10 +66,10 @@ def test_mended_at_once_the_slaves_behind_go_on_in_op_with_their_addresses() -> 
 
 def test_the_watchdog_takes_the_slaves_behind_a_broken_cable_out_of_op_and_they_can_come_back() -> None:
     line = in_op()
-    mend = cut(line, 2)
+    end = cut(line, 2)
     exchange_for(line, 150 * MS)
     assert [device.valid for device in line.devices] == [[True], [True], [True, False], [True, False]]
-    mend(line.now)
+    end(line.now)
     assert line.al(2) == line.al(3) == (SAFE_OP | ERROR, 0x001B)
     assert line.exchange()[1] == 8
     for slave in (2, 3):
@@ -82,11 +82,11 @@ def test_the_watchdog_takes_the_slaves_behind_a_broken_cable_out_of_op_and_they_
 
 def test_what_the_slaves_before_a_broken_cable_are_set_to_meanwhile_is_kept() -> None:
     line = in_op()
-    mend = cut(line, 2)
+    end = cut(line, 2)
     line.one(Command.APWR, 0, 0x0010, b"\x77\x00")
     line.one(Command.FPWR, 0x77, 0x0600, bytes(32))
     assert line.exchange()[1] == 3
-    mend(line.now)
+    end(line.now)
     assert line.exchange()[1] == 9
     assert line.one(Command.FPRD, 0x77, 0x0130, bytes(2)).counter == 1
     assert line.one(Command.FPRD, STATION, 0x0130, bytes(2)).counter == 0
@@ -94,14 +94,14 @@ def test_what_the_slaves_before_a_broken_cable_are_set_to_meanwhile_is_kept() ->
 
 def test_between_master_and_slave_1_a_broken_cable_brings_nothing_back_and_no_slave_sees_the_frame() -> None:
     line = in_op()
-    mend = cut(line, 0)
+    end = cut(line, 0)
     frame = build(Datagram(Command.BWR, 0, 0, 0x0F80, b"\x55"))
     assert line.raw(frame) is None
     line.pass_time(150 * MS)
     assert line.raw(frame) is None
     assert [slave.application.state for slave in line.slaves] == [SAFE_OP] * 4
     assert [slave.esc.memory[0x0F80] for slave in line.slaves] == [0] * 4
-    mend(line.now)
+    end(line.now)
     assert count(line) == 4
     assert line.number(0, LOST_LINKS, 1) == 1
 
@@ -115,7 +115,7 @@ def test_of_several_broken_cables_the_nearest_counts() -> None:
     far(line.now)
     assert count(line) == 3
     far(line.now)
-    assert count(line) == 3, "what is mended twice is mended once"
+    assert count(line) == 3, "what is ended twice is ended once"
     again(line.now)
     assert count(line) == 4
 
@@ -126,12 +126,12 @@ def test_both_ends_of_a_broken_cable_show_no_link_and_count_its_loss() -> None:
     assert [found & (LINK_0 | LINK_1 | CLOSED_0 | CLOSED_1) for found in before] == [
         LINK_0 | LINK_1, LINK_0 | LINK_1, LINK_0 | LINK_1, LINK_0 | CLOSED_1,
     ]  # fmt: skip
-    mend = cut(line, 2)
+    end = cut(line, 2)
     assert line.number(1, DL_STATUS, 2) & (LINK_0 | LINK_1 | CLOSED_0 | CLOSED_1) == LINK_0 | CLOSED_1
     assert line.number(0, DL_STATUS, 2) == before[0]
     assert int.from_bytes(line.slaves[2].esc.memory[0x0110:0x0112], "little") & (LINK_0 | CLOSED_0) == CLOSED_0
     assert line.read(1, LOST_LINKS, 4) == bytes((0, 1, 0, 0))
-    mend(line.now)
+    end(line.now)
     assert [line.number(n, DL_STATUS, 2) for n in range(4)] == before
     assert [line.read(n, LOST_LINKS, 2) for n in range(4)] == [bytes(2), b"\0\1", b"\1\0", bytes(2)]
 
@@ -162,9 +162,9 @@ def test_the_delays_measured_are_those_of_the_slaves_reached_and_afterwards_as_b
         return [back - there if back else 0 for there, back in ports]
 
     assert around() == [5000, 3360, 1680, 0]
-    mend = cut(line, 3)
+    end = cut(line, 3)
     assert around() == [3320, 1680, 0]
-    mend(line.now)
+    end(line.now)
     assert around() == [5000, 3360, 1680, 0]
 
 
@@ -175,10 +175,10 @@ def test_sync0_goes_on_behind_a_broken_cable() -> None:
     start_sync0(line, 1, MS)
     line.pass_time(20 * MS)
     pulses = line.slaves[1].esc.dc.sync0.pulses
-    mend = cut(line, 1)
+    end = cut(line, 1)
     line.pass_time(50 * MS)
     assert line.slaves[1].esc.dc.sync0.pulses - pulses == 50
-    mend(line.now)
+    end(line.now)
     assert line.al(1) == (PRE_OP, 0)
 
 

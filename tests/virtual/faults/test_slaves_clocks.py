@@ -34,12 +34,12 @@ def test_without_sync0_a_slave_leaves_op_and_with_it_again_it_goes_on_in_the_sam
     line = by_sync0()
     sync0 = line.slaves[0].esc.dc.sync0
     first, pulses = sync0.next, sync0.pulses
-    mend = begin(line.segment, Sync0Lost(1), line.now)
+    end = begin(line.segment, Sync0Lost(1), line.now)
     for _ in range(20):
         line.exchange(1)
     assert sync0.pulses == pulses
     assert line.al(0) == (SAFE_OP | ERROR, 0x002C)
-    mend(line.now)
+    end(line.now)
     pulses = sync0.pulses
     line.pass_time(10 * MS)
     assert sync0.pulses == pulses + 10
@@ -53,19 +53,19 @@ def test_without_sync0_a_slave_leaves_op_and_with_it_again_it_goes_on_in_the_sam
 def test_sync0_that_is_activated_while_it_is_lost_begins_when_mended() -> None:
     line = Line([TinyDevice()])
     line.address()
-    mend = begin(line.segment, Sync0Lost(1), line.now)
+    end = begin(line.segment, Sync0Lost(1), line.now)
     start_sync0(line, 0, MS, first_in=2 * MS)
     line.pass_time(20 * MS)
     sync0 = line.slaves[0].esc.dc.sync0
     assert (sync0.pulses, sync0.due) == (0, None)
-    mend(line.now)
+    end(line.now)
     line.pass_time(5 * MS)
     assert sync0.pulses == 5
 
 
 def test_sync0_stays_lost_through_a_loss_of_supply_and_when_lost_twice_until_mended_twice() -> None:
     line = Line([TinyDevice()])
-    mends = [begin(line.segment, Sync0Lost(1), line.now) for _ in range(2)]
+    ends = [begin(line.segment, Sync0Lost(1), line.now) for _ in range(2)]
     begin(line.segment, PowerFault(1), line.now)(line.now)
     line.address()
     for expected in (0, 0, 5):
@@ -73,8 +73,8 @@ def test_sync0_stays_lost_through_a_loss_of_supply_and_when_lost_twice_until_men
         line.pass_time(5 * MS + MS // 2)
         assert line.slaves[0].esc.dc.sync0.pulses == expected
         line.write(0, 0x0981, b"\x00")
-        if mends:
-            mends.pop()(line.now)
+        if ends:
+            ends.pop()(line.now)
 
 
 @pytest.mark.parametrize("us", [400.0, -400.0])
@@ -130,12 +130,12 @@ def test_drift_compensation_takes_a_jump_back() -> None:
 def test_a_clock_drifts_from_now_on_until_mended_and_what_it_has_gained_stays() -> None:
     line = Line([TinyDevice(), TinyDevice()], drifts=[0.0, 10.0])
     before = local_times(line)
-    mend = begin(line.segment, ClockDrift(2, 200.0), line.now)
+    end = begin(line.segment, ClockDrift(2, 200.0), line.now)
     assert local_times(line) == before
     line.pass_time(1000 * MS)
     ran = [now - then for now, then in zip(local_times(line), before, strict=True)]
     assert ran == [10**9, pytest.approx(10**9 + 210_000, abs=2)]
-    mend(line.now)
+    end(line.now)
     line.pass_time(1000 * MS)
     ran = [now - then for now, then in zip(local_times(line), before, strict=True)]
     assert ran == [2 * 10**9, pytest.approx(2 * 10**9 + 220_000, abs=3)]
@@ -143,11 +143,11 @@ def test_a_clock_drifts_from_now_on_until_mended_and_what_it_has_gained_stays() 
 
 def test_a_drift_is_still_there_after_a_loss_of_supply_and_gone_when_mended() -> None:
     line = Line([TinyDevice()])
-    mend = begin(line.segment, ClockDrift(1, 500.0), line.now)
+    end = begin(line.segment, ClockDrift(1, 500.0), line.now)
     begin(line.segment, PowerFault(1), line.now)(line.now)
     line.pass_time(1000 * MS)
     assert local_times(line) == [pytest.approx(10**9 + 500_000, abs=2)]
-    mend(line.now)
+    end(line.now)
     line.pass_time(1000 * MS)
     assert local_times(line) == [pytest.approx(2 * 10**9 + 500_000, abs=3)]
 

@@ -7,9 +7,9 @@ from itertools import pairwise
 import pytest
 
 from rtcp.config.faults import DriveFault, InputsFrozen, PowerFault, StickCode, TerminalFault
+from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.faults import devices
 from rtcp.virtual.faults.slaves import FaultRefused, begin
-from rtcp.virtual.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from tests.virtual.line import MS, Line
 
@@ -71,8 +71,8 @@ class Joint:
 @pytest.mark.parametrize("error", CODES)
 def test_a_drive_tells_its_error_stops_and_can_be_reset_when_the_cause_is_gone(error: str) -> None:
     joint = Joint()
-    mend = begin(joint.line.segment, DriveFault(2, error), joint.line.now, lasts=2.0)
-    assert not mend.over
+    end = begin(joint.line.segment, DriveFault(2, error), joint.line.now, lasts=2.0)
+    assert not end.over
     assert joint.drive.powered is (error not in AT_ONCE), "by a ramp, or at once"
     joint.line.pass_time(1000 * MS)
     assert joint.state == "FAULT"
@@ -82,7 +82,7 @@ def test_a_drive_tells_its_error_stops_and_can_be_reset_when_the_cause_is_gone(e
     assert joint.emergencies() == [CODES[error]]
     assert joint.reset() == "FAULT"
     assert joint.emergencies() == [CODES[error]], "the drive tells again why it does not go on"
-    mend(joint.line.now)
+    end(joint.line.now)
     assert joint.state == "FAULT"
     assert joint.reset() == "SWITCH_ON_DISABLED"
     assert joint.emergencies() == [0]
@@ -172,21 +172,21 @@ def test_an_input_that_bounces_changes_with_each_half_period_and_begins_with_the
 ) -> None:
     box.inputs = level
     line = Line([box])
-    mend = begin(line.segment, TerminalFault(3, "bounce", 3.0), line.now)
+    end = begin(line.segment, TerminalFault(3, "bounce", 3.0), line.now)
     shown = [seen(line) == level for _ in range(18)]
     edges = [n for n in range(1, 18) if shown[n] != shown[n - 1]]
     assert shown[0] is False
     assert {after - before for before, after in pairwise(edges)} == {3}
-    mend(line.now)
+    end(line.now)
     assert [seen(line) for _ in range(9)] == [level] * 9
 
 
 def test_the_joystick_s_lines_show_a_code_whatever_the_stick_does(box: DiewuIoBox) -> None:
     line = Line([box])
-    mend = begin(line.segment, StickCode(0b010101), line.now)
+    end = begin(line.segment, StickCode(0b010101), line.now)
     box.inputs = 0xFFC0
     assert seen(line) == 0xFFD5
-    mend(line.now)
+    end(line.now)
     assert seen(line) == 0xFFC0
 
 
@@ -194,13 +194,13 @@ def test_frozen_inputs_keep_their_value_whatever_is_done_to_the_terminals(box: D
     line = Line([box])
     box.inputs = 0xFFFF
     assert seen(line) == 0xFFFF
-    mends = [begin(line.segment, InputsFrozen(1), line.now) for _ in range(2)]
+    ends = [begin(line.segment, InputsFrozen(1), line.now) for _ in range(2)]
     box.inputs = 0xFFC0
     pressed = begin(line.segment, TerminalFault(10, "low"), line.now)
     assert seen(line) == 0xFFFF
-    mends[0](line.now)
+    ends[0](line.now)
     assert seen(line) == 0xFFFF
-    mends[1](line.now)
+    ends[1](line.now)
     assert seen(line) == 0xFDC0
     pressed(line.now)
     assert seen(line) == 0xFFC0

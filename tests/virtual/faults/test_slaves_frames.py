@@ -72,12 +72,12 @@ def test_a_slave_before_the_damage_does_what_a_request_asks_and_a_slave_behind_i
 
 def test_damage_to_every_frame_ends_with_the_fault_and_the_counters_stop_at_255() -> None:
     line = in_op()
-    mend = begin(line.segment, Corrupt(2, rate=1.0), line.now)
+    end = begin(line.segment, Corrupt(2, rate=1.0), line.now)
     for _ in range(300):
         assert line.raw(lrw(0, 0, 0, 0)) is None
-    assert mend.counts == {"corrupted": 300}
-    assert not mend.over
-    mend(line.now)
+    assert end.counts == {"corrupted": 300}
+    assert not end.over
+    end(line.now)
     assert errors(line) == [(0, 0, 0)] * 2 + [(255, 255, 0), (0, 0, 255)]
     assert not line.segment.damages
 
@@ -193,7 +193,7 @@ def test_there_is_no_cable_to_damage_frames_behind_the_last_slave() -> None:
 def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: Command, share: int, full: int) -> None:
     line = in_op()
     line.exchange(1, 2, 3, 4)
-    mend = begin(line.segment, WorkingCounter(2, rate=1.0), line.now)
+    end = begin(line.segment, WorkingCounter(2, rate=1.0), line.now)
     data = bytes.fromhex("0500 0600 0700 0800") + bytes(8)
     answer = line.logical(command, 0, data)
     assert answer.counter == full - share
@@ -202,7 +202,7 @@ def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: Command,
     line.pass_time(MS)
     assert line.devices[1].out.value == (2 if command == Command.LRD else 6)
     assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 4
-    mend(line.now)
+    end(line.now)
     assert line.logical(command, 0, data).counter == full
 
 

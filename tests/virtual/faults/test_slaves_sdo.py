@@ -51,12 +51,12 @@ class Master:
 
 def test_an_answer_comes_so_much_later_and_afterwards_at_once_again() -> None:
     master = Master()
-    mend = begin(master.line.segment, SdoLate(1, 20.0), master.line.now)
+    end = begin(master.line.segment, SdoLate(1, 20.0), master.line.now)
     asked = master.ask(0x7000)
     found, at = master.wait(50)
     assert found[2:6] == bytes.fromhex("4b 00 70 01")
     assert 20 * MS <= at - asked < 22 * MS
-    mend(master.line.now)
+    end(master.line.now)
     asked = master.ask(0x7000)
     assert master.wait(5)[1] - asked < MS
 
@@ -94,12 +94,12 @@ def test_of_several_delays_the_longest_counts() -> None:
 @pytest.mark.parametrize("command", [0x40, 0x2B], ids=["upload", "download"])
 def test_every_service_is_aborted_with_the_code_and_changes_nothing(command: int) -> None:
     master = Master()
-    mend = begin(master.line.segment, SdoAbort(1, 0x08000021), master.line.now)
+    end = begin(master.line.segment, SdoAbort(1, 0x08000021), master.line.now)
     before = master.line.devices[0].out.value
     assert master.abort_code(0x7000, command) == 0x08000021
     assert master.line.devices[0].out.value == before
     assert master.abort_code(0x1018, 0x40) == 0x08000021
-    mend(master.line.now)
+    end(master.line.now)
     assert master.abort_code(0x7000, command) == 0
 
 

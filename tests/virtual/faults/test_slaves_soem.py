@@ -45,8 +45,8 @@ def test_a_real_master_sees_each_fault_and_brings_all_back_after_a_broken_cable_
     assert found["watched"] == [True] * 3 + [False] * 4
     assert found["lost_links"] == [0, 0, 0x0100, 0x0001, 0, 0, 0]
     assert found["behind"] == [[8, 0], [0x14, 0x1B], [0x14, 0x1B]]
-    assert found["mended"][0] == 8
-    assert {*found["mended"][1]} <= {21, -1}
+    assert found["cleared"][0] == 8
+    assert {*found["cleared"][1]} <= {21, -1}
     assert {*found["dark"], *found["back"]} <= {18, -1}
     assert found["recovered"] > 0
     assert found["reconfigured"] > 0

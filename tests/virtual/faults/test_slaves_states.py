@@ -23,13 +23,13 @@ def test_a_refused_state_gives_the_code_until_mended_and_what_lies_below_is_free
     name: str, state: int, below: int
 ) -> None:
     line = in_op()
-    mend = begin(line.segment, AlRefuse(2, name, REFUSED), line.now)
+    end = begin(line.segment, AlRefuse(2, name, REFUSED), line.now)
     assert line.al(1) == (OP, 0), "who is there stays there"
     assert line.request(1, below) == (below, 0)
     assert line.request(1, state) == (below | ERROR, REFUSED)
     assert line.request(1, below | ACK) == (below, 0)
     assert line.request(0, INIT) == (INIT, 0)
-    mend(line.now)
+    end(line.now)
     if state == PRE_OP:
         line.write(1, 0x0800, SM_MAILBOXES)
     line.write(1, 0x0120, bytes((state, 0)))
@@ -45,13 +45,13 @@ def test_a_request_downwards_is_not_refused() -> None:
 
 def test_a_slave_that_hangs_neither_follows_nor_refuses_and_does_it_afterwards() -> None:
     line = in_op()
-    mend = begin(line.segment, AlHang(2), line.now)
+    end = begin(line.segment, AlHang(2), line.now)
     assert line.request(1, SAFE_OP) == (OP, 0)
     assert line.request(1, INIT) == (OP, 0)
     for _ in range(200):
         assert line.exchange()[1] == 6
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)
-    mend(line.now)
+    end(line.now)
     assert line.al(1) == (INIT, 0)
 
 
@@ -59,11 +59,11 @@ def test_a_slave_that_hangs_on_its_way_to_op_does_not_arrive_there() -> None:
     line = Line([TinyDevice()])
     line.to_safe_op()
     line.request(0, OP)
-    mend = begin(line.segment, AlHang(1), line.now)
+    end = begin(line.segment, AlHang(1), line.now)
     for _ in range(50):
         line.exchange()
     assert line.al(0) == (SAFE_OP, 0)
-    mend(line.now)
+    end(line.now)
     line.exchange()
     assert line.al(0) == (OP, 0)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from random import Random
 
-from rtcp.virtual.inprocess_slave import InProcessSlave
+from rtcp.launch.inprocess_slave import InProcessSlave
 
 
 class InProcessData:

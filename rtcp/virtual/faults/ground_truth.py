@@ -33,7 +33,7 @@ class _Joint:
             self.peak = max(self.peak, speed)
 
 
-class Truth:
+class GroundTruth:
     """Watches the joints from the first question on, for as long as requests come: else a segment pays nothing.
 
     While `watching`, `look` is to be called after each step of a device.

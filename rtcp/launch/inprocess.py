@@ -15,9 +15,9 @@ from random import Random
 from typing import NamedTuple
 
 from rtcp.config.model import SlaveConfig
+from rtcp.launch.inprocess_data import InProcessData
+from rtcp.launch.inprocess_slave import InProcessError, InProcessSlave, identity_faults
 from rtcp.virtual.device import Device
-from rtcp.virtual.inprocess_data import InProcessData
-from rtcp.virtual.inprocess_slave import InProcessError, InProcessSlave, identity_faults
 from rtcp.virtual.registers import State
 from rtcp.virtual.statemachine import AlStatusCode
 

@@ -9,9 +9,9 @@ from typing import Any
 
 from rtcp.config.faults import ONCE, Planned
 from rtcp.virtual.faults import slaves
+from rtcp.virtual.faults.frame_faults import Send
 from rtcp.virtual.faults.frames import FOR_EVER, FRAME_FAULTS, Frames
 from rtcp.virtual.faults.slaves import FaultRefused, Undo
-from rtcp.virtual.faults.troubles import Send
 from rtcp.virtual.segment import Segment
 
 MOST_ACTIVE = 50
@@ -29,7 +29,7 @@ class _Active:
     undo: Undo
 
 
-class Book:
+class FaultRegistry:
     """Begins and ends faults. Nothing happens by itself: `tick` is to be called when `due` has come.
 
     `send` puts a frame on the cable to the master. The times of `script` count from instant `t`; what a segment refuses
@@ -57,7 +57,7 @@ class Book:
         """
         self._drop_passed()
         if len(self._active) >= MOST_ACTIVE:
-            raise FaultRefused(f"{MOST_ACTIVE} faults are active already: mend some of them first")
+            raise FaultRefused(f"{MOST_ACTIVE} faults are active already: clear some of them first")
         undo = self._make(planned, t)
         self._last += 1
         if not isinstance(planned.fault, ONCE) and not _over(undo):
@@ -71,7 +71,7 @@ class Book:
             return self.frames.begin(planned.fault, t)
         return slaves.begin(self._segment, planned.fault, t, planned.lasts)
 
-    def mend(self, number: int | None, t: int) -> list[int]:
+    def clear(self, number: int | None, t: int) -> list[int]:
         """End a fault, or all that are active when None; return the numbers of those that were.
 
         Raises:
@@ -83,12 +83,12 @@ class Book:
                 raise FaultRefused(f"fault {number} is not active any more")
             known = ", ".join(map(str, self._active)) or "none"
             raise FaultRefused(f"there was no fault {number}; active now: {known}")
-        mended = list(self._active) if number is None else [number]
+        cleared = list(self._active) if number is None else [number]
         # The last one first: each finds the segment as it was when it began.
-        for each in reversed(mended):
+        for each in reversed(cleared):
             self._active.pop(each).undo(t)
         self._look_ahead()
-        return mended
+        return cleared
 
     def tick(self, now: int) -> None:
         """End the faults whose time is over, begin those of the script that are due, send the frames that are due."""

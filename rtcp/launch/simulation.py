@@ -21,8 +21,8 @@ from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
 from rtcp.ipc.machine import State as MachineState
 from rtcp.ipc.observer import Answer, Event, Observer
-from rtcp.virtual.inline_service import InlineService
-from rtcp.virtual.inprocess import InProcessBus
+from rtcp.launch.inline_service import InlineService
+from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 
 NAME = "inprocess"

@@ -17,7 +17,7 @@ class _Struck(Protocol):
     def seed(self) -> int: ...
 
 
-class Strikes:
+class FrameSelector:
     """Which frames a fault strikes: each with the probability of its rate, or the next ones of its burst."""
 
     def __init__(self, fault: _Struck) -> None:

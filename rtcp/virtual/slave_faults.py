@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass
-class Trouble:
+class SlaveFaults:
     """It stays with the slave when its supply goes and comes back; firmware and mailbox look here while they work."""
 
     refusals: list[tuple[int, int]] = field(default_factory=list)

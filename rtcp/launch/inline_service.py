@@ -9,7 +9,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.control.assembly import position_of
 from rtcp.control.service import Service
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.virtual.inprocess import InProcessBus
+from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.registers import State
 
 _WATCH_TURNS = 10

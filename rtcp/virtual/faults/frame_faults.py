@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 from rtcp.config.faults import Delay, Duplicate, Fault, Garble, Loss, Noise, Reorder
 from rtcp.virtual.faults import noise
-from rtcp.virtual.faults.strikes import Strikes
+from rtcp.virtual.faults.selector import FrameSelector
 
 MOST_AT_ONCE = 16
 """Frames that are sent in one look at what is due: those of the master come in between."""
@@ -21,7 +21,7 @@ Later = Callable[[bytes, int], None]
 """Takes a frame and the instant at which it is to be sent."""
 
 
-class Trouble(Protocol):
+class FrameFault(Protocol):
     """A fault at work on the frames that pass."""
 
     counts: dict[str, int]
@@ -44,7 +44,7 @@ class _Losing:
     """Half of what is lost never reaches the slaves, the other half is lost on its way back."""
 
     def __init__(self, fault: Loss, later: Later) -> None:
-        self._strikes = Strikes(fault)
+        self._strikes = FrameSelector(fault)
         self._behind = False
         self.counts = {"lost_before": 0, "lost_behind": 0}
 
@@ -79,7 +79,7 @@ class _OnAnswers:
 
     def __init__(self, fault: Any, later: Later) -> None:
         self._fault = fault
-        self._strikes = Strikes(fault)
+        self._strikes = FrameSelector(fault)
         self._later = later
         self.counts = {self.NAME: 0}
 
@@ -188,7 +188,7 @@ class NoiseSource:
             self.counts["sent"] += 1
 
 
-TROUBLES: MappingProxyType[type[Fault], Callable[[Any, Later], Trouble]] = MappingProxyType({
+FRAME_FAULT_KINDS: MappingProxyType[type[Fault], Callable[[Any, Later], FrameFault]] = MappingProxyType({
     Loss: _Losing, Garble: _Garbling, Reorder: _Reordering, Duplicate: _Duplicating, Delay: _Delaying,
 })  # fmt: skip
 """What each fault does, in the order in which an answer meets them."""

@@ -9,7 +9,7 @@ import pytest
 
 from rtcp.config.segment import load_segment
 from rtcp.virtual.faults.client import SegmentClient
-from rtcp.virtual.faults.truth import PATIENCE, Truth
+from rtcp.virtual.faults.ground_truth import PATIENCE, GroundTruth
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.server import make_segment
@@ -30,10 +30,10 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-def watched(config: Path) -> tuple[Truth, Segment]:
+def watched(config: Path) -> tuple[GroundTruth, Segment]:
     loaded = load_segment(config)
     segment = make_segment(loaded, 0)
-    return Truth(segment, [slave.model for slave in loaded.slaves]), segment
+    return GroundTruth(segment, [slave.model for slave in loaded.slaves]), segment
 
 
 def drive_of(slave: Slave) -> CubemarsDrive:
