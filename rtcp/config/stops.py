@@ -1,4 +1,4 @@
-"""Which event takes which rung of the ladder of stops; what each rung does is in `rtcp.ipc.stops`.
+"""Which event takes which rung of the ladder of stops; what each rung does is in `rtcp.ipc.stop_reactions`.
 
 The first rung, to hold the last targets, is every lost cycle's up to `bus.lost_cycles` and nobody's choice. As `model`,
 this module imports nothing heavy.
@@ -28,7 +28,7 @@ class StopsConfig:
     """The cycle does not follow the reference clock any more."""
     emergency_stop: HardStop = "quick_stop"
     """Its input is active: IEC 60204-1 knows stop category 1, a quick stop and then no torque, and category 0."""
-    watch: HardStop = "quick_stop"
+    supervision: HardStop = "quick_stop"
     """What is measured was beyond a limit of `watch` for too long."""
     lease_ended: AnyStop = "controlled_stop"
     """The commander of what moves fell silent, or gave up its lease."""

@@ -61,9 +61,9 @@ KEYS = MappingProxyType(
         Code.DRIVE_LEFT_ENABLED: "drive_fault",
         Code.CLOCK_LOST: "clock_lost",
         Code.PRESSED: "emergency_stop",
-        Code.OVER_SPEED: "watch",
-        Code.OVER_TORQUE: "watch",
-        Code.FOLLOWING_ERROR: "watch",
+        Code.OVER_SPEED: "supervision",
+        Code.OVER_TORQUE: "supervision",
+        Code.FOLLOWING_ERROR: "supervision",
         Code.LEASE_ENDED: "lease_ended",
         Code.NOT_PERMITTED: "enabling_switch",
     }

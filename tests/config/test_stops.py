@@ -29,8 +29,8 @@ MISTAKES = {
         'stops.clock_lost: found the text "fast", allowed is one of controlled_stop, quick_stop, torque_off',
     ),
     "off is a text of its own, and no rung": (
-        ("watch: quick_stop", "watch: off"),
-        'stops.watch: found the text "off", allowed is one of quick_stop, torque_off',
+        ("supervision: quick_stop", "watch: off"),
+        'stops.supervision: found the text "off", allowed is one of quick_stop, torque_off',
     ),
     "an event that there is not": (
         ("slave_lost: quick_stop", "slaves_lost: quick_stop"),

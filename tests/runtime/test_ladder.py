@@ -91,7 +91,7 @@ CAUSES: dict[str, tuple[Callable[[Bench], object], Callable[[Bench], object]]] =
         lambda bench: put(bench, EMERGENCY_STOP_INPUT, False),
         lambda bench: put(bench, EMERGENCY_STOP_INPUT, True),
     ),
-    "watch": (turn_too_fast, let_go),
+    "supervision": (turn_too_fast, let_go),
     "lease_ended": (take_the_lease, give_the_lease),
     "enabling_switch": (lambda bench: put(bench, SWITCH_INPUT, False), lambda bench: put(bench, SWITCH_INPUT, True)),
 }
@@ -189,10 +189,10 @@ def test_no_rung_lets_a_target_jump(lived: Lived) -> None:
 
 
 def test_a_rung_ends_in_its_state(lived: Lived) -> None:
-    emergency = lived.key in ("emergency_stop", "watch")
+    emergency = lived.key in ("emergency_stop", "supervision")
     soft = lived.key in ENDS and lived.rung == "controlled_stop"
     assert lived.ended_in is (State.EMERGENCY_STOP if emergency else State.HOLDING if soft else State.FAULT)
-    if lived.key not in ("lost_frames", "watch"):
+    if lived.key not in ("lost_frames", "supervision"):
         assert lived.powered is (lived.rung != "torque_off" and not emergency)
         assert abs(lived.velocity) < 0.001
 

@@ -1,0 +1,198 @@
+"""The commands that the loop accepts: one frozen dataclass each, its fields in SI, and the states that accept it.
+
+A command crosses the ring of the blackboard as bytes (`rtcp.ipc.message`). On the control socket it is a JSON-RPC
+method of the same name where nothing has to be planned first (`docs/protocol.md`). A package outside registers its own
+by subclassing; the controller or handler that names it receives it.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rtcp.ipc.message import Joints, Kinds, Message
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
+
+ANYWHERE = frozenset(State) - {State.OFF}
+AT_REST = frozenset({State.READY, State.HOLDING})
+CALM = AT_REST | {State.MOVING, State.STOPPED_BY_LIMIT}
+MOTION = frozenset({State.HOLDING, State.MOVING})
+
+
+class Command(Message, abstract=True):
+    """Base of all commands."""
+
+    kinds: ClassVar[Kinds[Command]] = Kinds()
+    states: ClassVar[frozenset[State]]
+    """States in which it is accepted."""
+    needs_lease: ClassVar[bool] = True
+    """False where it only makes the arm safer: anyone may send it at any time."""
+    waits_for_drive_mode: ClassVar[bool] = False
+    """Whether it is refused while the drives change their mode."""
+
+
+class MotionCommand(Command, abstract=True):
+    """Base of what a motion controller accepts (`rtcp.motion.controllers`)."""
+
+    states = MOTION
+    waits_for_drive_mode = True
+    renewed: ClassVar[bool] = False
+    """Whether it lasts only for its hold time, or while more of its kind follow; else it ends by itself."""
+
+
+COMMANDS = Command.kinds
+
+
+class Enable(Command):
+    """Bring all drives to Operation Enabled."""
+
+    states = frozenset({State.READY})
+
+
+class Disable(Command):
+    """Stop, then take the torque off. In a fault: take the torque off at once."""
+
+    states = ANYWHERE - {State.STARTING, State.CLOSING}
+    needs_lease = False
+
+
+class Reset(Command):
+    """Leave a fault, an emergency stop, or a stop by a limit."""
+
+    states = frozenset({State.STOPPED_BY_LIMIT, State.FAULT, State.EMERGENCY_STOP})
+
+
+class SetDriveMode(Command):
+    """Change the cyclic synchronous mode of the drives."""
+
+    states = AT_REST
+    waits_for_drive_mode = True
+    mode: DriveMode
+
+
+class SetControlMode(Command):
+    """Change which motion commands the arm accepts."""
+
+    states = AT_REST
+    waits_for_drive_mode = True
+    mode: ControlMode
+
+
+class Halt(Command):
+    """Bring what moves to rest; the drives stay enabled."""
+
+    states = frozenset({State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
+    needs_lease = False
+
+
+class Shutdown(Command):
+    """Stop, disable and end the loop; the end of its process is the answer."""
+
+    states = ANYWHERE
+    needs_lease = False
+
+
+class SetOutput(Command):
+    """Set a digital output of the IO box."""
+
+    states = CALM | {State.ENABLING, State.STOPPING, State.HOMING, State.FAULT}
+    number: int
+    """From 1."""
+    value: bool
+
+
+class MoveGripper(Command):
+    """Open or close the gripper."""
+
+    states = CALM | {State.STOPPING}
+    open: bool
+
+
+class SetLimits(Command):
+    """Replace the limits by those of a slot of the plan area, all or none."""
+
+    states = CALM | {State.FAULT, State.EMERGENCY_STOP}
+    slot: int
+    rows: int
+
+
+class SetZero(Command):
+    """Set what a drive shows where its axis is at 0."""
+
+    states = frozenset({State.READY})
+    axis: int
+    offset: float
+    """rad"""
+
+
+class Home(Command):
+    """Run the homing of one drive (mode of operation 6)."""
+
+    states = frozenset({State.HOLDING})
+    waits_for_drive_mode = True
+    axis: int
+
+
+# -- motion commands: each is accepted by the controller that names it ------------------------------------------------
+
+
+class MoveJoints(MotionCommand):
+    """Move to joint positions, rad, at most at `speed`, rad/s."""
+
+    q: Joints
+    speed: float
+    synchronized: bool
+    """All joints arrive together; else each as soon as it can."""
+
+
+class RunTrajectory(MotionCommand):
+    """Run the trajectory in a slot of the plan area."""
+
+    slot: int
+    rows: int
+
+
+class RunLines(MotionCommand):
+    """Run the straight lines in a slot of the plan area."""
+
+    slot: int
+    rows: int
+
+
+class StreamPosition(MotionCommand):
+    """Send the next position of a stream."""
+
+    renewed = True
+    q: Joints
+    """rad"""
+    stamp_s: float
+    """Clock of the sender, s."""
+
+
+class Jog(MotionCommand):
+    """Move the tool with velocities along and about the axes of a frame, or the joints, for `hold_s`."""
+
+    renewed = True
+    velocity: Joints
+    """Tool: x y z, m/s, rx ry rz, rad/s. Joints: rad/s."""
+    frame: JogFrame
+    hold_s: float
+
+
+class MoveAtVelocity(MotionCommand):
+    """Move the joints at velocities, rad/s, for `hold_s`."""
+
+    renewed = True
+    velocity: Joints
+    hold_s: float
+
+
+class ApplyTorque(MotionCommand):
+    """Add joint torques, Nm, to what carries the weight of the arm, for `hold_s`."""
+
+    renewed = True
+    torque: Joints
+    stiffness: float
+    """Fraction, 0 to 1, of each joint's `cst_stiffness`."""
+    damping: float
+    """Fraction, 0 to 1, of each joint's `cst_damping`."""
+    hold_s: float

@@ -1,0 +1,448 @@
+"""What happens in the loop: one frozen dataclass a kind, whose docstring is its message.
+
+The number of a kind is also the error code in cycle records, in `rtcp status` and in ROS-Industrial's RobotStatus.
+Code decides on kinds and fields; `rtcp.ipc.names` makes the text, at the edge. A fault kind of a package outside is
+a subclass of `Fault` there, with a number from 1000 on.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rtcp.ipc.message import Kinds, Message
+from rtcp.ipc.states import ControlMode, DriveMode
+
+JOYSTICK_MODES = ("X-Y", "Z-yaw", "roll-pitch", "gripper")
+
+
+class Event(Message, abstract=True):
+    """Base of all events."""
+
+    kinds: ClassVar[Kinds[Event]] = Kinds()
+    is_fault: ClassVar[bool] = False
+    """Whether it begins a fault or an emergency stop."""
+    is_emergency: ClassVar[bool] = False
+    """Whether it begins the emergency stop, also out of a fault."""
+    stop_key: ClassVar[str] = ""
+    """Key under `stops` that sets its stop reaction (`rtcp.ipc.stop_reactions`); empty: a fault takes a quick stop."""
+
+
+EVENTS = Event.kinds
+
+
+class Fault(Event, abstract=True):
+    """Base of events that begin a fault."""
+
+    is_fault = True
+
+
+class Emergency(Fault, abstract=True):
+    """Base of events that begin the emergency stop."""
+
+    is_emergency = True
+
+
+# -- states of the machine --------------------------------------------------------------------------------------------
+
+
+class Ready(Event, number=10):
+    """all slaves are in OP"""
+
+
+class Enabled(Event, number=11):
+    """all drives are enabled, the arm holds"""
+
+
+class Disabled(Event, number=12):
+    """all drives are disabled"""
+
+
+class ResetDone(Event, number=13):
+    """reset: the fault is cleared, drives are disabled"""
+
+
+class Arrived(Event, number=14):
+    """the motion is complete"""
+
+
+class Stopped(Event, number=15):
+    """the arm has stopped and holds"""
+
+
+class LimitStopReset(Event, number=32):
+    """reset: the arm holds and accepts commands"""
+
+
+class ClockLocked(Event, number=16):
+    """the cycle is locked to the reference clock"""
+
+
+class ClockUnlocked(Event, number=17):
+    """the cycle has lost the phase of the reference clock"""
+
+
+class TorqueRemoved(Event, number=21):
+    """drives were commanded to remove their torque; the fault remains until `rtcp reset`"""
+
+
+class SlavesParked(Event, number=27):
+    """emergency stop complete: torque is off, slaves go to PRE-OP"""
+
+
+class LimitsChanged(Event, number=31):
+    """the limits were changed"""
+
+
+class ControlModeChanged(Event, number=30):
+    """control mode {mode}"""
+
+    mode: ControlMode
+
+
+class ReturningToRange(Event, number=44):
+    """{joint} stands {beyond:.2g} rad outside its range ({key}.position in {file}, or `rtcp limits`): it returns to the
+    edge at {speed:.6g} rad/s"""
+
+    axis: int
+    beyond: float
+    speed: float
+
+
+class EnabledInBox(Event, number=41):
+    """the arm stands {depth:.6g} m beyond the bounds of {box_name}: only motion that leads out is accepted; jog out"""
+
+    box: int
+    depth: float
+
+
+class MovedSinceFault(Event, number=45):
+    """{joint} stands at {position:.6g} rad, at the fault it stood at {before:.6g} rad: if nobody moved it and it did
+    not sag, its drive lost its zero; check that before `rtcp enable`"""
+
+    axis: int
+    position: float
+    before: float
+
+
+# -- joystick, gripper, zero ------------------------------------------------------------------------------------------
+
+
+class JoystickGranted(Event, number=29):
+    """the joystick controls the arm once it has been neutral"""
+
+
+class JoystickWithdrawn(Event, number=47):
+    """the joystick controls the wheelchair: the arm holds"""
+
+
+class JoystickModeChanged(Event, number=37):
+    """joystick mode {joystick_mode}"""
+
+    mode: int
+
+
+class UnknownJoystickCode(Event, number=38):
+    """the joystick reads {code}, which is no code: the arm stops until it is neutral"""
+
+    code: int
+
+
+class GripperOpens(Event, number=33):
+    """the gripper opens"""
+
+
+class GripperCloses(Event, number=48):
+    """the gripper closes"""
+
+
+class GripperAtRest(Event, number=40):
+    """{joint} rests at {position:.6g} rad"""
+
+    axis: int
+    position: float
+    holds: bool
+    """Something keeps it from its end position."""
+
+
+class ZeroSet(Event, number=34):
+    """{joint}: its zero is at {offset:.6g} rad of the drive"""
+
+    axis: int
+    offset: float
+
+
+class Homed(Event, number=35):
+    """{joint} is homed: its drive reads {position:.6g} rad"""
+
+    axis: int
+    position: float
+
+
+class HomingFailed(Event, number=36):
+    """{joint}: homing failed (statusword 0x{statusword:04X}); the arm holds"""
+
+    axis: int
+    statusword: int
+
+
+class HomingInBox(Event, number=42):
+    """homing was stopped: by the old zero the arm is in {box_name}"""
+
+    box: int
+
+
+# -- faults -----------------------------------------------------------------------------------------------------------
+
+
+class ProcessDataLost(Fault, number=1):
+    """process data lost: {in_a_row} cycles in a row, and {allowed} more without than with the expected working counter
+    ({lost_cycles} in {file}): {reaction}; `rtcp reset` when the slaves answer"""
+
+    stop_key = "lost_frames"
+    in_a_row: int
+    allowed: int
+
+
+class DriveLeftEnabled(Fault, number=2):
+    """{joint}: the drive left Operation Enabled by itself (statusword 0x{statusword:04X}): {reaction}; then `rtcp
+    reset`"""
+
+    stop_key = "drive_fault"
+    axis: int
+    statusword: int
+
+
+class DriveFault(Fault, number=18):
+    """{joint}: the drive is in fault (statusword 0x{statusword:04X}): {reaction}; then `rtcp reset`"""
+
+    stop_key = "drive_fault"
+    axis: int
+    statusword: int
+
+
+class EnableTimeout(Fault, number=3):
+    """{joint}: the drive did not reach Operation Enabled within {enable_timeout:g} s (statusword 0x{statusword:04X};
+    enable_timeout_s in {file}): {reaction}; then `rtcp reset`"""
+
+    axis: int
+    statusword: int
+
+
+class DisableTimeout(Fault, number=4):
+    """{joint}: the drive kept its torque for {enable_timeout:g} s (statusword 0x{statusword:04X}; enable_timeout_s in
+    {file}): {reaction}; then `rtcp reset`"""
+
+    axis: int
+    statusword: int
+
+
+class SlaveLost(Fault, number=5):
+    """slave {slave} ({slave_name}) left OP or does not answer: {reaction}; `rtcp reset` when it is back"""
+
+    stop_key = "slave_lost"
+    slave: int
+    """Position on the cable, from 1."""
+
+
+class ResetTimeout(Fault, number=6):
+    """{joint}: the drive remains in fault after the reset (statusword 0x{statusword:04X}): remove the cause, then `rtcp
+    reset`"""
+
+    axis: int
+    statusword: int
+
+
+class ResetWithoutSlaves(Fault, number=49):
+    """reset failed within 3 s: not all slaves are back in OP (`rtcp status` shows which): repair that, then `rtcp
+    reset`"""
+
+
+class ResetWithoutFrames(Fault, number=50):
+    """reset failed within 3 s: no frames return, or the reference clock is not locked (`rtcp status`)"""
+
+
+class ResetWhileMoving(Fault, number=22):
+    """{joint} still turns at {velocity:.6g} rad/s 3 s after the reset: its torque goes at standstill only; `rtcp
+    disable` removes it at once"""
+
+    axis: int
+    velocity: float
+
+
+class GeneratorFailed(Fault, number=7):
+    """the trajectory generator refused its input: {reaction}; then `rtcp reset`"""
+
+
+class DriveModeTimeout(Fault, number=8):
+    """{joint}: the drive shows mode {found} instead of {wanted}: {reaction}; then `rtcp reset`"""
+
+    axis: int
+    found: int
+    wanted: DriveMode
+
+
+class ClockLost(Fault, number=19):
+    """the cycle was not locked to the reference clock for 1 s: {reaction}; then `rtcp reset`"""
+
+    stop_key = "clock_lost"
+
+
+class LeftRange(Fault, number=20):
+    """{joint} left its range of {low:g} to {high:g} rad while being enabled or homed: it stands at {position:.6g} rad
+    ({key}.position in {file}): {reaction}; then `rtcp reset`"""
+
+    axis: int
+    position: float
+
+
+class PositionJumped(Fault, number=43):
+    """{joint} jumped from {before:.6g} to {position:.6g} rad while being enabled, for {supervision}: it was turned, or
+    its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
+
+    axis: int
+    position: float
+    before: float
+
+
+class HomingStillMoving(Fault, number=39):
+    """{joint} still turns at {velocity:.6g} rad/s 3 s after its homing: {reaction}; then `rtcp reset`"""
+
+    axis: int
+    velocity: float
+
+
+class LeaseExpired(Event, number=9):
+    """the commander fell silent or released its lease: {reaction}"""
+
+    stop_key = "lease_ended"
+
+
+class PermissionWithdrawn(Event, number=28):
+    """the enabling switch was released: {reaction}"""
+
+    stop_key = "enabling_switch"
+
+
+class EstopUnobservable(Event, number=46):
+    """the IO box has been out of OP for {after_s:g} s: the emergency stop (inputs.emergency_stop in {file}) cannot be
+    read and counts as pressed"""
+
+    after_s: float
+
+
+class EmergencyStopActivated(Emergency, number=23):
+    """the emergency stop is pressed: {reaction}; release it, then `rtcp reset`"""
+
+    stop_key = "emergency_stop"
+
+
+class OverSpeed(Emergency, number=24):
+    """{joint}: measured speed {value:.6g} rad/s exceeded {limit:.6g} rad/s for {supervision}: {reaction}; then `rtcp
+    reset`"""
+
+    stop_key = "supervision"
+    axis: int
+    value: float
+    limit: float
+
+
+class OverTorque(Emergency, number=25):
+    """{joint}: measured torque {value:.6g} Nm exceeded {limit:.6g} Nm for {supervision}: {reaction}; then `rtcp
+    reset`"""
+
+    stop_key = "supervision"
+    axis: int
+    value: float
+    limit: float
+
+
+class FollowingError(Emergency, number=26):
+    """{joint}: following error {value:.6g} rad exceeded {limit:.6g} rad for {supervision}: {reaction}; then `rtcp
+    reset`"""
+
+    stop_key = "supervision"
+    axis: int
+    value: float
+    limit: float
+
+
+# -- why a motion ended before its goal -------------------------------------------------------------------------------
+
+
+class MotionEnded(Event, abstract=True):
+    """Base of what ends a motion, by its controller or by a guard."""
+
+    by_limit: ClassVar[bool] = True
+    """Whether it leads to the state stopped by limit, which a reset leaves; else the arm holds and accepts commands."""
+
+
+class StreamEnded(MotionEnded, number=101):
+    """the stream of targets ended: controlled stop"""
+
+    by_limit = False
+
+
+class CommandExpired(MotionEnded, number=109):
+    """the command was not renewed in time: controlled stop"""
+
+    by_limit = False
+
+
+class OutOfReach(MotionEnded, number=102):
+    """the motion would have left the reach of the arm by {distance:.6g} m; the arm holds, then `rtcp reset`"""
+
+    distance: float
+
+
+class JointLimitReached(MotionEnded, number=103):
+    """{joint}: the motion wanted {value:.6g}, the limit is {limit:.6g} ({key} in {file}, or `rtcp limits`); the arm
+    holds, then `rtcp reset`"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class SingularityReached(MotionEnded, number=104):
+    """the motion came within {value:.6g} {singularity_unit} of the {singularity} singularity, allowed is {limit:.6g}
+    {singularity_unit} (cartesian.singularity.{singularity} in {file}); the arm holds, then `rtcp reset`"""
+
+    which: int
+    """0 shoulder, 1 elbow, 2 wrist."""
+    value: float
+    limit: float
+
+
+class PlanDamaged(MotionEnded, number=106):
+    """row {row} of the plan is damaged: found {value:.6g}; the arm holds, then `rtcp reset`"""
+
+    row: int
+    value: float
+
+
+class BoxReached(MotionEnded, number=107):
+    """the arm stopped {distance:.6g} m from {box_name}; the arm holds, then `rtcp reset`"""
+
+    box: int
+    distance: float
+
+
+class NotLeavingBox(MotionEnded, number=111):
+    """the arm is {depth:.6g} m beyond the bounds of {box_name}, and the motion did not lead out; `rtcp reset`, then jog
+    out"""
+
+    box: int
+    depth: float
+
+
+class SetpointJump(MotionEnded, number=108):
+    """{joint}: the motion would have jumped by {value:.6g} rad in a cycle, at most {limit:.6g} rad is possible; the arm
+    holds, then `rtcp reset`"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class ControllerFailed(MotionEnded, number=110):
+    """the trajectory generator refused its input"""

@@ -1,0 +1,132 @@
+"""The text of events and refusals: their docstrings, filled in with what the configuration calls things."""
+
+from __future__ import annotations
+
+import inspect
+import string
+from collections.abc import Callable
+from enum import IntEnum
+from typing import Any
+
+from rtcp.config.model import ArmConfig
+from rtcp.config.virtual import VIRTUAL
+from rtcp.ipc.commands import COMMANDS, Reset
+from rtcp.ipc.events import JOYSTICK_MODES, Emergency
+from rtcp.ipc.message import Message
+from rtcp.ipc.states import State
+from rtcp.ipc.stop_reactions import StopReaction, reactions
+
+_SINGULARITIES = (("shoulder", "m"), ("elbow", "rad"), ("wrist", "rad"))
+_DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class Names:
+    """What a configuration calls joints, slaves, boxes and reactions.
+
+    Args:
+        config: the arm.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        self.config = config
+        self.reactions = reactions(config.stops)
+        """The stop reaction to each event that has one."""
+
+    @property
+    def file(self) -> str:
+        """The configuration file, without its folder."""
+        return self.config.source.name or "the configuration"
+
+    def joint(self, axis: int) -> str:
+        """Return the name of an axis."""
+        axes = self.config.axes
+        return axes[axis].name if 0 <= axis < len(axes) else f"joint {axis + 1}"
+
+    def key(self, axis: int) -> str:
+        """Return the key of an axis in the file."""
+        return f"joints[{axis}]" if axis < len(self.config.joints) else "gripper.joint"
+
+    def slave(self, position: int) -> str:
+        """Return the name of the slave at `position`, from 1."""
+        slaves = self.config.slaves
+        return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
+
+    def box(self, which: int) -> str:
+        """Return the name of a keep-out box, or of the box that the tool stays in (-1), and its key."""
+        boxes = self.config.cartesian.keep_out
+        if 0 <= which < len(boxes):
+            return f"the keep-out box {boxes[which].name} (cartesian.keep_out[{which}] in {self.file})"
+        return f"the box that the tool stays in (cartesian.box in {self.file})"
+
+    def lost_cycles(self) -> str:
+        """Return the keys that set how many cycles may be lost."""
+        bus = self.config.bus
+        if bus.interface == VIRTUAL and bus.virtual_patience != 1:
+            return f"bus.lost_cycles times bus.virtual_patience, {bus.virtual_patience:g},"
+        return "bus.lost_cycles"
+
+    def reaction(self, event: Any) -> str:
+        """Return the stop reaction to an event, the key that sets it, and the way out where the arm does not hold."""
+        found = self.reactions[type(event)]
+        words = found.words
+        if isinstance(event, Emergency):
+            words += " at once" if found is StopReaction.TORQUE_OFF else ", then torque off"
+        if event.stop_key:
+            words += f" (stops.{event.stop_key} in {self.file})"
+        hold = event.is_fault or found is StopReaction.CONTROLLED_STOP
+        return words if hold else f"{words}; then `rtcp reset`"
+
+    def message(self, about: Message) -> str:
+        """Return the text of an event or a refusal: what happened, where, and what to do."""
+        template = " ".join(inspect.cleandoc(type(about).__doc__ or about.name).split())
+        return _Template(self, about).format(template)
+
+
+_WORDS: dict[str, Callable[[Names, Any], object]] = {
+    "file": lambda names, about: names.file,
+    "joint": lambda names, about: names.joint(about.axis),
+    "joint_or_box": lambda names, about: names.joint(about.axis) if about.axis >= 0 else "the Cartesian limits",
+    "key": lambda names, about: names.key(about.axis),
+    "low": lambda names, about: names.config.axes[about.axis].position.min,
+    "high": lambda names, about: names.config.axes[about.axis].position.max,
+    "box_name": lambda names, about: names.box(about.box),
+    "slave_name": lambda names, about: names.slave(about.slave),
+    "reaction": Names.reaction,
+    "lost_cycles": lambda names, about: names.lost_cycles(),
+    "enable_timeout": lambda names, about: names.config.enable_timeout_s,
+    "supervision": lambda names, about: f"{names.config.watch.cycles} cycles (watch in {names.file})",
+    "joystick_mode": lambda names, about: JOYSTICK_MODES[about.mode % len(JOYSTICK_MODES)],
+    "direction_name": lambda names, about: _DIRECTIONS[about.direction % len(_DIRECTIONS)],
+    "singularity": lambda names, about: _SINGULARITIES[about.which % 3][0],
+    "singularity_unit": lambda names, about: _SINGULARITIES[about.which % 3][1],
+    "command_name": lambda names, about: COMMANDS[about.command].name,
+    "accepting_states": lambda names, about: ", ".join(sorted(one.words for one in COMMANDS[about.command].states)),
+    "way_out": lambda names, about: _way_out(about.command, about.state),
+}
+"""What a message may name beside its own fields."""
+
+
+class _Template(string.Formatter):
+    """Fills in the message of one event or refusal."""
+
+    def __init__(self, names: Names, about: Message) -> None:
+        self._names = names
+        self._about = about
+
+    def get_value(self, key: int | str, args: Any, kwargs: Any) -> object:
+        """Return the value of a field, or what `_WORDS` has under its name."""
+        word = _WORDS.get(str(key))
+        if word is not None:
+            return word(self._names, self._about)
+        value = getattr(self._about, str(key))
+        return value.name.lower().replace("_", " ") if isinstance(value, IntEnum) else value
+
+
+def _way_out(number: int, state: State) -> str:
+    """Return what leads from a state to one that accepts the command."""
+    command = COMMANDS[number]
+    if state in Reset.states:
+        return "; `rtcp reset` first"
+    if state is State.READY and State.HOLDING in command.states:
+        return "; `rtcp enable` first"
+    return "; `rtcp disable` first" if command.states == {State.READY} and command.name != "enable" else ""

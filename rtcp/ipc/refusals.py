@@ -1,0 +1,334 @@
+"""Why a command is refused: one frozen dataclass a reason, whose docstring is its message
+(`rtcp.ipc.names.message`)."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rtcp.ipc.message import Kinds, Message
+from rtcp.ipc.states import ControlMode, DriveMode, State
+
+
+class Refusal(Message, abstract=True):
+    """Base of all refusals."""
+
+    kinds: ClassVar[Kinds[Refusal]] = Kinds()
+
+
+REFUSALS = Refusal.kinds
+
+
+class Malformed(Refusal):
+    """the command (number {kind}) is unknown, or its fields cannot be read"""
+
+    kind: int
+
+
+class NoLease(Refusal):
+    """the lease expired or belongs to another commander: nothing moved"""
+
+
+class WrongState(Refusal):
+    """{command_name} is not accepted in state {state}, only in: {accepting_states}{way_out}"""
+
+    command: int
+    """Number of the command's kind."""
+    state: State
+
+
+class NotInOp(Refusal):
+    """not all slaves are in OP: see `rtcp status`, then `rtcp reset`"""
+
+
+class ClockNotLocked(Refusal):
+    """the cycle is not locked to the reference clock yet (`rtcp status`, clocks)"""
+
+
+class DriveModeChanging(Refusal):
+    """the drives are changing their mode: retry when the change is done"""
+
+
+class EmergencyStopPressed(Refusal):
+    """the emergency stop is pressed (inputs.emergency_stop in {file}): release it, then `rtcp reset`"""
+
+
+class NotPermitted(Refusal):
+    """the enabling switch is not pressed (inputs.enabling_switch in {file})"""
+
+
+class NotAtStandstill(Refusal):
+    """{joint} turns at {velocity:.6g} rad/s: drives are enabled at standstill only"""
+
+    axis: int
+    velocity: float
+
+
+class JointOutsideRange(Refusal):
+    """{joint} stands at {position:.6g} rad, outside its range {low:g} to {high:g} rad ({key}.position in {file}): it is
+    not enabled there"""
+
+    axis: int
+    position: float
+
+
+class TorquePresent(Refusal):
+    """drives have torque: `rtcp disable` first"""
+
+
+class UnknownAxis(Refusal):
+    """axis {axis} does not exist: 0 to {highest}"""
+
+    axis: int
+    highest: int
+
+
+class OffsetOutOfRange(Refusal):
+    """{joint}: offset {value:.6g} rad is not allowed: at most {limit:.6g} rad"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+# -- outputs and gripper ----------------------------------------------------------------------------------------------
+
+
+class NoOutputs(Refusal):
+    """no IO box is configured (slaves in {file})"""
+
+
+class UnknownOutput(Refusal):
+    """output {output} does not exist: 1 to {highest}"""
+
+    output: int
+    highest: int
+
+
+class ReservedOutput(Refusal):
+    """output {output} has a function (outputs and gripper in {file}): it cannot be set directly"""
+
+    output: int
+
+
+class NoGripper(Refusal):
+    """no gripper is configured (gripper in {file})"""
+
+
+class GripperDisabled(Refusal):
+    """the drive of the gripper is not enabled: `rtcp enable` first"""
+
+
+# -- motion -----------------------------------------------------------------------------------------------------------
+
+
+class WrongControlMode(Refusal):
+    """the control mode is {active}, this command needs {needed}: `rtcp mode {needed}` first"""
+
+    active: ControlMode
+    needed: ControlMode
+
+
+class DriveModeFixed(Refusal):
+    """control mode {active} sets the mode of the drives: `rtcp mode joint` before {wanted}"""
+
+    active: ControlMode
+    wanted: DriveMode
+
+
+class NoGeometry(Refusal):
+    """the geometry of the arm is unknown: the key kinematics is missing in {file}"""
+
+
+class NotInCsp(Refusal):
+    """homing needs the drives in csp: `rtcp mode csp` first"""
+
+
+class WrongCount(Refusal):
+    """found {found} numbers, allowed are {allowed}"""
+
+    found: int
+    allowed: int
+
+
+class NotFinite(Refusal):
+    """{joint}: {value} is not a finite number"""
+
+    axis: int
+    value: float
+
+
+class StampNotFinite(Refusal):
+    """the time stamp {value} is not a finite number"""
+
+    value: float
+
+
+class PositionOutOfRange(Refusal):
+    """{joint}: target {value:.6g} rad is outside its range, beyond {limit:.6g} rad ({key}.position in {file}, or `rtcp
+    limits`)"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class SpeedOutOfRange(Refusal):
+    """speed {value:.6g} rad/s is not allowed: more than 0 and at most {limit:.6g} rad/s (joints[].velocity in
+    {file})"""
+
+    value: float
+    limit: float
+
+
+class JointSpeedOutOfRange(Refusal):
+    """{joint}: {value:.6g} rad/s is not allowed: at most {limit:.6g} in either direction ({key}.velocity in {file}, or
+    `rtcp limits`)"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class JogSpeedOutOfRange(Refusal):
+    """{direction_name}: {value:.6g} is not allowed: at most {limit:.6g} in either direction (cartesian.speed in m/s,
+    cartesian.angular_speed in rad/s, in {file})"""
+
+    direction: int
+    """0 to 5: x y z rx ry rz."""
+    value: float
+    limit: float
+
+
+class TorqueOutOfRange(Refusal):
+    """{joint}: torque {value:.6g} Nm is beyond its limit of {limit:.6g} Nm ({key}.torque in {file})"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class FractionOutOfRange(Refusal):
+    """stiffness or damping {value:.6g} is not allowed: a fraction from 0 to 1 of cst_stiffness and cst_damping
+    (joints[] in {file})"""
+
+    value: float
+
+
+class HoldTimeOutOfRange(Refusal):
+    """hold time {value:.6g} s is not allowed: more than 0 and at most {limit:.6g} s"""
+
+    value: float
+    limit: float
+
+
+class StreamPointDropped(Refusal):
+    """the target came {late_s:.6g} s late or out of order: it was dropped"""
+
+    late_s: float
+
+
+class TargetInBox(Refusal):
+    """at that target the arm would cross the bounds of {box_name}"""
+
+    box: int
+
+
+class NoTrajectory(Refusal):
+    """no trajectory of at most {longest_s:.6g} s reaches the target at {speed:.6g} rad/s: choose a higher speed or a
+    nearer target"""
+
+    speed: float
+    longest_s: float
+
+
+class WrongRowCount(Refusal):
+    """the plan cannot run: found {found} rows, allowed are 1 to {most}"""
+
+    found: int
+    most: int
+
+
+class DamagedRow(Refusal):
+    """the plan cannot run: found {value:.6g} in row {row}"""
+
+    row: int
+    value: float
+
+
+class PlanStartsElsewhere(Refusal):
+    """{joint}: the plan starts at {planned:.6g} rad, the arm is commanded to {commanded:.6g} rad: move there first
+    (`rtcp run --approach`)"""
+
+    axis: int
+    planned: float
+    commanded: float
+
+
+class PathStartsElsewhere(Refusal):
+    """the path starts {distance:.6g} (m or rad) away from the tool: move there first (`rtcp run --approach`)"""
+
+    distance: float
+
+
+class PlanStartsMoving(Refusal):
+    """{joint}: the plan starts at time 0 with {planned:.6g} rad/s, the arm is commanded {commanded:.6g} rad/s: give its
+    first point a later time"""
+
+    axis: int
+    planned: float
+    commanded: float
+
+
+class PathNeedsRest(Refusal):
+    """a path starts at rest, and {joint} moves at {velocity:.6g} rad/s: `rtcp halt` first"""
+
+    axis: int
+    velocity: float
+
+
+class ApproachImpossible(Refusal):
+    """no motion leads from the present state to the first point of the plan"""
+
+
+# -- limits -----------------------------------------------------------------------------------------------------------
+
+
+class LimitsExcludeJoint(Refusal):
+    """{joint} stands or would come to rest at {value:.9g} rad, outside the new limit {limit:.9g} rad: nothing was
+    changed"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class LimitsExcludeArm(Refusal):
+    """tool, wrist or elbow would cross the new bounds of {box_name}: nothing was changed"""
+
+    box: int
+
+
+class ImpossibleLimit(Refusal):
+    """{joint_or_box}: {value:.6g} cannot be set (its bound is {limit:.6g}): nothing was changed"""
+
+    axis: int
+    """-1: of a box."""
+    value: float
+    limit: float
+
+
+class LimitWidened(Refusal):
+    """{joint_or_box}: {value:.6g} is beyond what the configuration allows, {limit:.6g} (in {file}): limits are only
+    narrowed at run time"""
+
+    axis: int
+    value: float
+    limit: float
+
+
+class TorqueLimitTooLow(Refusal):
+    """{joint} holds {held:.6g} Nm, more than the new limit of {limit:.6g} Nm: it would sag, nothing was changed"""
+
+    axis: int
+    held: float
+    limit: float

@@ -1,0 +1,160 @@
+"""Stop reactions: which one an event takes, and how long and how far the arm moves at most until it stands.
+
+Hold is the reaction to every cycle with a wrong working counter, up to `bus.lost_cycles`. For the others the section
+`stops` of the configuration has a key an event; a fault without a key takes a quick stop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from enum import IntEnum
+from math import sqrt
+from typing import NamedTuple
+
+from rtcp.config.model import ArmConfig, Joint
+from rtcp.config.stops import StopsConfig
+from rtcp.ipc.events import EVENTS, Event
+
+_LATENCY_CYCLES = 3
+"""From the cycle that finds a reason to the drive that obeys, and to the master that sees it: frame, SYNC0, frame."""
+_DRIVE_S = 0.03
+"""A joint comes to rest so long after the end of its drive's ramp, or of its set-points, at most."""
+_QUICK_STOP_DECELERATION = (0x6085, 0)
+_UNKNOWN_S = 2.0
+"""A quick stop at a rate that is not known is given so long: as the emergency stop gives it."""
+
+
+class StopReaction(IntEnum):
+    """How the arm is stopped; each is harder than the one before. Stop categories: IEC 60204-1, 9.2.2."""
+
+    HOLD = 0
+    """The last targets are sent again."""
+    CONTROLLED_STOP = 1
+    """Set-points decelerate to standstill under the limits; drives stay enabled: stop category 2."""
+    QUICK_STOP = 2
+    """Each drive decelerates by itself at 0x6085 and holds (0x605A = 6): category 2, and 1 where the torque follows."""
+    TORQUE_OFF = 3
+    """Disable voltage; the brakes stop the arm: stop category 0."""
+
+    @property
+    def words(self) -> str:
+        """Return the name in words."""
+        return self.name.lower().replace("_", " ")
+
+
+def reactions(stops: StopsConfig) -> dict[type[Event], StopReaction]:
+    """Return the stop reaction to every event that has a key under `stops`, and to every fault: a quick stop else."""
+    return {
+        kind: StopReaction[getattr(stops, kind.stop_key).upper()] if kind.stop_key else StopReaction.QUICK_STOP
+        for kind in EVENTS
+        if kind.stop_key or kind.is_fault
+    }
+
+
+class Bound(NamedTuple):
+    """Within which what moves at full speed stands: counted from the cycle that finds the reason."""
+
+    time_s: float
+    way_rad: float
+    """Of a joint, or of the tool's turning; m of the tool's way."""
+
+
+def bounds(config: ArmConfig, reaction: StopReaction, braking: Sequence[float] = ()) -> tuple[Bound, ...]:
+    """Return the bound of each joint.
+
+    Args:
+        config: limits of the joints, of the tool and of the bus, and what the drives are set to.
+        reaction: how it is stopped. Of `HOLD` it is what may pass until the next rung, not until standstill.
+        braking: rad/s^2, what each joint's closed brake slows it down by at least, weight taken off; for `TORQUE_OFF`.
+
+    Raises:
+        ValueError: what the bound rests on is not known: 0x6085 of a drive, or a brake.
+    """
+    period_s = config.cycle.period_us * 1e-6
+    late_s = _LATENCY_CYCLES * period_s
+    found = []
+    for at, joint in enumerate(config.joints):
+        v = joint.velocity
+        if reaction is StopReaction.HOLD:
+            # In CSP a joint stands sooner. In CSV it runs on at the last speed.
+            held_s = config.bus.lost_cycles * period_s
+            found.append(Bound(held_s, v * (held_s + late_s)))
+        elif reaction is StopReaction.CONTROLLED_STOP:
+            stop = _ramp(v, joint.acceleration, joint.jerk)
+            found.append(Bound(stop.time_s + late_s + _DRIVE_S, stop.way_rad + v * (late_s + _DRIVE_S)))
+        else:
+            rate = (
+                _quick_stop_rate(config, joint) if reaction is StopReaction.QUICK_STOP else _brake(braking, at, joint)
+            )
+            late = late_s + _DRIVE_S
+            found.append(Bound(v / rate + late, 0.5 * v * v / rate + v * late))
+    return tuple(found)
+
+
+def unheard(config: ArmConfig) -> tuple[Bound, ...]:
+    """Return the bound of each joint where no frame reaches its drive any more, counted from the first that does not.
+
+    Until its watchdog ends it the drive goes on with its last target; then it is in fault and ramps down (0x605E = 2).
+    """
+    found = []
+    for joint, stop in zip(config.joints, bounds(config, StopReaction.QUICK_STOP), strict=True):
+        watchdog_s = 1e-3 * next(s.device.watchdog_ms for s in config.slaves if s.name == joint.slave)
+        found.append(Bound(watchdog_s + stop.time_s, joint.velocity * watchdog_s + stop.way_rad))
+    return tuple(found)
+
+
+def quick_stop_s(config: ArmConfig) -> float:
+    """Return within which time all that drives move, the gripper too, stands by a quick stop, s."""
+    try:
+        return max(bound.time_s for bound in bounds(replace(config, joints=config.axes), StopReaction.QUICK_STOP))
+    except ValueError:
+        return _UNKNOWN_S
+
+
+def longest_s(config: ArmConfig) -> float:
+    """Return the longest time of the ladder within which all that drives move stands, s."""
+    controlled = bounds(replace(config, joints=config.axes), StopReaction.CONTROLLED_STOP)
+    tool = tool_bounds(config, config.cartesian.speed, config.cartesian.angular_speed)
+    return max(quick_stop_s(config), *(bound.time_s for bound in (*controlled, *tool)))
+
+
+def tool_bounds(config: ArmConfig, speed: float, angular_speed: float) -> tuple[Bound, Bound]:
+    """Return the bounds of the tool's controlled stop: from `speed`, m/s, its way in m; from `angular_speed`, rad/s."""
+    limits = config.cartesian
+    late_s = _LATENCY_CYCLES * config.cycle.period_us * 1e-6 + _DRIVE_S
+    along = _ramp(speed, limits.acceleration, limits.jerk)
+    about = _ramp(angular_speed, limits.angular_acceleration, limits.angular_jerk)
+    return (
+        Bound(along.time_s + late_s, along.way_rad + speed * late_s),
+        Bound(about.time_s + late_s, about.way_rad + angular_speed * late_s),
+    )
+
+
+def _ramp(v: float, a: float, j: float) -> Bound:
+    """Bound a stop that is limited in jerk, from a speed of at most `v`, with whatever acceleration was under way.
+
+    At worst the speed rises with `a` when the stop begins: that acceleration ends first, at speed `v`, and the rest is
+    the stop from there, which is symmetrical.
+    """
+    rising = min(a, sqrt(2.0 * v * j)) / j
+    steepest = min(a, sqrt(v * j))
+    falling = v / steepest + steepest / j
+    return Bound(rising + falling, v * rising + 0.5 * v * falling)
+
+
+def _quick_stop_rate(config: ArmConfig, joint: Joint) -> float:
+    """Return what 0x6085 among the start-up SDOs of the joint's drive says, rad/s^2."""
+    device = next(slave.device for slave in config.slaves if slave.name == joint.slave)
+    # A rate counts as a speed does, by the second.
+    factors = [entry.factor for pdo in device.rpdo for entry in pdo.channels if entry.name == "target_velocity"]
+    rates = [sdo.value for sdo in device.sdo if (sdo.index, sdo.sub_index) == _QUICK_STOP_DECELERATION]
+    if not (rates and factors):
+        raise ValueError(f"{device.name}: 0x6085 is not among its start-up SDOs: how fast it stops is not known")
+    return rates[-1] * factors[0]
+
+
+def _brake(braking: Sequence[float], at: int, joint: Joint) -> float:
+    if at >= len(braking):
+        raise ValueError(f"{joint.name}: what its brake can do is not known")
+    return braking[at]
