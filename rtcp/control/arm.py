@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rtcp.config.model import ArmConfig
 from rtcp.control.gripper import FOLLOWED_RAD, DrivenGripper
 from rtcp.control.motions import Motions
-from rtcp.devices.cia402 import Cia402Drive, DriveGoal, DriveState
+from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.codes import Code
 from rtcp.motion.guards.envelope import SetPointGuard, Verdict
@@ -91,7 +91,7 @@ class Arm:
         if self.gripper is not None:
             self.gripper.encode(data)
 
-    def lead(self, goal: DriveGoal) -> None:
+    def lead(self, goal: TargetState) -> None:
         """Lead every drive one step towards `goal`."""
         for drive in self.all_drives:
             drive.advance(goal)

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.control.arm import Arm
 from rtcp.control.behaviour import Behaviour
+from rtcp.control.bus_service import BusService
 from rtcp.control.gripper import gripper_of
 from rtcp.control.loop import Loop
 from rtcp.control.operator import Operator
 from rtcp.control.orders import Orders
 from rtcp.control.record import Recorder
-from rtcp.control.service import Service
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
@@ -79,7 +79,7 @@ def assemble(
     config: ArmConfig,
     data: ProcessData,
     blackboard: Blackboard,
-    service: Service,
+    service: BusService,
     discipline: Discipline | None,
     now: Callable[[], int] = monotonic_ns,
 ) -> Parts:

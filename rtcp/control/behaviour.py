@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
+from rtcp.control.bus_service import BusService
 from rtcp.control.closing import TOLD_CYCLES, Closing
 from rtcp.control.emergency_stop import EmergencyStop
 from rtcp.control.enabling import Enabling
@@ -15,9 +16,8 @@ from rtcp.control.faulted import Faulted
 from rtcp.control.homing_arm import HomingArm
 from rtcp.control.operator import Operator
 from rtcp.control.resetting import Resetting
-from rtcp.control.service import Service
 from rtcp.control.tracking import Tracking
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import TABLE, WITH_TORQUE, Code, Event, State
 from rtcp.ipc.stops import Rung
@@ -52,7 +52,7 @@ class Behaviour:
         arm: Arm,
         operator: Operator,
         blackboard: Blackboard,
-        service: Service,
+        service: BusService,
         discipline: Discipline | None,
     ) -> None:
         period_s = config.cycle.period_us * 1e-6
@@ -237,7 +237,7 @@ class Behaviour:
             service.recover()
         if self.clock_followed:
             service.want_op()
-        self._arm.lead(DriveGoal.DISABLED)
+        self._arm.lead(TargetState.DISABLED)
         if good:
             self._arm.follow()
         if not service.all_op:
@@ -258,7 +258,7 @@ class Behaviour:
         if axis >= 0:
             self._failing.fail_drive(Code.DRIVE_FAULT, axis)
             return
-        arm.lead(DriveGoal.DISABLED)
+        arm.lead(TargetState.DISABLED)
         arm.follow()
 
     def _enabling(self, good: bool) -> None:
@@ -340,7 +340,7 @@ class Behaviour:
         if not good:
             return
         self.all_enabled = False
-        arm.lead(DriveGoal.DISABLED)
+        arm.lead(TargetState.DISABLED)
         arm.follow()
         self._told += 1
         axis = arm.first_with_torque()

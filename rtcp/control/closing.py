@@ -10,7 +10,7 @@ from rtcp.control.arm import Arm
 from rtcp.control.homing_arm import HomingArm
 from rtcp.control.operator import Operator
 from rtcp.control.standstill import Standstill
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 from rtcp.ipc.stops import Rung, quick_stop_s
@@ -60,7 +60,7 @@ class Closing:
         self._told = 0
         self._hard = False
         """Whether an emergency came: what still moves is stopped by its rung."""
-        self._goal = DriveGoal.QUICK_STOPPED
+        self._goal = TargetState.QUICK_STOPPED
         self._standstill = Standstill(config, arm)
 
     def lead(self, good: bool, lost: int) -> bool:
@@ -104,7 +104,7 @@ class Closing:
             return False
         self._standstill.reached(good)
         if self._standstill.unheard:
-            self._goal = DriveGoal.TORQUE_OFF
+            self._goal = TargetState.TORQUE_OFF
         if arm.first_moving() < 0 or self._cycles > self._patience:
             return False
         arm.lead(self._goal)
@@ -137,7 +137,7 @@ class Closing:
         # In a fault the drives ramp down by themselves: their torque goes when they stand.
         arm = self._arm
         ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
-        arm.lead(DriveGoal.QUICK_STOPPED if ramping else DriveGoal.DISABLED)
+        arm.lead(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)
         arm.follow()
         self._told = 0 if ramping else self._told + 1
         return self._told > TOLD_CYCLES and arm.first_with_torque() < 0

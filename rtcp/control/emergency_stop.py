@@ -10,9 +10,9 @@ from enum import Enum
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
-from rtcp.control.service import Service
+from rtcp.control.bus_service import BusService
 from rtcp.control.standstill import FIRST_CYCLES, Standstill
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 from rtcp.ipc.stops import Rung
@@ -36,7 +36,7 @@ class EmergencyStop:
         config: how long a quick stop takes, and the cycle.
     """
 
-    def __init__(self, arm: Arm, service: Service, blackboard: Blackboard, config: ArmConfig) -> None:
+    def __init__(self, arm: Arm, service: BusService, blackboard: Blackboard, config: ArmConfig) -> None:
         self._arm = arm
         self._service = service
         self._blackboard = blackboard
@@ -44,12 +44,12 @@ class EmergencyStop:
         self._off_cycles = round(_OFF_S / (config.cycle.period_us * 1e-6))
         self._step = _Step.QUICK_STOP
         self._cycles = 0
-        self._off = DriveGoal.DISABLED
+        self._off = TargetState.DISABLED
 
     def begin(self, rung: Rung) -> None:
         """Begin with the quick stop, or without torque, in the cycle that found the reason for it."""
         hard = rung is Rung.TORQUE_OFF
-        self._off = DriveGoal.TORQUE_OFF if hard else DriveGoal.DISABLED
+        self._off = TargetState.TORQUE_OFF if hard else TargetState.DISABLED
         self._next(_Step.TORQUE_OFF if hard else _Step.QUICK_STOP)
         self._standstill.begin()
         self._arm.hold_target()
@@ -65,11 +65,11 @@ class EmergencyStop:
         arm = self._arm
         self._cycles += 1
         if self._step is _Step.QUICK_STOP:
-            arm.lead(DriveGoal.QUICK_STOPPED)
+            arm.lead(TargetState.QUICK_STOPPED)
             if self._standstill.reached(good):
                 if self._standstill.unheard:
                     # In which state the drives are is not known: from every one this takes their torque.
-                    self._off = DriveGoal.TORQUE_OFF
+                    self._off = TargetState.TORQUE_OFF
                 self._next(_Step.TORQUE_OFF)
         elif self._step is _Step.TORQUE_OFF:
             arm.lead(self._off)

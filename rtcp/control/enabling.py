@@ -12,7 +12,7 @@ from __future__ import annotations
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.failing import Failing
-from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 from rtcp.motion.guards.guard import BACK_RAD_S
@@ -77,7 +77,7 @@ class Enabling:
         if self._false:
             # The last targets are sent again.
             return False
-        arm.lead(DriveGoal.ENABLED)
+        arm.lead(TargetState.ENABLED)
         arm.follow()
         arm.command()
         axis = arm.first_not_enabled()

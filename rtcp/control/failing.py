@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
+from rtcp.control.bus_service import BusService
 from rtcp.control.emergency_stop import EmergencyStop
 from rtcp.control.faulted import Faulted
 from rtcp.control.homing_arm import HomingArm
 from rtcp.control.operator import Operator
-from rtcp.control.service import Service
-from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import TABLE, Code, Event, State
 from rtcp.ipc.stops import Rung, rungs
@@ -57,7 +57,7 @@ class Failing:
         faulted: Faulted,
         emergency: EmergencyStop,
         watch: Watch,
-        service: Service,
+        service: BusService,
         blackboard: Blackboard,
     ) -> None:
         self._behaviour = behaviour
@@ -122,7 +122,7 @@ class Failing:
         self._faulted.begin(behaviour.state is State.DISABLING or (fails and self._faulted.off_at_rest))
         behaviour.all_enabled = False
         self._arm.hold_target()
-        self._arm.lead(DriveGoal.TORQUE_OFF if behaviour.torque_off else rung.goal)
+        self._arm.lead(TargetState.TORQUE_OFF if behaviour.torque_off else rung.goal)
         behaviour.on(Event.BROKEN)
 
     def stop_in_emergency(self, code: Code, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:

@@ -8,7 +8,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.operator import Operator
 from rtcp.control.standstill import Standstill
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 
@@ -57,7 +57,7 @@ class Faulted:
             behaviour.torque_off = True
             self._blackboard.event(Code.TORQUE_OFF)
         # Also without frames that come back: slaves that still hear must not go on with the last speed or torque.
-        arm.lead(DriveGoal.TORQUE_OFF if behaviour.torque_off else DriveGoal.QUICK_STOPPED)
+        arm.lead(TargetState.TORQUE_OFF if behaviour.torque_off else TargetState.QUICK_STOPPED)
         if good:
             arm.follow()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.config.operation import WatchConfig
-from rtcp.devices.cia402 import Cia402Drive, DriveGoal, DriveState
+from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.motion.controllers.gripper import GripperMotion
 from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED, Found
@@ -60,7 +60,7 @@ class DrivenGripper:
             abs(drive.position - self.motion.position) <= FOLLOWED_RAD
         )
 
-    def lead(self, goal: DriveGoal) -> None:
+    def lead(self, goal: TargetState) -> None:
         """Lead the drive one step towards `goal`."""
         self.drive.advance(goal)
 

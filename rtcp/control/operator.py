@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
-from rtcp.devices.io_box import IoBox
-from rtcp.devices.stick import Stick
-from rtcp.devices.terminals import Inputs, Outputs
+from rtcp.devices.io_box import Inputs, IoBox, JoystickInput, Outputs
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code, MotionMode
 from rtcp.motion.controllers.joystick import Joystick
@@ -28,7 +26,7 @@ class Operator:
         """The box's position on the cable; 0: there is none."""
         self._inputs = Inputs(config.inputs, cycle_s)
         self._outputs = Outputs(config.outputs, config.gripper)
-        self._stick = Stick(config.inputs, cycle_s)
+        self._stick = JoystickInput(config.inputs, cycle_s)
         self._joystick = Joystick(config.jog)
         self._arm_had_it = True
         self._code_told = False

@@ -10,10 +10,10 @@ from collections.abc import Callable, Sequence
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import RANGE_MARGIN_RAD, Arm
 from rtcp.control.behaviour import Behaviour
+from rtcp.control.bus_service import BusService
 from rtcp.control.limit_orders import LimitOrders
 from rtcp.control.motion_orders import MotionOrders
 from rtcp.control.operator import Operator
-from rtcp.control.service import Service
 from rtcp.control.verdict import DONE, Verdict
 from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
@@ -58,7 +58,7 @@ class Orders:
         operator: Operator,
         behaviour: Behaviour,
         blackboard: Blackboard,
-        service: Service,
+        service: BusService,
     ) -> None:
         self._arm = arm
         self._box = box

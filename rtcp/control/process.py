@@ -22,10 +22,11 @@ from typing import Any
 from rtcp.config.model import ArmConfig, DeviceDescription
 from rtcp.control.arm import Arm
 from rtcp.control.assembly import assemble, discipline_of, position_of
-from rtcp.control.service import Service
-from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, DriveGoal
-from rtcp.devices.codec import DeviceError, make_codec
-from rtcp.fieldbus.bus import BusError, ProcessData
+from rtcp.control.bus_service import BusService
+from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, TargetState
+from rtcp.devices.driver import DeviceError, make_codec
+from rtcp.fieldbus.bus import ProcessData
+from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.ipc.blackboard import Blackboard
@@ -36,7 +37,7 @@ from rtcp.ipc.stops import quick_stop_s
 from rtcp.realtime import scheduling
 
 _DISABLE_CYCLES = 20
-_BLIND_WORDS = {DriveGoal.QUICK_STOPPED: QUICK_STOP, DriveGoal.DISABLED: DISABLE_VOLTAGE}
+_BLIND_WORDS = {TargetState.QUICK_STOPPED: QUICK_STOP, TargetState.DISABLED: DISABLE_VOLTAGE}
 """What a drive is told whose driver raises."""
 
 
@@ -122,7 +123,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)
     scheduling.share_interpreter_quickly()
-    service = Service(
+    service = BusService(
         bus,
         blackboard,
         [position_of(config, joint) for joint in config.axes],
@@ -180,7 +181,7 @@ def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
     drives = arm.pairs if arm.gripper is None else [*arm.pairs, (arm.gripper.slot, arm.gripper.drive)]
     ramp_cycles = math.ceil(quick_stop_s(config) / period_s)
     due = time.monotonic()
-    for goal, cycles in ((DriveGoal.QUICK_STOPPED, ramp_cycles), (DriveGoal.DISABLED, _DISABLE_CYCLES)):
+    for goal, cycles in ((TargetState.QUICK_STOPPED, ramp_cycles), (TargetState.DISABLED, _DISABLE_CYCLES)):
         for _ in range(cycles):
             for slot, drive in drives:
                 with contextlib.suppress(Exception):
@@ -193,7 +194,7 @@ def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
             time.sleep(max(due - time.monotonic(), 0.0))
 
 
-def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: DriveGoal, device: DeviceDescription) -> bytes:
+def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: TargetState, device: DeviceDescription) -> bytes:
     """Lead a drive one step; where its driver raises, its controlword alone is put where the description has it."""
     try:
         drive.decode(data.input(slot))

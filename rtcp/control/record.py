@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from rtcp.control.arm import Arm
 from rtcp.control.behaviour import Behaviour
+from rtcp.control.bus_service import BusService
 from rtcp.control.operator import Operator
-from rtcp.control.service import Service
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.blackboard import Blackboard
@@ -51,7 +51,7 @@ class Recorder:
         operator: Operator,
         behaviour: Behaviour,
         blackboard: Blackboard,
-        service: Service,
+        service: BusService,
         discipline: Discipline | None,
     ) -> None:
         self._data = data

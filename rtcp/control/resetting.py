@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
+from rtcp.control.bus_service import BusService
 from rtcp.control.failing import Failing
 from rtcp.control.operator import Operator
-from rtcp.control.service import Service
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 
@@ -37,7 +37,7 @@ class Resetting:
         config: ArmConfig,
         arm: Arm,
         operator: Operator,
-        service: Service,
+        service: BusService,
         failing: Failing,
         blackboard: Blackboard,
     ) -> None:
@@ -55,7 +55,7 @@ class Resetting:
         """Do the part of a cycle in which all is back; return whether the reset is done."""
         arm = self._arm
         # What still moves is let come to rest first: its torque goes with the reset.
-        arm.lead(DriveGoal.RESET if arm.first_moving() < 0 else DriveGoal.QUICK_STOPPED)
+        arm.lead(TargetState.RESET if arm.first_moving() < 0 else TargetState.QUICK_STOPPED)
         arm.follow()
         # Whether the button is still pressed shows only now that the box is heard again.
         return arm.first_not_resting() < 0 and self._operator.button_known

@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 from rtcp.config.model import SlaveConfig
-from rtcp.devices.codec import DeviceError, factors, integer_range, make_codec, slots
+from rtcp.devices.driver import DeviceError, factors, integer_range, make_codec, slots
 from rtcp.fieldbus.pdo import layout
 
 
@@ -24,7 +24,7 @@ class DriveState(Enum):
     """A statusword that the standard does not define."""
 
 
-class DriveGoal(Enum):
+class TargetState(Enum):
     """Where a drive is led."""
 
     DISABLED = "disabled"
@@ -55,46 +55,46 @@ ENABLE_OPERATION, FAULT_RESET = 0x000F, 0x0080
 
 _S = DriveState
 # (state, goal) -> controlword of the next step (CiA 402-2, figure 7). A fault is reset on request only.
-CONTROLWORDS: dict[tuple[DriveState, DriveGoal], int] = {
-    (_S.NOT_READY_TO_SWITCH_ON, DriveGoal.ENABLED): DISABLE_VOLTAGE,
-    (_S.SWITCH_ON_DISABLED, DriveGoal.ENABLED): SHUTDOWN,
-    (_S.READY_TO_SWITCH_ON, DriveGoal.ENABLED): SWITCH_ON,
-    (_S.SWITCHED_ON, DriveGoal.ENABLED): ENABLE_OPERATION,
-    (_S.OPERATION_ENABLED, DriveGoal.ENABLED): ENABLE_OPERATION,
+CONTROLWORDS: dict[tuple[DriveState, TargetState], int] = {
+    (_S.NOT_READY_TO_SWITCH_ON, TargetState.ENABLED): DISABLE_VOLTAGE,
+    (_S.SWITCH_ON_DISABLED, TargetState.ENABLED): SHUTDOWN,
+    (_S.READY_TO_SWITCH_ON, TargetState.ENABLED): SWITCH_ON,
+    (_S.SWITCHED_ON, TargetState.ENABLED): ENABLE_OPERATION,
+    (_S.OPERATION_ENABLED, TargetState.ENABLED): ENABLE_OPERATION,
     # Transition 16: holds the arm, which `disable voltage` would let fall.
-    (_S.QUICK_STOP_ACTIVE, DriveGoal.ENABLED): ENABLE_OPERATION,
-    (_S.FAULT_REACTION_ACTIVE, DriveGoal.ENABLED): DISABLE_VOLTAGE,
-    (_S.FAULT, DriveGoal.ENABLED): DISABLE_VOLTAGE,
-    (_S.UNKNOWN, DriveGoal.ENABLED): DISABLE_VOLTAGE,
-    (_S.NOT_READY_TO_SWITCH_ON, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.SWITCH_ON_DISABLED, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.READY_TO_SWITCH_ON, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.SWITCHED_ON, DriveGoal.DISABLED): SHUTDOWN,
-    (_S.OPERATION_ENABLED, DriveGoal.DISABLED): SWITCH_ON,
-    (_S.QUICK_STOP_ACTIVE, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.FAULT_REACTION_ACTIVE, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.FAULT, DriveGoal.DISABLED): DISABLE_VOLTAGE,
-    (_S.UNKNOWN, DriveGoal.DISABLED): DISABLE_VOLTAGE,
+    (_S.QUICK_STOP_ACTIVE, TargetState.ENABLED): ENABLE_OPERATION,
+    (_S.FAULT_REACTION_ACTIVE, TargetState.ENABLED): DISABLE_VOLTAGE,
+    (_S.FAULT, TargetState.ENABLED): DISABLE_VOLTAGE,
+    (_S.UNKNOWN, TargetState.ENABLED): DISABLE_VOLTAGE,
+    (_S.NOT_READY_TO_SWITCH_ON, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.SWITCH_ON_DISABLED, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.READY_TO_SWITCH_ON, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.SWITCHED_ON, TargetState.DISABLED): SHUTDOWN,
+    (_S.OPERATION_ENABLED, TargetState.DISABLED): SWITCH_ON,
+    (_S.QUICK_STOP_ACTIVE, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.FAULT_REACTION_ACTIVE, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.FAULT, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.UNKNOWN, TargetState.DISABLED): DISABLE_VOLTAGE,
 }
 CONTROLWORDS |= {
-    (state, DriveGoal.RESET): FAULT_RESET if state is _S.FAULT else CONTROLWORDS[state, DriveGoal.DISABLED]
+    (state, TargetState.RESET): FAULT_RESET if state is _S.FAULT else CONTROLWORDS[state, TargetState.DISABLED]
     for state in DriveState
 }
 
-CONTROLWORDS |= {(state, DriveGoal.TORQUE_OFF): DISABLE_VOLTAGE for state in DriveState}
+CONTROLWORDS |= {(state, TargetState.TORQUE_OFF): DISABLE_VOLTAGE for state in DriveState}
 # Whatever state is shown: where a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
 # Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays there.
-CONTROLWORDS |= {(state, DriveGoal.QUICK_STOPPED): QUICK_STOP for state in DriveState}
+CONTROLWORDS |= {(state, TargetState.QUICK_STOPPED): QUICK_STOP for state in DriveState}
 
 _WITHOUT_TORQUE = frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT})
 
 # States in which a goal is reached.
-REACHED: dict[DriveGoal, frozenset[DriveState]] = {
-    DriveGoal.ENABLED: frozenset({_S.OPERATION_ENABLED}),
-    DriveGoal.DISABLED: _WITHOUT_TORQUE,
-    DriveGoal.TORQUE_OFF: _WITHOUT_TORQUE,
-    DriveGoal.QUICK_STOPPED: _WITHOUT_TORQUE | {_S.QUICK_STOP_ACTIVE},
-    DriveGoal.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
+REACHED: dict[TargetState, frozenset[DriveState]] = {
+    TargetState.ENABLED: frozenset({_S.OPERATION_ENABLED}),
+    TargetState.DISABLED: _WITHOUT_TORQUE,
+    TargetState.TORQUE_OFF: _WITHOUT_TORQUE,
+    TargetState.QUICK_STOPPED: _WITHOUT_TORQUE | {_S.QUICK_STOP_ACTIVE},
+    TargetState.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
 }
 
 _TARGET_STANDS = (ENABLE_OPERATION, QUICK_STOP)
@@ -202,7 +202,7 @@ class Cia402Drive:
         if self.controlword not in _TARGET_STANDS:
             self.target_position = self.position
 
-    def advance(self, goal: DriveGoal) -> bool:
+    def advance(self, goal: TargetState) -> bool:
         """Choose the controlword of the next step towards `goal` by the state found; return whether it is reached."""
         state = self.state
         word = CONTROLWORDS[state, goal]

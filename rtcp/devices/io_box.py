@@ -1,11 +1,12 @@
-"""The IO box: 16 digital inputs, 16 digital outputs, a counter."""
+"""The IO box: inputs, outputs, a counter; the terminals that have a meaning, and the joystick on them."""
 
 from __future__ import annotations
 
 import struct
 
-from rtcp.config.model import DeviceDescription, SlaveConfig
-from rtcp.devices.codec import DeviceError, slots
+from rtcp.config.model import DeviceDescription, GripperConfig, SlaveConfig
+from rtcp.config.operation import InputConfig, InputsConfig, OutputsConfig
+from rtcp.devices.driver import DeviceError, slots
 from rtcp.fieldbus.pdo import TYPES, ImageLayout, layout
 
 
@@ -75,3 +76,195 @@ def _field(device: DeviceDescription, key: str, image: ImageLayout, name: str) -
             "it must be an integer at a whole byte"
         )
     return struct.Struct("<" + TYPES[channel.type][1]), channel.bit_offset // 8
+
+
+class Switch:
+    """An input that means something when `active`. Before its first level has lasted, it has `before`; so it has again
+    when its level has not come to rest for four times the debounce, as at a loose contact.
+
+    Args:
+        config: number, polarity, debounce; None: there is no such input and `before` stays.
+        before: what it counts as until then, and for ever where there is none.
+        cycle_s: how often `read` is called, s.
+    """
+
+    __slots__ = ("_before", "_bit", "_candidate", "_debounce", "_inverted", "_restless", "_stable", "active")
+
+    def __init__(self, config: InputConfig | None, before: bool, cycle_s: float) -> None:
+        self.active = self._before = before
+        self._bit = 0 if config is None else 1 << config.number - 1
+        self._inverted = config is not None and config.active == "low"
+        self._debounce = 0 if config is None else round(config.debounce_ms * 1e-3 / cycle_s)
+        self._candidate = before
+        self._stable = self._restless = 0
+
+    @property
+    def settled(self) -> bool:
+        """Whether its level has lasted for the debounce, or there is no such input."""
+        return not self._bit or self._stable >= self._debounce
+
+    def forget(self) -> None:
+        """Count as not active until a level that says otherwise has lasted."""
+        self.active = self._candidate = False
+        self._stable = -1
+        self._restless = 0
+
+    def read_active(self, levels: int) -> None:
+        """Take the levels of a cycle, but not that what is active no longer is."""
+        if not self.active or bool(levels & self._bit) is not self._inverted:
+            self.read(levels)
+
+    def read(self, levels: int) -> None:
+        """Take the levels of all inputs of a cycle."""
+        if not self._bit:
+            return
+        seen = bool(levels & self._bit) is not self._inverted
+        if seen is not self._candidate:
+            self._candidate = seen
+            self._stable = 0
+        elif self._stable <= self._debounce:
+            self._stable += 1
+        if self._stable >= self._debounce:
+            self.active = seen
+            self._restless = 0
+            return
+        self._restless += 1
+        if self._restless > RESTLESS * self._debounce:
+            self.active = self._before
+
+
+class Inputs:
+    """The switches at the box; `read` once a cycle.
+
+    Args:
+        config: which there are.
+        cycle_s: the cycle, s.
+    """
+
+    __slots__ = ("arm_toggle", "emergency_stop", "enabling_switch")
+
+    def __init__(self, config: InputsConfig, cycle_s: float) -> None:
+        # Until the box has been heard, a stop that is there counts as pressed and a permission as not given.
+        self.emergency_stop = Switch(config.emergency_stop, config.emergency_stop is not None, cycle_s)
+        self.enabling_switch = Switch(config.enabling_switch, config.enabling_switch is None, cycle_s)
+        self.arm_toggle = Switch(config.arm_toggle, config.arm_toggle is None, cycle_s)
+
+    def read(self, levels: int) -> None:
+        """Take the levels of all inputs of a cycle."""
+        self.emergency_stop.read(levels)
+        self.enabling_switch.read(levels)
+        self.arm_toggle.read(levels)
+
+
+class Outputs:
+    """The outputs with a meaning, as masks; `write` changes nothing but them.
+
+    Args:
+        config: which there are.
+        gripper: its output, or None.
+    """
+
+    __slots__ = ("_closed", "_gripper", "_heartbeat", "_moving", "_powered", "meant")
+
+    def __init__(self, config: OutputsConfig, gripper: GripperConfig | None) -> None:
+        self._powered = _mask(config.state_lamp)
+        self._moving = _mask(config.motion_lamp)
+        self._heartbeat = _mask(config.heartbeat)
+        self._gripper = 0 if gripper is None else _mask(gripper.output)
+        self._closed = gripper is not None and gripper.closed == "on"
+        numbers = (config.state_lamp, config.motion_lamp, config.heartbeat, None if gripper is None else gripper.output)
+        self.meant = frozenset(number for number in numbers if number is not None)
+        """Numbers of the outputs that nobody switches by hand."""
+
+    def write(self, outputs: int, powered: bool, moving: bool) -> int:
+        """Return `outputs` with the lamps as they have to be, and the heartbeat the other way round."""
+        lamps = (self._powered if powered else 0) | (self._moving if moving else 0)
+        return (outputs & ~(self._powered | self._moving) | lamps) ^ self._heartbeat
+
+    def lamps(self, outputs: int) -> int:
+        """Return `outputs` with all off that is neither a lamp nor the heartbeat."""
+        return outputs & (self._powered | self._moving | self._heartbeat)
+
+    def grip(self, outputs: int, close: bool) -> int:
+        """Return `outputs` with the gripper closed or open."""
+        on = close is self._closed
+        return outputs | self._gripper if on else outputs & ~self._gripper
+
+
+def _mask(number: int | None) -> int:
+    return 0 if number is None else 1 << number - 1
+
+
+RESTLESS = 4
+"""After so many times the debounce without rest the lines are no code."""
+
+
+class JoystickInput:
+    """What the stick shows. `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
+
+    Args:
+        config: which inputs are the stick's, and which others have a meaning.
+        cycle_s: how often `read` is called, s.
+    """
+
+    __slots__ = (
+        "_byte_at", "_candidate", "_checked", "_debounce", "_inverted", "_lines", "_restless", "_stable", "code",
+        "forward", "paddle", "side", "valid",
+    )  # fmt: skip
+
+    def __init__(self, config: InputsConfig, cycle_s: float) -> None:
+        joystick = config.joystick
+        self.forward = self.side = self.paddle = 0
+        self.code = 0
+        self.valid = False
+        self._candidate = -1
+        self._stable = self._restless = 0
+        self._lines: tuple[int, ...] = ()
+        self._checked = self._inverted = self._byte_at = self._debounce = 0
+        if joystick is None:
+            return
+        numbers = (joystick.forward, joystick.backward, joystick.left, joystick.right, joystick.mode_up,
+                   joystick.mode_down)  # fmt: skip
+        self._lines = tuple(1 << number - 1 for number in numbers)
+        self._inverted = sum(self._lines) if joystick.active == "low" else 0
+        self._debounce = round(joystick.debounce_ms * 1e-3 / cycle_s)
+        self._byte_at = (min(numbers) - 1) // 8 * 8
+        others = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
+        meant = sum(1 << one.number - 1 for one in others if one is not None)
+        bytes_used = {(number - 1) // 8 for number in numbers}
+        self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~meant
+
+    def read(self, levels: int) -> None:
+        """Take the levels of all inputs of a cycle; a change counts once it has lasted as long as configured."""
+        if not self._lines:
+            return
+        seen = levels & self._checked
+        if seen != self._candidate:
+            self._candidate = seen
+            self._stable = 0
+        elif self._stable <= self._debounce:
+            self._stable += 1
+        if self._stable < self._debounce:
+            self._restless += 1
+            if self._restless > RESTLESS * self._debounce:
+                # Lines that never come to rest, as at a loose contact: the last direction must not go on for ever.
+                self.forward = self.side = self.paddle = 0
+                self.valid = False
+            return
+        self._restless = 0
+        self.code = seen >> self._byte_at & 0xFF
+        active = seen ^ self._inverted
+        forward, backward, left, right, up, down = (bool(active & line) for line in self._lines)
+        rest = active
+        for line in self._lines:
+            rest &= ~line
+        deflected = forward or backward or left or right
+        self.valid = not (
+            rest or (forward and backward) or (left and right) or (up and down) or (deflected and (up or down))
+        )
+        if self.valid:
+            self.forward = forward - backward
+            self.side = left - right
+            self.paddle = up - down
+        else:
+            self.forward = self.side = self.paddle = 0

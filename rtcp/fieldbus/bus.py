@@ -2,33 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.alstatus import AlState, code_meaning, code_remedy, state_name
+from rtcp.fieldbus.al_state import AlState, code_meaning, code_remedy, state_name
 from rtcp.fieldbus.emergency import Emergency
-
-if TYPE_CHECKING:
-    from rtcp.fieldbus.sdo import SdoClient
-    from rtcp.fieldbus.watcher import Watcher
-
-
-class BusError(Exception):
-    """The bus, or a slave on it, refused or failed; `sentences` say what, where, found and expected."""
-
-    def __init__(self, *sentences: str) -> None:
-        super().__init__("\n".join(sentences))
-        self.sentences = sentences
-
-
-class SdoAborted(BusError):
-    """An SDO service that the slave refused with an abort code (`code`, ETG.1000.6, table 41)."""
-
-    def __init__(self, sentence: str, code: int) -> None:
-        super().__init__(sentence)
-        self.code = code
 
 
 @dataclass(frozen=True)
@@ -209,16 +189,6 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Bring the slaves back to INIT, switch SYNC off, close the bus; may be called at any time, also twice."""
-
-
-class WatchedBus(Bus, Protocol):
-    """A bus on a wire: slaves are lost and brought back while the cycle goes on."""
-
-    def sdo(self, position: int) -> SdoClient:
-        """Return SDO access to a slave, also in steps."""
-
-    def watcher(self, say: Callable[[str], None]) -> Watcher:
-        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
 
 
 def slave_label(position: int, name: str) -> str:

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from rtcp.config.model import DeviceDescription, SlaveConfig
-from rtcp.fieldbus.bus import BusError, slave_label, station_of
-from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.steps import Steps
+from rtcp.fieldbus.bus import slave_label, station_of
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.registers import RegisterPort, Steps
 
 DC_ACTIVATE = 0x0981
 """Activation register: bit 0 cyclic operation, bit 1 SYNC0, bit 2 SYNC1."""

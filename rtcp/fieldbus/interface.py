@@ -1,21 +1,103 @@
-"""Opening a network interface for SOEM, and making its packet socket fit for a cycle."""
+"""The network interface: whether it can be the master's end of a cable, its flags, its namespace, who uses it."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import errno
+import fcntl
 import os
 import socket
-from typing import Any
+import struct
 
-from pysoem import pysoem
+from rtcp.fieldbus.errors import BusError
 
-from rtcp.fieldbus.bus import BusError
-from rtcp.fieldbus.registers import attach_filter
+# netdevice(7): struct ifreq of 40 bytes, name and flags.
+_SIOCGIFFLAGS, _SIOCSIFFLAGS = 0x8913, 0x8914
+_IFF_UP, _IFF_LOOPBACK, _IFF_PROMISC = 0x1, 0x8, 0x100
+_REQUEST = struct.Struct("=16sH22x")
 
-_SOEM_LAST_INDEX = 15
-_SDO_TIMEOUT_US = 700_000
-_ANSWER_US, _PATIENCE_US = 40_000, 500_000
-"""Until SOEM sends a frame again, and until it gives up. The cycle's frames have a time of their own."""
+
+def check_name(name: str) -> None:
+    """Raise BusError where no interface has this name, or the one that has it has no cable."""
+    known = [found for _, found in socket.if_nameindex()]
+    if name not in known:
+        raise BusError(f"there is no network interface {name} (`interface`); there are {', '.join(known) or 'none'}")
+    if _flags(name) & _IFF_LOOPBACK:
+        raise BusError(
+            f"interface {name} (`interface`) is the loopback, which has no cable: an Ethernet interface is expected"
+        )
+
+
+def check_interface(name: str) -> None:
+    """Raise BusError where `check_name` does, or the interface is down."""
+    check_name(name)
+    if not _flags(name) & _IFF_UP:
+        raise BusError(f"network interface {name} is down: `ip link set {name} up` brings it up")
+
+
+class PromiscuousMode:
+    """Whether an interface was promiscuous; `close` makes it so again. SOEM switches that on and leaves it on."""
+
+    def __init__(self, interface: str) -> None:
+        self._interface = interface
+        self._before = _flags(interface) & _IFF_PROMISC
+
+    def close(self) -> None:
+        """Switch the mode off where it was off; may be called twice, and when the interface is gone."""
+        with contextlib.suppress(OSError):
+            flags = _flags(self._interface)
+            if flags & _IFF_PROMISC and not self._before:
+                _ioctl(_SIOCSIFFLAGS, self._interface, flags & ~_IFF_PROMISC)
+
+
+def _flags(name: str) -> int:
+    return int(_REQUEST.unpack(_ioctl(_SIOCGIFFLAGS, name, 0))[1])
+
+
+def _ioctl(request: int, name: str, flags: int) -> bytes:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        return fcntl.ioctl(probe, request, _REQUEST.pack(name.encode(), flags))
+
+
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWNET = 0x40000000
+# os.setns came with Python 3.12 only.
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def enter(pid: int) -> None:
+    """Join the user namespace (where it differs from ours) and the network namespace of process `pid`.
+
+    The kernel lets only a process of a single thread join a user namespace: call this before any thread is started.
+
+    Raises:
+        BusError: the process does not exist, or the kernel refuses.
+    """
+    for kind, flag in (("user", _CLONE_NEWUSER), ("net", _CLONE_NEWNET)):
+        try:
+            target = os.open(f"/proc/{pid}/ns/{kind}", os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise BusError(
+                f"the {kind} namespace of process {pid} cannot be opened: {error.strerror}; is the segment running?"
+            ) from error
+        try:
+            theirs, ours = os.fstat(target), os.stat(f"/proc/self/ns/{kind}")
+            if (theirs.st_dev, theirs.st_ino) == (ours.st_dev, ours.st_ino):
+                continue
+            if _libc.setns(target, flag) != 0:
+                raise BusError(_refusal(kind, pid, ctypes.get_errno()))
+        finally:
+            os.close(target)
+
+
+def _refusal(kind: str, pid: int, number: int) -> str:
+    why = os.strerror(number)
+    if kind == "user" and number == errno.EINVAL:
+        why += "; only a process of a single thread may join a user namespace"
+    if number == errno.EPERM:
+        why += "; the segment must have been started by the same user, or this must be root"
+    return f"the {kind} namespace of process {pid} cannot be joined: {why}"
 
 
 def claim(interface: str) -> socket.socket:
@@ -35,45 +117,3 @@ def claim(interface: str) -> socket.socket:
             f"interface {interface} is in use by another process of this platform: `rtcp stop` it first"
         ) from error
     return mine
-
-
-def open_master(interface: str) -> tuple[Any, socket.socket]:
-    """Return pysoem's master, open, and a duplicate of its packet socket, which no longer blocks.
-
-    Raises:
-        BusError: the interface cannot be opened.
-    """
-    timeouts = pysoem.settings.timeouts
-    # By default an answer after 2 ms is one too late: a shared host, or a segment in software, may be off its CPU for
-    # longer. In a mailbox SOEM then takes the answer to one SDO for that to the next, and its map fails.
-    timeouts.ret = _ANSWER_US
-    timeouts.safe = timeouts.eeprom = _PATIENCE_US
-    master = pysoem.Master()
-    master.sdo_read_timeout = master.sdo_write_timeout = _SDO_TIMEOUT_US
-    # The slaves are led through their states by us, so that a refusal is told with its code.
-    master.manual_state_change = 1
-    before = _sockets()
-    try:
-        master.open(interface)
-    except ConnectionError as error:
-        raise BusError(f"interface {interface} cannot be opened by the EtherCAT master: {error}") from error
-    opened = [fd for fd, _ in _sockets() - before]
-    if len(opened) != 1:
-        master.close()
-        raise BusError(f"the master's packet socket on {interface} was not found among the open descriptors")
-    duplicate = socket.socket(fileno=os.dup(opened[0]))
-    # Both descriptors are one socket. Blocking, an empty receive would last a jiffy or two: 4 to 8 ms (SOEM#451).
-    duplicate.setblocking(False)
-    attach_filter(duplicate, 0, _SOEM_LAST_INDEX)
-    return master, duplicate
-
-
-def _sockets() -> set[tuple[int, str]]:
-    found = set()
-    for name in os.listdir("/proc/self/fd"):
-        # The descriptor of the listing itself is gone by now.
-        with contextlib.suppress(FileNotFoundError):
-            target = os.readlink(f"/proc/self/fd/{name}")
-            if target.startswith("socket:"):
-                found.add((int(name), target))
-    return found

@@ -1,12 +1,249 @@
-"""A slave's mailbox, through a RegisterPort (ETG.1000.4, 5.6 and 6.7: sync managers 0 and 1 in mailbox mode)."""
+"""Mailboxes of the slaves: SDO access and emergency messages (ETG.1000.4, 5.6; ETG.1000.6, 5.6.2).
+
+Not through SOEM: an abort that a slave sends as an SDO response (some do; the standard says request) is a success to
+its download and a wrong length to its upload, and its functions cannot be taken in steps.
+"""
 
 from __future__ import annotations
 
 import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 
-from rtcp.fieldbus.bus import BusError, MailboxInfo
-from rtcp.fieldbus.registers import Command, RegisterPort
+from rtcp.fieldbus.bus import MailboxInfo, slave_label, station_of
+from rtcp.fieldbus.emergency import Emergency, parse
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.registers import Command, RegisterPort, Steps, T, finish, pause
+
+_RETRY_S = 0.01
+_TIMEOUT_S = 0.7
+_PATIENCE_S = 3.0
+"""For the mailbox, while another service of the same slave is under way."""
+_SDO = struct.Struct("<BHBI")
+_COE_HEADER = 2
+_REQUEST, _RESPONSE = 2, 3
+"""CoE services (ETG.1000.6, table 28)."""
+_EXPEDITED, _SIZED, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
+_DOWNLOAD, _DOWNLOAD_SEGMENT, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0x20, 0x00, 0x40, 0x60, 0x80
+"""Commands of the client (upper three bits)."""
+_UPLOADED, _UPLOADED_SEGMENT, _DOWNLOADED, _DOWNLOADED_SEGMENT = 0x40, 0x00, 0x60, 0x20
+"""Commands of the server."""
+_SPECIFIER = 0xE0
+_SEGMENT_DATA = 7
+"""Bytes of data that a segment has at least, filled up (ETG.1000.6, 5.6.2.5 and 5.6.2.3)."""
+_LARGEST_OBJECT = 1 << 16
+"""Bytes; no object of a drive or a terminal comes near it."""
+
+
+class SdoClient:
+    """Reads and writes objects of a slave, one service at a time: at once (`read`) or in steps (`reading`)."""
+
+    def __init__(
+        self,
+        mailbox: Mailbox | None,
+        position: int,
+        name: str,
+        lock: threading.Lock,
+        other: Callable[[bytes, int], None],
+    ) -> None:
+        """Take the mailbox of the slave at `position` (from 1); None where it has none for CoE.
+
+        Args:
+            mailbox: the slave's mailbox.
+            position: position of the slave on the cable, from 1.
+            name: name of the slave.
+            lock: the lock of this slave's mailbox.
+            other: takes CoE messages that are no SDO (emergencies), with the slave's position.
+        """
+        self.position = position
+        self.name = name
+        self._mailbox = mailbox
+        self._lock = lock
+        self._other = other
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Return an object's value.
+
+        Raises:
+            SdoAborted: the slave refused.
+            BusError: the slave did not answer.
+        """
+        return finish(self.reading(index, subindex))
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write an object's value; raises as `read`."""
+        finish(self.writing(index, subindex, data))
+
+    def reading(self, index: int, subindex: int) -> Steps[bytes]:
+        """Return an object's value; raises as `read`."""
+        return self._call(f"read of 0x{index:04X}:{subindex}", lambda box: self._upload(box, index, subindex))
+
+    def writing(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """Write an object's value; raises as `read`."""
+        shown = data.hex(" ") if len(data) <= 8 else f"{len(data)} bytes"
+        what = f"write of {shown or 'nothing'} to 0x{index:04X}:{subindex}"
+        return self._call(what, lambda box: self._download(box, index, subindex, data))
+
+    def reading_int(self, index: int, subindex: int) -> Steps[int]:
+        """Return an object's value as an unsigned integer; raises as `read`."""
+        return int.from_bytes((yield from self.reading(index, subindex)), "little")
+
+    def writing_int(self, index: int, subindex: int, value: int, length: int) -> Steps[None]:
+        """Write an unsigned integer of `length` bytes; raises as `read`."""
+        return self.writing(index, subindex, value.to_bytes(length, "little"))
+
+    def _call(self, what: str, service: Callable[[Mailbox], Steps[T]]) -> Steps[T]:
+        where = slave_label(self.position, self.name)
+        if self._mailbox is None:
+            raise BusError(f"{where}: {what} is not possible, its EEPROM tells of no CoE mailbox")
+        deadline = time.monotonic() + _PATIENCE_S
+        while not self._lock.acquire(blocking=False):
+            if time.monotonic() >= deadline:
+                raise BusError(f"{where}, {what}: its mailbox is in use by others")
+            yield
+        try:
+            until = time.monotonic() + self._mailbox.patience_s
+            tried_again = False
+            while True:
+                try:
+                    return (yield from service(self._mailbox))
+                except SdoAborted as error:
+                    raise SdoAborted(f"{where} refused the {what}: {error}", error.code) from error
+                except BusError as error:
+                    # Its messages are sent and fetched once only each: of many frames that get lost some are theirs.
+                    if tried_again and time.monotonic() >= until:
+                        raise BusError(f"{where}, {what}: {error}") from error
+                tried_again = True
+                # An immediate second try may fail where one a little later works (SOEM#825).
+                yield from pause(_RETRY_S)
+        finally:
+            self._lock.release()
+
+    def _exchange(
+        self, mailbox: Mailbox, request: bytes, specifier: int, address: tuple[int, int] | None
+    ) -> Steps[bytes]:  # fmt: skip
+        """Return the answer to an SDO request, from its command on; `address`: index and subindex it must repeat."""
+        deadline = time.monotonic() + _TIMEOUT_S
+        # What is left of an earlier service, or an emergency, would be taken for the answer.
+        while (left := mailbox.receive()) is not None:
+            self._other(left, self.position)
+            _check_time(deadline, "its mailbox does not get empty")
+        while not mailbox.send((_REQUEST << 12).to_bytes(2, "little") + request):
+            if time.monotonic() >= deadline:
+                raise BusError("its mailbox stays full")
+            yield
+        while True:
+            if (message := mailbox.receive()) is None:
+                if time.monotonic() >= deadline:
+                    raise BusError("no answer in time")
+                yield
+                continue
+            if len(message) < _COE_HEADER + _SDO.size or message[1] >> 4 not in {_REQUEST, _RESPONSE}:
+                self._other(message, self.position)
+                _check_time(deadline, "no answer in time, but other messages")
+                continue
+            command, index, subindex, number = _SDO.unpack_from(message, _COE_HEADER)
+            if command == _ABORT:
+                raise SdoAborted(f"abort code 0x{number:08X}, {abort_meaning(number)}", number)
+            if command & _SPECIFIER != specifier or (address is not None and address != (index, subindex)):
+                raise BusError(f"it answered something else (command 0x{command:02X})")
+            return message[_COE_HEADER:]
+
+    def _upload(self, mailbox: Mailbox, index: int, subindex: int) -> Steps[bytes]:
+        request = _SDO.pack(_UPLOAD, index, subindex, 0)
+        answer = yield from self._exchange(mailbox, request, _UPLOADED, (index, subindex))
+        command, _, _, size = _SDO.unpack_from(answer)
+        if command & _EXPEDITED:
+            return answer[4 : 8 - (command >> 2 & 3) if command & _SIZED else 8]
+        if size > _LARGEST_OBJECT:
+            raise BusError(f"it tells of {size} bytes; at most {_LARGEST_OBJECT} are read")
+        data = bytearray(answer[8:])
+        toggle = 0
+        while len(data) < size:
+            request = _SDO.pack(_UPLOAD_SEGMENT | toggle, 0, 0, 0)
+            answer = yield from self._exchange(mailbox, request, _UPLOADED_SEGMENT, None)
+            command = answer[0]
+            if command & _TOGGLE != toggle:
+                raise BusError("it repeated a segment")
+            part = answer[1:]
+            # Seven bytes or fewer: the command tells how many of them count.
+            data += part[: _SEGMENT_DATA - (command >> 1 & 7)] if len(part) == _SEGMENT_DATA else part
+            toggle ^= _TOGGLE
+            if command & _LAST:
+                break
+            if len(answer) < 2 or (len(part) == _SEGMENT_DATA and command >> 1 & 7 == _SEGMENT_DATA):
+                raise BusError("it sent a segment without data")
+        return bytes(data[:size])
+
+    def _download(self, mailbox: Mailbox, index: int, subindex: int, data: bytes) -> Steps[None]:
+        if 1 <= len(data) <= 4:
+            command = _DOWNLOAD | _EXPEDITED | _SIZED | (4 - len(data)) << 2
+            request = _SDO.pack(command, index, subindex, 0)[:4] + data.ljust(4, b"\0")
+            yield from self._exchange(mailbox, request, _DOWNLOADED, (index, subindex))
+            return
+        first = mailbox.room - _COE_HEADER - _SDO.size
+        request = _SDO.pack(_DOWNLOAD | _SIZED, index, subindex, len(data)) + data[:first]
+        yield from self._exchange(mailbox, request, _DOWNLOADED, (index, subindex))
+        size = mailbox.room - _COE_HEADER - 1
+        toggle = 0
+        for start in range(first, len(data), size):
+            part = data[start : start + size]
+            missing = max(_SEGMENT_DATA - len(part), 0)
+            last = _LAST if start + size >= len(data) else 0
+            request = bytes((_DOWNLOAD_SEGMENT | toggle | missing << 1 | last,)) + part.ljust(_SEGMENT_DATA, b"\0")
+            yield from self._exchange(mailbox, request, _DOWNLOADED_SEGMENT, None)
+            toggle ^= _TOGGLE
+
+
+def _check_time(deadline: float, sentence: str) -> None:
+    if time.monotonic() >= deadline:
+        raise BusError(sentence)
+
+
+ABSENT = frozenset((0x06020000, 0x06090011))
+"""The codes that say that an object or a subindex does not exist."""
+
+ABORT_CODES: dict[int, str] = {
+    0x05030000: "toggle bit not changed",
+    0x05040000: "SDO protocol timeout",
+    0x05040001: "command specifier not valid or unknown",
+    0x05040005: "out of memory",
+    0x06010000: "unsupported access to an object",
+    0x06010001: "attempt to read a write-only object",
+    0x06010002: "attempt to write a read-only object",
+    0x06010003: "subindex cannot be written, subindex 0 must be 0 first",
+    0x06010004: "complete access not supported for objects of variable length",
+    0x06010005: "object longer than the mailbox",
+    0x06010006: "object is mapped to an RxPDO, download blocked",
+    0x06020000: "the object does not exist",
+    0x06040041: "the object cannot be mapped into the PDO",
+    0x06040042: "number and length of the mapped objects exceed the PDO",
+    0x06040043: "general parameter incompatibility",
+    0x06040047: "general internal incompatibility of the device",
+    0x06060000: "access failed because of a hardware error",
+    0x06070010: "data type does not match: length differs",
+    0x06070012: "data type does not match: too long",
+    0x06070013: "data type does not match: too short",
+    0x06090011: "the subindex does not exist",
+    0x06090030: "value out of range",
+    0x06090031: "value too high",
+    0x06090032: "value too low",
+    0x06090036: "maximum below minimum",
+    0x08000000: "general error",
+    0x08000020: "data cannot be transferred or stored",
+    0x08000021: "data cannot be transferred or stored: local control",
+    0x08000022: "data cannot be transferred or stored in the present state of the device",
+    0x08000023: "no object dictionary is present",
+}
+
+
+def abort_meaning(code: int) -> str:
+    """Return what an abort code means."""
+    return ABORT_CODES.get(code, "not in the standard")
+
 
 _SM0_STATUS, _SM1_STATUS, _FULL = 0x0805, 0x080D, 0x08
 _HEADER = struct.Struct("<HHBB")
@@ -95,3 +332,74 @@ class Mailbox:
         if status is None:
             raise BusError("it does not answer")
         return bool(status[0] & _FULL)
+
+
+_SM1_STATUS, _FULL = 0x080D, 0x08
+_MESSAGES_A_POLL = 8
+
+
+class Mailboxes:
+    """One lock a slave: what waits for one of them keeps nobody from another."""
+
+    def __init__(self, port: RegisterPort, names: Sequence[str], infos: Sequence[MailboxInfo | None]) -> None:
+        """Take the slaves in the order of the cable: their names, and what their EEPROMs tell of their mailboxes."""
+        self._port = port
+        self._names = names
+        self._infos = infos
+        self._locks = [threading.Lock() for _ in names]
+        self._emergencies: deque[Emergency] = deque(maxlen=256)
+
+    def sdo(self, position: int) -> SdoClient:
+        """Return SDO access to the slave at `position`; raises BusError where there is none."""
+        if not 1 <= position <= len(self._names):
+            raise BusError(f"there is no slave {position}; the bus has slaves 1 to {len(self._names)}")
+        info = self._infos[position - 1]
+        mailbox = Mailbox(self._port, station_of(position), info) if info is not None and info.has_coe else None
+        return SdoClient(mailbox, position, self._names[position - 1], self._locks[position - 1], self._keep)
+
+    def emergencies(self) -> tuple[Emergency, ...]:
+        """Return the emergency messages that came since the last call; without any it takes one frame.
+
+        Raises:
+            BusError: a message got lost; whatever else there is comes with the next call.
+        """
+        full = self._port.read_all(_SM1_STATUS, 1).data
+        if any(byte & _FULL for byte in full):
+            self._empty_all()
+        found = []
+        while self._emergencies:
+            found.append(self._emergencies.popleft())
+        return tuple(found)
+
+    def _empty_all(self) -> None:
+        faults: list[str] = []
+        for position, info in enumerate(self._infos, 1):
+            lock = self._locks[position - 1]
+            # While an SDO is under way its answer is in the mailbox; whoever waits for it then meets emergencies too.
+            if info is None or not lock.acquire(blocking=False):
+                continue
+            try:
+                self._empty(position, info)
+            except BusError as error:
+                faults.append(f"{slave_label(position, self._names[position - 1])}, reading its mailbox: {error}")
+            finally:
+                lock.release()
+        if faults:
+            raise BusError(*faults)
+
+    def _empty(self, position: int, info: MailboxInfo) -> None:
+        status = self._port.read(station_of(position), _SM1_STATUS, 1, tries=1)
+        # A slave that does not answer is the watcher's business.
+        if status is None or not status[0] & _FULL:
+            return
+        mailbox = Mailbox(self._port, station_of(position), info)
+        for _ in range(_MESSAGES_A_POLL):
+            message = mailbox.receive()
+            if message is None:
+                return
+            self._keep(message, position)
+
+    def _keep(self, message: bytes, position: int) -> None:
+        found = parse(message, position, self._names[position - 1])
+        if found is not None:
+            self._emergencies.append(found)

@@ -6,6 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rtcp.config.model import DeviceDescription, Pdo
+from rtcp.fieldbus.bus import PdoEntryInfo, PdoInfo, slave_label
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.mailbox import ABSENT, SdoClient
+from rtcp.fieldbus.registers import Steps
 
 # type: (bits, code of `struct`); bool stands in the image as single bits
 TYPES: dict[str, tuple[int, str]] = {
@@ -21,6 +25,11 @@ TYPES: dict[str, tuple[int, str]] = {
     "float32": (32, "f"),
     "float64": (64, "d"),
 }
+
+
+RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
+Mapping = tuple[tuple[int, tuple[tuple[int, int, int], ...]], ...]
+"""PDOs in order, each its index and its entries (index, subindex, bits)."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +86,77 @@ def layout_faults(device: DeviceDescription) -> list[str]:
         for key, image in (("rpdo", layout(device.rpdo)), ("tpdo", layout(device.tpdo)))
         if 0 < image.bits < 8
     ]
+
+
+def mapping_of(pdos: Sequence[Pdo]) -> Mapping:
+    """Return what `pdos` of a description map."""
+    return tuple(
+        (pdo.index, tuple((e.index, e.sub_index if e.index else 0, TYPES[e.type][0]) for e in pdo.channels))
+        for pdo in pdos
+    )  # fmt: skip
+
+
+def mapping_text(mapping: Mapping) -> str:
+    """Return a mapping in words, with its length."""
+    bits = sum(entry[2] for _, entries in mapping for entry in entries)
+    listed = "; ".join(
+        f"0x{pdo:04X}: " + (", ".join(f"0x{index:04X}:{sub}/{width}" for index, sub, width in entries) or "nothing")
+        for pdo, entries in mapping
+    )
+    return f"{bits} bits ({listed or 'no PDO'})"
+
+
+def write_mapping(sdo: SdoClient, assignment: int, mapping: Mapping) -> Steps[None]:
+    """Write PDO mapping and assignment: counts to 0, entries, counts (ETG.1000.6, 5.6.5.2)."""
+    yield from sdo.writing_int(assignment, 0, 0, 1)
+    for pdo, entries in mapping:
+        yield from sdo.writing_int(pdo, 0, 0, 1)
+        for i, (index, sub_index, bits) in enumerate(entries, 1):
+            yield from sdo.writing_int(pdo, i, index << 16 | sub_index << 8 | bits, 4)
+        yield from sdo.writing_int(pdo, 0, len(entries), 1)
+    for i, (pdo, _) in enumerate(mapping, 1):
+        yield from sdo.writing_int(assignment, i, pdo, 2)
+    yield from sdo.writing_int(assignment, 0, len(mapping), 1)
+
+
+def compare_mapping(sdo: SdoClient, assignment: int, expected: Mapping, key: str) -> Steps[None]:
+    """Read the mapping and compare it; raises BusError where it differs (`key`: that of the device's file)."""
+    try:
+        found = tuple(
+            (pdo.index, tuple((e.index, e.sub_index, e.bits) for e in pdo.entries))
+            for pdo in (yield from reading_assignment(sdo, assignment))
+        )
+    except SdoAborted as error:
+        if error.code not in ABSENT or expected:
+            raise
+        return
+    if found != expected:
+        raise BusError(
+            f"{slave_label(sdo.position, sdo.name)}: the mapping assigned through 0x{assignment:04X} differs from "
+            f"the device's file (key `{key}`): expected {mapping_text(expected)}, found {mapping_text(found)}"
+        )
+
+
+def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:
+    """Return the PDOs that 0x1C12 or 0x1C13 lists and what is mapped into them; names are left empty.
+
+    Raises:
+        BusError: the slave refuses or does not answer.
+    """
+    pdos = []
+    for number in range(1, (yield from _reading(sdo, assignment, 0, 0xFF)) + 1):
+        pdo = yield from _reading(sdo, assignment, number, 0xFFFF)
+        entries = []
+        for i in range(1, (yield from _reading(sdo, pdo, 0, 0xFF)) + 1):
+            mapped = yield from sdo.reading_int(pdo, i)
+            entries.append(PdoEntryInfo(mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF, ""))
+        pdos.append(PdoInfo(pdo, tuple(entries)))
+    return tuple(pdos)
+
+
+def _reading(sdo: SdoClient, index: int, subindex: int, most: int) -> Steps[int]:
+    found = yield from sdo.reading_int(index, subindex)
+    if found > most:
+        where = slave_label(sdo.position, sdo.name)
+        raise BusError(f"{where}: 0x{index:04X}:{subindex} reads as 0x{found:X}, at most 0x{most:X} is possible")
+    return found

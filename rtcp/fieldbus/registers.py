@@ -12,10 +12,11 @@ import socket
 import struct
 import threading
 import time
+from collections.abc import Generator
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
-from rtcp.fieldbus.bus import BusError
+from rtcp.fieldbus.errors import BusError
 
 ETHERTYPE = 0x88A4
 FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
@@ -199,3 +200,26 @@ class RegisterPort:
     def close(self) -> None:
         """Close the port; may be called twice."""
         self._socket.close()
+
+
+T = TypeVar("T")
+Steps = Generator[None, None, T]
+_POLL_S = 0.0002
+
+
+def finish(steps: Steps[T]) -> T:
+    """Take all steps, asleep between them; return what they return, raise what they raise."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            found: T = end.value
+            return found
+        time.sleep(_POLL_S)
+
+
+def pause(seconds: float) -> Steps[None]:
+    """Let time pass."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        yield

@@ -8,22 +8,13 @@ from typing import Any
 
 from pysoem import pysoem
 
-from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, code_meaning, state_name
-from rtcp.fieldbus.bus import (
-    BusError,
-    MailboxInfo,
-    PdoEntryInfo,
-    PdoInfo,
-    SlaveInfo,
-    SyncManagerInfo,
-    slave_label,
-)
-from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.sdo import SdoClient
-from rtcp.fieldbus.states import read_al
-from rtcp.fieldbus.steps import Steps, finish
+from rtcp.fieldbus.al_state import ERROR_BIT, AlState, code_meaning, read_al, state_name
+from rtcp.fieldbus.bus import MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, SyncManagerInfo
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.mailbox import SdoClient
+from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
+from rtcp.fieldbus.registers import RegisterPort, finish
 
-RX_ASSIGN, TX_ASSIGN = 0x1C12, 0x1C13
 _DEVICE_NAME = 0x1008
 _ESC_FMMUS = 0x0004
 _ALIAS = 0x0012
@@ -66,36 +57,6 @@ def name_of(slave: Any) -> str:
 def read_serial(slave: Any) -> int:
     """Return the serial number in the EEPROM."""
     return int.from_bytes(slave.eeprom_read(_SII_SERIAL, _EEPROM_US), "little")
-
-
-def eeprom_to_device(port: RegisterPort, station: int) -> bool:
-    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
-    return port.write(station, _EEPROM_CONFIG, b"\x01\x00")
-
-
-def reading_assignment(sdo: SdoClient, assignment: int) -> Steps[tuple[PdoInfo, ...]]:
-    """Return the PDOs that 0x1C12 or 0x1C13 lists and what is mapped into them; names are left empty.
-
-    Raises:
-        BusError: the slave refuses or does not answer.
-    """
-    pdos = []
-    for number in range(1, (yield from _reading(sdo, assignment, 0, 0xFF)) + 1):
-        pdo = yield from _reading(sdo, assignment, number, 0xFFFF)
-        entries = []
-        for i in range(1, (yield from _reading(sdo, pdo, 0, 0xFF)) + 1):
-            mapped = yield from sdo.reading_int(pdo, i)
-            entries.append(PdoEntryInfo(mapped >> 16, mapped >> 8 & 0xFF, mapped & 0xFF, ""))
-        pdos.append(PdoInfo(pdo, tuple(entries)))
-    return tuple(pdos)
-
-
-def _reading(sdo: SdoClient, index: int, subindex: int, most: int) -> Steps[int]:
-    found = yield from sdo.reading_int(index, subindex)
-    if found > most:
-        where = slave_label(sdo.position, sdo.name)
-        raise BusError(f"{where}: 0x{index:04X}:{subindex} reads as 0x{found:X}, at most 0x{most:X} is possible")
-    return found
 
 
 class _Names:

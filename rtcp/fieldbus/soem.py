@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import socket
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -11,32 +13,29 @@ from typing import Any
 from pysoem import pysoem
 
 from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus import states
-from rtcp.fieldbus.alstatus import AlState
-from rtcp.fieldbus.bus import BusError, MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus import al_state
+from rtcp.fieldbus.al_state import AlState
+from rtcp.fieldbus.bus import MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import DC_ACTIVATE, start_clocks
-from rtcp.fieldbus.configure import configure_slave, identity_faults
 from rtcp.fieldbus.emergency import Emergency
-from rtcp.fieldbus.exchange import SoemProcessData
-from rtcp.fieldbus.fence import Fence
-from rtcp.fieldbus.interface import claim, open_master
-from rtcp.fieldbus.link import PromiscuousMode, check_interface
-from rtcp.fieldbus.mailboxes import Mailboxes
-from rtcp.fieldbus.namespace import enter
+from rtcp.fieldbus.errors import BusError, MappingMisread
+from rtcp.fieldbus.interface import PromiscuousMode, check_interface, claim, enter
+from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
 from rtcp.fieldbus.pdo import layout, layout_faults
-from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort
-from rtcp.fieldbus.restore import Restorer, take_set_up
-from rtcp.fieldbus.scan import describe, eeprom_to_device, name_of, parents, read_mailbox, read_serial
-from rtcp.fieldbus.sdo import SdoClient
-from rtcp.fieldbus.steps import finish
-from rtcp.fieldbus.watcher import Watcher
+from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
+from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort, attach_filter, finish
+from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
+from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, take_set_up
+from rtcp.fieldbus.supervision import SlaveWatcher
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _MAP_TRIES = 3
 
 
-class _MisreadError(BusError):
-    """SOEM did not get the PDO mapping that the slave has: a frame got lost, or came when it was waited for no more."""
+_SOEM_LAST_INDEX = 15
+_SDO_TIMEOUT_US = 700_000
+_ANSWER_US, _PATIENCE_US = 40_000, 500_000
+"""Until SOEM sends a frame again, and until it gives up. The cycle's frames have a time of their own."""
 
 
 class SoemBus:
@@ -68,12 +67,12 @@ class SoemBus:
         self._claim: socket.socket | None = None
         self._promiscuous: PromiscuousMode | None = None
         self._port: RegisterPort | None = None
-        self._fence: Fence | None = None
+        self._fence: FrameBarrier | None = None
         self._names: list[str] = []
         self._infos: list[MailboxInfo | None] = []
         self._serials: list[int] = []
         self._boxes: Mailboxes | None = None
-        self._restorer: Restorer | None = None
+        self._restorer: SlaveRestorer | None = None
 
     def __enter__(self) -> SoemBus:
         self.open()
@@ -112,7 +111,7 @@ class SoemBus:
         try:
             self._port = RegisterPort(self.interface)
             self._port.tries = PATIENT_TRIES
-            self._fence = Fence(self.interface)
+            self._fence = FrameBarrier(self.interface)
             self._promiscuous = PromiscuousMode(self.interface)
             self._master, self._socket = open_master(self.interface)
         except BaseException:
@@ -153,7 +152,7 @@ class SoemBus:
             try:
                 self._map(slaves)
                 break
-            except _MisreadError:
+            except MappingMisread:
                 # SOEM maps on from where it is: only from INIT on does it map anew.
                 if not tries_left:
                     raise
@@ -169,7 +168,7 @@ class SoemBus:
             take_set_up(self.port, position, config.name, serial)
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
-        self._restorer = Restorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
+        self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)
         # From here on a cycle runs, and slaves are watched beside it: what is lost is to be known soon.
         self.port.tries = TRIES
         return data
@@ -214,14 +213,14 @@ class SoemBus:
         return self._lead(AlState.PREOP, stations) if stations else ()
 
     def _lead(self, state: AlState, stations: dict[int, str]) -> tuple[str, ...]:
-        states.request_state(self.port, stations, state)
-        return states.wait_for_state(self.port, stations, state, self._state_timeout_s)
+        al_state.request_state(self.port, stations, state)
+        return al_state.wait_for_state(self.port, stations, state, self._state_timeout_s)
 
     def _configure_slave(self, i: int, config: SlaveConfig, period_ns: int) -> list[str]:
         return finish(configure_slave(self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), config, period_ns))
 
     def _map(self, slaves: Sequence[SlaveConfig]) -> None:
-        """Let SOEM read the mapping and make the process image of it; raises BusError, `_MisreadError` by chance."""
+        """Let SOEM read the mapping and make the process image of it; raises BusError, `MappingMisread` by chance."""
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
@@ -232,7 +231,7 @@ class SoemBus:
                 # SOEM may meet the same one hundreds of times.
                 told = (f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
                 refused = any(isinstance(fault, pysoem.SdoError) for fault in met)
-                raise (BusError if refused else _MisreadError)(*dict.fromkeys(told)) from error
+                raise (BusError if refused else MappingMisread)(*dict.fromkeys(told)) from error
         faults = []
         for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
             label = slave_label(i + 1, config.name)
@@ -242,7 +241,7 @@ class SoemBus:
                     faults.append(f"{label}: expected {expected} bytes of {key}, found {len(image)} bytes")
         if faults:
             # The slave's own mapping was compared before, entry by entry.
-            raise _MisreadError(*faults)
+            raise MappingMisread(*faults)
 
     def _process_data(self, period_ns: int) -> SoemProcessData:
         assert self._socket is not None
@@ -256,26 +255,26 @@ class SoemBus:
 
     def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
         """Request `state` of the slaves at `positions` (from 1), None: of all; nothing is waited for."""
-        states.request_state(self.port, self._stations(positions), state)
+        al_state.request_state(self.port, self._stations(positions), state)
 
     def wait_for_state(
         self, state: AlState, timeout_s: float, positions: Iterable[int] | None = None
     ) -> tuple[str, ...]:
         """Wait until the slaves are in `state`; return a sentence for each that is not."""
-        return states.wait_for_state(self.port, self._stations(positions), state, timeout_s)
+        return al_state.wait_for_state(self.port, self._stations(positions), state, timeout_s)
 
     def acknowledge(self, position: int) -> None:
         """Acknowledge a slave's error; it stays in the state that it is in."""
-        states.acknowledge(self.port, station_of(position))
+        al_state.acknowledge(self.port, station_of(position))
 
     def read_states(self) -> tuple[SlaveState, ...]:
         """Return what every slave's AL status register says; while all are in OP it takes one frame."""
-        all_of_them = self.port.read_all(states.AL_STATUS, 2)
+        all_of_them = self.port.read_all(al_state.AL_STATUS, 2)
         in_op = all_of_them.wkc == len(self._names) and all_of_them.data == b"\x08\x00"
         result = []
         for position, name in enumerate(self._names, 1):
             station = station_of(position)
-            state, error, code = (AlState.OP, False, 0) if in_op else states.read_al(self.port, station)
+            state, error, code = (AlState.OP, False, 0) if in_op else al_state.read_al(self.port, station)
             result.append(SlaveState(position, station, name, state, error, code))
         return tuple(result)
 
@@ -295,10 +294,10 @@ class SoemBus:
         """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
         return self._mailboxes.sdo(position)
 
-    def watcher(self, say: Callable[[str], None]) -> Watcher:
+    def watcher(self, say: Callable[[str], None]) -> SlaveWatcher:
         """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return Watcher(self.port, self._names, self._restorer, say)
+        return SlaveWatcher(self.port, self._names, self._restorer, say)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -321,12 +320,54 @@ class SoemBus:
 
     def _to_init(self, port: RegisterPort) -> None:
         everyone = self._stations(None)
-        if states.broadcast_state(port, AlState.SAFEOP) < 0:
+        if al_state.broadcast_state(port, AlState.SAFEOP) < 0:
             raise BusError("no frame comes back")
         # Slaves that were below SAFE-OP refuse it: what matters is that none is left in OP.
-        states.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
-        states.broadcast_state(port, AlState.INIT)
-        left = states.wait_for_state(port, everyone, AlState.INIT, _INIT_S)
+        al_state.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
+        al_state.broadcast_state(port, AlState.INIT)
+        left = al_state.wait_for_state(port, everyone, AlState.INIT, _INIT_S)
         port.write_all(DC_ACTIVATE, b"\0")
         if left:
             raise BusError(*left)
+
+
+def open_master(interface: str) -> tuple[Any, socket.socket]:
+    """Return pysoem's master, open, and a duplicate of its packet socket, which no longer blocks.
+
+    Raises:
+        BusError: the interface cannot be opened.
+    """
+    timeouts = pysoem.settings.timeouts
+    # By default an answer after 2 ms is one too late: a shared host, or a segment in software, may be off its CPU for
+    # longer. In a mailbox SOEM then takes the answer to one SDO for that to the next, and its map fails.
+    timeouts.ret = _ANSWER_US
+    timeouts.safe = timeouts.eeprom = _PATIENCE_US
+    master = pysoem.Master()
+    master.sdo_read_timeout = master.sdo_write_timeout = _SDO_TIMEOUT_US
+    # The slaves are led through their states by us, so that a refusal is told with its code.
+    master.manual_state_change = 1
+    before = _sockets()
+    try:
+        master.open(interface)
+    except ConnectionError as error:
+        raise BusError(f"interface {interface} cannot be opened by the EtherCAT master: {error}") from error
+    opened = [fd for fd, _ in _sockets() - before]
+    if len(opened) != 1:
+        master.close()
+        raise BusError(f"the master's packet socket on {interface} was not found among the open descriptors")
+    duplicate = socket.socket(fileno=os.dup(opened[0]))
+    # Both descriptors are one socket. Blocking, an empty receive would last a jiffy or two: 4 to 8 ms (SOEM#451).
+    duplicate.setblocking(False)
+    attach_filter(duplicate, 0, _SOEM_LAST_INDEX)
+    return master, duplicate
+
+
+def _sockets() -> set[tuple[int, str]]:
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        # The descriptor of the listing itself is gone by now.
+        with contextlib.suppress(FileNotFoundError):
+            target = os.readlink(f"/proc/self/fd/{name}")
+            if target.startswith("socket:"):
+                found.add((int(name), target))
+    return found

@@ -12,7 +12,7 @@ from rtcp.config.model import Joint
 from rtcp.control.arm import WITH_TORQUE
 from rtcp.control.closing import TOLD_CYCLES
 from rtcp.devices.cia402 import DriveState, state_of
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway.carrier import MOVING, POLL_S, Carrier, CommandFailed
 from rtcp.ipc.codes import Code, MotionMode
 from rtcp.ipc.machine import Command, State

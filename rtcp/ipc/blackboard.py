@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.layout import (
     ANSWER,
     ANSWER_AT,

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.config.stops import StopsConfig
-from rtcp.devices.cia402 import DriveGoal
+from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.codes import Code
 
 _LATENCY_CYCLES = 3
@@ -46,12 +46,12 @@ class Rung(IntEnum):
         return self.name.lower().replace("_", " ")
 
     @property
-    def goal(self) -> DriveGoal:
+    def goal(self) -> TargetState:
         """Where the drives are led; holding and a controlled stop leave them enabled."""
         return _GOALS[self]
 
 
-_GOALS = (DriveGoal.ENABLED, DriveGoal.ENABLED, DriveGoal.QUICK_STOPPED, DriveGoal.TORQUE_OFF)
+_GOALS = (TargetState.ENABLED, TargetState.ENABLED, TargetState.QUICK_STOPPED, TargetState.TORQUE_OFF)
 
 KEYS = MappingProxyType(
     {

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.assembly import position_of
-from rtcp.control.service import Service
+from rtcp.control.bus_service import BusService
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.registers import State
@@ -17,7 +17,7 @@ _ERROR_CODE = 0x603F
 _ERROR_BIT = 0x10
 
 
-class InlineService(Service):
+class InlineService(BusService):
     """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
 
     def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:

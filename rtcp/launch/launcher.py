@@ -18,8 +18,8 @@ from rtcp.config.schema import load, segment_path, with_motion, with_period
 from rtcp.config.segment import load_segment
 from rtcp.config.virtual import VIRTUAL, widen
 from rtcp.config.zero import read_zeros, state_directory
-from rtcp.fieldbus.bus import BusError
-from rtcp.fieldbus.link import check_name
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.interface import check_name
 from rtcp.gateway.blackbox import BlackBox
 from rtcp.gateway.blackbox_file import faults_directory
 from rtcp.ipc.client import LONGEST_SOCKET_PATH, ControlError

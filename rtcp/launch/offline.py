@@ -88,8 +88,8 @@ def sdo_write(bus: str, config: Path | None, slave: int, index: int, subindex: i
 
 def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str, Any]:
     if bus != VIRTUAL:
-        from rtcp.fieldbus.bus import BusError
-        from rtcp.fieldbus.link import check_name
+        from rtcp.fieldbus.errors import BusError
+        from rtcp.fieldbus.interface import check_name
 
         try:
             check_name(bus)

@@ -9,7 +9,7 @@ import sys
 from types import FrameType
 from typing import Any
 
-from rtcp.fieldbus.bus import BusError, SdoAborted
+from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.soem import SoemBus
 
 

@@ -5,7 +5,8 @@ import struct
 
 import pytest
 
-from rtcp.devices import Cia402Drive, DeviceError, DriveGoal, DriveState
+from rtcp.devices import Cia402Drive, DeviceError, DriveState
+from rtcp.devices import TargetState as T
 
 from .conftest import RPDO, TPDO, slave
 
@@ -31,7 +32,7 @@ def test_the_statusword_tells_the_state(drive, wire, word, state):
 
 def test_every_state_has_a_controlword_for_every_goal(drive, wire):
     for word in range(0x80):
-        for goal in DriveGoal:
+        for goal in T:
             wire.says(word)
             drive.advance(goal)
 
@@ -39,11 +40,11 @@ def test_every_state_has_a_controlword_for_every_goal(drive, wire):
 @pytest.mark.parametrize(
     ("goal", "steps"),
     [
-        (DriveGoal.ENABLED, [(DISABLED, 0x06), (READY, 0x07), (SWITCHED_ON, 0x0F), (ENABLED, 0x0F)]),
-        (DriveGoal.DISABLED, [(ENABLED, 0x07), (SWITCHED_ON, 0x06), (READY, 0x00), (DISABLED, 0x00)]),
-        (DriveGoal.RESET, [(FAULT_REACTION, 0x00), (FAULT, 0x80), (DISABLED, 0x00)]),
-        (DriveGoal.ENABLED, [(FAULT, 0x00), (FAULT, 0x00), (FAULT, 0x00)]),
-        (DriveGoal.ENABLED, [(QUICK_STOP, 0x0F), (ENABLED, 0x0F)]),
+        (T.ENABLED, [(DISABLED, 0x06), (READY, 0x07), (SWITCHED_ON, 0x0F), (ENABLED, 0x0F)]),
+        (T.DISABLED, [(ENABLED, 0x07), (SWITCHED_ON, 0x06), (READY, 0x00), (DISABLED, 0x00)]),
+        (T.RESET, [(FAULT_REACTION, 0x00), (FAULT, 0x80), (DISABLED, 0x00)]),
+        (T.ENABLED, [(FAULT, 0x00), (FAULT, 0x00), (FAULT, 0x00)]),
+        (T.ENABLED, [(QUICK_STOP, 0x0F), (ENABLED, 0x0F)]),
     ],
 )
 def test_each_step_is_decided_by_the_state_found(drive, wire, goal, steps):
@@ -56,16 +57,16 @@ def test_each_step_is_decided_by_the_state_found(drive, wire, goal, steps):
 def test_a_drive_that_stays_where_it_is_gets_the_same_step_again(drive, wire):
     for _ in range(20):
         wire.says(READY)
-        assert not drive.advance(DriveGoal.ENABLED)
+        assert not drive.advance(T.ENABLED)
         assert wire.hears()[0] == 0x07
 
 
 @pytest.mark.parametrize(
     ("goal", "status", "reached"),
     [
-        (DriveGoal.ENABLED, ENABLED, True), (DriveGoal.ENABLED, SWITCHED_ON, False), (DriveGoal.ENABLED, FAULT, False),
-        (DriveGoal.DISABLED, DISABLED, True), (DriveGoal.DISABLED, ENABLED, False), (DriveGoal.DISABLED, FAULT, True),
-        (DriveGoal.DISABLED, QUICK_STOP, False), (DriveGoal.RESET, FAULT, False), (DriveGoal.RESET, DISABLED, True),
+        (T.ENABLED, ENABLED, True), (T.ENABLED, SWITCHED_ON, False), (T.ENABLED, FAULT, False),
+        (T.DISABLED, DISABLED, True), (T.DISABLED, ENABLED, False), (T.DISABLED, FAULT, True),
+        (T.DISABLED, QUICK_STOP, False), (T.RESET, FAULT, False), (T.RESET, DISABLED, True),
     ],
 )  # fmt: skip
 def test_advance_tells_whether_the_goal_is_reached(drive, wire, goal, status, reached):
@@ -77,7 +78,7 @@ def test_the_fault_reset_is_repeated_as_an_edge(drive, wire):
     words = []
     for _ in range(24):
         wire.says(FAULT)
-        drive.advance(DriveGoal.RESET)
+        drive.advance(T.RESET)
         words.append(wire.hears()[0])
     edges = sum(1 for before, now in zip([0, *words], words, strict=False) if now & 0x80 and not before & 0x80)
     assert set(words) == {0x00, 0x80}
@@ -88,26 +89,26 @@ def test_the_target_follows_the_position_until_the_drive_is_enabled(drive, wire)
     for status, position in ((DISABLED, 100), (READY, 200), (SWITCHED_ON, 300)):
         wire.says(status, position)
         assert wire.hears()[1] == position
-        drive.advance(DriveGoal.ENABLED)
+        drive.advance(T.ENABLED)
 
 
 def test_the_target_is_latched_once_on_the_step_to_operation_enabled(drive, wire):
     wire.says(SWITCHED_ON, 12345)
-    drive.advance(DriveGoal.ENABLED)
+    drive.advance(T.ENABLED)
     sent = [wire.hears()[1]]
     # The arm sags by a count a cycle: a target that were copied would sag with it.
     for position in range(12344, 12300, -1):
         wire.says(SWITCHED_ON if position > 12340 else ENABLED, position)
-        drive.advance(DriveGoal.ENABLED)
+        drive.advance(T.ENABLED)
         sent.append(wire.hears()[1])
     assert set(sent) == {12345}
 
 
 def test_the_target_is_latched_anew_after_a_fault_reset(drive, wire):
     for status, position, goal in (
-        (SWITCHED_ON, 1000, DriveGoal.ENABLED), (ENABLED, 1000, DriveGoal.ENABLED), (FAULT, 4000, DriveGoal.ENABLED),
-        (FAULT, 5000, DriveGoal.RESET), (DISABLED, 6000, DriveGoal.ENABLED), (READY, 7000, DriveGoal.ENABLED),
-        (SWITCHED_ON, 8000, DriveGoal.ENABLED), (ENABLED, 8001, DriveGoal.ENABLED),
+        (SWITCHED_ON, 1000, T.ENABLED), (ENABLED, 1000, T.ENABLED), (FAULT, 4000, T.ENABLED),
+        (FAULT, 5000, T.RESET), (DISABLED, 6000, T.ENABLED), (READY, 7000, T.ENABLED),
+        (SWITCHED_ON, 8000, T.ENABLED), (ENABLED, 8001, T.ENABLED),
     ):  # fmt: skip
         wire.says(status, position)
         drive.advance(goal)
@@ -117,14 +118,14 @@ def test_the_target_is_latched_anew_after_a_fault_reset(drive, wire):
 def test_the_target_is_latched_anew_when_the_drive_left_the_enabled_state_on_its_own(drive, wire):
     for status, position in ((SWITCHED_ON, 1000), (ENABLED, 1000), (SWITCHED_ON, 9000), (ENABLED, 9001)):
         wire.says(status, position)
-        drive.advance(DriveGoal.ENABLED)
+        drive.advance(T.ENABLED)
     assert wire.hears()[1] == 9000
 
 
 def test_latching_forgets_a_velocity_and_a_torque_of_before(drive, wire):
     drive.target_velocity, drive.target_torque = 1.0, 5.0
     wire.says(SWITCHED_ON)
-    drive.advance(DriveGoal.ENABLED)
+    drive.advance(T.ENABLED)
     assert (drive.target_velocity, drive.target_torque) == (0.0, 0.0)
 
 
@@ -157,7 +158,7 @@ def test_a_quick_stop_is_held_and_sends_neither_speed_nor_torque(drive, wire):
         drive.mode, drive.target_velocity, drive.target_torque = mode, 0.25, 12.0
         for status in (ENABLED, QUICK_STOP, QUICK_STOP):
             wire.says(status, mode=mode)
-            drive.advance(DriveGoal.QUICK_STOPPED)
+            drive.advance(T.QUICK_STOPPED)
             assert wire.hears()[0] == 0x02
             assert wire.hears()[2:4] == (0, 0)
 
@@ -165,14 +166,14 @@ def test_a_quick_stop_is_held_and_sends_neither_speed_nor_torque(drive, wire):
 @pytest.mark.parametrize("status", [DISABLED, FAULT])
 def test_a_drive_without_torque_has_reached_its_quick_stop(drive, wire, status):
     wire.says(status)
-    assert drive.advance(DriveGoal.QUICK_STOPPED)
+    assert drive.advance(T.QUICK_STOPPED)
 
 
 def test_a_quick_stop_is_sent_whatever_the_statusword_says(drive, wire):
     # The word may be false, and the drive enabled: anything else would take its torque.
     for word in range(0x80):
         wire.says(word)
-        drive.advance(DriveGoal.QUICK_STOPPED)
+        drive.advance(T.QUICK_STOPPED)
         assert wire.hears()[0] == 0x02
 
 
@@ -187,10 +188,10 @@ def test_no_speed_and_no_torque_is_sent_to_a_drive_that_is_not_enabled(drive, wi
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 def test_a_target_that_is_no_number_leaves_what_was_sent(drive, wire, bad):
     wire.says(SWITCHED_ON, 700)
-    drive.advance(DriveGoal.ENABLED)
+    drive.advance(T.ENABLED)
     drive.mode = 9
     wire.says(ENABLED, mode=9)
-    drive.advance(DriveGoal.ENABLED)
+    drive.advance(T.ENABLED)
     drive.target_velocity = 0.1
     assert wire.hears()[1:3] == (700, 1000)
     drive.target_position = drive.target_velocity = bad

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rtcp.config.model import Pdo, PdoEntry
-from rtcp.devices.codec import make_codec
+from rtcp.devices.driver import make_codec
 from rtcp.fieldbus.pdo import layout
 
 BITS = Pdo(0x1A00, tuple(PdoEntry(0x6000, i, "bool", f"in{i}") for i in range(1, 4)))

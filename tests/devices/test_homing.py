@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from rtcp.devices import Cia402Drive, DriveGoal, DriveState
+from rtcp.devices import Cia402Drive, DriveState, TargetState
 from rtcp.devices.homing import ENDED, HOMING, SHOWN, START, Homing, HomingPhase, Shown
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
@@ -42,7 +42,7 @@ def homing(drive, wire) -> Homing:
 def enabled(drive, wire) -> None:
     for word in (SWITCHED_ON, ENABLED):
         wire.says(word, 700)
-        drive.advance(DriveGoal.ENABLED)
+        drive.advance(TargetState.ENABLED)
 
 
 def told(homing, wire, word: int, times: int = 1, position: int = 700, mode: int = 6, velocity: int = 0) -> HomingPhase:
@@ -206,7 +206,7 @@ def test_a_drive_that_is_let_go_is_in_csp_when_it_is_enabled_again(homing, drive
     homing.abandon()
     assert homing.ended
     told(homing, wire, UNDER_WAY, 3)
-    drive.advance(DriveGoal.QUICK_STOPPED)
+    drive.advance(TargetState.QUICK_STOPPED)
     assert (wire.hears()[0], wire.hears()[4]) == (0x02, 8)
 
 
@@ -246,7 +246,7 @@ class Line:
         self.drive = Cia402Drive(slave(), speed_limit=0.5, zero=zero)
         self._on_the_way = [self._packed()] * 2
         self.cycle()
-        while not self.drive.advance(DriveGoal.ENABLED):
+        while not self.drive.advance(TargetState.ENABLED):
             self.cycle()
 
     def __setitem__(self, key: tuple[int, int], value: int) -> None:
@@ -378,7 +378,7 @@ def test_after_a_fault_in_mid_search_it_is_enabled_in_csp(line: Maker) -> None:
         if one.drive.state is not DriveState.OPERATION_ENABLED:
             homing.abandon()
             break
-    for goal in (DriveGoal.RESET, DriveGoal.ENABLED):
+    for goal in (TargetState.RESET, TargetState.ENABLED):
         for _ in range(4000):
             one.cycle()
             if one.drive.advance(goal) and one.still:

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig
-from rtcp.devices.stick import Stick
+from rtcp.devices.io_box import JoystickInput
 
 CYCLE = 0.0005
 NEUTRAL = 63
@@ -22,15 +22,15 @@ TABLE = {
 }  # the facts' rows, then two directions at once
 
 
-def stick_of(debounce_ms: float = 0.0, **others) -> Stick:
-    return Stick(InputsConfig(joystick=JoystickConfig(debounce_ms=debounce_ms), **others), CYCLE)
+def stick_of(debounce_ms: float = 0.0, **others) -> JoystickInput:
+    return JoystickInput(InputsConfig(joystick=JoystickConfig(debounce_ms=debounce_ms), **others), CYCLE)
 
 
-def shown(stick: Stick) -> tuple[int, int, int]:
+def shown(stick: JoystickInput) -> tuple[int, int, int]:
     return stick.forward, stick.side, stick.paddle
 
 
-def held(stick: Stick, levels: int, cycles: int) -> Stick:
+def held(stick: JoystickInput, levels: int, cycles: int) -> JoystickInput:
     for _ in range(cycles):
         stick.read(levels)
     return stick
@@ -111,7 +111,7 @@ def test_other_inputs_with_a_meaning_and_other_bytes_do_not_disturb_it():
 
 
 def test_a_stick_that_is_active_high_is_neutral_at_zero():
-    stick = Stick(InputsConfig(joystick=JoystickConfig(active="high", debounce_ms=0.0)), CYCLE)
+    stick = JoystickInput(InputsConfig(joystick=JoystickConfig(active="high", debounce_ms=0.0)), CYCLE)
     held(stick, 0, 1)
     assert stick.valid
     assert shown(stick) == (0, 0, 0)
@@ -121,7 +121,7 @@ def test_a_stick_that_is_active_high_is_neutral_at_zero():
 
 def test_a_stick_may_sit_on_the_upper_byte():
     joystick = JoystickConfig(9, 10, 11, 12, 13, 14, debounce_ms=0.0)
-    stick = Stick(InputsConfig(joystick=joystick), CYCLE)
+    stick = JoystickInput(InputsConfig(joystick=joystick), CYCLE)
     held(stick, 59 << 8 | 0xAA, 1)
     assert stick.valid
     assert stick.code == 59
@@ -129,6 +129,6 @@ def test_a_stick_may_sit_on_the_upper_byte():
 
 
 def test_where_there_is_no_stick_nothing_is_ever_valid():
-    stick = held(Stick(InputsConfig(), CYCLE), NEUTRAL, 100)
+    stick = held(JoystickInput(InputsConfig(), CYCLE), NEUTRAL, 100)
     assert not stick.valid
     assert shown(stick) == (0, 0, 0)

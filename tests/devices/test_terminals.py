@@ -4,7 +4,7 @@ import pytest
 
 from rtcp.config.model import GripperConfig
 from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, OutputsConfig
-from rtcp.devices.terminals import Inputs, Outputs, Switch
+from rtcp.devices.io_box import Inputs, Outputs, Switch
 
 CYCLE = 0.0005
 ALL = InputsConfig(

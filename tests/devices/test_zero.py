@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.devices import Cia402Drive, DriveGoal
+from rtcp.devices import Cia402Drive, TargetState
 
 from .conftest import Wire, slave
 
@@ -35,7 +35,7 @@ def test_the_target_is_sent_as_the_drive_counts(shifted):
 
 def test_speed_and_torque_know_no_zero(shifted):
     drive = shifted.drive
-    drive.advance(DriveGoal.ENABLED)
+    drive.advance(TargetState.ENABLED)
     drive.controlword, drive.mode, drive.target_velocity, drive.target_torque = 0x0F, 9, 0.2, 1.0
     shifted.says(ENABLED, 2500, mode=9)
     assert shifted.hears()[2] == 2000
@@ -52,7 +52,7 @@ def test_the_end_of_the_field_is_the_wires_and_not_the_joints(shifted):
 def test_a_target_latched_at_the_position_is_sent_as_the_very_counts_that_came(zero, counts):
     wire = Wire(Cia402Drive(slave(), zero=zero))
     wire.says(SWITCHED_ON, counts)
-    wire.drive.advance(DriveGoal.ENABLED)
+    wire.drive.advance(TargetState.ENABLED)
     assert wire.hears()[1] == counts
 
 
@@ -60,7 +60,7 @@ def test_a_target_latched_at_the_position_is_sent_as_the_very_counts_that_came(z
 def test_another_zero_moves_what_is_shown_and_not_what_is_sent(before, after, counts):
     wire = Wire(Cia402Drive(slave(), zero=before))
     wire.says(SWITCHED_ON, counts)
-    wire.drive.advance(DriveGoal.ENABLED)
+    wire.drive.advance(TargetState.ENABLED)
     wire.drive.zero = after
     assert wire.hears()[1] == counts
     assert wire.drive.position == pytest.approx(counts * 1e-4 - after, abs=1e-9)

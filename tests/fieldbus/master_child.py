@@ -21,12 +21,13 @@ from typing import Any
 
 from rtcp.config.model import Pdo, PdoEntry, SlaveConfig, StartupSdo
 from rtcp.config.schema import load
-from rtcp.devices import Cia402Drive, DriveGoal
+from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
-from rtcp.fieldbus.namespace import enter
+from rtcp.fieldbus.errors import MappingMisread
+from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.soem import SoemBus, _MisreadError
+from rtcp.fieldbus.soem import SoemBus
 
 ARM = Path(__file__).parents[2] / "config" / "assistive_arm.yaml"
 INTERFACE = "ecat0"
@@ -177,7 +178,7 @@ def misread(bus: SoemBus, count: int, times: int) -> Any:
         make(slaves)
         tries.append(len(slaves))
         if next(left, None) is not None:
-            raise _MisreadError("slave 1: its PDO mapping could not be read: Unexpected frame returned")
+            raise MappingMisread("slave 1: its PDO mapping could not be read: Unexpected frame returned")
 
     bus._map = fails  # type: ignore[method-assign]
     result = op(bus, count, 1_000_000)
@@ -286,7 +287,7 @@ def emergency(bus: SoemBus, count: int) -> Any:
 
     def control() -> None:
         drive.decode(data.input(1))
-        drive.advance(DriveGoal.ENABLED)
+        drive.advance(TargetState.ENABLED)
         data.set_output(1, drive.encode())
         if not steps or steps[-1] != drive.state.value:
             steps.append(drive.state.value)

@@ -8,13 +8,12 @@ from typing import Any
 
 import pytest
 
-from rtcp.fieldbus import care, watcher
-from rtcp.fieldbus.alstatus import AlState
-from rtcp.fieldbus.bus import BusError, station_of
-from rtcp.fieldbus.registers import Answer, Command, RegisterPort
-from rtcp.fieldbus.states import AL_CONTROL, AL_STATUS
-from rtcp.fieldbus.steps import Steps
-from rtcp.fieldbus.watcher import Watcher
+from rtcp.fieldbus import supervision
+from rtcp.fieldbus.al_state import AL_CONTROL, AL_STATUS, AlState
+from rtcp.fieldbus.bus import station_of
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.registers import Answer, Command, RegisterPort, Steps
+from rtcp.fieldbus.supervision import SlaveWatcher
 
 NAMES = ("io", "drive1", "drive2")
 OP, SAFEOP, PREOP, INIT = AlState.OP, AlState.SAFEOP, AlState.PREOP, AlState.INIT
@@ -71,13 +70,13 @@ class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
         clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.wait)
-        for module in (watcher, care):
+        for module in (supervision,):
             monkeypatch.setattr(module, "time", clock)
         self.port = Slaves()
         self.said: list[str] = []
         self.restored: list[int] = []
         self.restoration: Callable[[int], Steps[None]] = self.endless
-        self.watcher = Watcher(self.port, NAMES, self, self.said.append)  # type: ignore[arg-type]
+        self.watcher = SlaveWatcher(self.port, NAMES, self, self.said.append)  # type: ignore[arg-type]
 
     def wait(self, seconds: float) -> None:
         self.now += seconds

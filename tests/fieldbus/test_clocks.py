@@ -8,10 +8,9 @@ import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
-from rtcp.fieldbus.bus import BusError
 from rtcp.fieldbus.clocks import settle_clock, start_sync, take_over_time
-from rtcp.fieldbus.registers import Command
-from rtcp.fieldbus.steps import finish
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.registers import Command, finish
 from rtcp.virtual.server import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
-from rtcp.fieldbus.configure import identity_faults, interpolation_time, mapping_of, mapping_text
-from rtcp.fieldbus.pdo import layout_faults
+from rtcp.fieldbus.pdo import layout_faults, mapping_of, mapping_text
 from rtcp.fieldbus.scan import parents
+from rtcp.fieldbus.slave_setup import identity_faults, interpolation_time
 
 
 def slave(name: str, vendor: int = 1, product: int = 2, entries=("uint16",)) -> SlaveConfig:

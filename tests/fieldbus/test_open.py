@@ -6,8 +6,9 @@ import pytest
 from pysoem import pysoem
 
 from rtcp.fieldbus import AlState, BusError
-from rtcp.fieldbus.namespace import enter
-from rtcp.fieldbus.soem import SoemBus, _MisreadError
+from rtcp.fieldbus.errors import MappingMisread
+from rtcp.fieldbus.interface import enter
+from rtcp.fieldbus.soem import SoemBus
 
 
 def test_an_interface_that_does_not_exist_is_told_with_those_that_do():
@@ -62,4 +63,4 @@ def test_a_map_is_misread_by_chance_only_where_no_slave_has_refused_an_object(me
     bus._master = Master()
     with pytest.raises(BusError, match="slave 2: its PDO mapping could not be read: Unexpected frame") as told:
         bus._map([])
-    assert isinstance(told.value, _MisreadError) is by_chance
+    assert isinstance(told.value, MappingMisread) is by_chance

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from rtcp.fieldbus import registers
-from rtcp.fieldbus.bus import BusError
+from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import FIRST_INDEX, PATIENT_TRIES, TRIES, Answer, Command, RegisterPort, build_frame
 
 STATUS = bytes((8, 0, 0, 0, 0, 0))

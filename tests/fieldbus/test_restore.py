@@ -7,10 +7,9 @@ from pathlib import Path
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
-from rtcp.fieldbus.bus import BusError
-from rtcp.fieldbus.registers import Command
-from rtcp.fieldbus.restore import Restorer, SetUp
-from rtcp.fieldbus.steps import finish
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.registers import Command, finish
+from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup
 from rtcp.virtual.server import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm
@@ -31,7 +30,7 @@ def port() -> Direct:
 @pytest.mark.parametrize("register", [0x0500, 0x0502, 0x0981, 0x0928, 0x0920, 0x0930])
 def test_a_write_that_got_lost_ends_the_attempt(port: Direct, register: int) -> None:
     port.lost = {(Command.APWR, register)}
-    set_up = SetUp(bytes(0x80), (bytes(8),) * 8, bytes(4), 0)
-    restorer = Restorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
+    set_up = SlaveSetup(bytes(0x80), (bytes(8),) * 8, bytes(4), 0)
+    restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* register 0x{register:04X}"):
         finish(restorer.restore(3, lost_address=True))

@@ -7,7 +7,7 @@ import threading
 import pytest
 
 from rtcp.fieldbus import BusError, SdoAborted
-from rtcp.fieldbus.sdo import SdoClient
+from rtcp.fieldbus.mailbox import SdoClient
 
 EMERGENCY = bytes.fromhex("0010 1186 21 0102030405")
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
-from rtcp.fieldbus.alstatus import AlState
-from rtcp.fieldbus.states import read_al, wait_for_state
+from rtcp.fieldbus.al_state import AlState, read_al, wait_for_state
 from rtcp.virtual.server import make_segment
 from tests.fieldbus.direct import Direct
 

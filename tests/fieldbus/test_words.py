@@ -4,10 +4,10 @@ import struct
 
 import pytest
 
-from rtcp.fieldbus.abort import abort_meaning
-from rtcp.fieldbus.alstatus import AlState, code_meaning, refusal, state_name
+from rtcp.fieldbus.al_state import AlState, code_meaning, refusal, state_name
 from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.emergency import ERROR_CODES, REMEDIES, Emergency, error_meaning, error_remedy, error_words, parse
+from rtcp.fieldbus.mailbox import abort_meaning
 
 
 @pytest.mark.parametrize(

@@ -13,9 +13,9 @@ from master_child import Cycle, arm, to_op, with_device
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus import AlState
 from rtcp.fieldbus.bus import station_of
-from rtcp.fieldbus.restore import Restorer, take_set_up
+from rtcp.fieldbus.slave_setup import SlaveRestorer, take_set_up
 from rtcp.fieldbus.soem import SoemBus
-from rtcp.fieldbus.watcher import Watcher
+from rtcp.fieldbus.supervision import SlaveWatcher
 from rtcp.virtual.faults.client import SegmentClient
 
 PERIOD = 1_000_000
@@ -63,7 +63,7 @@ def clocks(bus: SoemBus, count: int) -> list[tuple[int, int]]:
 class Watching:
     """What the thread beside the cycle does: turns of the watcher, ten milliseconds apart."""
 
-    def __init__(self, watcher: Watcher) -> None:
+    def __init__(self, watcher: SlaveWatcher) -> None:
         self.watcher = watcher
         self.left: list[int] = []
         self.longest_s = 0.0
@@ -112,14 +112,14 @@ class Watched:
     def registers(self) -> list[dict[str, str]]:
         return [registers(self.bus, position) for position in range(1, self.count + 1)]
 
-    def strange_watcher(self, position: int, say: Any, serial: int) -> Watcher:
+    def strange_watcher(self, position: int, say: Any, serial: int) -> SlaveWatcher:
         """Return a watcher that expects another device at `position`, or where `serial` is not 0 one of its kind."""
         own = self.slaves[position - 1].device
         other = own if serial else replace(own, product_id=0x4711)
         changed = [replace(one, device=other) if at == position else one for at, one in enumerate(self.slaves, 1)]
         set_ups = [take_set_up(self.bus.port, at, one.name, serial) for at, one in enumerate(self.slaves, 1)]
-        restorer = Restorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
-        return Watcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
+        restorer = SlaveRestorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
+        return SlaveWatcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
 
     def episode(
         self, faults: list[dict[str, Any]], act: Any = None, foreign: int = 0, serial: int = 0

@@ -22,8 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from rtcp.config import default_config, load
 from rtcp.fieldbus import AlState, BusError
 from rtcp.fieldbus.bus import station_of
-from rtcp.fieldbus.exchange import SoemProcessData
-from rtcp.fieldbus.namespace import enter
+from rtcp.fieldbus.interface import enter
+from rtcp.fieldbus.process_data import SoemProcessData
 from rtcp.fieldbus.soem import SoemBus
 from tests.malformed.answerer import ask
 from tests.malformed.segment_play import resident_kb

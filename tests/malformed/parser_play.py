@@ -17,14 +17,12 @@ from random import Random
 from typing import Any
 
 from rtcp.config import default_config, load
-from rtcp.fieldbus import AlState, BusError, registers, scan, states
+from rtcp.fieldbus import AlState, BusError, al_state, registers, scan
 from rtcp.fieldbus.bus import MailboxInfo, SlaveState
-from rtcp.fieldbus.configure import configure_slave
 from rtcp.fieldbus.emergency import Emergency, parse
-from rtcp.fieldbus.mailbox import Mailbox
-from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.sdo import SdoClient
-from rtcp.fieldbus.steps import finish
+from rtcp.fieldbus.mailbox import Mailbox, SdoClient
+from rtcp.fieldbus.registers import RegisterPort, finish
+from rtcp.fieldbus.slave_setup import configure_slave
 from rtcp.virtual.device import Emergency as Sent
 from tests.malformed.line import OP, PRE_OP, SIZES, STATION, Line
 from tests.malformed.mutate import garbled
@@ -134,14 +132,14 @@ class Master:
         self._random.choice(self.deeds)(self._random.randrange(len(SIZES)))
 
     def _states(self, at: int) -> None:
-        state, error, code = states.read_al(self._port, STATION + at)
+        state, error, code = al_state.read_al(self._port, STATION + at)
         SlaveState(at + 1, STATION + at, "x", state, error, code).words()
 
     def _wait(self, at: int) -> None:
         where = {STATION + at: "it"}
-        states.request_state(self._port, where, AlState.PREOP)
-        states.wait_for_state(self._port, where, AlState.PREOP, 0.01)
-        states.acknowledge(self._port, STATION + at)
+        al_state.request_state(self._port, where, AlState.PREOP)
+        al_state.wait_for_state(self._port, where, AlState.PREOP, 0.01)
+        al_state.acknowledge(self._port, STATION + at)
 
     def _registers(self, at: int) -> None:
         found = self._port.read(STATION + at, 0x0300, 20)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from rtcp.fieldbus import BusError
+from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.scan import name_of, read_mailbox
-from rtcp.fieldbus.sdo import SdoClient
 from tests.malformed import parser_play
 from tests.malformed.cable import answerer, master, told
 from tests.malformed.line import Line

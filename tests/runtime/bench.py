@@ -11,8 +11,8 @@ from typing import NamedTuple
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.control.assembly import assemble
-from rtcp.control.service import Service
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.control.bus_service import BusService
+from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.messages import Sentences
@@ -184,7 +184,7 @@ class Bench:
         period_ns = round(PERIOD_S * 1e9)
         self.discipline = Followed(period_ns, 0)
         self.discipline.locked = True
-        self.service = Service(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
+        self.service = BusService(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
         self.slaves_come_back = True
         for position in range(1, 1 + len(config.slaves)):
             board.slave(position, AlState.OP, 0)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config.model import GripperConfig
-from rtcp.fieldbus.alstatus import ERROR_BIT, AlState
+from rtcp.fieldbus.al_state import ERROR_BIT, AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.observer import Observer

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway import commander
 from rtcp.gateway.carrier import Carrier, CommandFailed
 from rtcp.gateway.commander import Commander

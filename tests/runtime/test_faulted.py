@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config.model import ArmConfig
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.observer import Observer

@@ -10,7 +10,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.control.gripper import DrivenGripper, gripper_of
-from rtcp.devices.cia402 import DriveGoal, DriveState
+from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
@@ -40,7 +40,7 @@ class Bench:
         self._rx = PdoImage.from_assignment(self.model.objects, RX_ASSIGN)
         self._tx = PdoImage.from_assignment(self.model.objects, TX_ASSIGN)
         self._outputs = bytes(self._rx.byte_length)
-        self.goal = DriveGoal.DISABLED
+        self.goal = TargetState.DISABLED
         self.object_at: float | None = None
         self.run(0.02)
 
@@ -73,7 +73,7 @@ class Bench:
         return path
 
     def enabled(self) -> Bench:
-        self.goal = DriveGoal.ENABLED
+        self.goal = TargetState.ENABLED
         self.run(0.1)
         assert self.gripper.enabled
         return self
@@ -142,11 +142,11 @@ def test_after_a_fault_on_its_way_it_goes_nowhere_by_itself() -> None:
     bench.gripper.grip(True)
     bench.run(0.5)
     bench.model.inject_fault(0x7305)
-    bench.goal = DriveGoal.QUICK_STOPPED
+    bench.goal = TargetState.QUICK_STOPPED
     bench.run(0.5)
     assert bench.gripper.drive.state is DriveState.FAULT
     here = bench.model.mechanics.position
-    bench.goal = DriveGoal.RESET
+    bench.goal = TargetState.RESET
     bench.run(0.2)
     bench.enabled()
     assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
@@ -157,7 +157,7 @@ def test_enabled_out_of_a_quick_stop_it_stands_where_it_came_to_rest() -> None:
     bench.model.objects[0x605A, 0].value = 6
     bench.gripper.grip(True)
     bench.run(0.5)
-    bench.goal = DriveGoal.QUICK_STOPPED
+    bench.goal = TargetState.QUICK_STOPPED
     bench.run(0.5)
     assert bench.gripper.drive.state is DriveState.QUICK_STOP_ACTIVE
     here = bench.model.mechanics.position
@@ -216,7 +216,7 @@ def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:
     bench = Bench().enabled()
     bench.gripper.grip(True)
     bench.run(0.5)
-    bench.goal = DriveGoal.DISABLED
+    bench.goal = TargetState.DISABLED
     bench.run(1.0)
     here = bench.model.mechanics.position
     bench.enabled()

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from rtcp.fieldbus.alstatus import AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.machine import Code, Command, State
 
 from .bench import CSP, CST, CSV, EMERGENCY_STOP_INPUT, LOST_CYCLES, PERIOD_S, VOLTAGE_OFF, Bench

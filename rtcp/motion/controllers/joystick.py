@@ -21,7 +21,7 @@ _DIRECTIONS = (((0, 1.0), (1, 1.0)), ((2, -1.0), (5, 1.0)), ((3, 1.0), (4, 1.0))
 
 
 class Shown(Protocol):
-    """What the stick shows; see `rtcp.devices.stick`."""
+    """What the stick shows; see `rtcp.devices.io_box`."""
 
     forward: int
     side: int

@@ -7,9 +7,10 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rtcp.fieldbus.bus import BusError, SdoAborted, WatchedBus
 from rtcp.fieldbus.emergency import error_words
-from rtcp.fieldbus.steps import Steps
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.registers import Steps
+from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT, SERVICE_TEXT_SIZE
 
@@ -22,7 +23,7 @@ _LONGEST_S = 4.0
 _ERROR_CODE = 0x603F
 
 
-class Errands:
+class SdoRequests:
     """Answers the request on the blackboard, and reads drives' error codes; one of each at a time.
 
     Args:
@@ -30,7 +31,7 @@ class Errands:
         blackboard: where requests come from and answers and sentences go.
     """
 
-    def __init__(self, bus: WatchedBus, blackboard: Blackboard) -> None:
+    def __init__(self, bus: SupervisedBus, blackboard: Blackboard) -> None:
         self._bus = bus
         self._blackboard = blackboard
         self._answering: Steps[dict[str, Any]] | None = None

@@ -11,13 +11,14 @@ from typing import Any
 
 import pytest
 
-from rtcp.control.service import Service
-from rtcp.fieldbus.alstatus import AlState
-from rtcp.fieldbus.bus import BusError, SlaveState
-from rtcp.fieldbus.charges import Charge
+from rtcp.control.bus_service import BusService
+from rtcp.fieldbus.al_state import AlState
+from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.emergency import Emergency
+from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.port_errors import PortErrors
-from rtcp.fieldbus.steps import Steps
+from rtcp.fieldbus.registers import Steps
+from rtcp.fieldbus.supervision import MonitoredSlave
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Health, Observer
 
@@ -28,7 +29,7 @@ class Watching:
     silent = False
 
     def __init__(self) -> None:
-        self.slaves = (Charge(1, "io"), Charge(2, "drive1"))
+        self.slaves = (MonitoredSlave(1, "io"), MonitoredSlave(2, "drive1"))
         self.errors = SimpleNamespace(of=[PortErrors(), PortErrors()])
         self.all_op = True
         self.parked = False
@@ -99,8 +100,8 @@ def bus() -> Bus:
 
 
 @pytest.fixture
-def service(bus: Bus, board: Blackboard) -> Iterator[Service]:
-    made = Service(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
+def service(bus: Bus, board: Blackboard) -> Iterator[BusService]:
+    made = BusService(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
     made.want_op()
     made.start()
     until(lambda: made.all_op)
@@ -142,7 +143,7 @@ def turns(bus: Bus, count: int = 20) -> None:
 
 
 def test_a_slave_that_is_back_before_anybody_looked_stays_lost_until_it_is_recovered(
-    bus: Bus, service: Service
+    bus: Bus, service: BusService
 ) -> None:
     bus.watching.left = 2
     until(lambda: service.lost_slave == 2)
@@ -155,7 +156,7 @@ def test_a_slave_that_is_back_before_anybody_looked_stays_lost_until_it_is_recov
     assert (service.lost_slave, bus.watching.resumed) == (0, 1)
 
 
-def test_a_recovery_lasts_until_every_slave_is_in_op(bus: Bus, service: Service) -> None:
+def test_a_recovery_lasts_until_every_slave_is_in_op(bus: Bus, service: BusService) -> None:
     bus.watching.left = 2
     until(lambda: service.lost_slave == 2)
     bus.watching.resume = lambda: None  # type: ignore[method-assign]
@@ -167,7 +168,7 @@ def test_a_recovery_lasts_until_every_slave_is_in_op(bus: Bus, service: Service)
     until(lambda: service.all_op)
 
 
-def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, service: Service) -> None:
+def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, service: BusService) -> None:
     service.park()
     until(lambda: bus.watching.parked)
     bus.watching.all_op = True
@@ -177,7 +178,7 @@ def test_parked_slaves_are_in_op_again_only_when_they_are_recovered(bus: Bus, se
     until(lambda: service.all_op)
 
 
-def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: Bus, service: Service) -> None:
+def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: Bus, service: BusService) -> None:
     for asked, parked in (
         (("park",), True),
         (("recover", "park"), True),
@@ -193,7 +194,9 @@ def test_of_recovery_and_parking_asked_within_one_turn_the_last_one_counts(bus: 
         assert (bus.watching.parked, service.all_op) == (parked, not parked), asked
 
 
-def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_success(bus: Bus, service: Service) -> None:
+def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_success(
+    bus: Bus, service: BusService
+) -> None:
     # Asked while the watcher is looking: it saw slaves in OP, and they are not when it has brought them back.
     bus.watching.resume = lambda: setattr(bus.watching, "all_op", False)  # type: ignore[method-assign]
     held = hold_turn(bus)
@@ -204,7 +207,7 @@ def test_what_was_seen_before_a_recovery_was_asked_for_is_not_taken_for_its_succ
     assert True not in seen
 
 
-def test_slaves_are_not_asked_for_op_while_the_clock_is_not_followed(bus: Bus, service: Service) -> None:
+def test_slaves_are_not_asked_for_op_while_the_clock_is_not_followed(bus: Bus, service: BusService) -> None:
     for followed in (False, True):
         service.clock_followed = lambda followed=followed: followed  # type: ignore[misc]
         turns(bus, 2)
@@ -212,7 +215,7 @@ def test_slaves_are_not_asked_for_op_while_the_clock_is_not_followed(bus: Bus, s
 
 
 def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
-    bus: Bus, service: Service, observer: Observer
+    bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.patience = 30
     before = bus.watching.turns
@@ -231,7 +234,7 @@ def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
 
 @pytest.mark.parametrize("request_", [{"do": "nothing", "slave": 1, "index": 0, "subindex": 0}, {"do": "sdo_read"}, []])
 def test_a_request_of_another_form_is_answered_in_a_sentence(
-    service: Service, observer: Observer, request_: Any
+    service: BusService, observer: Observer, request_: Any
 ) -> None:  # fmt: skip
     observer.ask_service(request_)
     found: list[dict[str, Any]] = []
@@ -247,7 +250,7 @@ def test_a_request_of_another_form_is_answered_in_a_sentence(
 
 
 def test_what_slaves_have_been_through_is_read_as_it_was_written(
-    bus: Bus, service: Service, observer: Observer
+    bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.watching.slaves[1].lost, bus.watching.slaves[1].recovered = 3, 2
     bus.watching.errors.of[1] = PortErrors(rx=70_000, forwarded=1 << 40, links=5)
@@ -256,7 +259,7 @@ def test_what_slaves_have_been_through_is_read_as_it_was_written(
 
 
 def test_an_interface_that_is_gone_is_said_once_and_not_in_every_turn(
-    bus: Bus, service: Service, observer: Observer
+    bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.watching.gone = True
     turns(bus, 100)
@@ -273,13 +276,13 @@ def sentences(observer: Observer) -> list[str]:
     return [text.sentence for text in observer.texts_since(0)]
 
 
-def test_an_end_without_the_interface_is_no_defect(bus: Bus, service: Service, observer: Observer) -> None:
+def test_an_end_without_the_interface_is_no_defect(bus: Bus, service: BusService, observer: Observer) -> None:
     bus.read_state = gone
     service.finish()
     assert (service.refused, sentences(observer)) == ((), ["the interface does not take frames any more"])
 
 
-def test_two_failures_that_take_turns_are_said_once_each(bus: Bus, service: Service, observer: Observer) -> None:
+def test_two_failures_that_take_turns_are_said_once_each(bus: Bus, service: BusService, observer: Observer) -> None:
     def alternate() -> None:
         bus.watching.gone = False
         raise BusError(f"failure {bus.watching.turns % 2}")
@@ -290,7 +293,7 @@ def test_two_failures_that_take_turns_are_said_once_each(bus: Bus, service: Serv
 
 
 def test_emergencies_of_one_slave_without_an_end_leave_room_for_those_of_another(
-    bus: Bus, service: Service, observer: Observer
+    bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.waiting = [Emergency(1, "io", code, 0, bytes(5)) for code in (0x1000, *range(0x5000, 0x5030))]
     bus.waiting += [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
@@ -301,7 +304,7 @@ def test_emergencies_of_one_slave_without_an_end_leave_room_for_those_of_another
 
 
 def test_an_emergency_that_comes_again_after_a_reset_is_said_again(
-    bus: Bus, service: Service, observer: Observer
+    bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.waiting = [Emergency(2, "drive1", 0x3210, 0, bytes(5))]
     for _ in range(2):
@@ -314,7 +317,7 @@ def test_an_emergency_that_comes_again_after_a_reset_is_said_again(
     assert len(set(sentences(observer))) == 1
 
 
-def test_drives_that_fail_together_are_all_explained(bus: Bus, service: Service, observer: Observer) -> None:
+def test_drives_that_fail_together_are_all_explained(bus: Bus, service: BusService, observer: Observer) -> None:
     bus.patience = 10
     held = hold_turn(bus)
     service.explain_drive(1)

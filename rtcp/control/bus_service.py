@@ -1,4 +1,4 @@
-"""The ordinary thread beside the cycle: the way to OP, the slave watcher's turns, emergencies, SDO errands.
+"""The ordinary thread beside the cycle: the way to OP, the slave watcher's turns, emergencies, SDO requests.
 
 It shares a few plain attributes with the cycle (one writer each) and never holds the interpreter while it waits.
 """
@@ -6,14 +6,15 @@ It shares a few plain attributes with the cycle (one writer each) and never hold
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
-from rtcp.control.errands import Errands
-from rtcp.control.rationed import Rationed
-from rtcp.fieldbus.alstatus import AlState
-from rtcp.fieldbus.bus import BusError, SlaveState, WatchedBus
-from rtcp.fieldbus.charges import Charge
-from rtcp.fieldbus.watcher import Watcher
+from rtcp.control.sdo_requests import SdoRequests
+from rtcp.fieldbus.al_state import AlState
+from rtcp.fieldbus.bus import SlaveState
+from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.supervision import MonitoredSlave, SlaveWatcher, SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime.scheduling import thread_beside
 
@@ -33,7 +34,7 @@ def _always() -> bool:
     return True
 
 
-class Service(threading.Thread):
+class BusService(threading.Thread):
     """Watches the slaves and does for the cycle what takes time.
 
     Args:
@@ -49,7 +50,7 @@ class Service(threading.Thread):
 
     def __init__(
         self,
-        bus: WatchedBus,
+        bus: SupervisedBus,
         blackboard: Blackboard,
         drive_positions: Sequence[int],
         joint_names: Sequence[str],
@@ -61,8 +62,8 @@ class Service(threading.Thread):
         super().__init__(name="service", daemon=True)
         self._bus = bus
         self._blackboard = blackboard
-        self._errands = Errands(bus, blackboard)
-        self._watcher: Watcher | None = None
+        self._sdo_requests = SdoRequests(bus, blackboard)
+        self._watcher: SlaveWatcher | None = None
         self._drive_positions = drive_positions
         self._joint_names = joint_names
         self._op_timeout_s = op_timeout_s
@@ -75,8 +76,8 @@ class Service(threading.Thread):
         """What the cycle asked last, counted up: odd to park, even to recover."""
         self._done = 0
         self._explain = [False] * len(joint_names)
-        self._complaints = Rationed(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
-        self._emergencies: dict[int, Rationed] = {}
+        self._complaints = LogThrottle(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
+        self._emergencies: dict[int, LogThrottle] = {}
         self._end = threading.Event()
         self.all_op = False
         """Whether every slave is in OP, and was since the start or the last `recover`; read by the cycle."""
@@ -136,7 +137,7 @@ class Service(threading.Thread):
         while not self._end.wait(self._watch_s):
             turn += 1
             # Each part by itself: what one of them meets keeps none of the others from its turn.
-            for part in (self._watch, self._run_errands, self._listen):
+            for part in (self._watch, self._serve_sdo_requests, self._listen):
                 try:
                     part(turn)
                 except BusError as error:
@@ -202,34 +203,94 @@ class Service(threading.Thread):
         if self.refused:
             self.on_refused()
 
-    def _run_errands(self, turn: int) -> None:
-        if True in self._explain and not self._errands.explaining:
+    def _serve_sdo_requests(self, turn: int) -> None:
+        if True in self._explain and not self._sdo_requests.explaining:
             axis = self._explain.index(True)
             self._explain[axis] = False
-            self._errands.explain(self._joint_names[axis], self._drive_positions[axis])
-        self._errands.take_steps()
+            self._sdo_requests.explain(self._joint_names[axis], self._drive_positions[axis])
+        self._sdo_requests.take_steps()
 
     def _listen(self, turn: int) -> None:
         if turn % self._tell_turns:
             return
-        for rationed in (self._complaints, *self._emergencies.values()):
-            rationed.tell()
+        for throttle in (self._complaints, *self._emergencies.values()):
+            throttle.tell()
         if self._watcher is not None and self._watcher.silent:
             return
         for emergency in self._bus.emergencies():
             position = emergency.position
             if position not in self._emergencies:
                 what = f"emergency messages of slave {position}"
-                self._emergencies[position] = Rationed(self._blackboard.text, _MOST_EMERGENCIES, what)
+                self._emergencies[position] = LogThrottle(self._blackboard.text, _MOST_EMERGENCIES, what)
             self._emergencies[position].say(emergency.sentence())
 
-    def _tell_states(self, states: Iterable[SlaveState | Charge]) -> None:
+    def _tell_states(self, states: Iterable[SlaveState | MonitoredSlave]) -> None:
         for slave in states:
             self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
 
-    def _tell_health(self, watcher: Watcher) -> None:
+    def _tell_health(self, watcher: SlaveWatcher) -> None:
         self._tell_states(watcher.slaves)
         for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
             self._blackboard.health(
                 slave.position, slave.lost, slave.recovered, errors.rx, errors.forwarded, errors.links
             )
+
+
+SAY_AGAIN_S = 10.0
+"""An identical sentence is said at most so often."""
+
+
+@dataclass
+class _Said:
+    at: float
+    again: int = 0
+
+
+class LogThrottle:
+    """Says a sentence at once the first time, and at most every 10 s how often it has come again.
+
+    Args:
+        say: takes the sentences.
+        most: so many different ones are said in 10 s.
+        what: how the sentence on those beyond names them, as `messages of slave 3`.
+    """
+
+    def __init__(self, say: Callable[[str], None], most: int, what: str) -> None:
+        self._say = say
+        self._most = most
+        self._what = what
+        self._said: dict[str, _Said] = {}
+        self._beyond = 0
+        self._beyond_at = 0.0
+
+    def say(self, sentence: str) -> None:
+        """Say `sentence`, or count it."""
+        now = time.monotonic()
+        said = self._said.get(sentence)
+        if said is not None:
+            said.again += 1
+        elif len(self._said) < self._most:
+            self._said[sentence] = _Said(now)
+            self._say(sentence)
+        else:
+            self._beyond_at = self._beyond_at if self._beyond else now
+            self._beyond += 1
+
+    def tell(self) -> None:
+        """Say what was counted and is due, and forget what did not come again; to be called now and then."""
+        now = time.monotonic()
+        for sentence, said in tuple(self._said.items()):
+            if now - said.at < SAY_AGAIN_S:
+                continue
+            if said.again:
+                self._say(f"{sentence} ({_times(said.again)} again in {now - said.at:.0f} s)")
+                said.at, said.again = now, 0
+            else:
+                del self._said[sentence]
+        if self._beyond and now - self._beyond_at >= SAY_AGAIN_S:
+            self._say(f"further {self._what} were left out: {self._beyond} in {now - self._beyond_at:.0f} s")
+            self._beyond = 0
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"

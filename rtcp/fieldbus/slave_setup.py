@@ -1,26 +1,27 @@
-"""Setting up again one slave that has lost its set-up while the others go on: address, clock, objects, process data.
+"""Setting up one slave: in PRE-OP before the cycle, and again beside it after the slave has lost its set-up.
 
-What `SoemBus.configure` does through SOEM for all slaves at once, here for one and beside the cycle. What SOEM chose
-(FMMUs, sync managers, delays) is copied after `configure` and written back as it was.
+Everything written is read back. `SlaveRestorer` does for one slave beside the cycle what `SoemBus.configure` does
+through SOEM for all: what SOEM chose (FMMUs, sync managers, delays) is copied after `configure` and written back.
 """
 
 from __future__ import annotations
 
+import math
 import struct
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from rtcp.config.model import SlaveConfig
-from rtcp.fieldbus.alstatus import ERROR_BIT, AlState, refusal
-from rtcp.fieldbus.bus import BusError, slave_label, station_of
+from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
+from rtcp.fieldbus.al_state import AL_CONTROL, ERROR_BIT, AlState, read_al, refusal
+from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.clocks import DC_ACTIVATE, forget_drift, settle_clock, start_sync, take_over_time
-from rtcp.fieldbus.configure import configure_slave
-from rtcp.fieldbus.registers import RegisterPort
-from rtcp.fieldbus.scan import eeprom_to_device
-from rtcp.fieldbus.sdo import SdoClient
-from rtcp.fieldbus.states import AL_CONTROL, read_al
-from rtcp.fieldbus.steps import Steps
+from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
+from rtcp.fieldbus.mailbox import ABSENT, SdoClient
+from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, TYPES, compare_mapping, mapping_of, write_mapping
+from rtcp.fieldbus.registers import RegisterPort, Steps
+from rtcp.fieldbus.scan import name_of
 
 STATION = 0x0010
 _FMMUS, _FMMUS_SIZE = 0x0600, 0x80
@@ -34,12 +35,8 @@ _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 _EEPROM_S, _STATE_S = 0.5, 3.0
 
 
-class ForeignSlave(BusError):
-    """At the place of a slave another device answers: nothing is written to it."""
-
-
 @dataclass(frozen=True)
-class SetUp:
+class SlaveSetup:
     """What a slave's registers hold after `configure`, beside what its object dictionary does."""
 
     fmmus: bytes
@@ -51,7 +48,7 @@ class SetUp:
     """Serial number in its EEPROM; 0: it has none."""
 
 
-def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SetUp:
+def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
     """Copy a slave's set-up, `serial` its serial number; raises BusError where it does not answer."""
     station = station_of(position)
     fmmus = port.read(station, _FMMUS, _FMMUS_SIZE)
@@ -60,7 +57,7 @@ def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Se
     if fmmus is None or managers is None or features is None:
         raise BusError(f"{slave_label(position, name)} stopped answering while its set-up was read")
     own = (managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE))
-    return SetUp(
+    return SlaveSetup(
         fmmus,
         tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
         port.read(station, _DELAY, 4) if features[0] & _FEATURE_DC else None,
@@ -68,14 +65,14 @@ def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> Se
     )
 
 
-class Restorer:
+class SlaveRestorer:
     """Sets up single slaves again, each in steps of a few frames."""
 
     def __init__(
         self,
         port: RegisterPort,
         slaves: Sequence[SlaveConfig],
-        set_ups: Sequence[SetUp],
+        set_ups: Sequence[SlaveSetup],
         sdo: Callable[[int], SdoClient],
         period_ns: int,
     ) -> None:
@@ -210,3 +207,141 @@ class Restorer:
             late = time.monotonic() >= deadline
             if late or found is AlState.NONE or (error and time.monotonic() >= deadline - _STATE_S + 0.1):
                 raise BusError(refusal(self._label(position), state, found | (ERROR_BIT if error else 0), code))
+
+
+_WATCHDOG_DIVIDER, _WATCHDOG_TIME = 0x0400, 0x0420
+_DIVIDER = 2498
+"""Watchdog divider of 100 us: (2498 + 2) * 40 ns (ETG.1000.4, 6.3)."""
+_INTERPOLATION = 0x60C2
+
+
+def identity_faults(found: Sequence[Any], expected: Sequence[SlaveConfig]) -> list[str]:
+    """Return a sentence for each position where the slaves found differ from the configuration.
+
+    Args:
+        found: pysoem's slaves.
+        expected: the slaves of the configuration, in the order of the cable.
+    """
+    faults = []
+    if len(found) != len(expected):
+        faults.append(f"{len(found)} slaves answer, the configuration (key `slaves`) lists {len(expected)}")
+    for position in range(1, max(len(found), len(expected)) + 1):
+        slave = found[position - 1] if position <= len(found) else None
+        config = expected[position - 1] if position <= len(expected) else None
+        if config is None and slave is not None:
+            faults.append(f"position {position}: expected nothing, found {_found(slave)}")
+        if config is None:
+            continue
+        device = config.device
+        wanted = _identity(device.name, device.vendor_id, device.product_id)
+        if slave is None:
+            faults.append(f"position {position} ({config.name}): expected {wanted}, found nothing")
+        elif (slave.man, slave.id) != (device.vendor_id, device.product_id):
+            faults.append(f"position {position} ({config.name}): expected {wanted}, found {_found(slave)}")
+    return faults
+
+
+def _identity(name: str, vendor: int, product: int) -> str:
+    return f"{name} (vendor 0x{vendor:08X}, product 0x{product:08X})"
+
+
+def _found(slave: Any) -> str:
+    return _identity(name_of(slave), slave.man, slave.id)
+
+
+def configure_slave(
+    sdo: SdoClient, port: RegisterPort, station: int, config: SlaveConfig, period_ns: int
+) -> Steps[list[str]]:
+    """Set up one slave that is in PRE-OP, in steps.
+
+    Returns:
+        Sentences on what was tolerated.
+
+    Raises:
+        BusError: the slave refuses something, or keeps another value than it was given.
+    """
+    device = config.device
+    notes: list[str] = []
+    for assignment, pdos, key in ((RX_ASSIGN, device.rpdo, "rpdo"), (TX_ASSIGN, device.tpdo, "tpdo")):
+        if device.configurable_pdos:
+            yield from write_mapping(sdo, assignment, mapping_of(pdos))
+        yield from compare_mapping(sdo, assignment, mapping_of(pdos), key)
+    for startup in device.sdo:
+        notes += yield from write_startup(sdo, startup)
+    if device.kind == "cia402":
+        notes += yield from write_interpolation_time(sdo, period_ns)
+    set_watchdog(port, station, slave_label(sdo.position, sdo.name), device)
+    return notes
+
+
+def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
+    """Write a start-up SDO and read it back; return a note where the device lacks it and may."""
+    code = "B" if startup.type == "bool" else TYPES[startup.type][1]
+    packer = struct.Struct("<" + code)
+    data = packer.pack(startup.value if code in "fd" else int(startup.value))
+    what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
+    where = slave_label(sdo.position, sdo.name)
+    try:
+        yield from sdo.writing(startup.index, startup.sub_index, data)
+        kept = yield from sdo.reading(startup.index, startup.sub_index)
+    except SdoAborted as error:
+        if startup.optional and error.code in ABSENT:
+            return [f"{where} has no {what}; it is marked optional and was left out"]
+        raise
+    if kept != data:
+        shown = f"{packer.unpack(kept)[0]}" if len(kept) == packer.size else f"bytes {kept.hex(' ')}"
+        raise BusError(f"{where}: {what} was set to {packer.unpack(data)[0]} and reads back as {shown}")
+    return []
+
+
+def interpolation_time(period_ns: int) -> tuple[int, int] | None:
+    """Return (value, exponent) of 0x60C2 with value * 10^exponent s = `period_ns`, None where it cannot be said.
+
+    The value has 8 bits (CiA 402-2, object 0x60C2), so that 500 us is 5, -4 and 333 us cannot be said.
+    """
+    value, exponent = period_ns, -9
+    while value and value % 10 == 0:
+        value, exponent = value // 10, exponent + 1
+    return (value, exponent) if 0 < value <= 255 else None
+
+
+def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]:
+    """Set 0x60C2 to the period where the drive has it; return a note where that was not possible."""
+    where = slave_label(sdo.position, sdo.name)
+    said = interpolation_time(period_ns)
+    if said is None:
+        return [f"{where}: its interpolation time (0x60C2) cannot say {period_ns / 1000:g} us and was left as it is"]
+    try:
+        for subindex, byte in ((1, said[0].to_bytes(1, "little")), (2, said[1].to_bytes(1, "little", signed=True))):
+            yield from sdo.writing(_INTERPOLATION, subindex, byte)
+            kept = yield from sdo.reading(_INTERPOLATION, subindex)
+            if kept != byte:
+                raise BusError(
+                    f"{where}: 0x60C2:{subindex} (interpolation time) was set to {byte.hex()}, "
+                    f"it reads back as {kept.hex()}"
+                )
+    except SdoAborted as error:
+        if error.code in ABSENT:
+            return [f"{where} has no interpolation time (0x60C2)"]
+        raise
+    return []
+
+
+def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDescription) -> None:
+    """Set the process-data watchdog (ETG.1000.4, 6.3; steps of 100 us) and read it back; raises BusError."""
+    ticks = max(1, math.ceil(device.watchdog_ms * 10 - 1e-9))
+    for address, value in ((_WATCHDOG_DIVIDER, _DIVIDER), (_WATCHDOG_TIME, ticks)):
+        data = value.to_bytes(2, "little")
+        port.write(station, address, data)
+        kept = port.read(station, address, 2)
+        if kept != data:
+            shown = "nothing" if kept is None else str(int.from_bytes(kept, "little"))
+            raise BusError(
+                f"{label}: watchdog register 0x{address:04X} was set to {value} (watchdog_ms: {device.watchdog_ms:g}) "
+                f"and reads back as {shown}"
+            )
+
+
+def eeprom_to_device(port: RegisterPort, station: int) -> bool:
+    """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
+    return port.write(station, _EEPROM_CONFIG, b"\x01\x00")

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.control.errands import Errands
-from rtcp.fieldbus.bus import BusError, SdoAborted
-from rtcp.fieldbus.steps import Steps
+from rtcp.control.sdo_requests import SdoRequests
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.registers import Steps
 from rtcp.gateway.carrier import Carrier, CommandFailed
 from rtcp.gateway.commander import Commander
 from rtcp.gateway.picture import Picture
@@ -59,7 +59,7 @@ def test_the_kind_of_an_error_reaches_whoever_asked(
 ) -> None:
     bus = Bus()
     bus.outcome = outcome
-    errands = Errands(bus, board)  # type: ignore[arg-type]
+    requests = SdoRequests(bus, board)  # type: ignore[arg-type]
     config = load(default_config())
     picture = Picture(observer, Session(config, "virtual", "ecat0", 0, 0), {})
     commander = Commander(Carrier(observer, picture, config))
@@ -69,7 +69,7 @@ def test_the_kind_of_an_error_reaches_whoever_asked(
             commander.service({"do": "sdo_read", "slave": 1, "index": 1, "subindex": 0} | other)
         )
         while not asked.done():
-            errands.take_steps()
+            requests.take_steps()
             await asyncio.sleep(0.001)
         return await asked
 
