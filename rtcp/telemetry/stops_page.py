@@ -123,7 +123,7 @@ Which event takes which rung is the section `stops` of the arm's file:
 - A guard that ends a motion always takes a controlled stop: it brakes in time on a way that was examined, which the
   drives' own ramps would leave. What has no key (a drive that does not enable, a reset that fails) is a quick stop.
 - The quick stop is sent whatever a drive's statusword says: a word that is false for one frame takes no joint's torque.
-- **Enabling** is supervised as motion is (`stops.supervision`); a drive that leaves Operation Enabled before all are there
+- **Enabling** is supervised as motion is (`stops.supervision`); a drive that leaves Operation Enabled too early
   is a `drive_fault`. A drive obeys some frames before it shows that it does, and until then its target is the place
   that it shows: a place more than 0.03 rad from the last is not followed, and after `watch.cycles` in a row a fault.
 - A fault while the arm is being disabled ramps the joints down by its rung; at standstill the torque goes, as was

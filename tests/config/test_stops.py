@@ -35,7 +35,7 @@ MISTAKES = {
     "an event that there is not": (
         ("slave_lost: quick_stop", "slaves_lost: quick_stop"),
         "stops.slaves_lost: this key is not known here; did you mean slave_lost? allowed are lost_frames, slave_lost, "
-        "drive_fault, clock_lost, emergency_stop, watch, lease_ended, enabling_switch",
+        "drive_fault, clock_lost, emergency_stop, supervision, lease_ended, enabling_switch",
     ),
 }
 
