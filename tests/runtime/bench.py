@@ -165,7 +165,7 @@ class Followed(Discipline):
     def observe(self, woken: int, dc_time: int) -> None:
         pass
 
-    def coast(self) -> None:
+    def holdover(self) -> None:
         pass
 
 
