@@ -6,20 +6,19 @@ The loop's process reads the session and writes its exit report; psutil is loade
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
-import pickle
 import stat
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import rtcp
 from rtcp.config.model import ArmConfig
+from rtcp.config.serialization import plain, typed
 
 if TYPE_CHECKING:
     import psutil
@@ -177,13 +176,13 @@ class Session:
         path = session_file(directory)
         path.unlink(missing_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        with open(descriptor, "wb") as file:
-            file.write(pickle.dumps((_form(self), self)))
+        with open(descriptor, "w") as file:
+            json.dump({"version": rtcp.__version__, "session": plain(self)}, file)
 
 
 def session_file(directory: Path) -> Path:
     """Return the path of the session file."""
-    return directory / "session.pickle"
+    return directory / "session.json"
 
 
 def read_session(directory: Path) -> Session:
@@ -194,44 +193,18 @@ def read_session(directory: Path) -> Session:
     """
     path = session_file(directory)
     try:
-        with open(path, "rb") as file:
-            owned = os.fstat(file.fileno())
-            if owned.st_uid not in (0, os.geteuid()) or owned.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-                raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
-            found = pickle.load(file)
+        owner = path.stat()
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
-    except SessionError:
-        raise
-    except Exception as error:
-        # What a damaged pickle leads to is not told by its documentation.
-        raise SessionError(f"{path} is damaged ({type(error).__name__}: {error})") from error
-    form, session = found if isinstance(found, tuple) and len(found) == 2 else ("", found)
-    if not isinstance(session, Session):
-        raise SessionError(f"{path} holds no session")
-    if form != _form(session):
-        raise SessionError(f"{path} was written by another version of rtcp: it is not read by this one")
-    return session
-
-
-def _form(session: Session) -> str:
-    """Return a digest of the version and all fields in it: pickle takes what an older class made without a word."""
-    seen: dict[str, list[str]] = {}
-
-    def look(value: object) -> None:
-        if is_dataclass(value):
-            kind = type(value)
-            seen[f"{kind.__module__}.{kind.__qualname__}"] = [f"{one.name}: {one.type}" for one in fields(value)]
-            for one in vars(value).values():
-                look(one)
-        elif isinstance(value, tuple | list | set | frozenset):
-            for one in value:
-                look(one)
-        elif isinstance(value, Mapping):
-            look(tuple(value.items()))
-
-    look(session)
-    return hashlib.sha256(json.dumps([rtcp.__version__, seen], sort_keys=True).encode()).hexdigest()
+    if owner.st_uid not in (0, os.geteuid()) or owner.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
+    found = read_json(path, dict)
+    if found.get("version") != rtcp.__version__:
+        raise SessionError(f"{path} was written by another version of rtcp: it is not read by {rtcp.__version__}")
+    try:
+        return typed(Session, found.get("session"))
+    except ValueError as error:
+        raise SessionError(f"{path} is damaged: {error}") from error
 
 
 def read_json(path: Path, kind: type[T]) -> T:

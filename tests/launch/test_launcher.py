@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -65,13 +65,6 @@ def session_of(config: ArmConfig) -> Session:
     return Session(config, "virtual", "ecat0", 0, 77)
 
 
-def older(config: ArmConfig) -> ArmConfig:
-    """A configuration as a version without the section `stops` has made it."""
-    made = replace(config)
-    vars(made).pop("stops")
-    return made
-
-
 @pytest.fixture
 def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
     """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
@@ -83,15 +76,28 @@ def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]
     blackboard_file(directory).unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("how", ["as it was", "with a digest"])
-def test_a_session_of_other_classes_is_a_sentence(tmp_path: Path, config: ArmConfig, how: str) -> None:
-    file = session_file(tmp_path)
+@pytest.mark.parametrize("older", [{"version": "0.0.1"}, {"version": None}])
+def test_a_session_of_another_version_is_refused(tmp_path: Path, config: ArmConfig, older: dict[str, None]) -> None:
     session_of(config).write(tmp_path)
     assert read_session(tmp_path) == session_of(config)
-    form, _ = pickle.loads(file.read_bytes())
-    old = session_of(older(config))
-    file.write_bytes(pickle.dumps(old if how == "as it was" else ("0" * len(form), old)))
-    with pytest.raises(SessionError, match=r"session\.pickle was written by another version of rtcp"):
+    found = json.loads(session_file(tmp_path).read_text())
+    session_file(tmp_path).write_text(json.dumps({**found, **older}))
+    with pytest.raises(SessionError, match=r"session\.json was written by another version of rtcp"):
+        read_session(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", ["without a key", "with a key of another type"])
+def test_a_session_whose_fields_do_not_fit_is_refused_and_the_key_named(
+    tmp_path: Path, config: ArmConfig, wrong: str
+) -> None:
+    session_of(config).write(tmp_path)
+    found = json.loads(session_file(tmp_path).read_text())
+    if wrong == "without a key":
+        del found["session"]["config"]["stops"]
+    else:
+        found["session"]["config"]["stops"] = "none"
+    session_file(tmp_path).write_text(json.dumps(found))
+    with pytest.raises(SessionError, match=r"session\.json is damaged: .*stops"):
         read_session(tmp_path)
 
 
@@ -101,7 +107,7 @@ def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
     monkeypatch: pytest.MonkeyPatch, wrong: str,
 ) -> None:  # fmt: skip
     if wrong == "session":
-        session_file(directory).write_bytes(pickle.dumps(session_of(older(config))))
+        session_file(directory).write_text('{"version": "0.0.1"}')
     else:
         session_of(config).write(directory)
         monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)

@@ -222,9 +222,10 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
 
 SESSIONS: dict[str, bytes] = {
     "nothing": b"",
-    "no pickle": b"hello",
-    "another object": b"\x80\x04N.",
-    "a class that is not there": b"crtcp.nowhere\nNothing\n.",
+    "no JSON": b"hello",
+    "no text": b"\xff\xfe",
+    "another value": b"[]",
+    "too deep": b"[" * 100_000,
     "half": b"",
 }
 
@@ -236,7 +237,7 @@ def test_a_damaged_session_is_a_sentence_of_the_process_that_reads_it(tmp_path: 
     assert file.stat().st_mode & 0o077 == 0
     assert read_session(tmp_path).bus == "virtual"
     file.write_bytes(file.read_bytes()[:500] if how == "half" else SESSIONS[how])
-    with pytest.raises(SessionError, match=r"session\..* .*(holds no session|is damaged)"):
+    with pytest.raises(SessionError, match=r"session\.json is damaged: "):
         read_session(tmp_path)
 
 
