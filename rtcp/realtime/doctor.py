@@ -859,6 +859,6 @@ CHECKS = (
     Check("power-mode", _power_mode, "a lower mode switches CPUs off and bounds the clocks of the others"),
     Check("jetson-clocks", _jetson_clocks,
           "else memory and CPU clocks follow the load, and a short cycle looks like none"),
-    Check("skipped-ticks", _skipped_ticks),
+    Check("skipped-ticks", _skipped_ticks,
           "a skipped tick delays the motion by a cycle; the drives bridge one, not many"),
 )  # fmt: skip
