@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.cli.output import complain
-from rtcp.ipc.client import ControlClient, ControlError
-from rtcp.ipc.paths import runtime_directory
-from rtcp.ipc.session import is_ours, read_processes
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import is_running, read_processes
 
 _PATIENCE_S = 10.0
 """For a gateway that somebody else is starting."""
@@ -23,7 +24,7 @@ def connect(command: str) -> ControlClient:
     A loop that lives and has lost its gateway is given a new one first, and that is told on standard error.
 
     Raises:
-        ControlError: as `ControlClient` does, `not running` above all.
+        RtcpError: as `ControlClient` does, `not running` above all.
     """
     name = f"rtcp {command} (pid {os.getpid()})"
     directory = runtime_directory()
@@ -31,7 +32,7 @@ def connect(command: str) -> ControlClient:
     while True:
         try:
             return ControlClient(name)
-        except ControlError as error:
+        except RtcpError as error:
             if error.kind != "not running" or time.monotonic() > until or not _is_our_loop(directory):
                 raise
             _replace_gateway(directory, error)
@@ -42,7 +43,7 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
     """Send one request on a connection of its own and return the result.
 
     Raises:
-        ControlError: what the platform answered, or that there is none.
+        RtcpError: what the platform answered, or that there is none.
     """
     with connect(command) as client:
         return client.call(verb, arguments)
@@ -50,7 +51,7 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
 
 def loop_lives() -> bool:
     """Whether the platform's loop runs, whoever answers for it."""
-    return is_ours(read_processes(runtime_directory()).loop)
+    return is_running(read_processes(runtime_directory()).loop)
 
 
 def _is_our_loop(directory: Path) -> bool:
@@ -58,15 +59,15 @@ def _is_our_loop(directory: Path) -> bool:
     return loop_lives() and directory.stat().st_uid == os.geteuid()
 
 
-def _replace_gateway(directory: Path, error: ControlError) -> None:
+def _replace_gateway(directory: Path, error: RtcpError) -> None:
     from rtcp.launch.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
-    from rtcp.launch.running import StartError
+    from rtcp.launch.platform import StartError
 
     try:
         if process := replace_gateway(directory):
             complain(f"the gateway had ended and was started anew (process {process}); nothing was enabled by that")
     except StartError as refused:
         if refused.kind != "refused":
-            raise ControlError("not running", f"{error.message}; {refused}") from refused
+            raise RtcpError("not running", f"{error.message}; {refused}") from refused
     except (OSError, TypeError):
         raise error from None  # what the loop was started with cannot be read: no platform of this version

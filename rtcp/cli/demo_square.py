@@ -57,10 +57,10 @@ class SquareDrive:
         """Move to the first corner, then along the four sides, while every cycle is recorded.
 
         Raises:
-            ControlError: as the platform ended a motion.
+            RtcpError: as the platform ended a motion.
             CommandError: nothing moved.
         """
-        from rtcp.ipc.paths import blackboard_file, runtime_directory
+        from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
         from rtcp.telemetry.recording import recording
         from rtcp.telemetry.square import SPEED_M_S, NoSquare, judge
 

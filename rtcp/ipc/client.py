@@ -10,12 +10,12 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, cast
+from typing import Any, cast
 
-from rtcp.ipc.paths import control_socket, runtime_directory
-from rtcp.ipc.session import is_ours, read_processes
+from rtcp.ipc.errors import ErrorKind, RtcpError
+from rtcp.ipc.runtime_directory import control_socket, runtime_directory
+from rtcp.ipc.session import is_running, read_processes
 
-ErrorKind = Literal["refused", "fault", "timeout", "invalid", "internal", "not running", "lost"]
 Progress = Callable[[Mapping[str, Any]], None]
 
 ANSWER_TIMEOUT_S = 15.0
@@ -28,19 +28,6 @@ _PEER = struct.Struct("3i")
 """Process, user and group at the other end (unix(7), SO_PEERCRED)."""
 
 _KINDS_ON_THE_WIRE = frozenset({"refused", "fault", "timeout", "invalid", "internal"})
-
-
-class ControlError(Exception):
-    """A request that did not succeed: `message` is a sentence for people, `kind` is for programs.
-
-    `not running` and `lost` arise at this end (nobody answers; the connection ended before the answer); the other kinds
-    are the platform's own.
-    """
-
-    def __init__(self, kind: ErrorKind, message: str) -> None:
-        super().__init__(message)
-        self.kind: ErrorKind = kind
-        self.message = message
 
 
 class ControlClient:
@@ -57,11 +44,11 @@ class ControlClient:
             path: the control socket; that of the runtime directory when None.
 
         Raises:
-            ControlError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
+            RtcpError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
                 when its path is too long for a socket.
         """
         self._path = control_socket(runtime_directory()) if path is None else path
-        self._name = name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
+        self._name = client_name(name)
         self._request = 0
         self._received = bytearray()
         self._socket = _connect(self._path)
@@ -94,7 +81,7 @@ class ControlClient:
             timeout_s: longest silence, not longest duration: a progress report starts it anew.
 
         Raises:
-            ControlError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
+            RtcpError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
                 connection ends first.
         """
         self._request += 1
@@ -121,7 +108,7 @@ class ControlClient:
         except TimeoutError as error:
             raise self._silence(verb, self._socket.gettimeout()) from error
         except OSError as error:
-            raise ControlError(
+            raise RtcpError(
                 "lost", f"the platform closed the connection before it took the request {verb!r}"
             ) from error
 
@@ -134,63 +121,69 @@ class ControlClient:
             except OSError:
                 chunk = b""
             if not chunk:
-                raise ControlError("lost", f"the platform closed the connection before it answered {verb!r}")
+                raise RtcpError("lost", f"the platform closed the connection before it answered {verb!r}")
             self._received += chunk
         line = bytes(self._received[:end])
         del self._received[: end + 1]
         try:
             reply = json.loads(line)
         except ValueError as error:
-            raise ControlError("internal", f"the answer to {verb!r} is not JSON: {line[:80]!r}") from error
+            raise RtcpError("internal", f"the answer to {verb!r} is not JSON: {line[:80]!r}") from error
         if not isinstance(reply, dict):
-            raise ControlError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
+            raise RtcpError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
         return reply
 
-    def _silence(self, verb: str, timeout_s: float | None) -> ControlError:
+    def _silence(self, verb: str, timeout_s: float | None) -> RtcpError:
         gateway, _, _ = _PEER.unpack(self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-        return ControlError(
+        return RtcpError(
             "timeout",
             f"the platform has not answered {verb!r} for {timeout_s:g} s: if its gateway (process {gateway}) hangs, "
             f"`kill -9 {gateway}` and `rtcp start` give the loop another, `rtcp stop` ends all of it",
         )
 
 
+def client_name(name: str) -> str:
+    """Return the name under which others hear of this client: `name`, or the process."""
+    return name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
+
+
 def _connect(path: Path) -> socket.socket:
-    length = len(os.fsencode(path))
-    if length > LONGEST_SOCKET_PATH:
-        raise ControlError(
-            "invalid",
-            f"the control socket's path {path} has {length} bytes, a socket's path at most {LONGEST_SOCKET_PATH}: "
-            "set RTCP_RUNTIME_DIR to a shorter one",
-        )
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(ANSWER_TIMEOUT_S)
     try:
         connection.connect(os.fspath(path))
-    except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError) as error:
-        connection.close()
-        raise ControlError("not running", _who_runs(path)) from error
-    except PermissionError as error:
-        connection.close()
-        raise ControlError("refused", f"the control socket {path} is another user's: only its owner may use it") from (
-            error
-        )
     except OSError as error:
         connection.close()
-        raise ControlError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}") from error
+        raise connection_error(path, error) from error
     return connection
+
+
+def connection_error(path: Path, error: OSError) -> RtcpError:
+    """Return why the control socket cannot be reached."""
+    length = len(os.fsencode(path))
+    if length > LONGEST_SOCKET_PATH:
+        return RtcpError(
+            "invalid",
+            f"the path of the control socket, {path}, has {length} bytes, at most {LONGEST_SOCKET_PATH} are possible: "
+            "set RTCP_RUNTIME_DIR to a shorter one",
+        )
+    if isinstance(error, FileNotFoundError | ConnectionRefusedError | NotADirectoryError):
+        return RtcpError("not running", _who_runs(path))
+    if isinstance(error, PermissionError):
+        return RtcpError("refused", f"the control socket {path} is another user's: only its owner may use it")
+    return RtcpError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}")
 
 
 def _who_runs(path: Path) -> str:
     loop = read_processes(path.parent).loop
-    if is_ours(loop):
+    if is_running(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
     return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
 
 
-def _refusal(verb: str, error: object) -> ControlError:
+def _refusal(verb: str, error: object) -> RtcpError:
     """Turn the `error` of an answer into an exception, whatever shape it came in."""
     found = error if isinstance(error, dict) else {}
     kind = found.get("kind")
     message = str(found.get("message") or f"the platform refused {verb!r} without saying why")
-    return ControlError(cast("ErrorKind", kind) if kind in _KINDS_ON_THE_WIRE else "fault", message)
+    return RtcpError(cast("ErrorKind", kind) if kind in _KINDS_ON_THE_WIRE else "fault", message)

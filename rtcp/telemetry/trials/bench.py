@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.machine import State
 from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, control_socket, segment_control
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
 from rtcp.telemetry.steps import target_steps
 from rtcp.virtual.faults.client import SegmentClient
@@ -172,7 +173,7 @@ class Bench:
         self.injected += 1
 
     def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
-        """Ask the platform; raises ControlError."""
+        """Ask the platform; raises RtcpError."""
         return self.client.call(verb, arguments, timeout_s=60.0)
 
     def bring_up(self) -> tuple[int, str]:
@@ -188,7 +189,7 @@ class Bench:
                     self.call("reset")
                 if self.state() != "holding":
                     self.call("enable")
-            except ControlError as error:
+            except RtcpError as error:
                 sentence = error.message
                 self.until(lambda: False, _RESET_PAUSE_S)
                 continue
@@ -214,7 +215,7 @@ class Bench:
             try:
                 self.call("motion", name="joint")
                 self.call("move", q=list(q), speed=_SPEED)
-            except ControlError as error:
+            except RtcpError as error:
                 sentence = error.message
                 continue
             return ""
@@ -223,4 +224,4 @@ class Bench:
 
 def _segment_socket(directory: Path) -> Path:
     """Return where the platform's own segment is asked: another one may have the usual place."""
-    return read_session(directory / "session.pickle").segment_control or segment_control(directory)
+    return read_session(directory).segment_control or segment_control(directory)

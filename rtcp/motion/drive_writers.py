@@ -1,0 +1,141 @@
+"""How set-points reach a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
+
+In CSP the drive closes the position loop; in CSV and CST it is closed here, so that `hold` and `move` mean the same in
+all three.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from math import exp
+from typing import Protocol
+
+from rtcp.config.model import Joint
+
+_FADE_S = 0.3
+"""Time constant with which the drive's own following error gives way to the position loop closed here."""
+
+
+class DriveMode(IntEnum):
+    """Modes of operation that the cycle uses (CiA 402-2, object 0x6060)."""
+
+    CSP = 8
+    CSV = 9
+    CST = 10
+
+
+class Commanded(Protocol):
+    """The part of a drive that a mode reads and writes, in SI."""
+
+    position: float
+    velocity: float
+    torque: float
+    target_position: float
+    target_velocity: float
+    target_torque: float
+
+
+class DriveWriter(Protocol):
+    """One mode for all joints."""
+
+    mode: DriveMode
+
+    def start(self, drives: Sequence[Commanded]) -> None:
+        """Begin at standstill: forget what an earlier use left behind."""
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write the targets of the drives for the set-points `position` (rad) and `velocity` (rad/s)."""
+
+
+class CspWriter:
+    """CSP: the set-point itself."""
+
+    mode = DriveMode.CSP
+
+    def start(self, drives: Sequence[Commanded]) -> None:
+        """Nothing is kept."""
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Pass the set-points on; the drive takes the velocity field as its speed limit, which the driver fills in."""
+        for i, drive in enumerate(drives):
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = 0.0
+
+
+class CsvWriter:
+    """CSV: the set-point's velocity and a proportional pull back to its position."""
+
+    mode = DriveMode.CSV
+
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+        self._gain = [joint.csv_gain for joint in joints]
+        self._keep = exp(-period_s / _FADE_S)
+        self._bias = [0.0] * len(self._gain)
+
+    def start(self, drives: Sequence[Commanded]) -> None:
+        """Begin without a pull: what a drive is away from its target now is taken back little by little."""
+        for i, drive in enumerate(drives):
+            self._bias[i] = drive.target_position - drive.position
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write target velocities (rad/s)."""
+        gain, bias, keep = self._gain, self._bias, self._keep
+        for i, drive in enumerate(drives):
+            bias[i] *= keep
+            drive.target_position = position[i]
+            drive.target_velocity = velocity[i] + gain[i] * (position[i] - drive.position - bias[i])
+            drive.target_torque = 0.0
+
+
+class CstWriter:
+    """CST: stiffness, damping and a bounded integral about the set-point (an impedance that ends where it should)."""
+
+    mode = DriveMode.CST
+
+    def __init__(self, joints: Sequence[Joint], period_s: float) -> None:
+        self._stiffness = [joint.cst_stiffness for joint in joints]
+        self._damping = [joint.cst_damping for joint in joints]
+        self._integral_step = [joint.cst_integral * period_s for joint in joints]
+        self._bound = [joint.torque for joint in joints]
+        self._integral = [0.0] * len(self._bound)
+        self._passed = False
+
+    def start(self, drives: Sequence[Commanded]) -> None:
+        """Begin with the torque that holds the arm now, so that it does not sag on the change."""
+        self._passed = False
+        for i, drive in enumerate(drives):
+            bound = self._bound[i]
+            self._integral[i] = min(max(drive.torque, -bound), bound)
+
+    def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write `torque` (Nm) itself, with nothing about a set-point; `position` (rad) is where the arm is.
+
+        `update` takes over without a step, wherever its set-point is.
+        """
+        integral = self._integral
+        self._passed = True
+        for i, drive in enumerate(drives):
+            bound, wanted = self._bound[i], torque[i]
+            integral[i] = bounded = bound if wanted > bound else -bound if wanted < -bound else wanted
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = bounded
+
+    def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
+        """Write target torques (Nm)."""
+        integral = self._integral
+        for i, drive in enumerate(drives):
+            error = position[i] - drive.position
+            bound = self._bound[i]
+            if self._passed:
+                integral[i] -= self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity)
+            summed = integral[i] + self._integral_step[i] * error
+            integral[i] = summed = bound if summed > bound else -bound if summed < -bound else summed
+            drive.target_position = position[i]
+            drive.target_velocity = 0.0
+            drive.target_torque = (
+                self._stiffness[i] * error + self._damping[i] * (velocity[i] - drive.velocity) + summed
+            )
+        self._passed = False

@@ -1,0 +1,73 @@
+"""What is measured against its limit, cycle by cycle: speed, torque, following error."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rtcp.config.model import ArmConfig
+from rtcp.motion.limits import Limits
+from rtcp.motion.state import ArmState
+
+SPEED, TORQUE, FOLLOWING_ERROR = 0, 1, 2
+
+
+class Found(NamedTuple):
+    """What was beyond its limit for too long: `kind` 0 speed, 1 torque, 2 following error; the joint, value, limit."""
+
+    kind: int
+    axis: int
+    value: float
+    limit: float
+
+
+class Supervision:
+    """Counts the cycles in a row in which a joint is beyond a limit.
+
+    Args:
+        config: factors, and how many cycles are too many.
+        limits: of the joints; read every cycle.
+    """
+
+    def __init__(self, config: ArmConfig, limits: Limits) -> None:
+        watch, n = config.watch, len(config.joints)
+        self._limits = limits
+        self._cycles = watch.cycles
+        self._speed, self._torque, self._error = watch.speed, watch.torque, watch.following_error
+        self._joints = range(n)
+        self._counts = [[0] * n, [0] * n, [0] * n]
+
+    def reset(self) -> None:
+        """Begin to count anew."""
+        for counts in self._counts:
+            for i in self._joints:
+                counts[i] = 0
+
+    def look(self, state: ArmState) -> Found | None:
+        """Look at the cycle's measurements; return what has been beyond its limit for too long, or None."""
+        limits, error = self._limits, self._error
+        speeds, torques, errors = self._counts
+        for i in self._joints:
+            bound = self._speed * limits.velocity[i]
+            value = state.actual_velocity[i]
+            if -bound <= value <= bound:
+                speeds[i] = 0
+            else:
+                speeds[i] += 1
+                if speeds[i] >= self._cycles:
+                    return Found(SPEED, i, value, bound)
+            bound = self._torque * limits.torque[i]
+            value = state.actual_torque[i]
+            if -bound <= value <= bound:
+                torques[i] = 0
+            else:
+                torques[i] += 1
+                if torques[i] >= self._cycles:
+                    return Found(TORQUE, i, value, bound)
+            value = state.actual[i] - state.commanded[i]
+            if -error <= value <= error:
+                errors[i] = 0
+            else:
+                errors[i] += 1
+                if errors[i] >= self._cycles:
+                    return Found(FOLLOWING_ERROR, i, value, error)
+        return None

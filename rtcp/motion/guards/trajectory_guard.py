@@ -1,0 +1,264 @@
+"""The guards of the set-points: behind every mode, before the law of the drives.
+
+For each joint the mean speed of the next cycle is within its limit, differs from the last by no more than
+acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). Whoever keeps to this
+once can keep to it for ever: what a stop leaves of the speed in the next cycle fulfils it there. The boxes are kept
+in the same way: a set-point is passed on only if the stop from it touches none, so that the stop from the last one,
+which was examined a cycle ago, is always at hand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+from math import inf, isfinite
+
+from kinematics.forward import frames
+from kinematics.pose import Pose
+from rtcp.config.model import ArmConfig
+from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
+from rtcp.motion.guards.zones import Zones
+from rtcp.motion.limits import Limits, Refused, Values, Wrong
+from rtcp.motion.state import ArmState, Reason, Setpoint
+
+# So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
+# cycle; and of a change that a limit demands.
+_ROUNDING_RAD = 1e-7
+_ROUNDING_SPEED = 5e-7
+_ROUNDING_CHANGE = 5e-5
+_ROUNDING_RAD_S = 1e-10
+
+
+class GuardResult(IntEnum):
+    """What became of a target."""
+
+    PASS = 0
+    CLAMPED = 1
+    STOPPING = 2
+    """The guard brakes; targets are not looked at until the arm stands."""
+    STOPPED = 3
+    """The guard's stop has come to rest in this cycle."""
+
+
+class TrajectoryGuard:
+    """Guards the set-points of one arm.
+
+    After a cut, `held` is the bit mask of the joints that were clamped; `code`, `axis`, `value` and `limit` say what
+    the guard's stop was for.
+
+    Args:
+        config: the arm; without its geometry no box is looked at.
+        limits: read every cycle.
+        dt: the cycle, s.
+    """
+
+    def __init__(self, config: ArmConfig, limits: Limits, dt: float) -> None:
+        n = len(config.joints)
+        self._limits = limits
+        self._dt = dt
+        self._model = config.arm
+        self.zones = None if config.arm is None else Zones(config.arm, limits)
+        self._joints = range(n)
+        self._mean = [0.0] * n
+        """Mean speed of each joint in the last cycle: what its acceleration is counted from."""
+        self._next = [0.0] * n
+        self._position = [0.0] * n
+        self._state = ArmState(n)
+        self._poses: Sequence[Pose] | None = None
+        self._room = self._room_then = 0.0
+        """No watched point is nearer to a boundary, m; 0: not known."""
+        self._poses_then: Sequence[Pose] | None = None
+        self._box, self._keep_out = limits.box, limits.keep_out
+        self.stopping = False
+        self.held = 0
+        self.code = Reason.NONE
+        self.axis, self.value, self.limit = -1, 0.0, 0.0
+
+    @property
+    def poses(self) -> Sequence[Pose]:
+        """`frames` of what is commanded; empty without geometry."""
+        if self._poses is None:
+            self._poses = () if self._model is None else frames(self._model, self._state.commanded)
+        return self._poses
+
+    def latch(self, state: ArmState) -> None:
+        """Begin at rest where `state` is."""
+        for i in self._joints:
+            self._mean[i] = state.commanded_velocity[i] = state.commanded_acceleration[i] = 0.0
+        self.stopping = False
+        self.held = 0
+        self._state = state
+        self._poses, self._room = None, 0.0
+
+    def zone_at(self, q: Sequence[float]) -> int | None:
+        """Return the number of the box (`zones`) whose bounds the arm would pass at `q` (rad), or None."""
+        distance, which = self.nearest_box(q)
+        return which if distance < 0.0 else None
+
+    def nearest_box(self, q: Sequence[float]) -> tuple[float, int]:
+        """Return how far the arm at `q` (rad) is from the bounds of the nearest box, m, below 0: beyond; and which."""
+        if self.zones is None or self._model is None:
+            return inf, 0
+        return self.zones.distance(frames(self._model, q))
+
+    def _gap_to(self, box: int, ahead: float) -> float:
+        """Return how near to `box` the stop would come, m; below 0 only where the arm itself is beyond its bounds."""
+        here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
+        return here if here < 0.0 and nearest == box else max(ahead, 0.0)
+
+    def probe(self, state: ArmState, position: Sequence[float], velocity: Sequence[float]) -> bool:
+        """Return whether a target would pass as it is."""
+        return not self._bound(state, position) and self._touches(state, position) is None
+
+    def refuses(self, state: ArmState, new: Values) -> Refused | None:
+        """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
+        refused = self._limits.check(new, state.commanded, self._mean)
+        if refused is not None or self._model is None:
+            return refused
+        limits, mean = self._limits, self._mean
+        same = new.box == limits.box and new.keep_out == limits.keep_out
+        slower = any(rate < now for rate, now in zip(new.acceleration, limits.acceleration, strict=True))
+        # Also where the arm is on the wrong side of a box already: nothing becomes worse.
+        if same and not (slower and any(mean)):
+            return None
+        zones, poses = Zones(self._model, new), frames(self._model, state.commanded)
+        distance, which = zones.distance(poses)
+        if distance >= 0.0:
+            stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
+            if stop is None:
+                return None
+            which, distance = stop
+        return Refused(Wrong.OUTSIDE, -1, distance, float(which))
+
+    def apply(self, state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:
+        """Write what may be commanded of `target` into `state`: position, velocity, acceleration.
+
+        A speed that does not go with the position is replaced by the one that does.
+
+        Args:
+            state: what was commanded in the last cycle.
+            target: what the mode wants; numbers that are none are cut as any other.
+            tolerates_saturation: whether the controller tolerates a cut setpoint; otherwise a cut starts a stop.
+        """
+        self._state = state
+        if self.stopping:
+            return self._brake(state)
+        wanted = target.position
+        self.held = held = self._bound(state, wanted)
+        position, mean, last, dt = self._position, self._next, self._mean, self._dt
+        if held:
+            if not tolerates_saturation:
+                return self._stop(state, Reason.JOINT_LIMIT, *self._excess(state, wanted))
+            for i in self._joints:
+                position[i] = state.commanded[i] + mean[i] * dt if held >> i & 1 else wanted[i]
+            wanted = position
+        found = self._touches(state, wanted)
+        if found is not None:
+            return self._stop(state, Reason.KEEP_OUT, found[0], self._gap_to(*found), 0.0)
+        self._poses, self._room = self._poses_then, self._room_then
+        here, speeds, rates, most = state.commanded, target.velocity, self._limits.acceleration, self._limits.velocity
+        velocity, acceleration = state.commanded_velocity, state.commanded_acceleration
+        for i in self._joints:
+            w, speed, rate, fastest = mean[i], speeds[i], rates[i], most[i] * (1.0 + _ROUNDING_SPEED)
+            u = rate * dt * (1.0 + _ROUNDING_CHANGE)
+            if not (w - u <= speed <= w + u and -fastest <= speed <= fastest) or held >> i & 1:
+                speed = w
+            change = (speed - velocity[i]) / dt
+            acceleration[i] = rate if change > rate else -rate if change < -rate else change
+            velocity[i] = speed
+            here[i] = wanted[i]
+            last[i] = w
+        return GuardResult.CLAMPED if held else GuardResult.PASS
+
+    def _bound(self, state: ArmState, wanted: Sequence[float]) -> int:
+        """Put the allowed mean speeds into `_next`; return the mask of the joints whose target was cut."""
+        limits, dt, last, allowed, here = self._limits, self._dt, self._mean, self._next, state.commanded
+        lows, highs, most, rates = limits.low, limits.high, limits.velocity, limits.acceleration
+        held = 0
+        for i in self._joints:
+            q, v, rate, fastest = here[i], last[i], rates[i], most[i]
+            u = rate * dt
+            w = (wanted[i] - q) / dt
+            stopping_distance = (highs[i] - q if w > 0.0 else q - lows[i]) + _ROUNDING_RAD
+            speed, before = (w, v) if w > 0.0 else (-w, -v)
+            slack = u * _ROUNDING_CHANGE
+            # No joint slows down faster than it may: what is beyond a limit comes back at that rate.
+            slowed = before - u
+            if (
+                slowed - slack <= speed <= before + u + slack
+                and (speed <= fastest * (1.0 + _ROUNDING_SPEED) or speed <= slowed + _ROUNDING_RAD_S)
+                and (
+                    speed * (dt + 0.5 * speed / rate) <= stopping_distance
+                    or speed <= fastest_stoppable(stopping_distance, u, dt)
+                    or speed <= slowed + _ROUNDING_RAD_S
+                )
+            ):
+                allowed[i] = w
+                continue
+            held |= 1 << i
+            allowed[i] = self._cut(w, q, v, i)
+        return held
+
+    def _cut(self, w: float, q: float, v: float, i: int) -> float:
+        """Return the nearest mean speed that is allowed; what is no number brakes."""
+        limits, dt = self._limits, self._dt
+        fastest, u = limits.velocity[i], limits.acceleration[i] * dt
+        high = min(fastest, fastest_stoppable(limits.high[i] - q, u, dt))
+        low = -min(fastest, fastest_stoppable(q - limits.low[i], u, dt))
+        high = min(max(high, v - u), v + u)
+        low = max(min(low, v + u), v - u)
+        return min(max(w if isfinite(w) else 0.0, low), high)
+
+    def _touches(self, state: ArmState, position: Sequence[float]) -> tuple[int, float] | None:
+        """Return the box that `position` with the speeds `_next`, or the stop from there, would touch, or None."""
+        zones, model, mean, limits = self.zones, self._model, self._next, self._limits
+        self._poses_then, self._room_then = None, self._room
+        if zones is None or model is None:
+            return None
+        if not any(mean):
+            self._poses_then = self._poses
+            return None
+        if limits.box is not self._box or limits.keep_out is not self._keep_out:
+            self._box, self._keep_out, self._room = limits.box, limits.keep_out, 0.0
+        step, whole = travel(mean, limits.acceleration, zones.reach, self._dt)
+        if self._room <= whole:
+            self._room = zones.distance(self.poses)[0]
+        self._room_then = self._room - step
+        if self._room > whole:
+            return None
+        self._room_then = 0.0
+        self._poses_then = frames(model, position)
+        return touched(zones, self.poses, self._poses_then, position, mean, limits.acceleration, self._dt)
+
+    def _excess(self, state: ArmState, wanted: Sequence[float]) -> tuple[int, float, float]:
+        """Return the first joint that was cut, what was wanted of it and what is allowed."""
+        axis = (self.held & -self.held).bit_length() - 1
+        target, limits = wanted[axis], self._limits
+        if target > limits.high[axis]:
+            return axis, target, limits.high[axis]
+        if target < limits.low[axis]:
+            return axis, target, limits.low[axis]
+        return axis, (target - state.commanded[axis]) / self._dt, self._next[axis]
+
+    def _stop(self, state: ArmState, code: Reason, axis: int, value: float, limit: float) -> GuardResult:
+        self.stopping = True
+        self.code, self.axis, self.value, self.limit = code, axis, value, limit
+        return self._brake(state)
+
+    def _brake(self, state: ArmState) -> GuardResult:
+        limits, dt, mean = self._limits, self._dt, self._mean
+        self._poses, self._room = None, 0.0
+        moving = False
+        for i in self._joints:
+            v, u = mean[i], limits.acceleration[i] * dt
+            w = v - u if v > u else v + u if v < -u else 0.0
+            state.commanded_acceleration[i] = (w - v) / dt
+            state.commanded[i] += w * dt
+            state.commanded_velocity[i] = mean[i] = w
+            moving = moving or w != 0.0
+        if moving:
+            return GuardResult.STOPPING
+        self.stopping = False
+        for i in self._joints:
+            state.commanded_acceleration[i] = 0.0
+        return GuardResult.STOPPED

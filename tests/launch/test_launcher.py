@@ -1,0 +1,279 @@
+"""The launcher beside others: what an older version left, who waits for whom, what a gateway is handed."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket, exclusive, stop_marker
+from rtcp.ipc.session import (
+    Pid,
+    Processes,
+    Session,
+    SessionError,
+    exit_problems,
+    identify,
+    is_running,
+    read_processes,
+    read_session,
+    remove_exit_report,
+    session_file,
+    write_exit_report,
+)
+from rtcp.launch import launcher, platform
+from rtcp.launch.platform import Platform, StartError
+
+JOINTS = 6
+
+
+@pytest.fixture(scope="module")
+def config() -> ArmConfig:
+    return load(default_config())
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    return tmp_path
+
+
+@pytest.fixture
+def other() -> Iterator[subprocess.Popen[bytes]]:
+    """A process of a platform that only has to live."""
+    process = subprocess.Popen(["sleep", "600"])
+    yield process
+    process.kill()
+    process.wait()
+
+
+def session_of(config: ArmConfig) -> Session:
+    return Session(config, "virtual", "ecat0", 0, 77)
+
+
+@pytest.fixture
+def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
+    board = Blackboard(blackboard_file(directory), JOINTS, 500_000)
+    board.publish([0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS))
+    Processes(loop=Pid(os.getpid(), 1), segment=identify(other.pid)).write(directory)
+    yield
+    board.close()
+    blackboard_file(directory).unlink(missing_ok=True)
+
+
+@pytest.mark.parametrize("older", [{"version": "0.0.1"}, {"version": None}])
+def test_a_session_of_another_version_is_refused(tmp_path: Path, config: ArmConfig, older: dict[str, None]) -> None:
+    session_of(config).write(tmp_path)
+    assert read_session(tmp_path) == session_of(config)
+    found = json.loads(session_file(tmp_path).read_text())
+    session_file(tmp_path).write_text(json.dumps({**found, **older}))
+    with pytest.raises(SessionError, match=r"session\.json was written by another version of rtcp"):
+        read_session(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", ["without a key", "with a key of another type"])
+def test_a_session_whose_fields_do_not_fit_is_refused_and_the_key_named(
+    tmp_path: Path, config: ArmConfig, wrong: str
+) -> None:
+    session_of(config).write(tmp_path)
+    found = json.loads(session_file(tmp_path).read_text())
+    if wrong == "without a key":
+        del found["session"]["config"]["stops"]
+    else:
+        found["session"]["config"]["stops"] = "none"
+    session_file(tmp_path).write_text(json.dumps(found))
+    with pytest.raises(SessionError, match=r"session\.json is damaged: .*stops"):
+        read_session(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", ["session", "black box"])
+def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
+    directory: Path, dead_loop: None, other: subprocess.Popen[bytes], config: ArmConfig,
+    monkeypatch: pytest.MonkeyPatch, wrong: str,
+) -> None:  # fmt: skip
+    if wrong == "session":
+        session_file(directory).write_text('{"version": "0.0.1"}')
+    else:
+        session_of(config).write(directory)
+        monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)
+    sockets = [directory / "segment.sock", directory / "segment-7.sock"]
+    for path in sockets:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as left:
+            left.bind(str(path))
+    told: list[str] = []
+    left_over = launcher.stop(told.append)
+    said = "had ended before, and not in order: its drives were left to their watchdog"
+    assert left_over == (f"the loop (process {os.getpid()}) {said}",)
+    assert not any(path.exists() for path in sockets)
+    assert len(told) == 1
+    assert f"the end of the loop (process {os.getpid()}) was not recorded" in told[0]
+    assert ("another version" if wrong == "session" else "AttributeError") in told[0]
+    assert other.wait(timeout=60) == -signal.SIGTERM
+    assert not blackboard_file(directory).exists()
+    assert read_processes(directory) == Processes()
+
+
+def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subprocess.Popen[bytes]) -> None:
+    Processes(segment=identify(other.pid)).write(directory)
+    told: list[str] = []
+    stopper = threading.Thread(target=launcher.stop, args=(told.append,))
+    with exclusive(directory):
+        stopper.start()
+        time.sleep(0.3)
+        assert other.poll() is None
+        assert told == ["another process starts or stops the platform: waiting for it, at most 30 s"]
+    stopper.join()
+    assert other.wait(timeout=60) == -signal.SIGTERM
+
+
+def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
+    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "_ANSWER_S", 0.2)
+    gateway = subprocess.Popen(["sleep", "600"])
+    Processes(loop=identify(other.pid), gateway=identify(gateway.pid)).write(directory)
+    told: list[tuple[str, int | None]] = []
+    began_s = time.monotonic()
+    # As one that is stopped: the kernel takes the connection, nobody the request.
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(control_socket(directory)))
+        listener.listen()
+        launcher.stop(lambda said: told.append((said, other.poll())))
+    ended_by = other.wait(), gateway.wait()
+    # Well under the 20 s that one is given that answers.
+    assert time.monotonic() - began_s < 10
+    said = "the gateway did not stop the platform: it has not answered for 0.2 s; its processes are ended one by one"
+    assert told == [(said, None)]
+    assert ended_by == (-signal.SIGTERM, -signal.SIGTERM)
+
+
+def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
+    directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launcher, "STOP_WAITS_S", 0.1)
+    Processes(segment=identify(other.pid)).write(directory)
+    with exclusive(directory), pytest.raises(StartError, match=r"another process starts or stops .* has done nothing"):
+        launcher.stop(print)
+    assert other.poll() is None
+
+
+class Replacement:
+    """A gateway that is being started for a loop (this process) and is held up before it is ready."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self.ended: list[object] = []
+        self._thread = threading.Thread(target=self._replace)
+        self._thread.start()
+        while not (gateway := read_processes(directory).gateway):
+            time.sleep(0.002)
+        self.gateway = gateway
+        os.kill(gateway, signal.SIGSTOP)
+
+    def _replace(self) -> None:
+        try:
+            self.ended.append(launcher.replace_gateway(self._directory))
+        except StartError as error:
+            self.ended.append(error)
+
+    def until_ended(self) -> object:
+        self._thread.join()
+        return self.ended[0]
+
+
+@pytest.fixture
+def replacement(directory: Path, config: ArmConfig) -> Iterator[Replacement]:
+    session_of(config).write(directory)
+    Processes(loop=identify(os.getpid())).write(directory)
+    made = Replacement(directory)
+    yield made
+    if is_running(made.gateway):
+        os.kill(made.gateway, signal.SIGKILL)
+    made.until_ended()
+
+
+def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, replacement: Replacement) -> None:
+    until = time.monotonic() + 20
+    while True:
+        try:
+            with exclusive(directory):
+                break
+        except LockHeld:
+            assert time.monotonic() < until, "the lock is held until the gateway is ready"
+            time.sleep(0.01)
+    assert replacement.ended == []
+    # A gateway that is already on its way is nobody else's to start.
+    assert launcher.replace_gateway(directory) == 0
+    os.kill(replacement.gateway, signal.SIGKILL)
+    assert f"the gateway (process {replacement.gateway}) ended with code -9" in str(replacement.until_ended())
+
+
+def test_a_gateway_that_a_stop_ends_while_it_is_waited_for_is_no_error(
+    directory: Path, replacement: Replacement
+) -> None:
+    stop_marker(directory).touch()
+    os.kill(replacement.gateway, signal.SIGKILL)
+    assert replacement.until_ended() == 0
+
+
+def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
+    running = Platform(directory, config, Processes(), directory / "of the start")
+    os.close(running.begin_gateway())
+    (child,) = running._children
+    try:
+        environment = Path(f"/proc/{child.pid}/environ").read_bytes().split(b"\0")
+    finally:
+        child.kill()
+        child.wait()
+    assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment
+
+
+def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
+    directory: Path, config: ArmConfig
+) -> None:
+    running = Platform(directory, config, Processes())
+    running._children.append(subprocess.Popen(["sh", "-c", "sleep 0.2; exit 7"]))
+    reading, writing = os.pipe()
+    os.close(writing)
+    with pytest.raises(StartError, match="ended with code 7"):
+        running.await_gateway(reading)
+
+
+def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmConfig) -> None:
+    (directory / "loop.log").write_text("what went wrong")
+    (directory / "gateway.log").write_text("who asked")
+    (directory / "gateway.log.1").write_text("long ago")
+    broken = replace(config, bus=replace(config.bus, interface="nosuch0"))
+    with pytest.raises(StartError):
+        launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda said: None)
+    assert (directory / "loop.log.1").read_text() == "what went wrong"
+    assert (directory / "gateway.log.1").read_text() == "who asked"
+
+
+@pytest.mark.parametrize("lived", [True, False])
+def test_a_loop_of_another_start_does_not_answer_for_this_one(directory: Path, lived: bool) -> None:
+    this = identify(os.getpid())
+    write_exit_report(directory, this, ["a slave stayed in OP"])
+    assert exit_problems(directory, this, lived) == ("a slave stayed in OP",)
+    gone = Pid(this + 1, this.started)
+    (sentence,) = exit_problems(directory, gone, lived)
+    assert ("was killed" in sentence) == lived
+    assert "left to their watchdog" in sentence
+    remove_exit_report(directory)
+    assert "left to their watchdog" in exit_problems(directory, gone, lived)[0]
+    assert exit_problems(directory, Pid(0), lived) == ()

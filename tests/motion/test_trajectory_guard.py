@@ -1,0 +1,272 @@
+"""Whatever a mode wants, what is commanded keeps to range, speed and acceleration, and can stop; what fits passes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import inf, nan
+from random import Random
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.controllers.velocity import VelocityController
+from rtcp.motion.guards.braking import fastest_stoppable
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
+from rtcp.motion.limits import Limits, Values
+from rtcp.motion.state import Phase, Reason, Setpoint
+
+from .judge import JOINTS_ONLY, Judge
+
+CYCLES_S = st.sampled_from([0.0005, 0.002, 0.01])
+
+# What may be wanted of a joint, from where it is: (judge, joint) -> rad.
+WISHES: dict[str, Callable[[Judge, int], float]] = {
+    "stay": lambda judge, i: judge.state.commanded[i],
+    "nan": lambda judge, i: nan,
+    "infinite": lambda judge, i: inf,
+    "minus infinite": lambda judge, i: -inf,
+    "far up": lambda judge, i: 1e9,
+    "far down": lambda judge, i: -1e9,
+    "upper edge": lambda judge, i: judge.limits.high[i],
+    "lower edge": lambda judge, i: judge.limits.low[i],
+    "over the edge": lambda judge, i: judge.limits.high[i] + 1e-8,
+    "full acceleration up": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt),
+    "full acceleration down": lambda judge, i: _at(judge, i, judge.mean[i] - judge.limits.acceleration[i] * judge.dt),
+    "a bit too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.00004),
+    "too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.001),
+    "full speed": lambda judge, i: _at(judge, i, judge.limits.velocity[i]),
+    "as it goes": lambda judge, i: _at(judge, i, judge.mean[i]),
+    "creep up": lambda judge, i: _at(judge, i, 1e-7),
+    "creep down": lambda judge, i: _at(judge, i, -4e-8),
+    "brake a bit too little": lambda judge, i: _at(
+        judge, i, judge.mean[i] - judge.limits.acceleration[i] * judge.dt * 0.99996
+    ),
+}
+WISH = st.sampled_from(sorted(WISHES))
+SHARES = st.floats(0.0, 1.0)
+
+
+def _at(judge: Judge, i: int, speed: float) -> float:
+    return judge.state.commanded[i] + speed * judge.dt
+
+
+def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
+    """Limits within the widest; shares of 1 leave them as they are."""
+    widest = judge.limits.widest
+    a, b, c, d = shares
+    return replace(
+        widest,
+        low=tuple(low * (0.02 + 0.98 * a) for low in widest.low),
+        high=tuple(high * (0.02 + 0.98 * b) for high in widest.high),
+        velocity=tuple(v * (0.02 + 0.98 * c) for v in widest.velocity),
+        acceleration=tuple(rate * (0.05 + 0.95 * d) for rate in widest.acceleration),
+    )
+
+
+DEED = st.one_of(
+    st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 40)),
+    st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
+)
+
+
+@given(
+    dt=CYCLES_S,
+    start=st.tuples(st.one_of(SHARES, st.sampled_from([0.0, 1.0])), st.one_of(SHARES, st.sampled_from([0.0, 1.0]))),
+    deeds=st.lists(DEED, min_size=1, max_size=15),
+)
+@settings(max_examples=150)
+def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
+    dt: float, start: tuple[float, float], deeds: list[tuple[object, ...]]
+) -> None:
+    bounds = Limits(JOINTS_ONLY)
+    at = [low + share * (high - low) for low, high, share in zip(bounds.low, bounds.high, start, strict=True)]
+    judge = Judge(JOINTS_ONLY, at, dt)
+    for kind, *given_ in deeds:
+        if kind == "limits":
+            judge.change(narrower(judge, given_))  # type: ignore[arg-type]
+            continue
+        first, second, tolerates_saturation, times = given_
+        for _ in range(times):  # type: ignore[call-overload]
+            judge.ask([WISHES[first](judge, 0), WISHES[second](judge, 1)], tolerates_saturation)  # type: ignore[index,arg-type]
+    judge.ask([nan, inf], tolerates_saturation=False)
+    judge.stop()
+
+
+@given(dt=CYCLES_S, velocity=st.lists(st.floats(width=64), min_size=2, max_size=2), way=st.floats(-0.5, 0.5))
+def test_a_speed_that_does_not_go_with_the_position_is_not_commanded(
+    dt: float, velocity: list[float], way: float
+) -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
+    for _ in range(30):
+        judge.ask([way, way], tolerates_saturation=True, velocity=velocity)
+
+
+# -- what fits passes -----------------------------------------------------------------------------------------------
+
+
+@given(
+    dt=st.sampled_from([0.0005, 0.004, 0.01]),
+    legs=st.lists(st.tuples(SHARES, SHARES, st.floats(0.05, 1.5), st.booleans(), st.integers(1, 1500)), max_size=3),
+    jerky=st.booleans(),
+)
+@settings(max_examples=30)
+def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
+    dt: float, legs: list[tuple[float, float, float, bool, int]], jerky: bool
+) -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
+    limits = judge.limits
+    if jerky:
+        # So that the whole move is made with the greatest acceleration there is.
+        limits.jerk[:] = [1e4, 1e4]
+    generator = JointMoveController(dt, limits.velocity, limits.acceleration, limits.jerk)
+    for a, b, speed, each, cycles in [*legs, (1.0, 0.0, 9.0, True, 10**6), (0.0, 1.0, 9.0, False, 10**6)]:
+        # Shares beyond a half are the edges themselves.
+        goal = [
+            limits.high[0] if a > 0.5 else limits.low[0] * (1.0 - 2.0 * a),
+            limits.high[1] if b > 0.5 else limits.low[1] * (1.0 - 2.0 * b),
+        ]
+        if not generator.move_to(judge.state, goal, speed, each=each):
+            continue
+        for _ in range(cycles):
+            target = generator.update(judge.state, dt)
+            position, velocity = list(target.position), list(target.velocity)
+            verdict = judge.ask(position, tolerates_saturation=False, velocity=velocity)
+            guard = judge.guard
+            assert verdict is GuardResult.PASS, (guard.axis, guard.value, guard.limit, judge.mean)
+            assert (judge.state.commanded, judge.state.commanded_velocity) == (position, velocity)
+            if generator.phase is Phase.HOLD:
+                break
+    assert judge.state.commanded == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
+
+
+@settings(max_examples=40)
+@given(start=st.floats(-0.29, 0.19), dt=CYCLES_S, seed=st.integers(0, 2**32))
+def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start: float, dt: float, seed: int) -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, start], dt)
+    limits, position, mean, chance = judge.limits, [0.0, start], [0.0, 0.0], Random(seed)
+    for _ in range(300):
+        for i in range(2):
+            u = limits.acceleration[i] * dt
+            w = mean[i] + chance.choice([u, -u, 0.0, chance.uniform(-u, u)])
+            bound = limits.velocity[i]
+            top = fastest_stoppable(limits.high[i] - position[i], u, dt)
+            bottom = -fastest_stoppable(position[i] - limits.low[i], u, dt)
+            w = max(min(w, bound, top), -bound, bottom)
+            mean[i] = min(max(w, mean[i] - u), mean[i] + u)
+            position[i] += mean[i] * dt
+        assert judge.ask(position, tolerates_saturation=False) is GuardResult.PASS
+        assert judge.state.commanded == position
+
+
+# -- cuts -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dt", [0.001, 0.01])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float) -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
+    edge = judge.limits.high if sign > 0 else judge.limits.low
+    for _ in range(round(12.0 / dt)):
+        verdict = judge.ask([sign * 1e3] * 2, tolerates_saturation=True)
+    assert (verdict, judge.guard.held) == (GuardResult.CLAMPED, 0b11)
+    assert judge.state.commanded == pytest.approx(edge, abs=1e-12)
+    assert max(map(abs, judge.state.commanded_velocity)) < 1e-9
+
+
+def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it() -> None:
+    judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.001)
+    mode = VelocityController(judge.limits, judge.dt)
+    mode.start(judge.state)
+    for cycle in range(4000):
+        if cycle % 100 == 0:
+            mode.command([0.5, -1.5], 1.0, judge.state.now_ns)
+        target = mode.update(judge.state, judge.dt)
+        verdict = judge.ask(list(target.position), mode.tolerates_saturation, list(target.velocity))
+        assert verdict in (GuardResult.PASS, GuardResult.CLAMPED)
+        judge.state.now_ns += 1_000_000
+        assert judge.state.commanded[0] <= judge.limits.high[0] + 1e-7
+        assert judge.state.commanded[1] >= judge.limits.low[1] - 1e-7
+    assert judge.state.commanded == pytest.approx([judge.limits.high[0], judge.limits.low[1]], abs=1e-3)
+
+
+@pytest.mark.parametrize("wish", [nan, inf, -inf])
+def test_what_is_no_number_brakes(wish: float) -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    for _ in range(100):
+        judge.ask([1.0, 0.2], tolerates_saturation=True)
+    speeds = list(judge.mean)
+    assert min(speeds) > 0.0
+    assert judge.ask([wish, wish], tolerates_saturation=True) is GuardResult.CLAMPED
+    bounds = judge.limits.acceleration
+    assert judge.mean == pytest.approx([v - a * 0.001 for v, a in zip(speeds, bounds, strict=True)], abs=1e-9)
+
+
+def test_only_the_joint_that_asks_too_much_is_clamped() -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    fits = 0.5 * judge.limits.acceleration[1] * 0.001**2
+    assert judge.ask([1.0, fits], tolerates_saturation=True) is GuardResult.CLAMPED
+    assert judge.guard.held == 0b01
+    assert judge.state.commanded[1] == fits
+
+
+def test_a_cut_of_a_mode_that_cannot_live_with_it_is_a_stop_that_looks_at_no_target_until_it_rests() -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    for _ in range(100):
+        judge.ask([1.0, 0.0], tolerates_saturation=True)
+    assert judge.ask([99.0, 0.0], tolerates_saturation=False) is GuardResult.STOPPING
+    guard = judge.guard
+    assert (guard.code, guard.axis, guard.value, guard.limit) == (Reason.JOINT_LIMIT, 0, 99.0, judge.limits.high[0])
+    speed = judge.state.commanded_velocity[0]
+    cycles = 1
+    while judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=True) is GuardResult.STOPPING:
+        assert judge.state.commanded_velocity[0] < speed
+        speed = judge.state.commanded_velocity[0]
+        cycles += 1
+    assert judge.state.commanded_velocity == [0.0, 0.0]
+    assert cycles * 0.001 == pytest.approx(0.1, abs=0.003)
+    assert judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
+
+
+def test_a_step_that_is_too_long_is_told_as_a_speed() -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    judge.ask([0.0, 0.1], tolerates_saturation=False)
+    guard = judge.guard
+    assert (guard.axis, guard.value, guard.limit) == (1, pytest.approx(100.0), pytest.approx(0.7e-3))
+
+
+@given(beyond=st.floats(0.0, 0.02), dt=CYCLES_S, outward=st.booleans())
+@settings(max_examples=30)
+def test_a_joint_beyond_its_range_comes_back_and_never_goes_further_out(
+    beyond: float, dt: float, outward: bool
+) -> None:
+    limits = Limits(JOINTS_ONLY)
+    guard = TrajectoryGuard(JOINTS_ONLY, limits, dt)
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
+    state = judge.state
+    state.commanded = [limits.high[0] + beyond, limits.low[1] - beyond]
+    guard.latch(state)
+    target, farthest = Setpoint(2), list(state.commanded)
+    for wish in ([9.0, -9.0] if outward else [0.0, 0.0], [0.0, 0.0]):
+        for _ in range(round(1.0 / dt)):
+            target.position, target.velocity = list(wish), [0.0, 0.0]
+            guard.apply(state, target, tolerates_saturation=True)
+            assert state.commanded[0] <= farthest[0] + 1e-12
+            assert state.commanded[1] >= farthest[1] - 1e-12
+            assert max(map(abs, state.commanded_velocity)) <= 1.5
+            farthest[0] = min(farthest[0], max(state.commanded[0], limits.high[0]))
+            farthest[1] = max(farthest[1], min(state.commanded[1], limits.low[1]))
+    assert state.commanded[0] < limits.high[0]
+    assert state.commanded[1] > limits.low[1]
+
+
+def test_to_probe_changes_nothing() -> None:
+    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    judge.ask([1e-6, 0.0], tolerates_saturation=False)
+    state, speeds = list(judge.state.commanded), list(judge.state.commanded_velocity)
+    assert judge.guard.probe(judge.state, [3e-6, 0.0], [2e-3, 0.0])
+    assert not judge.guard.probe(judge.state, [1.0, 0.0], [0.0, 0.0])
+    assert (judge.state.commanded, judge.state.commanded_velocity) == (state, speeds)
+    assert judge.ask([3e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
