@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.gateway.carrier import Carrier, CommandFailed
-from rtcp.ipc.machine import Command
+from rtcp.gateway.command_channel import Caller, CommandChannel, Json
+from rtcp.ipc.commands import SetLimits
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import limits_file
 from rtcp.motion.limits import LEAST_PART, Corners, Limits, Values, rows
 
@@ -28,24 +28,24 @@ ALL = "joints"
 """Stands for every joint in a key."""
 
 
-class LimitKeeper:
+class LimitSettings:
     """Shows and changes the limits.
 
     Args:
-        carrier: the way to the loop.
-        limits: what is in force; changed here when the loop has taken it.
-        directory: the runtime directory, where it is kept as long as the loop lives.
+        channel: the way to the loop.
+        limits: in force; changed here when the loop has accepted the change.
+        directory: the runtime directory, where they are kept as long as the loop lives.
     """
 
-    def __init__(self, carrier: Carrier, limits: Limits, directory: Path) -> None:
-        self._carrier = carrier
-        self._config = carrier.config
+    def __init__(self, channel: CommandChannel, limits: Limits, directory: Path) -> None:
+        self._channel = channel
+        self._config = channel.config
         self._limits = limits
         self._file = limits_file(directory)
-        if kept := _read(self._file, carrier.observer.loop_pid):
+        if kept := _read(self._file, channel.observer.loop_pid):
             limits.apply(kept)
 
-    def show(self) -> dict[str, Any]:
+    def show(self) -> Json:
         """Return what is in force beside what is configured."""
         config = self._config
         return {
@@ -60,15 +60,15 @@ class LimitKeeper:
             } | {"singularity": dataclasses.asdict(config.cartesian.singularity)},
         }  # fmt: skip
 
-    async def change(self, client: str, changes: Mapping[str, float]) -> dict[str, Any]:
+    async def change(self, caller: Caller, changes: Mapping[str, float]) -> Json:
         """Change limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`."""
         new = changed(self._config, now(self._limits), changes)
-        async with self._carrier.lease(client) as lease:
+        async with self._channel.lease(caller) as lease:
             plan = rows(new)
-            slot = self._carrier.observer.write_plan(plan)
-            await self._carrier.give(lease, Command.LIMITS, [slot, len(plan)])
+            slot = self._channel.observer.write_plan(plan)
+            await self._channel.send(lease, SetLimits(slot, len(plan)))
             self._limits.apply(new)
-            _write(self._file, new, self._carrier.observer.loop_pid)
+            _write(self._file, new, self._channel.observer.loop_pid)
         return self.show()
 
 
@@ -82,16 +82,16 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
     """Return `values` with `changes`.
 
     Raises:
-        CommandFailed: `invalid`, naming each key or number that is none.
+        RtcpError: `invalid`, naming each key or number that is none.
     """
     if not changes:
-        raise CommandFailed("invalid", f"no limit was named: give a key and a number, as {_example(config)}")
+        raise RtcpError("invalid", f"changes: found none, give a key and a number, as {_example(config)}")
     names = [joint.name for joint in config.joints]
     per_joint, boxes = _lists(config, values)
     wrong = []
     for key, number in changes.items():
-        if not math.isfinite(number):
-            wrong.append(f"{key}: found {number}, allowed is a finite number")
+        if type(number) not in (int, float) or not abs(number) <= sys.float_info.max:
+            wrong.append(f"{key}: found {json.dumps(number)[:60]}, allowed is a finite number")
             continue
         head, _, rest = key.rpartition(".") if key.rpartition(".")[2] in _JOINT_KEYS else (key, "", "")
         which, _, end = head.rpartition(".")
@@ -107,7 +107,7 @@ def changed(config: ArmConfig, values: Values, changes: Mapping[str, float]) -> 
         else:
             wrong.append(f"{key}: there is no such limit; allowed are {_example(config)}")
     if wrong := wrong or [*_empty(names, per_joint, boxes)]:
-        raise CommandFailed("invalid", "\n".join(wrong))
+        raise RtcpError("invalid", "\n".join(wrong))
     joints = {name: tuple(numbers) for name, numbers in per_joint.items()}
     inner = _corners(boxes.pop("box")) if values.box is not None else None
     return Values(**joints, box=inner, keep_out=tuple(_corners(corners) for corners in boxes.values()))
@@ -171,7 +171,7 @@ def _corners(six: list[float]) -> Corners:
     return a, b, c, d, e, f
 
 
-def _shown(config: ArmConfig, values: Values) -> dict[str, Any]:
+def _shown(config: ArmConfig, values: Values) -> Json:
     boxes = zip((one.name for one in config.cartesian.keep_out), values.keep_out, strict=True)
     return {
         **{key: list(getattr(values, name)) for key, name in _JOINT_KEYS.items()},
