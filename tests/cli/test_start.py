@@ -169,7 +169,7 @@ def test_a_later_bearer_of_the_loops_pid_is_neither_taken_for_it_nor_signalled(
     rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
 ) -> None:
     # As if the loop had ended and its id gone round: what bears it now started at another instant.
-    Processes(loop=Pid(loop.pid, identify(loop.pid).started - 1)).write(directory)
+    Processes(loop=Pid(loop.pid, identify(loop.pid).identity - 1)).write(directory)
     assert rtcp("stop").code == 4
     assert "no platform is running" in rtcp("status").trouble
     assert loop.poll() is None
@@ -187,4 +187,4 @@ def test_the_pids_stand_in_their_file_as_plain_numbers_by_name(
     loop: subprocess.Popen[bytes], directory: Path
 ) -> None:  # fmt: skip
     found = json.loads((directory / "processes.json").read_text())
-    assert found == {"loop": loop.pid, "gateway": 0, "segment": 0, "started": found["started"]}
+    assert found == {"loop": loop.pid, "gateway": 0, "segment": 0, "identities": found["identities"]}
