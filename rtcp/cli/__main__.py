@@ -14,7 +14,7 @@ import rtcp
 from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, motion, platform, segment, service, soak, status
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 from rtcp.ipc.errors import RtcpError
 
 app = typer.Typer(

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.errors import CommandError
-from rtcp.config.plain_number import plain_number
+from rtcp.config.numbers import plain_number
 
 ConfigFile = Annotated[
     Path | None,
@@ -120,7 +120,7 @@ def _numbers(values: Sequence[str], names: Sequence[tuple[str, str]]) -> list[fl
 def _angle(value: str) -> object:
     if "pi" not in value:
         return value
-    from rtcp.config.geometry import angle  # imports the validator, which loads slowly
+    from rtcp.config.numbers import angle  # imports the validator, which loads slowly
 
     return angle(value)
 

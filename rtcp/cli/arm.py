@@ -123,7 +123,7 @@ def _urdf(
     """Export the arm as URDF, for viewers, simulators and planners."""
     from kinematics.urdf import to_urdf
     from rtcp.config import find_arm, load_kinematics
-    from rtcp.config.kinematics import torque_limits
+    from rtcp.config.loader import torque_limits
 
     file = find_arm(arm)
     text = to_urdf(load_kinematics(file), torque_limits(file))

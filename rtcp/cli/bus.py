@@ -17,8 +17,8 @@ from rtcp.cli.connection import connect
 from rtcp.cli.errors import CommandError, code_of, interruption_code, signals_raise
 from rtcp.cli.output import emit, emit_json, facts, report, show, table
 from rtcp.cli.platform import refuse_second_platform
-from rtcp.config.plain_number import plain_number
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL
+from rtcp.config.numbers import plain_number
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
 from rtcp.launch import offline
@@ -151,7 +151,7 @@ class OfflineBus:
         self._config = config
         self.name = offline.configuration(config).bus.interface if bus is None else bus
         if self.name == VIRTUAL:
-            from rtcp.config.schema import segment_path
+            from rtcp.config.loader import segment_path
             from rtcp.virtual.check import check_segment
 
             check_segment(segment_path(offline.configuration(config)))

@@ -12,7 +12,7 @@ import typer
 from rtcp.cli.arguments import AsJson, ConfigFile
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, show, table
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
 from rtcp.realtime.host import Host

@@ -208,7 +208,7 @@ def kinds() -> list[Kind]:
 
 
 def _allowed(kind: Any, field: Any) -> str:
-    from rtcp.config.checking import allowed
+    from rtcp.config.validation import allowed
 
     text = allowed(get_type_hints(kind, include_extras=True)[field.name])
     if field.default is MISSING:

@@ -12,7 +12,7 @@ from rtcp.cli.arguments import AsJson, ConfigFile, positive
 from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.output import emit, report, show, table
 from rtcp.cli.platform import launch, refuse_second_platform
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL
 
 if TYPE_CHECKING:
     from rich.table import Table

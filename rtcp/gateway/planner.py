@@ -11,9 +11,7 @@ from kinematics.forward import frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import Pose
-from rtcp.config.errors import ConfigError
-from rtcp.config.model import ArmConfig
-from rtcp.config.motion_points import Point, Stop
+from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
 from rtcp.gateway.carrier import CommandFailed
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits

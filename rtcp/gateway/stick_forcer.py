@@ -12,9 +12,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rtcp.config.model import ArmConfig
-from rtcp.config.operation import InputConfig
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL, ArmConfig, InputConfig
 from rtcp.gateway.carrier import CommandFailed
 from rtcp.gateway.commander import Commander
 from rtcp.gateway.held import Caller

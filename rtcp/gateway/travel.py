@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rtcp.config.motion_points import Point, Stop
+from rtcp.config.model import Point, Stop
 from rtcp.gateway.carrier import MOVING, Carrier, CommandFailed, Progress
 from rtcp.gateway.planner import Planner
 from rtcp.ipc.codes import MotionMode

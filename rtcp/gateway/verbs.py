@@ -7,8 +7,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.model import ArmConfig
-from rtcp.config.motion_points import Point, Stop
+from rtcp.config.model import ArmConfig, Point, Stop
 from rtcp.gateway.arguments import Arguments
 from rtcp.gateway.carrier import Carrier, CommandFailed, Progress
 from rtcp.gateway.commander import Commander

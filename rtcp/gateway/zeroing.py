@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from typing import Any
 
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 from rtcp.config.zero import read_zeros, store_zero, zero_file
 from rtcp.gateway.carrier import Carrier, CommandFailed
 from rtcp.ipc.codes import Code

@@ -123,7 +123,7 @@ def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: P
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        (("fault", "cabel", "after=1"), "fault: this fault is not known here; did you mean cable?"),
+        (("fault", "cabel", "after=1"), "fault: this fault does not exist; did you mean cable?"),
         (("fault", "cable"), "the key after is missing; it must be an integer from 0 to 254"),
         (("fault", "cable", "after"), "'after' is not KEY=VALUE, as after=3 or code=0x1A"),
         (("fault", "cable", "=3"), "'=3' is not KEY=VALUE"),
