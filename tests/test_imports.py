@@ -180,7 +180,7 @@ def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
     listed = re.search(r"^dependencies = (\[.*?^\])", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
     assert listed is not None
     declared = {
-        re.split(r"[^\w-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
+        re.split(r"[^\w.-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
     }
     names = {found.module.partition(".")[0] for found in IMPORTS if not is_ours(found)} - sys.stdlib_module_names
     assert {PACKAGES.get(name, name) for name in names} - declared == set()

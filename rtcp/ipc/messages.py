@@ -183,7 +183,8 @@ class Sentences:
             f"{self._joint(matter)} was followed to {number(matter.limit)} rad while being enabled and is suddenly at "
             f"{number(matter.value)} rad, for {self._config.supervision.cycles} cycles (supervision.cycles in "
             f"{self._file}): it was turned, or its drive shows a false position; "
-            f"{self._names.stop(Code.POSITION_JUMPED)}, let it stand, compare it with `rtcp status`; `rtcp reset` goes on"
+            f"{self._names.stop(Code.POSITION_JUMPED)}, let it stand, compare it with `rtcp status`; "
+            "`rtcp reset` goes on"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:
