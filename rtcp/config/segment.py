@@ -9,10 +9,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Le, MinLen
 
-from rtcp.config.checking import Checker, shown
 from rtcp.config.document import Finding, read
-from rtcp.config.errors import ConfigError
-from rtcp.config.model import U16, Name
+from rtcp.config.model import ConfigError
+from rtcp.config.numbers import U16, Name
+from rtcp.config.validation import Checker, shown
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.config.document import Document, Finding, read
-from rtcp.config.errors import ConfigError
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.config.rules import wire_range
 
 LARGEST = 100.0

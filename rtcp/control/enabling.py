@@ -37,7 +37,7 @@ class Enabling:
         self, config: ArmConfig, arm: Arm, watch: Supervision, failing: Failing, blackboard: Blackboard
     ) -> None:
         self._patience = round(config.enable_timeout_s / (config.cycle.period_us * 1e-6))
-        self._false_cycles = config.watch.cycles
+        self._false_cycles = config.supervision.cycles
         self._false = 0
         """Cycles in a row in which a drive said that it is where it cannot be."""
         self._were_enabled = 0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rtcp.config.model import ArmConfig, Joint
-from rtcp.config.operation import WatchConfig
+from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.motion.controllers.gripper import GripperMotion
@@ -112,7 +111,7 @@ class GripperWatch:
         axis: the joint's number, for the sentence.
     """
 
-    def __init__(self, config: WatchConfig, joint: Joint, axis: int) -> None:
+    def __init__(self, config: SupervisionConfig, joint: Joint, axis: int) -> None:
         self._axis = axis
         self._cycles = config.cycles
         self._speed = config.speed * joint.velocity
@@ -151,4 +150,4 @@ def gripper_of(config: ArmConfig) -> DrivenGripper | None:
     drive = Cia402Drive(config.slaves[slot], speed_limit=joint.velocity, zero=zero)
     period_s = config.cycle.period_us * 1e-6
     motion = GripperMotion(joint, gripper.open_position, gripper.closed_position, period_s)
-    return DrivenGripper(slot, drive, motion, GripperWatch(config.watch, joint, len(config.joints)))
+    return DrivenGripper(slot, drive, motion, GripperWatch(config.supervision, joint, len(config.joints)))

@@ -40,9 +40,9 @@ class Motions:
         )
         self.jog = None if config.arm is None else JogController(config, config.arm, limits, trajectory_guard, period_s)
         self.active: Controller = self.generator
-        self.mode = MotionMode[config.motion.upper()]
+        self.mode = MotionMode[config.control_mode.upper()]
         """What the arm takes commands for."""
-        self.drive_mode = DRIVE_MODES[config.mode]
+        self.drive_mode = DRIVE_MODES[config.drive_mode]
         """What moves, lines and jogs reach the drives in."""
         self.has_geometry = config.arm is not None
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 from typing import get_args, get_type_hints
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
-from rtcp.config.stops import StopsConfig
+from rtcp.config.model import ArmConfig, StopsConfig
 from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
 
 HEADING = "## The ladder of stops"
@@ -19,7 +18,7 @@ _EVENTS = {
     "drive_fault": "a drive is in fault, or has left Operation Enabled by itself: the rung is that of all others",
     "clock_lost": "the cycle has not followed the reference clock for 1 s",
     "emergency_stop": "its input is active",
-    "supervision": "speed, torque or following error was beyond its limit for `watch.cycles`",
+    "supervision": "speed, torque or following error was beyond its limit for `supervision.cycles`",
     "lease_ended": "the commander of what moves fell silent or gave up its lease",
     "enabling_switch": "it was let go while something moves",
 }
@@ -93,7 +92,7 @@ def section(config: ArmConfig) -> str:
 Printed by `python -m rtcp.telemetry.stops_page`; a test holds both together, and others measure the bounds on the
 device models. The figures are those of the shipped arm, for joints at full speed, from the cycle that finds the
 reason: they follow the joints' limits, `bus.lost_cycles`, 0x6085 and `watchdog_ms` of the configuration. On the bus
-`virtual` hold and watchdog last `bus.virtual_patience` times as long.
+`virtual` hold and watchdog last `bus.timeout_scale` times as long.
 
 {rungs(config)}
 
@@ -125,7 +124,8 @@ Which event takes which rung is the section `stops` of the arm's file:
 - The quick stop is sent whatever a drive's statusword says: a word that is false for one frame takes no joint's torque.
 - **Enabling** is supervised as motion is (`stops.supervision`); a drive that leaves Operation Enabled too early
   is a `drive_fault`. A drive obeys some frames before it shows that it does, and until then its target is the place
-  that it shows: a place more than 0.03 rad from the last is not followed, and after `watch.cycles` in a row a fault.
+  that it shows: a place more than 0.03 rad from the last is not followed, and after `supervision.cycles` in a row
+  a fault.
 - A fault while the arm is being disabled ramps the joints down by its rung; at standstill the torque goes, as was
   asked.
 - A `disable` goes on to its end where the clock is lost under `controlled_stop`: the fault is then without torque.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rtcp.config.document import Finding, read
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 from rtcp.config.segment import SegmentSlave, load_segment
 from rtcp.virtual.models import MODELS, create
 from rtcp.virtual.server import default_delays

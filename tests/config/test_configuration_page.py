@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from rtcp.config import default_config
-from rtcp.config.checking import _bare, allowed
+from rtcp.config.loader import ArmFile
 from rtcp.config.model import Joint
-from rtcp.config.schema import ArmFile
+from rtcp.config.validation import allowed
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "configuration.md"
 UNITS = {"", "m", "m/s", "m/s²", "m/s³", "rad", "rad/s", "rad/s²", "rad/s³", "Nm", "Nm/rad", "Nm s/rad", "Nm/(rad s)",
@@ -44,8 +44,8 @@ def keys_of(kind: Any, above: str = "") -> Iterator[Row]:
     hints = get_type_hints(kind, include_extras=True)
     for entry in fields(kind):
         key, wanted = above + entry.name, hints[entry.name]
-        bare = _bare(wanted)
-        inner = _bare(get_args(bare)[0]) if get_args(bare) and getattr(bare, "__origin__", None) is tuple else None
+        bare = bare_type(wanted)
+        inner = bare_type(get_args(bare)[0]) if get_args(bare) and getattr(bare, "__origin__", None) is tuple else None
         if inner is not None and is_dataclass(inner):
             yield from keys_of(inner, f"{key}[].")
         elif is_dataclass(bare) and (bare is not Joint or not above):
@@ -74,7 +74,7 @@ def test_every_key_has_a_meaning_and_a_unit_of_the_si_or_none() -> None:
         assert meaning, key
     without = {row[0] for row in table_rows() if not row[1] and row[2].startswith("a number")}
     assert without == {
-        "`bus.receive_fraction`", "`bus.send_phase`", "`bus.virtual_patience`", "`watch.speed`", "`watch.torque`",
+        "`bus.receive_fraction`", "`bus.send_phase`", "`bus.timeout_scale`", "`supervision.speed`", "`supervision.torque`",
     }  # fmt: skip
 
 

@@ -16,7 +16,7 @@ import pytest
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.faults import load_script
-from rtcp.config.kinematics import load_kinematics
+from rtcp.config.loader import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, store_zero, zero_file

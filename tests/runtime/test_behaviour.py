@@ -269,7 +269,8 @@ FAULT_STORIES = (
     ),
     Fault(
         "a joint that says it is elsewhere while it is enabled", Code.POSITION_JUMPED, 1,
-        ("joint2", "followed to 0 rad", "0.1 rad", "5 cycles (watch.cycles in assistive_arm.yaml)", "`rtcp reset`"),
+        ("joint2", "followed to 0 rad", "0.1 rad", "5 cycles (supervision.cycles in assistive_arm.yaml)",
+         "`rtcp reset`"),
         joint_says_it_is_elsewhere, joint_says_where_it_is,
     ),
     Fault(

@@ -10,8 +10,7 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load, load_segment, segment_path
-from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
-from rtcp.config.operation import InputConfig
+from rtcp.config.model import ArmConfig, GripperConfig, InputConfig, Joint, Range, SlaveConfig
 from rtcp.config.segment import SegmentSlave
 from rtcp.ipc.codes import Code, Command, Refusal
 from rtcp.ipc.machine import State
@@ -297,7 +296,7 @@ def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
 @pytest.fixture
 def by_stick(with_hand: Callable[..., Hand]) -> Hand:
     """The stick closes it; nobody holds a lease."""
-    hand = with_hand(replace(CONFIG, motion="joystick"))
+    hand = with_hand(replace(CONFIG, control_mode="joystick"))
     hand.simulation.lease = 0
     for code in [PADDLE_UP, NEUTRAL] * 3:
         hand.inputs(clear=0x3F, put=code)
@@ -396,7 +395,7 @@ def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Han
     while hand.state is State.HOLDING:
         hand.simulation.cycle()
         beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
-    assert beyond == CONFIG.watch.cycles
+    assert beyond == CONFIG.supervision.cycles
     assert hand.state is State.EMERGENCY_STOP
     assert hand.sentence(Code.OVER_SPEED).startswith("finger")
 
@@ -407,8 +406,8 @@ def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_i
     beyond = 0
     while hand.state is State.HOLDING:
         hand.simulation.cycle()
-        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.watch.following_error
-    assert beyond == CONFIG.watch.cycles
+        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.supervision.following_error
+    assert beyond == CONFIG.supervision.cycles
     assert hand.state is State.EMERGENCY_STOP
     assert hand.sentence(Code.FOLLOWING_ERROR).startswith("finger")
 
@@ -460,7 +459,7 @@ def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:
     watch = hand.gripper.watch
-    watch._fast = watch._off = CONFIG.watch.cycles - 1
+    watch._fast = watch._off = CONFIG.supervision.cycles - 1
     hand.simulation.order(Command.DISABLE)
     hand.until(State.READY)
     hand.simulation.order(Command.ENABLE)

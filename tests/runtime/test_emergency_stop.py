@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.config.operation import InputConfig
+from rtcp.config.model import InputConfig
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import Code, Command, Refusal, State
 from rtcp.ipc.observer import Observer
@@ -155,7 +155,7 @@ def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(bench: Bench) -
     bench.do(Command.MOVE, move_numbers(0.0, 0.4, speed=SPEED))
     bench.until(State.EMERGENCY_STOP)
     assert (bench.codes[-1], bench.events[-1].axis) == (Code.FOLLOWING_ERROR, 1)
-    assert "watch in assistive_arm.yaml" in bench.said[-1]
+    assert "supervision in assistive_arm.yaml" in bench.said[-1]
 
 
 @pytest.mark.parametrize("cycles", [4, 5])

@@ -80,7 +80,7 @@ def test_no_joint_follows_a_false_position_while_its_drive_is_being_enabled(
 
 def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_places(bench: Bench) -> None:
     falsify(until_told_to_enable(bench), word=SWITCHED_ON, position=0.1)
-    bench.run((CONFIG.watch.cycles - 1) * PERIOD_S)
+    bench.run((CONFIG.supervision.cycles - 1) * PERIOD_S)
     assert bench.state is State.ENABLING
     bench.cycle()
     assert (bench.state, bench.codes[-1]) == (State.FAULT, Code.POSITION_JUMPED)
@@ -91,7 +91,7 @@ def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_p
 def test_false_positions_that_do_not_follow_each_other_are_not_added_up(bench: Bench) -> None:
     bench.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     until_told_to_enable(bench)
-    for _ in range(2 * CONFIG.watch.cycles):
+    for _ in range(2 * CONFIG.supervision.cycles):
         end = falsify(bench, axis=1, position=0.1)
         bench.cycle()
         end()
@@ -116,7 +116,7 @@ def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(be
     bench.wait(lambda: bench.log[-1].drives[0].statusword & 0x6F == 0x27)
     turned = bench.models[0].mechanics
     turned.inertia, turned.velocity = 1e5, 0.9
-    bench.until(State.EMERGENCY_STOP, (CONFIG.watch.cycles + 3) * PERIOD_S)
+    bench.until(State.EMERGENCY_STOP, (CONFIG.supervision.cycles + 3) * PERIOD_S)
     assert bench.codes[-1] is Code.OVER_SPEED
 
 
@@ -214,7 +214,7 @@ def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not
     end()
     assert {cycle.drives[1].target for cycle in bench.log[before:]} == {20150}
     falsify(bench, axis=1, word=SWITCHED_ON, position=1.98)
-    bench.until(State.FAULT, 2 * CONFIG.watch.cycles * PERIOD_S)
+    bench.until(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
     assert bench.codes[-1] is Code.POSITION_JUMPED
     assert bench.said[-1].startswith("joint2 was followed to 2.015 rad while being enabled and is suddenly at 1.98 rad")
 

@@ -8,8 +8,7 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from rtcp.config.operation import InputConfig
-from rtcp.config.stops import StopsConfig
+from rtcp.config.model import InputConfig, StopsConfig
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import TABLE, Code, Command, Event, State
 from rtcp.ipc.messages import Sentences

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from kinematics.forward import forward
-from rtcp.config.motion_points import Stop
+from rtcp.config.model import Stop
 from rtcp.gateway.planner import Planner
 from rtcp.ipc.codes import Code, MotionMode, Refusal
 from rtcp.ipc.machine import Command

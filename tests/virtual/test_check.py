@@ -12,7 +12,7 @@ from rtcp.virtual.check import check_segment
 MISTAKES = {
     "its form": (
         "slaves:\n- model: diewu-io\n- model: cubemars-orh70\n  drift: 3\n",
-        ["4: slaves[1].drift: this key is not known here; did you mean drift_ppm?"],
+        ["4: slaves[1].drift: this key does not exist; did you mean drift_ppm?"],
     ),
     "an unknown model": (
         "slaves:\n- model: diewu-io\n- model: toaster\n",

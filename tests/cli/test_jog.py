@@ -1,4 +1,4 @@
-"""`rtcp jog` and `rtcp joystick`: what lasts only as long as a key, or as a time."""
+"""`rtcp jog` and `rtcp joystick`: motion while a key is held, or for a time."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.cli.keys import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey
-from rtcp.cli.renewal import Renewal
+from rtcp.cli.keyboard import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey, RenewalCheck
 
 pytestmark = pytest.mark.alone
 
@@ -58,55 +57,42 @@ def terminal(rtcp_process: Callable[..., Any]) -> Iterator[Callable[..., Termina
         os.close(one.master)
 
 
-# -- keys -----------------------------------------------------------------------------------------------------------
+# -- held keys ------------------------------------------------------------------------------------------------------
+
+SOON, LATE = 0.9 * RELEASED_AFTER_S, 1.1 * RELEASED_AFTER_S
 
 
-def test_a_tap_is_not_held() -> None:
+@pytest.mark.parametrize(
+    ("presses", "at", "held"),
+    [
+        ([("x", 0.0)], 0.01, ""),
+        ([("x", 0.0), ("x", 0.6), ("x", 0.64)], 0.64 + SOON, "x"),
+        ([("x", 0.0), ("x", 0.6), ("x", 0.64)], 0.64 + LATE, ""),
+        ([("x", 0.0), ("x", 0.6), ("x", 0.6 + LATE)], 0.61 + LATE, ""),
+        ([("x", 0.0), ("x", 1.1 * REPEATS_WITHIN_S)], 1.1 * REPEATS_WITHIN_S, ""),
+        ([("x", 0.0), ("x", 0.6), ("y", 0.65)], 0.66, ""),
+    ],
+    ids=["a tap", "repeated", "released", "a tap after the release", "two taps", "another key"],
+)
+def test_a_key_is_held_from_its_first_repetition_until_shortly_after_its_last(
+    presses: list[tuple[str, float]], at: float, held: str
+) -> None:
     key = HeldKey()
-    key.press("x", 0.0)
-    assert key.held(0.01) == ""
-
-
-def test_a_key_is_held_from_its_first_repetition_until_shortly_after_its_last() -> None:
-    key = HeldKey()
-    for at in (0.0, 0.6, 0.64, 0.68):
-        key.press("x", at)
-    assert key.held(0.68 + 0.9 * RELEASED_AFTER_S) == "x"
-    assert key.held(0.68 + 1.1 * RELEASED_AFTER_S) == ""
-
-
-def test_a_press_after_the_release_is_a_tap_again() -> None:
-    key = HeldKey()
-    for at in (0.0, 0.6, 0.64, 0.64 + 1.5 * RELEASED_AFTER_S):
-        key.press("x", at)
-    assert key.held(0.64 + 1.6 * RELEASED_AFTER_S) == ""
-
-
-def test_two_taps_far_apart_are_no_repetition() -> None:
-    key = HeldKey()
-    key.press("x", 0.0)
-    key.press("x", 1.1 * REPEATS_WITHIN_S)
-    assert key.held(1.1 * REPEATS_WITHIN_S) == ""
-
-
-def test_another_key_lets_go_of_the_first() -> None:
-    key = HeldKey()
-    for at in (0.0, 0.6, 0.64):
-        key.press("x", at)
-    key.press("y", 0.65)
-    assert key.held(0.66) == ""
+    for name, now in presses:
+        key.press(name, now)
+    assert key.held(at) == held
 
 
 # -- a process that was suspended ----------------------------------------------------------------------------------
 
 
-def test_a_silence_longer_than_a_word_counts_is_told_once() -> None:
-    renewal = Renewal(0.25)
-    assert [renewal.missed(at) for at in (7.0, 7.25, 7.75, 8.0)] == [0.0, 0.0, 0.5, 0.0]
+def test_a_renewal_is_overdue_once_when_it_comes_later_than_a_command_is_valid() -> None:
+    renewal = RenewalCheck(0.25)
+    assert [renewal.overdue(at) for at in (7.0, 7.25, 7.75, 8.0)] == [0.0, 0.0, 0.5, 0.0]
 
 
 def suspend(process: Any, seconds: float, meanwhile: Callable[[], None] = lambda: None) -> None:
-    """Stop a process as nothing can prevent, and let it go on."""
+    """Stop a process with SIGSTOP, and continue it."""
     process.send_signal(signal.SIGSTOP)
     os.waitpid(process.pid, os.WUNTRACED)
     meanwhile()
@@ -117,11 +103,11 @@ def suspend(process: Any, seconds: float, meanwhile: Callable[[], None] = lambda
 @pytest.mark.parametrize(
     ("command", "verb", "last", "words"),
     [
-        (("jog", "joint1", "0.1"), "jog", "halt", "the arm had stopped, and stays so"),
-        (("joystick", "forward"), "stick", "stick", "it had been let go, and stays so"),
+        (("jog", "joint1", "0.1"), "jog", "halt", "the arm had stopped and stays stopped"),
+        (("joystick", "forward"), "stick", "stick", "it was released and stays released"),
     ],
 )
-def test_what_was_suspended_ends_and_moves_nothing_again(
+def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
     platform: Any,
     rtcp_process: Callable[..., Any],
     wait_until: Callable[..., None],
@@ -136,19 +122,19 @@ def test_what_was_suspended_ends_and_moves_nothing_again(
     suspend(held, 0.6, lambda: counts.append(settled(lambda: len(platform.asked(verb)))))
     _, trouble = held.communicate()
     assert held.returncode == 5
-    assert f"the {verb} was not said again for 0." in trouble
+    assert f"the {command[0]} was not renewed for 0." in trouble
     assert words in trouble
     assert len(platform.asked(verb)) == counts[0]
     assert platform.requests[-1]["do"] == last
 
 
 def settled(count: Callable[[], int]) -> int:
-    """Return a count once the other thread has taken what had been sent."""
+    """Return a count once the other thread has received what had been sent."""
     time.sleep(0.1)
     return count()
 
 
-def test_a_jog_carries_the_instant_at_which_it_was_wanted(platform: Any, rtcp: Callable[..., Any]) -> None:
+def test_a_jog_carries_the_instant_at_which_it_was_requested(platform: Any, rtcp: Callable[..., Any]) -> None:
     before = time.monotonic()
     rtcp("jog", "x", "0.1", "--seconds", "0.1")
     instants = [one["t"] for one in platform.asked("jog")]
@@ -156,15 +142,15 @@ def test_a_jog_carries_the_instant_at_which_it_was_wanted(platform: Any, rtcp: C
 
 
 def hold_until(keyboard: Terminal, key: bytes, met: Callable[[], bool]) -> None:
-    """Hold a key until `met`: how soon that is, a shared host decides."""
+    """Hold a key until `met`, which takes longer on a busy host."""
     for _ in range(100):
         keyboard.hold(key, 0.2)
         if met():
             return
-    raise AssertionError("the key was held in vain")
+    raise AssertionError("the condition was not met")
 
 
-def test_keys_that_were_typed_while_the_process_was_suspended_move_nothing(
+def test_keys_typed_while_the_process_was_suspended_move_nothing(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("jog", "joint1", "0.1")
@@ -182,12 +168,12 @@ def test_keys_that_were_typed_while_the_process_was_suspended_move_nothing(
     # One may have been on its way: the platform refuses it by its instant.
     assert len(platform.asked("jog")) <= counts[0] + 1
     assert all(one["t"] < suspended + 0.1 for one in platform.asked("jog"))
-    assert "the keys were not looked at for" in keyboard.process.stdout.readline()
+    assert "the keyboard was not read for" in keyboard.process.stdout.readline()
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > counts[0])
     assert keyboard.quit() == 0
 
 
-def test_arrows_that_were_typed_while_the_process_was_suspended_are_no_stick(
+def test_arrows_typed_while_the_process_was_suspended_are_ignored(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("joystick")
@@ -215,7 +201,7 @@ def test_arrows_that_were_typed_while_the_process_was_suspended_are_no_stick(
         (("JOINT6", "-.2"), "joints", [0, 0, 0, 0, 0, -0.2]),
     ],
 )
-def test_a_jog_for_a_time_is_said_again_and_again_and_ends_in_a_halt(
+def test_a_jog_for_a_time_is_renewed_and_ends_in_a_halt(
     platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], frame: str, speeds: list[float]
 ) -> None:
     ended = rtcp("jog", *arguments, "--seconds", "0.4")
@@ -228,21 +214,21 @@ def test_a_jog_for_a_time_is_said_again_and_again_and_ends_in_a_halt(
 
 
 WRONG = {
-    "an axis that is none": (("w", "0.1", "--seconds", "1"), "'w' is no axis: x, y, z, rx, ry, rz, or joint1"),
+    "an unknown axis": (("w", "0.1", "--seconds", "1"), "'w' is not an axis: x, y, z, rx, ry, rz, or joint1"),
     "a joint beyond the last": (("joint7", "0.1", "--seconds", "1"), "joint7 does not exist: joint1 to joint6"),
-    "a joint before the first": (("joint0", "0.1", "--seconds", "1"), "'joint0' is no axis"),
-    "a speed that is none": (("x", "fast", "--seconds", "1"), "'fast' is not a number (m/s)"),
-    "no speed": (("x", "0", "--seconds", "1"), "speed 0 is not allowed"),
-    "a speed without bound": (("rz", "inf", "--seconds", "1"), "speed inf is not allowed: a finite number of rad/s"),
-    "a frame that is none": (("x", "1", "--seconds", "1", "--frame", "world"), "--frame world is not known"),
-    "a time that is none": (("x", "1", "--seconds", "nan"), "--seconds nan is not allowed"),
+    "a joint before the first": (("joint0", "0.1", "--seconds", "1"), "'joint0' is not an axis"),
+    "not a number": (("x", "fast", "--seconds", "1"), "'fast' is not a number (m/s)"),
+    "no speed": (("x", "0", "--seconds", "1"), "SPEED 0 is not allowed"),
+    "an infinite speed": (("rz", "inf", "--seconds", "1"), "SPEED: inf is not finite; a finite number of rad/s"),
+    "an unknown frame": (("x", "1", "--seconds", "1", "--frame", "world"), "--frame world is not known"),
+    "not a time": (("x", "1", "--seconds", "nan"), "--seconds nan is not allowed"),
     "a time too long": (("x", "1", "--seconds", "61"), "at most 60"),
     "a misspelt option": (("x", "1", "--second", "1"), "--second"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), WRONG.values(), ids=WRONG.keys())
-def test_a_jog_that_is_none_is_refused_in_a_sentence(
+def test_a_wrong_argument_of_a_jog_is_refused_by_name(
     platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], sentence: str
 ) -> None:
     ended = rtcp("jog", *arguments)
@@ -253,7 +239,7 @@ def test_a_jog_that_is_none_is_refused_in_a_sentence(
 @pytest.mark.parametrize(
     ("command", "words"), [(("jog", "x", "0.1"), "give --seconds N"), (("joystick",), "give a position")]
 )
-def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
+def test_without_a_terminal_a_duration_or_position_is_required(
     platform: Any, rtcp_process: Callable[..., Any], command: tuple[str, ...], words: str
 ) -> None:
     ended = rtcp_process(*command)
@@ -262,7 +248,7 @@ def test_without_a_terminal_and_a_time_there_is_nothing_to_hold(
     assert words in trouble
 
 
-def test_a_stick_that_would_be_suspended_is_let_go_and_ended(
+def test_a_suspended_joystick_is_released_and_ends(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     held = rtcp_process("joystick", "forward", "--seconds", "50")
@@ -272,7 +258,7 @@ def test_a_stick_that_would_be_suspended_is_let_go_and_ended(
     assert (held.returncode, trouble) == (148, "rtcp: interrupted: the joystick is released\n")
 
 
-def test_an_interrupted_jog_closes_its_connection_and_says_that_the_arm_stops(
+def test_an_interrupted_jog_closes_its_connection_and_reports_the_stop(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     jogging = rtcp_process("jog", "x", "0.1", "--seconds", "50")
@@ -280,10 +266,10 @@ def test_an_interrupted_jog_closes_its_connection_and_says_that_the_arm_stops(
     jogging.send_signal(signal.SIGINT)
     _, trouble = jogging.communicate()
     assert jogging.returncode == 130
-    assert trouble == "rtcp: interrupted: the connection is closed, so the arm comes to a controlled stop\n"
+    assert trouble == "rtcp: interrupted: the connection is closed, the arm comes to a controlled stop\n"
 
 
-def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_let_go(
+def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_released(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("jog", "y", "0.1")
@@ -307,16 +293,14 @@ def test_a_tap_moves_nothing(platform: Any, terminal: Callable[..., Terminal]) -
     assert platform.asked("jog") == []
 
 
-def test_a_key_that_is_held_when_the_command_is_ended_moves_no_further(
-    platform: Any, terminal: Callable[..., Terminal]
-) -> None:
+def test_quitting_with_a_held_key_stops_the_arm(platform: Any, terminal: Callable[..., Terminal]) -> None:
     keyboard = terminal("jog", "joint1", "0.1")
     keyboard.hold(b" ", 0.7)
     assert keyboard.quit() == 0
     assert [request["do"] for request in platform.requests][-2:] == ["halt", "status"]
 
 
-# -- stick ----------------------------------------------------------------------------------------------------------
+# -- joystick -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -330,7 +314,7 @@ def test_a_key_that_is_held_when_the_command_is_ended_moves_no_further(
         (("byte", "61"), [], 61),
     ],
 )
-def test_a_position_is_held_for_a_time_by_saying_it_again(
+def test_a_position_is_held_for_a_time_by_renewal(
     platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], pressed: list[str], byte: int | None
 ) -> None:
     ended = rtcp("joystick", *words, "--seconds", "0.4")
@@ -343,15 +327,15 @@ def test_a_position_is_held_for_a_time_by_saying_it_again(
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (("sideways",), "'sideways' is no position of the stick"),
+        (("sideways",), "'sideways' is not a joystick position"),
         (("byte",), "byte is not allowed"),
         (("byte", "256"), "byte 256 is not allowed: one number from 0 to 255"),
         (("byte", "61", "62"), "one number from 0 to 255"),
-        (("forward", "release"), "'release' is no position"),
+        (("forward", "release"), "'release' is not a joystick position"),
         (("forward", "--seconds", "0"), "--seconds 0 is not allowed"),
     ],
 )
-def test_what_is_no_position_is_refused(
+def test_an_unknown_position_is_refused(
     platform: Any, rtcp: Callable[..., Any], words: tuple[str, ...], sentence: str
 ) -> None:
     ended = rtcp("joystick", *words)
@@ -359,7 +343,7 @@ def test_what_is_no_position_is_refused(
     assert sentence in ended.trouble
 
 
-def test_arrows_are_the_stick_and_letters_its_switches(
+def test_arrows_are_the_joystick_and_letters_its_switches(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("joystick")
@@ -386,7 +370,7 @@ def test_arrows_are_the_stick_and_letters_its_switches(
     assert keyboard.quit() == 0
 
 
-def test_a_stick_that_is_killed_is_gone_with_its_connection(
+def test_a_killed_joystick_sends_nothing_more(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     playing = rtcp_process("joystick", "forward", "--seconds", "50")
