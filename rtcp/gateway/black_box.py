@@ -13,19 +13,20 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 import rtcp
-from rtcp.gateway.blackbox_file import About, Moment, Recording, RecordingError, listed, write
-from rtcp.gateway.fault_events import AFTER_S, BEFORE_S, Fault, FaultEvents
+from rtcp.ipc.events import Event, ResetDone
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
-from rtcp.ipc.machine import TABLE, State
-from rtcp.ipc.messages import Sentences
-from rtcp.ipc.observer import Event, Observer
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import EventRecord, Observer
+from rtcp.ipc.recording import About, Moment, Recording, RecordingError, listed, write
 from rtcp.ipc.session import Session
+from rtcp.ipc.states import State
 
 SILENT_S = 1.0
 """A loop that has published nothing for so long hangs."""
@@ -33,6 +34,86 @@ _WATCHDOG = "the drives' watchdog stops them"
 _ENDED = f"ended unexpectedly; {_WATCHDOG}"
 _IN_FAULT = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 log = logging.getLogger("rtcp.blackbox")
+BEFORE_S = 10.0
+AFTER_S = 1.0
+"""A recording's time before and after the fault's instant."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What has begun: by an event of the loop, or (number 0) by its silence or end."""
+
+    time_ns: int
+    """CLOCK_REALTIME, for people."""
+    monotonic_ns: int
+    """CLOCK_MONOTONIC: it decides."""
+    what: str
+    number: int = 0
+    code: int = 0
+    """Number of the kind of the event."""
+    later: bool = False
+    """It came while a fault was on already."""
+
+
+class FaultEvents:
+    """Divides events into recordings: within one fault at most one begins in 10 s.
+
+    What comes in between is put off: the newest event of it begins a recording then, and the others are in the ten
+    seconds before that. The events' own instants decide, so that a gateway that finds old ones divides them as the one
+    before it did: those of CLOCK_MONOTONIC, because the wall clock may be set by hours just then.
+
+    Args:
+        message: returns the text of an event.
+    """
+
+    def __init__(self, message: Callable[[Event], str]) -> None:
+        self._message = message
+        self.on = False
+        """A fault is on."""
+        self._later: Fault | None = None
+        self._ends_ns = self._next_ns = 0
+        """When the newest recording ends, and from when on another may begin; CLOCK_MONOTONIC."""
+
+    def begun(self, events: Sequence[EventRecord], now_ns: int) -> list[Fault]:
+        """Return what begins a recording, of new events and of what was put off; `now_ns`: CLOCK_MONOTONIC."""
+        found: list[Fault] = []
+        for event in events:
+            found += self._due(event.monotonic_ns)
+            if isinstance(event.event, ResetDone):
+                found += self.put_off()
+                self.on = False
+            elif event.event.is_fault:
+                what = self._message(event.event)
+                found += self.met(Fault(event.time_ns, event.monotonic_ns, what, event.number, event.event.number))
+        return found + self._due(now_ns)
+
+    def put_off(self) -> list[Fault]:
+        """Return what was put off: it begins its recording now."""
+        if self._later is None:
+            return []
+        fault, self._later = self._later, None
+        self._begin(fault, max(self._next_ns, fault.monotonic_ns))
+        return [fault]
+
+    def met(self, fault: Fault) -> list[Fault]:
+        """Return what a fault begins: its own recording, or that of what was put off."""
+        fault = replace(fault, later=self.on)
+        if not self.on:
+            self.on = True
+            before = self.put_off()
+            self._begin(fault, fault.monotonic_ns)
+            return [*before, fault]
+        # A silence shows only after it has begun: no recording that began before has it.
+        if fault.monotonic_ns > self._ends_ns or not fault.number:
+            self._later = fault
+        return self._due(fault.monotonic_ns)
+
+    def _due(self, now_ns: int) -> list[Fault]:
+        return self.put_off() if now_ns >= self._next_ns else []
+
+    def _begin(self, fault: Fault, begun_ns: int) -> None:
+        self._ends_ns = fault.monotonic_ns + round(AFTER_S * 1e9)
+        self._next_ns = begun_ns + round(BEFORE_S * 1e9)
 
 
 class BlackBox:
@@ -42,16 +123,16 @@ class BlackBox:
         observer: the blackboard; it is read in another thread too.
         session: what was started.
         directory: where the files go.
-        tell: is given sentences about what was written or could not be; from any thread.
+        report: called with messages on what was written or could not be; from any thread.
     """
 
-    def __init__(self, observer: Observer, session: Session, directory: Path, tell: Callable[[str], None]) -> None:
+    def __init__(self, observer: Observer, session: Session, directory: Path, report: Callable[[str], None]) -> None:
         self._observer = observer
         self._session = session
         self._directory = directory
-        self._tell = tell
-        self._sentences = Sentences(session.config)
-        self._events = FaultEvents(self._sentences.faults, self._words)
+        self._report = report
+        self._names = Names(session.config)
+        self._events = FaultEvents(self._names.message)
         self._event = 0
         self._since = 0.0
         """When the fault that is on was seen."""
@@ -147,10 +228,7 @@ class BlackBox:
 
     def _say(self, sentence: str) -> None:
         log.error("%s", sentence)
-        self._tell(sentence)
-
-    def _words(self, event: Event) -> str:
-        return self._sentences.event(event.code, event.axis, event.value, event.limit)
+        self._report(sentence)
 
     # -- what; in the writer's thread -------------------------------------------------------------------------------
 
@@ -193,7 +271,7 @@ class BlackBox:
         else:
             sentence = f"black box: this fault is number {number} (`rtcp faults show {number}`)"
             log.info("%s: %s", sentence, path)
-            self._tell(sentence)
+            self._report(sentence)
 
     def _defect(self, what: str, error: Exception) -> None:
         log.exception("black box")
@@ -236,18 +314,18 @@ class BlackBox:
         """Return what was said in the recording's time, and what of that is lost."""
         events, texts = self._observer.events_since(0), self._observer.texts_since(0)
         # Counted from the fault, however the wall clock is set meanwhile. A text has its wall time alone.
-        said = [(event.monotonic_ns - fault.monotonic_ns, self._words(event)) for event in events]
+        said = [(event.monotonic_ns - fault.monotonic_ns, self._names.message(event.event)) for event in events]
         said += [(text.time_ns - fault.time_ns, text.sentence) for text in texts]
         said += [(0, fault.what)] if not fault.number else []
         begins_ns, ends_ns = -round(BEFORE_S * 1e9), ends_ns - fault.monotonic_ns
         notes = []
         oldest = [("events", EVENTS, one.number, one.monotonic_ns - fault.monotonic_ns) for one in events[:1]]
-        oldest += [("sentences", TEXTS, one.number, one.time_ns - fault.time_ns) for one in texts[:1]]
+        oldest += [("messages", TEXTS, one.number, one.time_ns - fault.time_ns) for one in texts[:1]]
         for name, room, number, away_ns in oldest:
             if number > 1 and away_ns > begins_ns:
                 notes.append(f"more than {room} {name} came: those before {away_ns * 1e-9:+.1f} s are lost")
         kept = sorted((one for one in said if begins_ns <= one[0] <= ends_ns), key=lambda one: one[0])
-        return tuple(Moment(fault.time_ns + away_ns, sentence) for away_ns, sentence in kept), notes
+        return tuple(Moment(fault.time_ns + away_ns, message) for away_ns, message in kept), notes
 
 
 def _place(records: npt.NDArray[np.void], fault: Fault, newest: int) -> int:
@@ -272,7 +350,7 @@ def _wall(monotonic_ns: int) -> int:
 def _state(records: npt.NDArray[np.void], at: int) -> str:
     if not len(records):
         return "unknown"
-    return TABLE[State(int(records["state"][max(at, 0)]))].words
+    return State(int(records["state"][max(at, 0)])).words
 
 
 def _silent_s(records: npt.NDArray[np.void], first: int) -> float:

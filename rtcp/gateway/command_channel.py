@@ -10,8 +10,6 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc.commands import Command
@@ -89,8 +87,8 @@ class CommandChannel:
 
     # -- what the loop shows now --------------------------------------------------------------------------------------
 
-    def record(self) -> np.void:
-        """Return the latest cycle record."""
+    def record(self) -> Any:
+        """Return the latest cycle record, a numpy record."""
         latest = self.observer.latest()
         if latest is None:
             raise RtcpError("fault", "the loop has published no cycle")
@@ -177,11 +175,15 @@ class CommandChannel:
             late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
             # The answer is a little older than the record of its cycle.
             head = await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late)
-        return await self.wait(
-            lambda: outcome() if self.observer.head > head else self.check_loop(),
-            timeout_s,
-            lambda: RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}"),
-        )
+
+        def look() -> T | None:
+            self.check_loop()
+            return outcome() if self.observer.head > head else None
+
+        def timed_out() -> RtcpError:
+            return RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
+
+        return await self.wait(look, timeout_s, timed_out)
 
     def _accepted(self, number: int) -> int | None:
         self.check_loop()
@@ -218,9 +220,7 @@ class CommandChannel:
             if not self._waiters:
                 self._has_waiters.clear()
 
-    def reaching(
-        self, wanted: State, through: frozenset[State], what: str, since: int
-    ) -> Callable[[], State | None]:
+    def reaching(self, wanted: State, through: frozenset[State], what: str, since: int) -> Callable[[], State | None]:
         """Return an outcome: the state `wanted`, reached through the states `through` only.
 
         Args:

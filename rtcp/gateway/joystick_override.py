@@ -11,8 +11,7 @@ import contextlib
 import time
 from collections.abc import Sequence
 
-from rtcp.config.model import ArmConfig, InputConfig
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL, ArmConfig, InputConfig
 from rtcp.gateway.command_channel import Caller, Json
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.ipc.errors import RtcpError

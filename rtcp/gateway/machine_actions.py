@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
 
 import numpy as np
 
@@ -28,7 +27,7 @@ from rtcp.ipc.commands import (
     Shutdown,
 )
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import Disabled, Event, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed
+from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.ipc.stop_reactions import longest_s
 

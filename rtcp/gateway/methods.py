@@ -17,8 +17,8 @@ from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 from annotated_types import Ge, Gt, Le
 
-from rtcp.config.validation import Checker
 from rtcp.config.model import Point, Stop
+from rtcp.config.validation import Checker
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
 from rtcp.gateway.joystick_override import LONGEST_HOLD_S, JoystickOverride
 from rtcp.gateway.limit_settings import LimitSettings
@@ -31,7 +31,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.message import Joints
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Session, SessionError, read_json, read_processes
-from rtcp.ipc.states import ControlMode
+from rtcp.ipc.states import ControlMode, JogFrame
 from rtcp.motion.limits import Limits
 
 HOLD_S = 0.25
@@ -201,7 +201,7 @@ class Methods:
 
     @method()
     async def zero(self, caller: Caller, joint: str, at: float = 0.0) -> Json:
-        """Define the present position of a joint as `at`, rad. Returns joint, `offset` and `before`, rad, and `file`."""
+        """Define the present position of a joint as `at`, rad. Returns `joint`, `offset`, `before`, `file`."""
         return await self.machine.zero(caller, joint, at)
 
     @method()
@@ -217,9 +217,7 @@ class Methods:
     @method()
     async def sdo_write(self, caller: Caller, slave: int, index: int, subindex: int, hex: str) -> Json:
         """Write an object of a slave, in state ready only."""
-        return await self.machine.sdo_write(
-            caller, {"slave": slave, "index": index, "subindex": subindex, "hex": hex}
-        )
+        return await self.machine.sdo_write(caller, {"slave": slave, "index": index, "subindex": subindex, "hex": hex})
 
     @method(at_once=True)
     async def limits(self, caller: Caller) -> Json:
@@ -296,7 +294,7 @@ class Methods:
         """Move the tool, m/s and rad/s along and about the axes of `frame`, or the joints, rad/s, for `hold_s`."""
         _check_age(hold_s, sent_s)
         self._check_count("velocity", velocity, len(self._config.joints) if frame == "joints" else 6)
-        command: Command = commands.Jog(velocity, commands.JogFrame[frame.upper()], hold_s)
+        command: Command = commands.Jog(velocity, JogFrame[frame.upper()], hold_s)
         if frame == "joints" and self.channel.control_mode is ControlMode.VELOCITY:
             command = commands.MoveAtVelocity(velocity, hold_s)
         return await self._streaming.send(caller, command)
@@ -335,7 +333,7 @@ class Methods:
         ]
         if held:
             fields.append(("sent_s", float | None, field(default=None)))
-        checker = Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
+        checker: Checker[Any] = Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
         return Method(kind.name, checker, call, inspect.cleandoc(kind.__doc__ or ""), streams=streams)
 
     @staticmethod
@@ -351,14 +349,14 @@ def _method_of(function: Any) -> Method:
         for name, one in inspect.signature(function).parameters.items()
         if name != "caller"
     ]
-    checker = Checker(make_dataclass(function.__name__, fields, frozen=True, kw_only=True))
+    checker: Checker[Any] = Checker(make_dataclass(function.__name__, fields, frozen=True, kw_only=True))
     return Method(function.__name__, checker, function, inspect.cleandoc(function.__doc__), **function.method_flags)
 
 
 def _parameter(hint: Any) -> Any:
     """Return the type of a parameter for a command's field: an enum goes by its names in lower case."""
     if isinstance(hint, type) and issubclass(hint, IntEnum):
-        return Literal[tuple(one.name.lower() for one in hint)]  # type: ignore[valid-type]
+        return Literal[tuple(one.name.lower() for one in hint)]
     return hint
 
 

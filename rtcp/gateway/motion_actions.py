@@ -127,9 +127,7 @@ class MotionActions:
         self._planner = planner
         self._count = len(channel.config.joints)
 
-    async def move_joints(
-        self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool
-    ) -> Json:
+    async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
         if len(q) != self._count:
             raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
@@ -161,9 +159,7 @@ class MotionActions:
             plan = await asyncio.to_thread(self._planner.trajectory, points, self._start())
             return await self._run_plan(lease, RunTrajectory, plan, "the trajectory")
 
-    async def run_path(
-        self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool
-    ) -> Json:
+    async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
         """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
         async with self._channel.lease(caller) as lease:
             if approach and stops:
@@ -210,9 +206,7 @@ class MotionActions:
         timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
         return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"))
 
-    async def _run_plan(
-        self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, what: str
-    ) -> Json:
+    async def _run_plan(self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, what: str) -> Json:
         try:
             slot = self._channel.observer.write_plan(plan.rows)
         except PlanTooLong as error:

@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from rtcp.gateway.black_box import BlackBox
 from rtcp.gateway.command_channel import Caller, Json
@@ -25,8 +24,8 @@ from rtcp.gateway.methods import Methods
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.recording import faults_directory
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.recording import faults_directory
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, log_format, stop_marker
 from rtcp.ipc.session import (
     SessionError,

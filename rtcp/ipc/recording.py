@@ -1,7 +1,8 @@
-"""A fault on disk: one `.npz` file of plain arrays, written whole or not at all, and read with distrust.
+"""Cycle records on disk: one MCAP file a fault, written whole or not at all, and read with distrust.
 
-Each field of the cycle record is an array of its own, (n,) or (n, joints): `numpy.load(file)["position"]`. `about` is a
-JSON text in bytes: what happened, when, to which arm. Nothing in it is a pickle.
+Foxglove, PlotJuggler and `ros2 bag` open them. Topic `/cycle` has a message a cycle (schema `rtcp_msgs/msg/Cycle`, the
+fields of `rtcp.ipc.layout`, in CDR), `/log` the messages of the loop (schema `foxglove.Log`); the metadata `rtcp/about`
+says what happened, when, to which arm.
 """
 
 from __future__ import annotations
@@ -9,61 +10,70 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import json
-import lzma
 import math
 import os
 import re
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib import format as npy
+import zstandard
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
 
 from rtcp.config.zero import state_directory
-from rtcp.ipc.layout import PER_JOINT, SCALARS, RecordLayout
-from rtcp.ipc.observer import record_type
+from rtcp.ipc.layout import PER_JOINT, SCALARS
 
-FORMAT = 1
+FORMAT = 2
 KEPT = 100
-"""Files: more than anyone reads, and with about 2 MB each (20 000 cycles of six joints) less disk than a film."""
-_ABOUT = "about"
+"""Files: more than anyone reads, of about 2 MB each (20 000 cycles of six joints)."""
+_ABOUT = "rtcp/about"
+_CYCLE, _LOG = "/cycle", "/log"
 _LAST = "last"
 """File with the last number that was given: none is given twice, also where its file was removed."""
-_NAME = re.compile(r"fault-(\d{1,12})-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.npz")
-_LARGEST = 1 << 26
-"""Bytes of one array, unpacked: three times a whole ring of four values for ten joints."""
+_NAME = re.compile(r"fault-(\d{1,12})-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap")
+_LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
+"""Bytes of one record of the file, and of all messages, unpacked: three times a whole ring of ten joints."""
 _JOINTS_MAX = 10
-_QUICK = 1
-"""zlib's level: half the time of the usual one, a tenth more bytes."""
-
-_DAMAGE = (ValueError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, OverflowError, RecursionError)
-"""What numpy and json make of bytes that are not theirs."""
-_NO_ARCHIVE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, NotImplementedError, RuntimeError, *_DAMAGE,
-)  # fmt: skip
-"""And zipfile, which lets through what its parts raise."""
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+"""CDR, little endian (OMG DDSI-RTPS, 10.5)."""
+_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
+          "h": ("int16", "<i2"), "I": ("uint32", "<u4"), "i": ("int32", "<i4"), "f": ("float32", "<f4"),
+          "d": ("float64", "<f8")}  # fmt: skip
+"""Struct code to the types of ROS 2 messages and of numpy."""
+_LOG_SCHEMA = {
+    "type": "object",
+    "title": "foxglove.Log",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "level": {"type": "integer"},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+    },
+}
+_INFO = 2
 
 Records = dict[str, npt.NDArray[Any]]
 
 
 class RecordingError(Exception):
-    """A recording cannot be written or read: a sentence."""
+    """A recording cannot be written or read; the message names file and defect."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A sentence of the loop and when it was said, CLOCK_REALTIME ns."""
+    """A message of the loop and its instant, CLOCK_REALTIME ns."""
 
     time_ns: int
-    sentence: str
+    message: str
 
 
 @dataclass(frozen=True)
@@ -75,7 +85,7 @@ class About:
     time_ns: int
     """Of the fault, CLOCK_REALTIME."""
     what: str
-    """The fault's first sentence."""
+    """The message of the fault."""
     before: str
     """The machine's state in the cycle before."""
     arm: str
@@ -90,7 +100,7 @@ class About:
     at: int
     """Index of the fault's cycle in the arrays; -1: there are no records."""
     notes: tuple[str, ...]
-    """What is not in it, in sentences."""
+    """What is missing, a sentence each."""
     timeline: tuple[Moment, ...]
 
     @property
@@ -141,7 +151,7 @@ def write(directory: Path, recording: Recording) -> tuple[int, Path]:
             fcntl.flock(descriptor, fcntl.LOCK_EX)
             number = _next_number(directory)
             about = replace(recording.about, number=number)
-            path = directory / f"fault-{number:06d}-{about.when:%Y-%m-%dT%H-%M-%S}.npz"
+            path = directory / f"fault-{number:06d}-{about.when:%Y-%m-%dT%H-%M-%S}.mcap"
             new = directory / f".{path.name}.new"
             try:
                 _fill(new, replace(recording, about=about))
@@ -170,15 +180,58 @@ def _next_number(directory: Path) -> int:
 
 
 def _fill(path: Path, recording: Recording) -> None:
-    about = json.dumps({"format": FORMAT, **asdict(recording.about)}).encode()
-    arrays = {_ABOUT: np.frombuffer(about, dtype=np.uint8), **recording.records}
+    about = recording.about
     with open(path, "xb") as file:
-        with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=_QUICK) as archive:
-            for name, array in arrays.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                    npy.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start("ros2", f"rtcp {about.versions.get('rtcp', '')}")
+        told = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
+        writer.add_metadata(_ABOUT, {"json": json.dumps(told)})
+        _write_cycles(writer, recording)
+        schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(_LOG_SCHEMA).encode())
+        channel = writer.register_channel(_LOG, "json", schema)
+        for moment in about.timeline:
+            sec, nsec = divmod(moment.time_ns, 1_000_000_000)
+            log = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": moment.message, "name": "rtcp"}
+            writer.add_message(channel, moment.time_ns, json.dumps(log).encode(), moment.time_ns)
+        writer.finish()
         file.flush()
         os.fsync(file.fileno())
+
+
+def _write_cycles(writer: Writer, recording: Recording) -> None:
+    about, records = recording.about, recording.records
+    kind = _message_type(len(about.joints))
+    rows = np.zeros(len(records["number"]), dtype=kind)
+    for name in rows.dtype.names or ():
+        rows[name] = records[name]
+    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", _definition(len(about.joints)))
+    channel = writer.register_channel(_CYCLE, "cdr", schema)
+    # The record's clock is CLOCK_MONOTONIC; the file's is that of the fault's instant, CLOCK_REALTIME.
+    offset_ns = about.time_ns - int(records["time_ns"][about.at]) if len(rows) else 0
+    packed, size = rows.tobytes(), kind.itemsize
+    for at, (number, time_ns) in enumerate(zip(records["number"], records["time_ns"], strict=True)):
+        data = _ENCAPSULATION + packed[at * size : (at + 1) * size]
+        when = max(int(time_ns) + offset_ns, 0)
+        writer.add_message(channel, when, data, when, int(number) & 0xFFFF_FFFF)
+
+
+def _message_type(joints: int) -> np.dtype[np.void]:
+    """Return a cycle's message: CDR aligns each number to its size, as numpy's aligned types do."""
+    fields: list[Any] = [(name, _TYPES[code][1]) for name, code in SCALARS]
+    fields += [(name, _TYPES[code][1], (joints,)) for name, code in PER_JOINT]
+    return np.dtype(fields, align=True)
+
+
+def _definition(joints: int) -> bytes:
+    """Return the same as a ROS 2 message definition."""
+    lines = [f"{_TYPES[code][0]} {name}" for name, code in SCALARS]
+    lines += [f"{_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _seconds(records: Records) -> float:
+    instants = records["time_ns"]
+    return (int(instants[-1]) - int(instants[0])) * 1e-9 if len(instants) else 0.0
 
 
 def _thin_out(directory: Path) -> None:
@@ -202,10 +255,12 @@ def listed(directory: Path) -> list[Listed]:
     found = []
     for number, path in files(directory):
         try:
-            with _opened(path) as archive:
-                about = _about(path, archive)
-                instants = _instants(path, archive)
-            seconds = (int(instants[-1]) - int(instants[0])) * 1e-9 if len(instants) else 0.0
+            with _opened(path) as file:
+                about, seconds = next(_abouts(file), (None, 0.0))
+                file.seek(-8, os.SEEK_END)
+                whole = file.read() == b"\x89MCAP0\r\n"
+            if about is None or not whole:
+                raise RecordingError(f"{path}: the file is cut off, damaged or no recording")
         except RecordingError as error:
             found.append(Listed(number, path, None, str(error)))
         else:
@@ -219,19 +274,15 @@ def read(path: Path) -> Recording:
     Raises:
         RecordingError: it is cut off, is none, or was written by another version.
     """
-    with _opened(path) as archive:
-        about = _about(path, archive)
-        records = {name: _array(path, archive, name) for name, _ in (*SCALARS, *PER_JOINT)}
-    cycles, joints = records["number"].size, len(about.joints)
-    kinds = record_type(RecordLayout(joints))
-    for name, array in records.items():
-        wanted = (cycles, *kinds[name].shape)
-        if array.shape != wanted or array.dtype != kinds[name].base:
-            found = f"{name} is {array.dtype} of the shape {array.shape}"
-            raise RecordingError(f"{path}: {found}, allowed is {kinds[name].base} of the shape {wanted}")
-    if not (0 <= about.at < cycles or (about.at == -1 and cycles == 0)):
-        raise RecordingError(f"{path}: the fault's cycle is said to be {about.at}, there are {cycles}")
-    return Recording(about, records)
+    with _opened(path) as file:
+        about, _ = next(_abouts(file), (None, 0.0))
+        if about is None:
+            raise RecordingError(f"{path}: the metadata {_ABOUT} is missing: it is no recording")
+        file.seek(0)
+        rows = _cycles(file, len(about.joints))
+    if not (0 <= about.at < len(rows) or (about.at == -1 and not len(rows))):
+        raise RecordingError(f"{path}: it gives {about.at} as the cycle of the fault, and has {len(rows)} cycles")
+    return Recording(about, {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()})
 
 
 def files(directory: Path) -> list[tuple[int, Path]]:
@@ -251,51 +302,65 @@ def files(directory: Path) -> list[tuple[int, Path]]:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
+def _opened(path: Path) -> Iterator[IO[bytes]]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            yield archive
-    except _NO_ARCHIVE as error:
-        raise RecordingError(f"{path}: the file is cut off, damaged or no recording: {error}") from error
+        with open(path, "rb") as file:
+            yield file
     except OSError as error:
         raise RecordingError(f"{path}: the file cannot be read: {error.strerror or error}") from error
+    except RecordingError:
+        raise
+    except Exception as error:
+        # The reader lets through whatever its parts, zstandard and json raise about bytes that are not theirs.
+        defect = f"{type(error).__name__} {error}".rstrip()
+        raise RecordingError(f"{path}: the file is cut off, damaged or no recording: {defect}") from error
 
 
-def _array(path: Path, archive: zipfile.ZipFile, name: str) -> npt.NDArray[Any]:
-    try:
-        member = archive.getinfo(f"{name}.npy")
-        if member.file_size > _LARGEST:
-            raise ValueError(f"{member.file_size} bytes, at most {_LARGEST} are allowed")
-        with archive.open(member) as stream:
-            found = npy.read_array(stream, allow_pickle=False)
-    except KeyError:
-        raise RecordingError(f"{path}: there is no {name} in it, it is no recording") from None
-    except _DAMAGE as error:
-        raise RecordingError(f"{path}: {name} is damaged: {error}") from error
-    return found
+def _records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """Return the records of a file, chunks unpacked and checked."""
+    left = _LARGEST
+    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD).records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        left -= record.uncompressed_size
+        size = zstandard.frame_content_size(record.data) if record.compression == "zstd" else len(record.data)
+        if size != record.uncompressed_size or left < 0 or record.compression not in ("zstd", ""):
+            raise ValueError(f"a chunk of {size} bytes, {record.uncompressed_size} announced, {left} allowed after it")
+        yield from breakup_chunk(record, validate_crc=True)
 
 
-def _instants(path: Path, archive: zipfile.ZipFile) -> npt.NDArray[np.int64]:
-    found = _array(path, archive, "time_ns")
-    if found.ndim != 1 or found.dtype != np.dtype("<i8"):
-        raise RecordingError(f"{path}: time_ns is {found.dtype} of the shape {found.shape}, allowed is a row of int64")
-    return found
+def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
+    """Return what a file says about itself, and the seconds from its first cycle to its last."""
+    for record in _records(file):
+        if isinstance(record, Metadata) and record.name == _ABOUT:
+            told = json.loads(record.metadata["json"])
+            if not isinstance(told, dict) or told.get("format") != FORMAT:
+                raise ValueError(f"allowed is format {FORMAT}")
+            yield _checked(told), float(_of(told, "seconds", float))
 
 
-def _about(path: Path, archive: zipfile.ZipFile) -> About:
-    try:
-        told = json.loads(_array(path, archive, _ABOUT).tobytes())
-        if not isinstance(told, dict) or told.get("format") != FORMAT:
-            raise ValueError(f"allowed is format {FORMAT}")
-        return _checked(told)
-    except (ValueError, KeyError, TypeError, OverflowError, OSError, RecursionError) as error:
-        raise RecordingError(f"{path}: what it says about itself is not of this version: {error}") from error
+def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
+    """Return the cycles of a file, oldest first."""
+    kind, channel, schema, found = _message_type(joints), 0, 0, []
+    for record in _records(file):
+        if isinstance(record, Schema) and record.data == _definition(joints):
+            schema = record.id
+        elif isinstance(record, Channel) and record.topic == _CYCLE and record.schema_id == schema:
+            channel = record.id
+        elif isinstance(record, Message) and record.channel_id == channel:
+            if len(record.data) != len(_ENCAPSULATION) + kind.itemsize:
+                raise ValueError(f"a cycle of {len(record.data)} bytes")
+            found.append(record.data[len(_ENCAPSULATION) :])
+    if not channel:
+        raise ValueError(f"no cycles of this version and {joints} joints")
+    return np.frombuffer(b"".join(found), dtype=kind)
 
 
 def _checked(told: Mapping[str, Any]) -> About:
     numbers = {key: _of(told, key, int) for key in ("number", "time_ns", "period_ns", "began_ns", "event", "at")}
     texts = {key: _of(told, key, str) for key in ("what", "before", "arm", "bus")}
-    moments = [Moment(_of(one, "time_ns", int), _of(one, "sentence", str)) for one in _of(told, "timeline", list)]
+    moments = [Moment(_of(one, "time_ns", int), _of(one, "message", str)) for one in _of(told, "timeline", list)]
     about = About(
         **numbers,
         **texts,
@@ -305,7 +370,7 @@ def _checked(told: Mapping[str, Any]) -> About:
         timeline=tuple(moments),
     )
     if about.period_ns <= 0 or not math.isfinite(about.when.timestamp()):
-        raise ValueError("its cycle or its time is none")
+        raise ValueError("its cycle or its time is impossible")
     return about
 
 
