@@ -306,7 +306,7 @@ def sdo_write(self: object, slave: int, index: int, subindex: int, data: bytes) 
 def joystick(
     self: object, *pressed: str, byte: int | None = None, hold_s: float = 1.0, sent_s: float | None = None
 ) -> Call[None]:
-    """Hold the joystick of the virtual IO box for `hold_s`, at most 1 s; without arguments: release it.
+    """Hold the joystick of the virtual IO box for `hold_s`, at most 1 s; nothing pressed: neutral.
 
     Args:
         pressed: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.

@@ -53,8 +53,8 @@ class JoystickOverride:
         """Whether there is a virtual IO box."""
         return self._bus == VIRTUAL and self._slave > 0
 
-    async def force(self, caller: Caller, pressed: Sequence[str], byte: int | None, hold_s: float) -> Json:
-        """Hold the joystick as `pressed` names it, or at `byte`, for `hold_s`; nothing pressed: release it.
+    async def force(self, caller: Caller, pressed: Sequence[str] | None, byte: int | None, hold_s: float) -> Json:
+        """Hold the joystick as `pressed` names it, or at `byte`, for `hold_s`; None and None: release it.
 
         Raises:
             RtcpError: `refused` where another holds it.
@@ -64,8 +64,8 @@ class JoystickOverride:
         if self._owner is not None and self._owner.connection != caller.connection:
             # What it holds ends by itself within a second.
             raise RtcpError("refused", f"the joystick is held by {self._owner.name}: wait until it is released")
-        mask, levels = forced(self._config, pressed, byte)
-        if mask == 0 or not (pressed or byte is not None):
+        mask, levels = (0, 0) if pressed is None and byte is None else forced(self._config, pressed or (), byte)
+        if mask == 0:
             await self.release()
             return {"mask": 0, "levels": 0}
         self._owner, self._until = caller, time.monotonic() + hold_s

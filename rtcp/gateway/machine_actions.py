@@ -10,7 +10,6 @@ import numpy as np
 from rtcp.config.model import ConfigError, Joint
 from rtcp.config.zero import read_zeros, store_zero, zero_file
 from rtcp.control.arm import WITH_TORQUE
-from rtcp.control.states import SETTLE_CYCLES
 from rtcp.devices.cia402 import DriveState, state_of
 from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
@@ -41,6 +40,8 @@ _HOMING = frozenset({State.HOMING})
 _RESETTABLE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
 _PARKED = (AlState.INIT, AlState.PREOP)
 """AL states in which a drive takes no process data: nothing gives it torque."""
+_SETTLE_CYCLES = 5
+"""What a drive shows is older than what it was told: so many cycles pass before it counts as without torque."""
 _CONFIRM_S = 2.0
 """How much longer than the longest stop a drive may take to show that its torque is gone."""
 _STOP_S = 30.0
@@ -271,7 +272,7 @@ class _Confirmation:
     def __init__(self, channel: CommandChannel) -> None:
         self._channel = channel
         self._config = channel.config
-        self._seen = channel.observer.head + SETTLE_CYCLES
+        self._seen = channel.observer.head + _SETTLE_CYCLES
         self._shown: np.void | None = None
         self._parked = False
 

@@ -233,12 +233,15 @@ class Methods:
     async def joystick(
         self,
         caller: Caller,
-        pressed: tuple[str, ...] = (),
+        pressed: tuple[str, ...] | None = None,
         byte: int | None = None,
         hold_s: Annotated[float, Gt(0), Le(LONGEST_HOLD_S)] = LONGEST_HOLD_S,
         sent_s: float | None = None,
     ) -> Json:
-        """Hold the joystick of the virtual IO box as `pressed` names it, or at `byte`; neither: release it."""
+        """Hold the joystick of the virtual IO box as `pressed` names it, or at `byte`; neither: release it.
+
+        `pressed`: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.
+        """
         _check_age(hold_s, sent_s)
         return await self.joystick_override.force(caller, pressed, byte, hold_s)
 

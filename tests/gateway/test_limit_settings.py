@@ -6,10 +6,10 @@ from dataclasses import replace
 from math import inf, nan
 
 import pytest
-
-from rtcp.config import default_config, load
 from rtcp.gateway.carrier import CommandFailed
 from rtcp.gateway.limit_keeper import changed
+
+from rtcp.config import default_config, load
 from rtcp.motion.limits import Values
 
 CONFIG = load(default_config())

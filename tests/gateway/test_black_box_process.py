@@ -13,15 +13,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rtcp.gateway.blackbox_file import About, listed
+from tests.runtime.played_loop import Loop
 
 from rtcp.config import default_config, load
 from rtcp.gateway import server as gateway
-from rtcp.gateway.blackbox_file import About, listed
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.codes import Code
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
-from tests.runtime.played_loop import Loop
 
 
 class Gateways:

@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from rtcp.gateway.carrier import Carrier, CommandFailed
+from rtcp.gateway.commander import Commander
+from rtcp.gateway.picture import Picture
 
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
 from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway import commander
-from rtcp.gateway.carrier import Carrier, CommandFailed
-from rtcp.gateway.commander import Commander
-from rtcp.gateway.picture import Picture
 from rtcp.ipc.machine import Code, State
 from rtcp.ipc.session import Session
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rtcp.gateway.picture import Picture
 
 from rtcp.config import default_config, load
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.gateway import picture
-from rtcp.gateway.picture import Picture
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 from rtcp.ipc.layout import FLAG_DC_LOCKED, PER_JOINT, SCALARS

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-from rtcp.config import default_config, load
 from rtcp.gateway.carrier import CommandFailed
 from rtcp.gateway.stick_forcer import forced
-from rtcp.ipc.machine import State
 from tests.runtime.played import Played, played
+
+from rtcp.config import default_config, load
+from rtcp.ipc.machine import State
 
 Q = [0.0] * 6
 MASK, LEVELS = (0x2000, 1), (0x2000, 2)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.runtime.played_loop import JOINTS, Loop
 
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.machine import Command
 from rtcp.ipc.runtime_directory import control_socket
-from tests.runtime.played_loop import JOINTS, Loop
 
 LINE_LIMIT = 65536
 

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rtcp.gateway.blackbox_file import About, Moment, Recording, RecordingError, files, listed, read, write
 
 from rtcp.gateway import blackbox_file
-from rtcp.gateway.blackbox_file import About, Moment, Recording, RecordingError, files, listed, read, write
 from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
 

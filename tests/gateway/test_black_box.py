@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rtcp.gateway.blackbox import BlackBox
+from rtcp.gateway.blackbox_file import Recording, listed, read
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.gateway import blackbox, fault_events
-from rtcp.gateway.blackbox import BlackBox
-from rtcp.gateway.blackbox_file import Recording, listed, read
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code, Command
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
