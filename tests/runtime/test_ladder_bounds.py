@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.stops_page import section
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
 from rtcp.launch.simulation import NAME, Frame, Simulation
-from docs.stops_page import section
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, bus=replace(CONFIG.bus, interface=NAME))

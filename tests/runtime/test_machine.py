@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from docs.machine_page import diagram, page
 from rtcp.gateway.robot_status import robot_status
 from rtcp.ipc.codes import Command, MotionMode
 from rtcp.ipc.layout import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
 from rtcp.ipc.machine import ALLOWED, TABLE, WITHOUT_LEASE, Event, State
-from docs.machine_page import diagram, page
 
 ROOT = Path(__file__).parents[2]
 ALLOWED_TO_MOVE = FLAG_ENABLED | FLAG_MOTION_ALLOWED
