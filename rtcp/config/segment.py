@@ -9,10 +9,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Le, MinLen
 
-from rtcp.config.document import Finding, read
+from rtcp.config.document import Finding, read, shown
 from rtcp.config.model import ConfigError
 from rtcp.config.numbers import U16, Name
-from rtcp.config.validation import Checker, shown
+from rtcp.config.validation import Checker
 
 
 @dataclass(frozen=True)
