@@ -152,7 +152,7 @@ class OfflineBus:
         self.name = offline.configuration(config).bus.interface if bus is None else bus
         if self.name == VIRTUAL:
             from rtcp.config.loader import segment_path
-            from rtcp.virtual.check import check_segment
+            from rtcp.virtual.segment import check_segment
 
             check_segment(segment_path(offline.configuration(config)))
 

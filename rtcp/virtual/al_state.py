@@ -1,22 +1,19 @@
-"""The EtherCAT state machine of a slave as tables: what may be asked for, what is checked, what a refusal is called.
+"""The EtherCAT state machine as tables, and the supervision of SYNC0.
 
-States and transitions: ETG.1000.6, 6.4.1; AL status codes: ETG.1020, table 11.
+States and transitions: ETG.1000.6, 6.4.1; AL status codes: ETG.1020, table 11; sync error counter: ETG.1020, 21.2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from itertools import pairwise
 
-from rtcp.virtual.device import Device
-from rtcp.virtual.distributed_clock import SYNC0
-from rtcp.virtual.esc import MEMORY_SIZE, Esc
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.esc import MEMORY_SIZE, Esc, SyncManager
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
-from rtcp.virtual.registers import REGISTER_SPACE, Register, State
-from rtcp.virtual.syncmanager import SyncManager
+from rtcp.virtual.protocol import REGISTER_SPACE, Register, State
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(4)
 """Sync managers of a slave with mailbox, by their use (ETG.1000.6, 5.6.7.4)."""
@@ -48,24 +45,16 @@ class AlStatusCode(IntEnum):
     INVALID_SYNC0_CYCLE = 0x0035
 
 
-@dataclass(frozen=True)
-class Parts:
-    """What a check looks at."""
-
-    esc: Esc
-    device: Device
-
-
-Check = Callable[[Parts], AlStatusCode]
+Check = Callable[[Esc, DeviceModel], AlStatusCode]
 
 
 def _in_ram(manager: SyncManager, size: int) -> bool:
     return manager.start >= REGISTER_SPACE and manager.start + size <= MEMORY_SIZE
 
 
-def check_mailboxes(parts: Parts) -> AlStatusCode:
+def check_mailboxes(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """SM0 and SM1 must be mailboxes, out and in, long enough and apart."""
-    out, in_ = parts.esc.sync_managers[MAILBOX_OUT], parts.esc.sync_managers[MAILBOX_IN]
+    out, in_ = esc.sync_managers[MAILBOX_OUT], esc.sync_managers[MAILBOX_IN]
     good = (
         all(m.enabled and m.mailbox and m.length >= MINIMUM_MAILBOX and _in_ram(m, m.length) for m in (out, in_))
         and out.master_writes
@@ -75,7 +64,7 @@ def check_mailboxes(parts: Parts) -> AlStatusCode:
     return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_MAILBOX_PREOP
 
 
-def mapped_image(device: Device, assignment: int) -> PdoImage | None:
+def mapped_image(device: DeviceModel, assignment: int) -> PdoImage | None:
     """The process image that `assignment` (0x1C12, 0x1C13) gives; None where it maps what does not exist."""
     try:
         return PdoImage.from_assignment(device.objects, assignment)
@@ -83,15 +72,15 @@ def mapped_image(device: Device, assignment: int) -> PdoImage | None:
         return None
 
 
-def check_output_mapping(parts: Parts) -> AlStatusCode:
+def check_output_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """All that 0x1C12 maps must exist."""
-    found = mapped_image(parts.device, RX_ASSIGN)
+    found = mapped_image(device, RX_ASSIGN)
     return AlStatusCode.INVALID_OUTPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
 
 
-def check_input_mapping(parts: Parts) -> AlStatusCode:
+def check_input_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """All that 0x1C13 maps must exist."""
-    found = mapped_image(parts.device, TX_ASSIGN)
+    found = mapped_image(device, TX_ASSIGN)
     return AlStatusCode.INVALID_INPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
 
 
@@ -108,46 +97,45 @@ def _fits(manager: SyncManager, length: int, master_writes: bool) -> bool:
     )
 
 
-def check_outputs(parts: Parts) -> AlStatusCode:
+def check_outputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """SM2 must be a buffer that the master writes, as long as the RxPDOs."""
-    image = mapped_image(parts.device, RX_ASSIGN)
-    good = image is not None and _fits(parts.esc.sync_managers[OUTPUTS], image.byte_length, True)
+    image = mapped_image(device, RX_ASSIGN)
+    good = image is not None and _fits(esc.sync_managers[OUTPUTS], image.byte_length, True)
     return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_OUTPUTS
 
 
-def check_inputs(parts: Parts) -> AlStatusCode:
+def check_inputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """SM3 must be a buffer that the master reads, as long as the TxPDOs."""
-    image = mapped_image(parts.device, TX_ASSIGN)
-    good = image is not None and _fits(parts.esc.sync_managers[INPUTS], image.byte_length, False)
+    image = mapped_image(device, TX_ASSIGN)
+    good = image is not None and _fits(esc.sync_managers[INPUTS], image.byte_length, False)
     return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_INPUTS
 
 
-def check_areas(parts: Parts) -> AlStatusCode:
+def check_areas(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """No two sync managers may share memory; a buffer takes its length three times."""
     areas = sorted(
-        (m.start, m.start + m.length * (1 if m.mailbox else BUFFERS)) for m in parts.esc.sync_managers if m.enabled
+        (m.start, m.start + m.length * (1 if m.mailbox else BUFFERS)) for m in esc.sync_managers if m.enabled
     )
     apart = all(first[1] <= second[0] for first, second in pairwise(areas))
     return AlStatusCode.NO_ERROR if apart else AlStatusCode.INVALID_SYNC_MANAGERS
 
 
-def check_watchdog(parts: Parts) -> AlStatusCode:
+def check_watchdog(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """A watchdog that SM2 triggers and that has a time must have a divider to count it with."""
-    esc = parts.esc
     wanted = esc.sync_managers[OUTPUTS].watchdog_trigger and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
     if wanted and not esc.get(Register.WATCHDOG_DIVIDER, 2):
         return AlStatusCode.INVALID_WATCHDOG
     return AlStatusCode.NO_ERROR
 
 
-def check_sync(parts: Parts) -> AlStatusCode:
+def check_sync(esc: Esc, device: DeviceModel) -> AlStatusCode:
     """Where SYNC pulses are on there must be SYNC0, with a cycle that the device can keep, and it must still come."""
-    dc = parts.esc.dc
+    dc = esc.dc
     if dc is None or not dc.cyclic:
         return AlStatusCode.NO_ERROR
-    if not dc.activation & SYNC0 or not dc.sync0.cycle:
+    if not dc.sync0_active or not dc.sync0.cycle:
         return AlStatusCode.INVALID_DC_SYNC
-    objects = parts.device.objects
+    objects = device.objects
     minimum = objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in objects else 0
     if isinstance(minimum, int) and dc.sync0.cycle < minimum:
         return AlStatusCode.INVALID_SYNC0_CYCLE
@@ -177,16 +165,16 @@ HELD: dict[State, tuple[tuple[tuple[Check, ...], State], ...]] = {
 }
 
 
-def first_failure(checks: tuple[Check, ...], parts: Parts) -> AlStatusCode:
+def first_failure(checks: tuple[Check, ...], esc: Esc, device: DeviceModel) -> AlStatusCode:
     """The code of the first check that fails, or NO_ERROR."""
     for check in checks:
-        code = check(parts)
+        code = check(esc, device)
         if code:
             return code
     return AlStatusCode.NO_ERROR
 
 
-def judge(state: State, wanted: int, parts: Parts) -> AlStatusCode:
+def judge(state: State, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:
     """Whether a slave in `state` may go to `wanted`, the value of AL control's low four bits."""
     if wanted not in State.__members__.values():
         return AlStatusCode.UNKNOWN_STATE
@@ -195,4 +183,79 @@ def judge(state: State, wanted: int, parts: Parts) -> AlStatusCode:
     if wanted <= state:
         return AlStatusCode.NO_ERROR
     checks = UPWARD.get((state, State(wanted)))
-    return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, parts)
+    return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, esc, device)
+
+
+MISSED, MET = 3, 1
+"""A SYNC0 window without outputs adds MISSED to the sync error counter, one with outputs subtracts MET."""
+SYNC_TYPE, CYCLE_TIME, MISSED_COUNTER, SYNC_ERROR = 1, 2, 11, 32
+TYPE_SM_EVENT, TYPE_SYNC0 = 1, 2
+OUTPUT_PARAMETERS, INPUT_PARAMETERS = 0x1C32, 0x1C33
+
+
+class SyncMonitor:
+    """Supervises SYNC0: counts the windows between two pulses that bring no outputs (ETG.1020, 21.2)."""
+
+    def __init__(self, esc: Esc, device: DeviceModel) -> None:
+        self._dc = esc.dc
+        self._device = device
+        self._came = 0
+        self._counter = 0
+        self._limit = 0
+        self._missed = 0
+        self.active = False
+        """Whether SYNC0 steps the device."""
+
+    @property
+    def running(self) -> bool:
+        """Whether SYNC0 pulses have come and will continue."""
+        return self._dc is not None and self._dc.sync0.pulses > 0 and self._dc.sync0.due is not None
+
+    def configure(self) -> None:
+        """Read from the DC activation register whether SYNC0 is used; show it in 0x1C32 and 0x1C33."""
+        sync0 = None if self._dc is None or not self._dc.sync0_active else self._dc.sync0
+        self.active = sync0 is not None and self._device.uses_sync0
+        cycle = 0 if sync0 is None or not self.active else sync0.cycle
+        for index in (OUTPUT_PARAMETERS, INPUT_PARAMETERS):
+            self._show(index, SYNC_TYPE, TYPE_SYNC0 if self.active else TYPE_SM_EVENT)
+            self._show(index, CYCLE_TIME, cycle)
+
+    def start(self) -> None:
+        """The slave enters OP: count from zero, with the limit of now (0: no limit)."""
+        self._limit = self._device.sync_error_limit
+        self._counter = 0
+        self._came = 1
+        self._show(OUTPUT_PARAMETERS, SYNC_ERROR, 0)
+
+    def stop(self) -> None:
+        """The slave left SAFE-OP."""
+        self.active = False
+
+    def outputs_came(self) -> None:
+        """A complete buffer of outputs arrived."""
+        self._came += 1
+
+    def pulse(self, on_time: bool) -> bool:
+        """SYNC0 has come; return whether the error counter is above its limit.
+
+        A pulse noticed late (the process was stopped) consumes one of the buffers that came meanwhile and is no miss.
+        """
+        if not on_time:
+            self._came = max(0, self._came - 1)
+            return False
+        if self._came:
+            self._came = 0
+            self._counter = max(0, self._counter - MET)
+            return False
+        self._counter += MISSED
+        self._missed = (self._missed + 1) & 0xFFFF
+        self._show(OUTPUT_PARAMETERS, MISSED_COUNTER, self._missed)
+        exceeded = 0 < self._limit < self._counter
+        if exceeded:
+            self._show(OUTPUT_PARAMETERS, SYNC_ERROR, 1)
+        return exceeded
+
+    def _show(self, index: int, subindex: int, value: int) -> None:
+        objects = self._device.objects
+        if (index, subindex) in objects:
+            objects[index, subindex].value = value

@@ -1,12 +1,9 @@
-"""Draws the machine's table for the docs: `python -m rtcp.telemetry.machine_drawing` writes docs/machine.md anew.
+"""The machine's table for docs/machine.md, which `python docs/generate.py` writes.
 
 A diagram (Mermaid, which the usual viewers of Markdown draw) and three tables, all from `rtcp.ipc.machine`.
 """
 
 from __future__ import annotations
-
-import sys
-from pathlib import Path
 
 from rtcp.ipc.machine import TABLE, WITHOUT_LEASE, Command, Event, Refusal, State
 
@@ -58,9 +55,8 @@ def page() -> str:
     """Return the whole page."""
     return f"""# The machine's state
 
-Drawn from the table in `rtcp/ipc/machine.py` by `python -m rtcp.telemetry.machine_drawing`; a test holds both
-together. Left out of the picture: `broken` leads to fault, `emergency` to emergency stop and `shutdown` to closing,
-from nearly everywhere.
+Made from the table in `rtcp/ipc/machine.py` by `python docs/generate.py`; a test holds both together. Left out of the
+picture: `broken` leads to fault, `emergency` to emergency stop and `shutdown` to closing, from nearly everywhere.
 
 ```mermaid
 {diagram()}
@@ -74,13 +70,3 @@ from nearly everywhere.
 
 {commands()}
 """
-
-
-def main() -> None:
-    """Write docs/machine.md of this checkout, or to the file that is named."""
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[2] / "docs" / "machine.md"
-    path.write_text(page())
-
-
-if __name__ == "__main__":
-    main()

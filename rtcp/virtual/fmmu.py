@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from rtcp.virtual.esc import Esc
-from rtcp.virtual.frame import Command
-from rtcp.virtual.registers import FMMU_COUNT, FMMU_SIZE, Register
-from rtcp.virtual.syncmanager import SyncManager
+from rtcp.virtual.esc import Esc, SyncManager
+from rtcp.virtual.protocol import FMMU_COUNT, FMMU_SIZE, Command, Register
 
 READS = frozenset((Command.LRD, Command.LRW))
 WRITES = frozenset((Command.LWR, Command.LRW))
@@ -141,7 +139,7 @@ def _exact_buffer(esc: Esc, part: Overlap) -> SyncManager | None:
     """The buffered sync manager whose whole area `part` is, if it is one."""
     for manager in esc.sync_managers:
         exact = part.aligned and part.physical == 8 * manager.start and part.bits == 8 * manager.length
-        if exact and manager.enabled and not manager.mailbox:
+        if exact and manager.enabled and not manager.mailbox and not manager.ecat_event:
             return manager
     return None
 

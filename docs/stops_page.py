@@ -1,4 +1,4 @@
-"""Writes the ladder of stops for the docs: `python -m rtcp.telemetry.stops_page` prints its section of docs/faults.md.
+"""The stop reactions for docs/faults.md, which `python docs/generate.py` writes.
 
 Bounds are those of the shipped arm, from `rtcp.ipc.stops`; the tests measure against the same ones.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import get_args, get_type_hints
 
-from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, StopsConfig
 from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
 
@@ -89,7 +88,7 @@ def section(config: ArmConfig) -> str:
     on = f"{bounds(config, Rung.HOLD)[0].way_rad:.3f} rad"
     return f"""{HEADING}
 
-Printed by `python -m rtcp.telemetry.stops_page`; a test holds both together, and others measure the bounds on the
+Made by `python docs/generate.py`; a test holds both together, and others measure the bounds on the
 device models. The figures are those of the shipped arm, for joints at full speed, from the cycle that finds the
 reason: they follow the joints' limits, `bus.lost_cycles`, 0x6085 and `watchdog_ms` of the configuration. On the bus
 `virtual` hold and watchdog last `bus.timeout_scale` times as long.
@@ -134,12 +133,3 @@ Which event takes which rung is the section `stops` of the arm's file:
   with 0: what the gripper's output was, or was switched by hand, is forgotten, and counts again when it is commanded
   after the reset. Where `gripper.closed` is `off` it is at 0 that the gripper closes, as at a loss of the supply.
 """
-
-
-def main() -> None:
-    """Print the section."""
-    print(section(load(default_config())), end="")
-
-
-if __name__ == "__main__":
-    main()

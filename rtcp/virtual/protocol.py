@@ -1,7 +1,8 @@
-"""Addresses and bits of the EtherCAT slave controller's registers (ETG.1000.4, clause 6; names as in the standard)."""
+"""Constants of the data link layer: frames, datagram commands, registers (ETG.1000.4; names as in the standard)."""
 
 from __future__ import annotations
 
+import struct
 from enum import IntEnum, IntFlag
 
 REGISTER_SPACE = 0x1000
@@ -25,6 +26,7 @@ class Register(IntEnum):
     FEATURES = 0x0008
     STATION_ADDRESS = 0x0010
     ALIAS = 0x0012
+    ESC_RESET = 0x0040
     DL_CONTROL = 0x0100
     DL_STATUS = 0x0110
     AL_CONTROL = 0x0120
@@ -96,9 +98,10 @@ class EcatEvent(IntFlag):
 
 
 # (first, last) addresses that the master may write; all others are read-only (ETG.1000.4, clause 6, access types).
-# Sync managers and the EEPROM interface restrict it further, see syncmanager.py and eeprom.py.
+# Sync managers and the EEPROM interface restrict it further, see esc.py and sii.py.
 WRITABLE = (
     (0x0010, 0x0011),
+    (0x0040, 0x0040),
     (0x0100, 0x0103),
     (0x0120, 0x0121),
     (0x0200, 0x0201),
@@ -124,6 +127,8 @@ WRITABLE_DC = (
     (0x0990, 0x0997),
     (0x09A0, 0x09A9),
 )
+ERROR_COUNTERS = ((0x0300, 0x030C), (0x030C, 0x030D), (0x030D, 0x030E), (0x0310, 0x0314))
+"""Groups of error counters, ends excluded: a write to one of a group clears the group (ET1100, 0x0300 to 0x0313)."""
 DC_SPACE = (0x0900, 0x0A00)
 """Addresses of the distributed clock unit, end excluded."""
 
@@ -149,3 +154,45 @@ FEATURE_DC = 0x0004
 FEATURE_DC_64 = 0x0008
 FEATURE_SEPARATE_FCS = 0x0080
 FEATURE_DC_SYNC_ENHANCED = 0x0100
+
+
+ETHERTYPE = 0x88A4
+ETHERNET_HEADER = 14
+VLAN_TAG = 4
+"""Bytes of an IEEE 802.1Q tag before the EtherType."""
+FRAME_HEADER = 2
+"""Bytes of the EtherCAT header: 11 bits length, 1 reserved, 4 bits type (1: datagrams)."""
+FIRST_DATAGRAM = ETHERNET_HEADER + FRAME_HEADER
+DATAGRAM_HEADER = 10
+COUNTER = 2
+"""Bytes of the working counter behind a datagram's data."""
+LENGTH_MASK = 0x07FF
+MORE_FOLLOWS = 0x8000
+CIRCULATING = 0x4000
+TYPE_DATAGRAMS = 0x1
+MAX_FRAME = 1514
+LOCAL_BIT = 0x02
+"""Bit of the source address' first byte that the first slave sets: locally administered."""
+
+HEADER = struct.Struct("<BBHHHH")
+"""Command, index, address (position or station), offset, length and flags, event request."""
+
+
+class Command(IntEnum):
+    """Datagram commands (ETG.1000.4, table 15 and following)."""
+
+    NOP = 0
+    APRD = 1
+    APWR = 2
+    APRW = 3
+    FPRD = 4
+    FPWR = 5
+    FPRW = 6
+    BRD = 7
+    BWR = 8
+    BRW = 9
+    LRD = 10
+    LWR = 11
+    LRW = 12
+    ARMW = 13
+    FRMW = 14

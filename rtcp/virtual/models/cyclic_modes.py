@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from rtcp.virtual.models.axis import Axis
+from rtcp.virtual.device import number
 from rtcp.virtual.models.cia402 import Status
 from rtcp.virtual.models.drive_objects import UNIT
-from rtcp.virtual.models.number import number
-from rtcp.virtual.models.profile import ramp
+from rtcp.virtual.models.mechanics import Axis
+from rtcp.virtual.models.profile_modes import ramp
 from rtcp.virtual.objects import ObjectDictionary
 
 # Plain ints: flag arithmetic is too slow for every step.

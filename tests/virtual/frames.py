@@ -1,50 +1,21 @@
-"""EtherCAT frames on the wire: header, datagram headers and commands (ETG.1000.4, clause 5)."""
+"""EtherCAT frames built and read by the tests."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import IntEnum
 
-ETHERTYPE = 0x88A4
-ETHERNET_HEADER = 14
-FRAME_HEADER = 2
-"""Bytes of the EtherCAT header: 11 bits length, 1 reserved, 4 bits type (1: datagrams)."""
-FIRST_DATAGRAM = ETHERNET_HEADER + FRAME_HEADER
-DATAGRAM_HEADER = 10
-COUNTER = 2
-"""Bytes of the working counter behind a datagram's data."""
-LENGTH_MASK = 0x07FF
-MORE_FOLLOWS = 0x8000
-CIRCULATING = 0x4000
-TYPE_DATAGRAMS = 0x1
-MAX_FRAME = 1514
-LOCAL_BIT = 0x02
-"""Bit of the source address' first byte that the first slave sets: locally administered."""
-
-HEADER = struct.Struct("<BBHHHH")
-"""Command, index, address (position or station), offset, length and flags, event request."""
-
-
-class Command(IntEnum):
-    """Datagram commands (ETG.1000.4, table 15 and following)."""
-
-    NOP = 0
-    APRD = 1
-    APWR = 2
-    APRW = 3
-    FPRD = 4
-    FPWR = 5
-    FPRW = 6
-    BRD = 7
-    BWR = 8
-    BRW = 9
-    LRD = 10
-    LWR = 11
-    LRW = 12
-    ARMW = 13
-    FRMW = 14
+from rtcp.virtual.protocol import (
+    COUNTER,
+    DATAGRAM_HEADER,
+    ETHERTYPE,
+    FIRST_DATAGRAM,
+    FRAME_HEADER,
+    HEADER,
+    LENGTH_MASK,
+    MORE_FOLLOWS,
+    TYPE_DATAGRAMS,
+)
 
 
 @dataclass(frozen=True)
