@@ -34,8 +34,8 @@ from rtcp.config.find import find_config
 from rtcp.config.schema import load
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, runtime_directory
-from rtcp.launch.launcher import Running, StartOptions, start
+from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
+from rtcp.launch.launcher import Platform, StartOptions, start
 from rtcp.realtime.scheduling import choose_cpu
 from rtcp.realtime.statistics import percentiles
 from rtcp.telemetry.square import SPEED_M_S, place
@@ -159,7 +159,7 @@ def platform_round(
 ) -> Round:
     """Start the platform, enable, let it run (moving or holding), stop; return what the cycle records tell."""
     options = StartOptions(config=config, cycle_us=float(cycle_us), poll=poll)
-    running: Running = start(options, lambda sentence: None)
+    running: Platform = start(options, lambda sentence: None)
     try:
         observer = Observer(blackboard_file(runtime_directory()))
         with ControlClient("benchmark") as client:

@@ -10,8 +10,8 @@ from typing import Any
 
 from rtcp.cli.output import complain
 from rtcp.ipc.client import ControlClient, ControlError
-from rtcp.ipc.paths import runtime_directory
-from rtcp.ipc.session import is_ours, read_processes
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import is_running, read_processes
 
 _PATIENCE_S = 10.0
 """For a gateway that somebody else is starting."""
@@ -50,7 +50,7 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
 
 def loop_lives() -> bool:
     """Whether the platform's loop runs, whoever answers for it."""
-    return is_ours(read_processes(runtime_directory()).loop)
+    return is_running(read_processes(runtime_directory()).loop)
 
 
 def _is_our_loop(directory: Path) -> bool:
@@ -60,7 +60,7 @@ def _is_our_loop(directory: Path) -> bool:
 
 def _replace_gateway(directory: Path, error: ControlError) -> None:
     from rtcp.launch.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
-    from rtcp.launch.running import StartError
+    from rtcp.launch.platform import StartError
 
     try:
         if process := replace_gateway(directory):

@@ -60,7 +60,7 @@ class SquareDrive:
             ControlError: as the platform ended a motion.
             CommandError: nothing moved.
         """
-        from rtcp.ipc.paths import blackboard_file, runtime_directory
+        from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
         from rtcp.telemetry.recording import recording
         from rtcp.telemetry.square import SPEED_M_S, NoSquare, judge
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code, orderly_signals
 from rtcp.config.errors import ConfigError
-from rtcp.ipc.paths import runtime_directory
+from rtcp.ipc.runtime_directory import runtime_directory
 
 if TYPE_CHECKING:
     from rtcp.launch.launcher import StartOptions
-    from rtcp.launch.running import Running
+    from rtcp.launch.platform import Platform
 
 
 def refuse_a_second_platform() -> None:
@@ -20,24 +20,24 @@ def refuse_a_second_platform() -> None:
     Raises:
         CommandError: with the process that runs.
     """
-    from rtcp.ipc.session import is_ours, read_processes
+    from rtcp.ipc.session import is_running, read_processes
 
     loop = read_processes(runtime_directory()).loop
-    if is_ours(loop):
+    if is_running(loop):
         raise CommandError(
             f"a platform runs already (loop process {loop}): `rtcp status` shows it, `rtcp stop` ends it",
             ExitCode.REFUSED,
         )
 
 
-def launch(options: StartOptions, report: Callable[[str], None]) -> Running:
+def launch(options: StartOptions, report: Callable[[str], None]) -> Platform:
     """Start the platform and return it in the state ready; `report` is given each step in one line.
 
     Raises:
         CommandError: with the launcher's sentence or the configuration's mistakes, or when a signal ended the start.
     """
     from rtcp.launch import launcher
-    from rtcp.launch.running import StartError
+    from rtcp.launch.platform import StartError
     from rtcp.virtual.check import check_segment
 
     try:
@@ -59,10 +59,12 @@ def serve(options: StartOptions, report: Callable[[str], None], announce: Callab
     Raises:
         CommandError: as `launch`.
     """
+    from rtcp.launch.supervisor import supervise
+
     with orderly_signals():
         running = launch(options, report)
         try:
             announce()
-            return running.wait(report)
+            return supervise(running, report)
         except KeyboardInterrupt:  # a signal that came before `wait` had taken them over
             return ExitCode.FAULT if running.stop(report) else ExitCode.DONE

@@ -88,7 +88,7 @@ def _outcome(ready: str) -> tuple[str, bool]:
 def _stop() -> None:
     """Stop the platform: drives disabled, slaves in INIT, processes ended."""
     from rtcp.launch import launcher
-    from rtcp.launch.running import StartError
+    from rtcp.launch.platform import StartError
 
     try:
         left = launcher.stop(report)

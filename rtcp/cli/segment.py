@@ -13,7 +13,7 @@ from rtcp.cli.arguments import refuse_old_name
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.options import Poll
 from rtcp.cli.output import emit, emit_json, report
-from rtcp.ipc.paths import listens, runtime_directory, segment_control
+from rtcp.ipc.runtime_directory import is_listening, runtime_directory, segment_control
 
 if TYPE_CHECKING:
     from rtcp.virtual.faults.client import SegmentClient
@@ -185,7 +185,7 @@ def _client(path: Path | None) -> Iterator[SegmentClient]:
 def _running() -> Path:
     directory = runtime_directory()
     usual = segment_control(directory)
-    found = [path for path in (usual, *sorted(directory.glob("segment-*.sock"))) if listens(path)]
+    found = [path for path in (usual, *sorted(directory.glob("segment-*.sock"))) if is_listening(path)]
     if not found:
         raise CommandError(f"no virtual segment is running: nothing listens at {usual}", ExitCode.NOT_RUNNING)
     if len(found) > 1:

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import report
-from rtcp.ipc.paths import (
+from rtcp.ipc.runtime_directory import (
     RuntimeDirectoryError,
     free_segment_control,
-    prepare,
+    make_runtime_directory,
     runtime_directory,
     segment_control,
 )
@@ -63,7 +63,7 @@ def _control() -> Path:
     """Return where the control socket is to be: where it is looked for, or else where nobody else's is."""
     directory = runtime_directory()
     try:
-        prepare(directory)
+        make_runtime_directory(directory)
     except RuntimeDirectoryError:
         return Path(tempfile.gettempdir()) / f"rtcp-segment-{os.getpid()}.sock"
     return free_segment_control(directory)

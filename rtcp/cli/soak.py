@@ -42,7 +42,7 @@ def _soak(
     if seed < 0:
         raise CommandError(f"--seed {seed} is not allowed: 0 or more")
     refuse_a_second_platform()
-    from rtcp.ipc.paths import runtime_directory
+    from rtcp.ipc.runtime_directory import runtime_directory
     from rtcp.ipc.session import read_processes, read_session
     from rtcp.launch.launcher import StartOptions
     from rtcp.telemetry.trials.bench import Bench
@@ -56,7 +56,7 @@ def _soak(
             directory = runtime_directory()
             found = read_processes(directory)
             pids = {"loop": found.loop, "gateway": found.gateway, "segment": found.segment}
-            with Bench(directory, read_session(directory / "session.pickle").config) as bench:
+            with Bench(directory, read_session(directory).config) as bench:
                 soak = Soak(bench, pids, seed, say)
                 try:
                     soak.run(minutes)

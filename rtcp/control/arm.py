@@ -10,12 +10,12 @@ from rtcp.control.motions import Motions
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.codes import Code
-from rtcp.motion.guards.envelope import SetPointGuard, Verdict
-from rtcp.motion.guards.guard import Guard
-from rtcp.motion.guards.watch import Watch
+from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveMode, DriveWriter
+from rtcp.motion.guards.output_limiter import OutputLimiter
+from rtcp.motion.guards.supervision import Supervision
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.modes import DriveMode, ModeLaw, PositionLaw, TorqueLaw, VelocityLaw
-from rtcp.motion.state import MotionState, Phase
+from rtcp.motion.state import ArmState, Phase
 
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
@@ -51,15 +51,15 @@ class Arm:
         self.pairs = list(drives)
         self.gripper = gripper
         self.all_drives = self.drives if gripper is None else [*self.drives, gripper.drive]
-        self.state = MotionState(len(joints))
+        self.state = ArmState(len(joints))
         self.limits = Limits(config)
-        self.guards = SetPointGuard(config, self.limits, self.period_s)
-        self.guard = Guard(self.limits, self.period_s)
-        self.motions = Motions(config, self.limits, self.guards, self.period_s)
-        self._torque_law = TorqueLaw(joints, self.period_s)
-        self._laws: dict[DriveMode, ModeLaw] = {
-            DriveMode.CSP: PositionLaw(),
-            DriveMode.CSV: VelocityLaw(joints, self.period_s),
+        self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
+        self.output_limiter = OutputLimiter(self.limits, self.period_s)
+        self.motions = Motions(config, self.limits, self.trajectory_guard, self.period_s)
+        self._torque_law = CstWriter(joints, self.period_s)
+        self._laws: dict[DriveMode, DriveWriter] = {
+            DriveMode.CSP: CspWriter(),
+            DriveMode.CSV: CsvWriter(joints, self.period_s),
             DriveMode.CST: self._torque_law,
         }
         self.set_mode(self.motions.drive_mode_of(self.motions.mode))
@@ -75,7 +75,7 @@ class Arm:
     def decode(self, data: ProcessData) -> None:
         """Take the drives' inputs."""
         state = self.state
-        actual, speed, torque = state.actual, state.speed, state.torque
+        actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
         for axis, (slot, drive) in enumerate(self.pairs):
             drive.decode(data.input(slot))
             actual[axis] = drive.position
@@ -105,7 +105,7 @@ class Arm:
     def hold_target(self) -> None:
         """Hold at the set-point that was made last, at rest from now on."""
         self.motions.rest()
-        self.guards.latch(self.state)
+        self.trajectory_guard.latch(self.state)
 
     def follow(self) -> None:
         """Let set-point and guard follow the drives that have no torque: their target is where they are.
@@ -113,32 +113,32 @@ class Arm:
         The set-point of a joint that stands outside its range is the edge of it, so that every mode begins inside; from
         where the joint is to there the guard leads its target, once the drive obeys it.
         """
-        position, latch, limits = self.state.position, self.guard.latch, self.limits
+        position, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
         for i, drive in enumerate(self.drives):
             if drive.state not in _HOLDING:
                 low, high, here = limits.low[i], limits.high[i], drive.position
                 position[i] = high if here > high else low if here < low else here
                 drive.target_position = here
                 latch(i, here)
-        self.guards.latch(self.state)
+        self.trajectory_guard.latch(self.state)
         if self.gripper is not None:
             self.gripper.follow()
 
-    def command(self) -> Verdict:
+    def command(self) -> GuardResult:
         """Write the targets of this cycle: the active mode, its guards, the law, the last clamp."""
         state, drives, mode = self.state, self.drives, self.motions.active
         target = mode.update(state, self.period_s)
-        verdict = self.guards.apply(state, target, mode.clamps)
+        verdict = self.trajectory_guard.apply(state, target, mode.tolerates_saturation)
         if mode is self.motions.torque and self.motions.torque.direct:
-            self._torque_law.pass_on(state.position, target.torque, drives)
+            self._torque_law.pass_on(state.commanded, target.torque, drives)
         else:
-            self._law.update(state.position, state.velocity, drives)
-        self.guard.check(drives)
+            self._law.update(state.commanded, state.commanded_velocity, drives)
+        self.output_limiter.check(drives)
         if self.gripper is not None:
             self.gripper.command()
         return verdict
 
-    def beyond(self, watch: Watch) -> tuple[Code, int, float, float] | None:
+    def beyond(self, watch: Supervision) -> tuple[Code, int, float, float] | None:
         """Look at what is measured of joints and gripper; return what is beyond its limit for too long, or None."""
         found = watch.look(self.state)
         if found is None and self.gripper is not None:
@@ -192,7 +192,7 @@ class Arm:
 
     def first_off_target(self) -> int:
         """Return the first joint that `follow` would take further than it can have turned since the last, or -1."""
-        followed = self.guard.last
+        followed = self.output_limiter.sent
         for axis, drive in enumerate(self.drives):
             if drive.state not in _HOLDING and not abs(drive.position - followed[axis]) <= FOLLOWED_RAD:
                 return axis
@@ -201,12 +201,12 @@ class Arm:
     def followed_to(self, axis: int) -> float:
         """Return where the drive of a joint, or of the gripper, was followed to, rad."""
         if axis < len(self.drives) or self.gripper is None:
-            return self.guard.last[axis]
+            return self.output_limiter.sent[axis]
         return self.gripper.motion.position
 
     def beyond_range(self, axis: int) -> float:
         """Return how far beyond its range the target of a joint is, from where the guard leads it back, rad, or 0."""
-        last, limits = self.guard.last[axis], self.limits
+        last, limits = self.output_limiter.sent[axis], self.limits
         return max(last - limits.high[axis], limits.low[axis] - last, 0.0)
 
     def first_led_back(self) -> int:
@@ -232,4 +232,4 @@ class Arm:
     def all_still(self) -> bool:
         """Whether the gripper's set-point stands still too, and no guard brakes: the torque may go."""
         gripper = self.gripper
-        return self.still and not self.guards.stopping and (gripper is None or not gripper.motion.moving)
+        return self.still and not self.trajectory_guard.stopping and (gripper is None or not gripper.motion.moving)

@@ -21,8 +21,8 @@ from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import TABLE, WITH_TORQUE, Code, Event, State
 from rtcp.ipc.stops import Rung
-from rtcp.motion.guards.watch import Watch
-from rtcp.motion.modes import DriveMode
+from rtcp.motion.drive_writers import DriveMode
+from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.state import Reason
 from rtcp.realtime.discipline import Discipline
 
@@ -61,7 +61,7 @@ class Behaviour:
         self._blackboard = blackboard
         self._service = service
         self._discipline = discipline
-        watch = Watch(config, arm.limits)
+        watch = Supervision(config, arm.limits)
         self.homing = HomingArm(arm, period_s)
         self._emergency = EmergencyStop(arm, service, blackboard, config)
         self._faults = Faulted(self, arm, operator, blackboard, config)
@@ -305,7 +305,7 @@ class Behaviour:
                 if arm.all_still:
                     failing.come_to_rest(Rung.QUICK_STOP)
                 return
-            if not arm.still or arm.guards.stopping:
+            if not arm.still or arm.trajectory_guard.stopping:
                 return
             self._blackboard.event(Code.STOPPED)
             arm.motions.rest()

@@ -14,8 +14,8 @@ from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
 from rtcp.ipc.stops import Rung, quick_stop_s
-from rtcp.motion.guards.envelope import Verdict
-from rtcp.motion.guards.watch import Watch
+from rtcp.motion.guards.supervision import Supervision
+from rtcp.motion.guards.trajectory_guard import GuardResult
 
 _CLOSING_S = 2.0
 TOLD_CYCLES = 5
@@ -40,7 +40,7 @@ class Closing:
         arm: Arm,
         homing: HomingArm,
         operator: Operator,
-        watch: Watch,
+        watch: Supervision,
         blackboard: Blackboard,
         config: ArmConfig,
         rungs: Mapping[Code, Rung],
@@ -129,7 +129,7 @@ class Closing:
         if arm.all_still or arm.first_not_enabled() >= 0:
             return True
         self._cycles = 0
-        if arm.command() is Verdict.STOPPED:
+        if arm.command() is GuardResult.STOPPED:
             arm.motions.rest()
         return False
 

@@ -15,8 +15,8 @@ from rtcp.control.failing import Failing
 from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code
-from rtcp.motion.guards.guard import BACK_RAD_S
-from rtcp.motion.guards.watch import Watch
+from rtcp.motion.guards.output_limiter import BACK_RAD_S
+from rtcp.motion.guards.supervision import Supervision
 
 _TOLD_RAD = 0.001
 """A joint that stands less beyond its range is led back without a word: it was at the edge, and sagged as it rested."""
@@ -33,7 +33,9 @@ class Enabling:
         blackboard: where it is told.
     """
 
-    def __init__(self, config: ArmConfig, arm: Arm, watch: Watch, failing: Failing, blackboard: Blackboard) -> None:
+    def __init__(
+        self, config: ArmConfig, arm: Arm, watch: Supervision, failing: Failing, blackboard: Blackboard
+    ) -> None:
         self._patience = round(config.enable_timeout_s / (config.cycle.period_us * 1e-6))
         self._false_cycles = config.watch.cycles
         self._false = 0
@@ -134,6 +136,6 @@ class Enabling:
         arm = self._arm
         self._count_anew()
         self._blackboard.event(Code.ENABLED)
-        distance, box = arm.guards.nearest_box(arm.state.actual)
+        distance, box = arm.trajectory_guard.nearest_box(arm.state.actual)
         if distance < 0.0:
             self._blackboard.event(Code.STANDS_IN, box, distance)

@@ -20,7 +20,7 @@ from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import TABLE, Code, Event, State
 from rtcp.ipc.stops import Rung, rungs
-from rtcp.motion.guards.watch import Watch
+from rtcp.motion.guards.supervision import Supervision
 
 if TYPE_CHECKING:
     from rtcp.control.behaviour import Behaviour
@@ -56,7 +56,7 @@ class Failing:
         homing: HomingArm,
         faulted: Faulted,
         emergency: EmergencyStop,
-        watch: Watch,
+        watch: Supervision,
         service: BusService,
         blackboard: Blackboard,
     ) -> None:
@@ -108,7 +108,7 @@ class Failing:
         # in which perhaps no joint has been heard.
         if self._behaviour.state not in _NOT_REMEMBERED:
             self.stood[:] = self._arm.state.actual
-            self.turned[:] = self._arm.state.speed
+            self.turned[:] = self._arm.state.actual_velocity
 
     def _break(self, code: Code, rung: Rung) -> None:
         self._remember()

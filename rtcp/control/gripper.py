@@ -7,7 +7,7 @@ from rtcp.config.operation import WatchConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.motion.controllers.gripper import GripperMotion
-from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED, Found
+from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED, Found
 
 _RANGE_MARGIN_RAD = 0.02
 """So far beyond its range it may stand and still be enabled, to be brought back to the edge."""

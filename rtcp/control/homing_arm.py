@@ -43,9 +43,9 @@ class HomingArm:
         """Lead a joint whose home is a little beyond its range back to the edge; return whether it is there."""
         arm, axis = self._arm, self.axis
         if arm.beyond_range(axis) > 0.0:
-            low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.position
+            low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.commanded
             position[axis] = min(max(position[axis], low), high)
-            arm.guards.latch(arm.state)
+            arm.trajectory_guard.latch(arm.state)
             arm.command()
         return arm.first_led_back() < 0
 
@@ -55,9 +55,9 @@ class HomingArm:
         if homing.ended:
             return
         homing.step()
-        arm.state.position[axis] = homing.position
-        arm.guard.latch(axis, homing.position)
-        arm.guards.latch(arm.state)
+        arm.state.commanded[axis] = homing.position
+        arm.output_limiter.latch(axis, homing.position)
+        arm.trajectory_guard.latch(arm.state)
         if arm.gripper is not None:
             arm.gripper.command()
 

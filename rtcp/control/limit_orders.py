@@ -41,17 +41,17 @@ class LimitOrders:
         new = read(self._blackboard.plan(int(slot)), int(count))
         if new is None:
             return Refusal.LIMITS_WRONG, -1, count, float(MOST_ROWS)
-        refused = arm.guards.refuses(arm.state, new)
+        refused = arm.trajectory_guard.refuses(arm.state, new)
         if refused is not None:
             return _REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
         limits = arm.limits
         if arm.first_with_torque() >= 0:
-            for axis, held in enumerate(arm.state.torque):
+            for axis, held in enumerate(arm.state.actual_torque):
                 most = new.torque[axis]
                 if most < limits.torque[axis] and abs(held) > most:
                     return Refusal.LIMITS_WEAK, axis, abs(held), most
         limits.apply(new)
-        arm.guard.take(limits)
+        arm.output_limiter.take(limits)
         arm.motions.generator.set_limits(limits.velocity, limits.acceleration, limits.jerk)
         self._blackboard.event(Code.LIMITS)
         return DONE

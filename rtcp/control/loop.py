@@ -114,7 +114,7 @@ class Loop:
             if wkc >= 0:
                 discipline.observe(woken, data.dc_time)
             else:
-                discipline.coast()
+                discipline.holdover()
             planned = discipline.next_wakeup(planned)
         finished = now()
         recorder.compute_ns = finished - received

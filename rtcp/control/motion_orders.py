@@ -14,12 +14,12 @@ from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Command, JogFrame, MotionMode, Refusal
 from rtcp.ipc.layout import PLAN_ROWS, PLANS
 from rtcp.ipc.machine import State
-from rtcp.motion.controllers.generator import LONGEST_S
-from rtcp.motion.controllers.line import LineMode
-from rtcp.motion.controllers.trajectory import TrajectoryMode
-from rtcp.motion.modes import DriveMode
+from rtcp.motion.controllers.joint_move import LONGEST_S
+from rtcp.motion.controllers.line import LineController
+from rtcp.motion.controllers.trajectory import TrajectoryController
+from rtcp.motion.drive_writers import DriveMode
 from rtcp.motion.planning.rows import Wrong
-from rtcp.motion.state import Mode, Phase
+from rtcp.motion.state import Controller, Phase
 
 MOST_PIECES = 256
 """Straight pieces of a plan: all are looked at in the cycle in which it begins."""
@@ -79,7 +79,7 @@ class MotionOrders:
             return (Refusal.NOT_PERMITTED,)
         return None
 
-    def _begin(self, lease: int, mode: Mode) -> Verdict:
+    def _begin(self, lease: int, mode: Controller) -> Verdict:
         behaviour = self._behaviour
         going_on = behaviour.state is State.MOVING and self._arm.motions.active is mode and behaviour.lease == lease
         self._arm.motions.active = mode
@@ -109,7 +109,7 @@ class MotionOrders:
             return Refusal.SPEED, -1, speed, fastest
         if wrong := self._in_range(numbers, limits.low, limits.high):
             return wrong
-        box = arm.guards.zone_at(self._numbers)
+        box = arm.trajectory_guard.zone_at(self._numbers)
         if box is not None:
             return Refusal.ZONE, box, 0.0
         generator = arm.motions.generator
@@ -123,7 +123,9 @@ class MotionOrders:
             return None
         return int(slot), int(count)
 
-    def _carry_out(self, lease: int, numbers: Sequence[float], mode: TrajectoryMode | LineMode, most: int) -> Verdict:
+    def _carry_out(
+        self, lease: int, numbers: Sequence[float], mode: TrajectoryController | LineController, most: int
+    ) -> Verdict:
         if hindrance := self._hindered(*AUTOMATIC):
             return hindrance
         rows = self._rows(numbers, most)
@@ -143,7 +145,7 @@ class MotionOrders:
         line = self._arm.motions.line
         return (Refusal.NO_GEOMETRY,) if line is None else self._carry_out(lease, numbers, line, MOST_PIECES)
 
-    def _goes_on(self, mode: Mode) -> bool:
+    def _goes_on(self, mode: Controller) -> bool:
         return self._arm.motions.active is mode and mode.phase is Phase.MOVE and self._behaviour.state is State.MOVING
 
     def _stream(self, lease: int, numbers: Sequence[float]) -> Verdict:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.codes import MotionMode
-from rtcp.motion.controllers.generator import JointGenerator
-from rtcp.motion.controllers.jog import JogMode
-from rtcp.motion.controllers.line import LineMode
-from rtcp.motion.controllers.stream import StreamMode
-from rtcp.motion.controllers.torque import TorqueMode
-from rtcp.motion.controllers.trajectory import TrajectoryMode
-from rtcp.motion.controllers.velocity import VelocityMode
-from rtcp.motion.guards.envelope import SetPointGuard
+from rtcp.motion.controllers.jog import JogController
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.controllers.line import LineController
+from rtcp.motion.controllers.stream import StreamController
+from rtcp.motion.controllers.torque import TorqueController
+from rtcp.motion.controllers.trajectory import TrajectoryController
+from rtcp.motion.controllers.velocity import VelocityController
+from rtcp.motion.drive_writers import DriveMode
+from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.modes import DriveMode
-from rtcp.motion.state import Mode, MotionState, Phase
+from rtcp.motion.state import ArmState, Controller, Phase
 
 DRIVE_MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
 
@@ -25,19 +25,21 @@ class Motions:
     Args:
         config: the arm.
         limits: its limits as they are now.
-        guards: what the modes ask whether they would be cut.
+        trajectory_guard: what the modes ask whether they would be cut.
         period_s: the cycle, s.
     """
 
-    def __init__(self, config: ArmConfig, limits: Limits, guards: SetPointGuard, period_s: float) -> None:
-        self.generator = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self.trajectory = TrajectoryMode(limits, period_s)
-        self.stream = StreamMode(limits, period_s)
-        self.velocity = VelocityMode(limits, period_s)
-        self.torque = TorqueMode(config.joints, limits, period_s, config.arm)
-        self.line = None if config.arm is None else LineMode(config.arm, limits, period_s, config.cartesian.singularity)
-        self.jog = None if config.arm is None else JogMode(config, config.arm, limits, guards, period_s)
-        self.active: Mode = self.generator
+    def __init__(self, config: ArmConfig, limits: Limits, trajectory_guard: TrajectoryGuard, period_s: float) -> None:
+        self.generator = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self.trajectory = TrajectoryController(limits, period_s)
+        self.stream = StreamController(limits, period_s)
+        self.velocity = VelocityController(limits, period_s)
+        self.torque = TorqueController(config.joints, limits, period_s, config.arm)
+        self.line = (
+            None if config.arm is None else LineController(config.arm, limits, period_s, config.cartesian.singularity)
+        )
+        self.jog = None if config.arm is None else JogController(config, config.arm, limits, trajectory_guard, period_s)
+        self.active: Controller = self.generator
         self.mode = MotionMode[config.motion.upper()]
         """What the arm takes commands for."""
         self.drive_mode = DRIVE_MODES[config.mode]
@@ -63,7 +65,7 @@ class Motions:
             self.jog.hold()
         self.active = self.generator
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Let what moves come to rest."""
         if self.active.phase is Phase.MOVE:
             self.active.stop(state)

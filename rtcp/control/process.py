@@ -30,9 +30,8 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.ending import LEFT, write_end
-from rtcp.ipc.paths import blackboard_file
-from rtcp.ipc.session import Session, SessionError, read_session
+from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, read_session, write_exit_report
 from rtcp.ipc.stops import quick_stop_s
 from rtcp.realtime import scheduling
 
@@ -68,8 +67,8 @@ class Report:
 def main() -> int:
     """Run the loop's process.
 
-    Return 0 after an orderly end, `LEFT` where slaves did not come to INIT then, 2 where the bus refused, 1 after a
-    defect of ours.
+    Return 0 after an orderly end, `EXIT_INCOMPLETE` where slaves did not come to INIT then, 2 where the bus refused,
+    1 after a defect of ours.
     """
     parser = argparse.ArgumentParser(prog="rtcp.control.process")
     parser.add_argument("--directory", type=Path, required=True)
@@ -77,7 +76,7 @@ def main() -> int:
     given = parser.parse_args()
     report = Report(given.ready_fd)
     try:
-        session = read_session(given.directory / "session.pickle")
+        session = read_session(given.directory)
     except SessionError as error:
         report.tell("error", sentences=[str(error)])
         sys.stderr.write(f"{error}\n")
@@ -100,9 +99,9 @@ def main() -> int:
         before = len(bus.notes)
         bus.close()
         left += bus.notes[before:]
-        write_end(given.directory, os.getpid(), left)
+        write_exit_report(given.directory, os.getpid(), left)
         sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
-    return LEFT if left else 0
+    return EXIT_INCOMPLETE if left else 0
 
 
 def _leave(number: int, frame: FrameType | None) -> None:

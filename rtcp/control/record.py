@@ -121,7 +121,7 @@ class Recorder:
             counter,
             behaviour.fault,
             behaviour.limit,
-            arm.guard.held | arm.guards.held,
+            arm.output_limiter.held | arm.trajectory_guard.held,
             behaviour.enables,
             behaviour.moves,
             mode.elapsed_s,
@@ -129,7 +129,7 @@ class Recorder:
         )
         at = len(_AT)
         n = len(arm.drives)
-        target = arm.state.position
+        target = arm.state.commanded
         for i, drive in enumerate(arm.drives):
             values[at + i] = drive.position
             values[at + n + i] = drive.velocity

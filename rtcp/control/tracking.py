@@ -11,7 +11,7 @@ from rtcp.control.operator import Operator
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.machine import Code, Event, State
 from rtcp.ipc.stops import Rung
-from rtcp.motion.guards.envelope import Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.state import Reason
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class Tracking:
             return False
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         verdict = arm.command()
-        if verdict is Verdict.PASS and arm.motions.active.reason is Reason.NONE:
+        if verdict is GuardResult.PASS and arm.motions.active.reason is Reason.NONE:
             return True
         return self._cut(verdict)
 
@@ -112,7 +112,7 @@ class Tracking:
             failing.fail(Code.LEFT_RANGE, outside, arm.all_drives[outside].position)
         else:
             # Before its home a drive does not know where it is: what can be told from its old zero is kept to.
-            if not homing.leaves and (box := arm.guards.zone_at(arm.state.actual)) is not None:
+            if not homing.leaves and (box := arm.trajectory_guard.zone_at(arm.state.actual)) is not None:
                 self._blackboard.event(Code.HOMING_ZONE, box)
                 homing.stop()
             return True
@@ -134,23 +134,29 @@ class Tracking:
         gripper.stop()
         return False
 
-    def _cut(self, verdict: Verdict) -> bool:
+    def _cut(self, verdict: GuardResult) -> bool:
         """Deal with a guard that cut the target, or a mode that ends by itself; return False when the state changed."""
         arm, mode, state = self._arm, self._arm.motions.active, self._behaviour.state
         reason = mode.reason
         if reason is Reason.GENERATOR:
             self._failing.fail(Code.GENERATOR)
             return False
-        if verdict is Verdict.STOPPING or verdict is Verdict.STOPPED:
-            guards = arm.guards
-            limited = not mode.clamps
+        if verdict is GuardResult.STOPPING or verdict is GuardResult.STOPPED:
+            guards = arm.trajectory_guard
+            limited = not mode.tolerates_saturation
             if state in (State.MOVING, State.HOLDING) or (limited and not self.limited):
                 self._end(guards.code, guards.axis, guards.value, guards.limit, limited)
-            if verdict is Verdict.STOPPED:
+            if verdict is GuardResult.STOPPED:
                 arm.motions.rest()
             return False
         if reason is not Reason.NONE and state is State.MOVING:
-            self._end(reason, mode.axis, mode.value, mode.limit, not mode.clamps and reason not in _ENDS_BY_ITSELF)
+            self._end(
+                reason,
+                mode.axis,
+                mode.value,
+                mode.limit,
+                not mode.tolerates_saturation and reason not in _ENDS_BY_ITSELF,
+            )
             return False
         return True
 

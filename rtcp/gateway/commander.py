@@ -17,7 +17,7 @@ from rtcp.gateway.carrier import MOVING, POLL_S, Carrier, CommandFailed
 from rtcp.ipc.codes import Code, MotionMode
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.stops import longest_s
-from rtcp.motion.modes import DriveMode
+from rtcp.motion.drive_writers import DriveMode
 
 DRIVE_MODES: dict[str, int] = {mode.name.lower(): mode for mode in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST)}
 MOTION_MODES: dict[str, int] = {mode.name.lower(): mode for mode in MotionMode}

@@ -12,7 +12,7 @@ from typing import Any
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.carrier import Carrier, CommandFailed
 from rtcp.ipc.machine import Command
-from rtcp.ipc.paths import limits_file
+from rtcp.ipc.runtime_directory import limits_file
 from rtcp.motion.limits import LEAST_PART, Corners, Limits, Values, rows
 
 _JOINT_KEYS = {

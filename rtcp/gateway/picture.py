@@ -16,7 +16,7 @@ from rtcp.ipc.machine import TABLE, Code, State
 from rtcp.ipc.messages import EMERGENCIES, Sentences
 from rtcp.ipc.motion_messages import STICK_MODES, motion_name
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.session import Processes, Session, is_ours
+from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.realtime.statistics import SlidingPercentiles
 
 MODE_NAMES = {8: "csp", 9: "csv", 10: "cst"}
@@ -254,7 +254,7 @@ class Picture:
             "pids": {
                 "loop": processes.loop if self.loop_lives else 0,
                 "gateway": processes.gateway,
-                "segment": processes.segment if is_ours(processes.segment) else 0,
+                "segment": processes.segment if is_running(processes.segment) else 0,
             },
             "messages": [sentence for _, sentence in list(self.messages)[-_TOLD:]],
             "events": [{"time": _iso(at), "sentence": sentence} for at, sentence in list(self.messages)[-_TOLD:]],

@@ -26,19 +26,18 @@ from rtcp.gateway.carrier import CommandFailed, Progress
 from rtcp.gateway.held import Caller
 from rtcp.gateway.picture import Picture
 from rtcp.gateway.verbs import Verb, Verbs
-from rtcp.ipc.ending import end_of
-from rtcp.ipc.journal import log_format
 from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.paths import blackboard_file, control_socket, stopping_mark
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, log_format, stop_marker
 from rtcp.ipc.session import (
     SessionError,
-    end,
-    forget_processes,
-    is_ours,
+    exit_problems,
+    is_running,
+    processes_file,
     read_json,
     read_processes,
     read_session,
-    wait_gone,
+    terminate,
+    wait_for_exit,
 )
 
 _FOLLOW_S = 0.02
@@ -60,7 +59,7 @@ class Gateway:
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
-        session = read_session(directory / "session.pickle")
+        session = read_session(directory)
         self._observer = Observer(blackboard_file(directory))
         started = read_json(directory / "started.json", dict)
         self._picture = Picture(self._observer, session, started)
@@ -233,26 +232,26 @@ class Gateway:
 
     async def _stop(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
         processes = read_processes(self._directory)
-        lived = is_ours(processes.loop)
+        lived = is_running(processes.loop)
         if processes.loop and not lived:
             # It has died before it was told to, and whoever saw that was quicker here than its end.
             self._loop_has_ended()
         self._box.end_is_wanted()
-        stopping_mark(self._directory).touch(mode=0o600)
+        stop_marker(self._directory).touch(mode=0o600)
         if self._picture.loop_lives:
             with contextlib.suppress(BlackboardError):
                 await self._arm.commander.shut_down()
             # The blocking waits run beside, so that this process goes on answering `status`.
-            if not await asyncio.to_thread(wait_gone, processes.loop, 6.0):
-                await asyncio.to_thread(end, processes.loop, 4.0)
-        await asyncio.to_thread(end, processes.segment, 3.0)
+            if not await asyncio.to_thread(wait_for_exit, processes.loop, 6.0):
+                await asyncio.to_thread(terminate, processes.loop, 4.0)
+        await asyncio.to_thread(terminate, processes.segment, 3.0)
         if self._following is not None:
             self._following.cancel()
         await asyncio.to_thread(self._box.finish)
         blackboard_file(self._directory).unlink(missing_ok=True)
-        forget_processes(self._directory)
+        processes_file(self._directory).unlink(missing_ok=True)
         self._stopping = True
-        return {"left": list(end_of(self._directory, processes.loop, lived))}
+        return {"left": list(exit_problems(self._directory, processes.loop, lived))}
 
 
 async def _read_line(reader: asyncio.StreamReader) -> bytes | None:

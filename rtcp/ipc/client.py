@@ -12,8 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, cast
 
-from rtcp.ipc.paths import control_socket, runtime_directory
-from rtcp.ipc.session import is_ours, read_processes
+from rtcp.ipc.runtime_directory import control_socket, runtime_directory
+from rtcp.ipc.session import is_running, read_processes
 
 ErrorKind = Literal["refused", "fault", "timeout", "invalid", "internal", "not running", "lost"]
 Progress = Callable[[Mapping[str, Any]], None]
@@ -183,7 +183,7 @@ def _connect(path: Path) -> socket.socket:
 
 def _who_runs(path: Path) -> str:
     loop = read_processes(path.parent).loop
-    if is_ours(loop):
+    if is_running(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
     return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
 

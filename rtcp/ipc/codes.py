@@ -22,7 +22,7 @@ class Command(IntEnum):
     MOTION = 9
     """[`MotionMode`]: what the arm takes commands for."""
     TRAJECTORY = 10
-    """[slot, knots]"""
+    """[slot, waypoints]"""
     LINE = 11
     """[slot, pieces]"""
     STREAM = 12

@@ -1,215 +1,217 @@
-"""What the processes of one running platform know of each other: small files in the runtime directory."""
+"""The processes of one running platform and what the launcher hands them: JSON files in the runtime directory.
+
+The loop's process reads the session and writes its exit report; psutil is loaded only where processes are looked up.
+"""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
-import pickle
-import signal
 import stat
+import sys
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import rtcp
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.paths import processes_file, starts_file
+from rtcp.config.serialization import plain, typed
+
+if TYPE_CHECKING:
+    import psutil
 
 T = TypeVar("T")
 
+EXIT_INCOMPLETE = 3
+"""Exit code of a loop that ended by itself but could not leave every slave in INIT with its drive disabled."""
+_KILL_TIMEOUT_S = 2.0
+_POLL_S = 0.01
+
 
 class SessionError(Exception):
-    """A file of the runtime directory is not there, damaged or another user's: a sentence."""
+    """A file of the runtime directory is missing, damaged or not to be trusted; the message names it."""
+
+
+# -- processes --------------------------------------------------------------------------------------------------
 
 
 class Pid(int):
-    """A process id and when its process started, ticks since boot: together they are no later process's."""
+    """A process id with the start of its process, s since boot; a later process with the same id differs."""
 
-    started: int
+    started: float
 
-    def __new__(cls, number: int, started: int = 0) -> Pid:
-        """Make it of both; `identify` finds out when a process started."""
+    def __new__(cls, number: int, started: float = 0.0) -> Pid:
+        """Combine both; `identify` looks up the start."""
         made = super().__new__(cls, number)
         made.started = started
         return made
 
 
-NONE = Pid(0)
+NO_PROCESS = Pid(0)
 
 
 def identify(number: int) -> Pid:
-    """Return the pid of a process that is known to be there: a child, or the caller."""
-    return Pid(number, _stat(number)[1])
+    """Return the identity of a process that exists: a child, or the caller."""
+    import psutil  # here and below: the loop's process must not load it
+
+    try:
+        return Pid(number, _started(number))
+    except psutil.Error:
+        return Pid(number)
+
+
+def is_running(pid: int) -> bool:
+    """Return whether this very process runs; a zombie, or a later process with the same id, does not count."""
+    return _find(pid) is not None
+
+
+def terminate(pid: Pid, timeout_s: float) -> bool:
+    """Send SIGTERM, after `timeout_s` SIGKILL; return whether SIGTERM was enough. Never signals another process."""
+    process = _find(pid)
+    if process is None:
+        return True
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        process.terminate()
+        if wait_for_exit(pid, timeout_s):
+            return True
+        process.kill()
+        wait_for_exit(pid, _KILL_TIMEOUT_S)
+        return False
+    return True
+
+
+def wait_for_exit(pid: Pid, timeout_s: float) -> bool:
+    """Wait until the process has exited; return whether it has. Does not reap it: its exit code stays its parent's."""
+    until = time.monotonic() + timeout_s
+    while is_running(pid):
+        if time.monotonic() > until:
+            return False
+        time.sleep(_POLL_S)
+    return True
+
+
+def _find(pid: int) -> psutil.Process | None:
+    if not isinstance(pid, Pid) or pid <= 0:
+        return None
+    import psutil
+
+    try:
+        process = psutil.Process(pid)
+        ended = process.status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+        return None if ended or _started(pid) != pid.started else process
+    except psutil.Error:
+        return None
+
+
+def _started(number: int) -> float:
+    """Return when a process started, s since boot: unlike psutil's own time, a step of the wall clock leaves it."""
+    import psutil
+
+    while True:  # psutil keeps the first answer of each `Process`
+        boot = psutil.boot_time()
+        started = psutil.Process(number).create_time() - boot
+        if psutil.boot_time() == boot:
+            return round(started, 2)
 
 
 @dataclass
 class Processes:
-    """Process ids; 0: there is none."""
+    """The platform's processes; `NO_PROCESS` where there is none."""
 
-    loop: Pid = NONE
-    gateway: Pid = NONE
-    segment: Pid = NONE
+    loop: Pid = NO_PROCESS
+    gateway: Pid = NO_PROCESS
+    segment: Pid = NO_PROCESS
 
     def write(self, directory: Path) -> None:
-        """Write `processes.json`, and beside it when each process started; each whole or not at all."""
-        # Ids without their starts are nobody's: the starts come first.
-        _replace(starts_file(directory), {str(pid): pid.started for pid in vars(self).values()})
-        _replace(processes_file(directory), vars(self))
+        """Replace `processes.json`, whole or not at all."""
+        started = {name: pid.started for name, pid in vars(self).items()}
+        _replace(processes_file(directory), {**vars(self), "started": started})
+
+
+def processes_file(directory: Path) -> Path:
+    """Return the path of the file that names the processes: `{"loop": 12, ..., "started": {"loop": 3.45, ...}}`."""
+    return directory / "processes.json"
 
 
 def read_processes(directory: Path) -> Processes:
-    """Return the processes that the files name; none where they are absent or damaged."""
+    """Return the processes that `processes.json` names; none where it is missing or damaged."""
     try:
-        numbers = json.loads(processes_file(directory).read_text())
-        starts = json.loads(starts_file(directory).read_text())
-        names = [field.name for field in fields(Processes)]
-        return Processes(*(Pid(int(numbers[name]), int(starts.get(str(numbers[name]), 0))) for name in names))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError):
+        found = json.loads(processes_file(directory).read_text())
+        return Processes(*(Pid(int(found[one.name]), float(found["started"][one.name])) for one in fields(Processes)))
+    except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError):
         return Processes()
 
 
-def forget_processes(directory: Path) -> None:
-    """Remove what `Processes.write` wrote."""
-    for path in (processes_file(directory), starts_file(directory)):
-        path.unlink(missing_ok=True)
-
-
-def is_ours(pid: int) -> bool:
-    """Whether the process lives (a zombie does not) and is the one that was written down, no later bearer of its id."""
-    if not isinstance(pid, Pid) or pid <= 0:
-        return False
-    state, started = _stat(pid)
-    return state not in "ZX" and started == pid.started
-
-
-def end(pid: Pid, patience_s: float) -> bool:
-    """End a process of ours by SIGTERM, after `patience_s` by SIGKILL; return whether it ended itself."""
-    if not is_ours(pid):
-        return True
-    _signal(pid, signal.SIGTERM)
-    if wait_gone(pid, patience_s):
-        return True
-    _signal(pid, signal.SIGKILL)
-    wait_gone(pid, 2.0)
-    return False
-
-
-def wait_gone(pid: Pid, patience_s: float) -> bool:
-    """Wait until the process is gone; return whether it is."""
-    until = time.monotonic() + patience_s
-    while is_ours(pid):
-        if time.monotonic() > until:
-            return False
-        time.sleep(0.01)
-    return True
-
-
-def _signal(pid: Pid, number: signal.Signals) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        held = os.pidfd_open(pid)
-        try:
-            # What is held stays the same process from here on, whatever becomes of its id.
-            if is_ours(pid):
-                signal.pidfd_send_signal(held, number)
-        finally:
-            os.close(held)
-
-
-def _stat(number: int) -> tuple[str, int]:
-    """Return a process's state and start, ticks since boot (proc_pid_stat(5), fields 3 and 22); X where it is gone."""
-    try:
-        # Field 2, the name, may hold spaces and brackets.
-        fields = Path(f"/proc/{number}/stat").read_text(errors="replace").rpartition(")")[2].split()
-        return fields[0], int(fields[19])
-    except (OSError, IndexError):
-        return "X", 0
-
-
-def _replace(path: Path, content: dict[str, int]) -> None:
+def _replace(path: Path, content: object) -> None:
     fresh = path.with_suffix(".new")
     fresh.write_text(json.dumps(content))
     fresh.replace(path)
 
 
+# -- the session ------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Session:
-    """What the launcher hands to the loop and the gateway, through a file that only their user can write."""
+    """What the launcher hands to the loop and the gateway."""
 
     config: ArmConfig
     bus: str
     interface: str
     segment_pid: int
     began_ns: int
-    """When the start was asked for, CLOCK_MONOTONIC."""
+    """When the start was requested, CLOCK_MONOTONIC."""
     state: Path | None = None
-    """Directory of what outlives a restart, whoever starts a gateway later; None: as its environment has it."""
+    """Directory of persistent state, also for a gateway that is started later; None: from its environment."""
     segment_control: Path | None = None
     """Control socket of the virtual segment that was started with it; None: there is none."""
 
-    def write(self, path: Path) -> None:
-        """Write the file, for its user alone: whoever reads it runs what it says."""
+    def write(self, directory: Path) -> None:
+        """Write the session file with mode 0600."""
+        path = session_file(directory)
         path.unlink(missing_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
-        with open(descriptor, "wb") as file:
-            file.write(pickle.dumps((_form(self), self)))
+        with open(descriptor, "w") as file:
+            json.dump({"version": rtcp.__version__, "session": plain(self)}, file)
 
 
-def read_session(path: Path) -> Session:
+def session_file(directory: Path) -> Path:
+    """Return the path of the session file."""
+    return directory / "session.json"
+
+
+def read_session(directory: Path) -> Session:
     """Read what `Session.write` wrote.
 
     Raises:
-        SessionError: the file is not there, is damaged or of another version, or others may write it.
+        SessionError: the file is missing, damaged or of another version, or others may write to it.
     """
+    path = session_file(directory)
     try:
-        with open(path, "rb") as file:
-            owned = os.fstat(file.fileno())
-            if owned.st_uid not in (0, os.geteuid()) or owned.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-                raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
-            found = pickle.load(file)
+        owner = path.stat()
     except OSError as error:
         raise SessionError(f"{path} cannot be read: {error.strerror}") from error
-    except SessionError:
-        raise
-    except Exception as error:
-        # What a damaged pickle leads to is not told by its documentation.
-        raise SessionError(f"{path} is damaged ({type(error).__name__}: {error})") from error
-    form, session = found if isinstance(found, tuple) and len(found) == 2 else ("", found)
-    if not isinstance(session, Session):
-        raise SessionError(f"{path} holds no session")
-    if form != _form(session):
-        raise SessionError(f"{path} was written by another version of rtcp: it is not read by this one")
-    return session
-
-
-def _form(session: Session) -> str:
-    """Return a digest of the version and all fields in it: pickle takes what an older class made without a word."""
-    seen: dict[str, list[str]] = {}
-
-    def look(value: object) -> None:
-        if is_dataclass(value):
-            kind = type(value)
-            seen[f"{kind.__module__}.{kind.__qualname__}"] = [f"{one.name}: {one.type}" for one in fields(value)]
-            for one in vars(value).values():
-                look(one)
-        elif isinstance(value, tuple | list | set | frozenset):
-            for one in value:
-                look(one)
-        elif isinstance(value, Mapping):
-            look(tuple(value.items()))
-
-    look(session)
-    return hashlib.sha256(json.dumps([rtcp.__version__, seen], sort_keys=True).encode()).hexdigest()
+    if owner.st_uid not in (0, os.geteuid()) or owner.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise SessionError(f"{path} is another user's, or others may write to it: it is not read")
+    found = read_json(path, dict)
+    if found.get("version") != rtcp.__version__:
+        raise SessionError(f"{path} was written by another version of rtcp: it is not read by {rtcp.__version__}")
+    try:
+        return typed(Session, found.get("session"))
+    except ValueError as error:
+        raise SessionError(f"{path} is damaged: {error}") from error
 
 
 def read_json(path: Path, kind: type[T]) -> T:
-    """Read a file of the runtime directory that holds a `kind` as JSON.
+    """Read a JSON file of the runtime directory whose outermost value is a `kind`.
 
     Raises:
-        SessionError: the file is not there or is damaged.
+        SessionError: the file is missing or damaged.
     """
     try:
         found = json.loads(path.read_text())
@@ -220,3 +222,47 @@ def read_json(path: Path, kind: type[T]) -> T:
     if not isinstance(found, kind):
         raise SessionError(f"{path} is damaged: found {type(found).__name__}, allowed is {kind.__name__}")
     return found
+
+
+# -- the loop's exit report -------------------------------------------------------------------------------------
+
+
+def _exit_report(directory: Path) -> Path:
+    return directory / "ended.json"
+
+
+def remove_exit_report(directory: Path) -> None:
+    """Remove the report of an earlier loop, before a new one starts."""
+    _exit_report(directory).unlink(missing_ok=True)
+
+
+def write_exit_report(directory: Path, pid: int, problems: Sequence[str]) -> None:
+    """Record that the loop `pid` has left the bus, and what it could not leave in order."""
+    path = _exit_report(directory)
+    try:
+        _replace(path, {"pid": pid, "left": list(problems)})
+    except OSError as error:
+        # Without a report the end counts as a crash, which is the safe side.
+        with contextlib.suppress(OSError):
+            sys.stderr.write(f"{path} cannot be written: {error.strerror}\n")
+
+
+def exit_problems(directory: Path, loop: Pid, was_running: bool) -> tuple[str, ...]:
+    """Return in sentences what a loop did not leave with drives disabled and slaves in INIT.
+
+    Args:
+        directory: the runtime directory.
+        loop: the loop's process; `NO_PROCESS`: there was none.
+        was_running: whether it ran when its end was requested.
+    """
+    if not loop:
+        return ()
+    with contextlib.suppress(SessionError):
+        report = read_json(_exit_report(directory), dict)
+        left = report.get("left")
+        if report.get("pid") == loop and isinstance(left, list):
+            return tuple(str(sentence) for sentence in left)
+    if is_running(loop):
+        return (f"the loop (process {loop}) does not end, also not by SIGKILL: its drives were left to their watchdog",)
+    fate = "did not end in time and was killed" if was_running else "had ended before, and not in order"
+    return (f"the loop (process {loop}) {fate}: its drives were left to their watchdog",)

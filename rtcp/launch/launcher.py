@@ -23,19 +23,27 @@ from rtcp.fieldbus.interface import check_name
 from rtcp.gateway.blackbox import BlackBox
 from rtcp.gateway.blackbox_file import faults_directory
 from rtcp.ipc.client import LONGEST_SOCKET_PATH, ControlError
-from rtcp.ipc.ending import forget_end
-from rtcp.ipc.lock import Busy, alone
 from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.paths import (
+from rtcp.ipc.runtime_directory import (
+    LockHeld,
     RuntimeDirectoryError,
     blackboard_file,
     control_socket,
-    prepare,
+    exclusive,
+    make_runtime_directory,
     runtime_directory,
-    stopping_mark,
+    stop_marker,
 )
-from rtcp.ipc.session import Processes, Session, SessionError, is_ours, read_processes, read_session
-from rtcp.launch.running import Report, Running, StartError, clear, end_platform, undisturbed
+from rtcp.ipc.session import (
+    Processes,
+    Session,
+    SessionError,
+    is_running,
+    read_processes,
+    read_session,
+    remove_exit_report,
+)
+from rtcp.launch.platform import Platform, Report, StartError, clear, end_platform, undisturbed
 
 CheckSegment = Callable[[Path], object]
 """Raises ConfigError where no segment can be made of the file. Which models there are is known to `rtcp.virtual`."""
@@ -59,18 +67,18 @@ STOP_WAITS_S = 30.0
 
 
 @contextlib.contextmanager
-def _alone(directory: Path, patience_s: float = 0.0, waits: Callable[[], None] | None = None) -> Iterator[None]:
+def _locked(directory: Path, patience_s: float = 0.0, waits: Callable[[], None] | None = None) -> Iterator[None]:
     """Hold the directory's lock: two starts at once would each find nothing running."""
     try:
-        with alone(directory, patience_s, waits):
+        with exclusive(directory, patience_s, waits):
             yield
-    except Busy:
+    except LockHeld:
         waited = f", for {patience_s:g} s and more" if patience_s else ""
         sentence = f"another process starts or stops the platform of {directory}{waited}: this one has done nothing"
         raise StartError(sentence, "refused") from None
 
 
-def start(options: StartOptions, report: Report, check_segment: CheckSegment = load_segment) -> Running:
+def start(options: StartOptions, report: Report, check_segment: CheckSegment = load_segment) -> Platform:
     """Start the platform; return when all slaves are in OP and the control socket listens.
 
     Args:
@@ -92,12 +100,12 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
             "usage",
         )
     try:
-        prepare(directory)
+        make_runtime_directory(directory)
     except RuntimeDirectoryError as error:
         raise StartError(str(error), "usage") from None
-    with _alone(directory, START_WAITS_S):
+    with _locked(directory, START_WAITS_S):
         _record_unseen_end(directory, report)
-        stopping_mark(directory).unlink(missing_ok=True)
+        stop_marker(directory).unlink(missing_ok=True)
         adopted = _adopt(directory, options, report)
         if adopted is None:
             config = _configured(options)
@@ -109,11 +117,11 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
     return running
 
 
-def _adopt(directory: Path, options: StartOptions, report: Report) -> tuple[Running, int] | None:
+def _adopt(directory: Path, options: StartOptions, report: Report) -> tuple[Platform, int] | None:
     """Deal with what an earlier start left: refuse, give a lone loop its gateway back, or clear remnants away."""
     found = read_processes(directory)
-    if is_ours(found.loop):
-        if is_ours(found.gateway):
+    if is_running(found.loop):
+        if is_running(found.gateway):
             raise StartError(
                 f"the platform is running already (loop process {found.loop}): `rtcp status`, `rtcp stop`", "refused"
             )
@@ -132,12 +140,12 @@ def _adopt(directory: Path, options: StartOptions, report: Report) -> tuple[Runn
 def _record_unseen_end(directory: Path, report: Report) -> None:
     """Have the black box record a loop that died while there was no gateway, before what it left is cleared away."""
     found = read_processes(directory)
-    if not found.loop or any(is_ours(pid) for pid in (found.loop, found.gateway)) or stopping_mark(directory).exists():
+    if not found.loop or any(is_running(pid) for pid in (found.loop, found.gateway)) or stop_marker(directory).exists():
         return
     try:
         with contextlib.closing(Observer(blackboard_file(directory))) as observer:
             if observer.loop_pid == found.loop:
-                session = read_session(directory / "session.pickle")
+                session = read_session(directory)
                 box = BlackBox(observer, session, faults_directory(session.state), report)
                 box.loop_had_ended()
                 box.finish()
@@ -149,13 +157,13 @@ def _record_unseen_end(directory: Path, report: Report) -> None:
         report(f"the end of the loop (process {found.loop}) was not recorded: {why}")
 
 
-def _with_gateway(directory: Path, found: Processes) -> tuple[Running, int]:
+def _with_gateway(directory: Path, found: Processes) -> tuple[Platform, int]:
     """Begin a loop's new gateway; return the pipe on which it says that it is ready too."""
     try:
-        session = read_session(directory / "session.pickle")
+        session = read_session(directory)
     except SessionError as error:
         raise StartError(f"{error}: `rtcp stop`, then start anew", "fault") from error
-    running = Running(directory, session.config, found, session.state)
+    running = Platform(directory, session.config, found, session.state)
     return running, running.begin_gateway()
 
 
@@ -165,15 +173,15 @@ def replace_gateway(directory: Path) -> int:
     Raises:
         StartError: while a start or stop is under way (`refused`), or where it does not become ready.
     """
-    with _alone(directory):
+    with _locked(directory):
         found = read_processes(directory)
-        if not is_ours(found.loop) or is_ours(found.gateway) or stopping_mark(directory).exists():
+        if not is_running(found.loop) or is_running(found.gateway) or stop_marker(directory).exists():
             return 0
         running, reading = _with_gateway(directory, found)
     try:
         running.await_gateway(reading)
     except StartError:
-        if is_ours(found.loop) and not stopping_mark(directory).exists():
+        if is_running(found.loop) and not stop_marker(directory).exists():
             raise
         return 0  # the platform was stopped meanwhile, and the gateway with it
     return running.processes.gateway
@@ -212,11 +220,11 @@ def _check_bus(config: ArmConfig, check_segment: CheckSegment) -> None:
 
 def _start_all(
     directory: Path, config: ArmConfig, options: StartOptions, began_ns: int, report: Report
-) -> Running:  # fmt: skip
+) -> Platform:  # fmt: skip
     bus = config.bus.interface
     state = state_directory().absolute()
-    running = Running(directory, config, Processes(), state)
-    forget_end(directory)
+    running = Platform(directory, config, Processes(), state)
+    remove_exit_report(directory)
     for log in directory.glob("*.log"):
         # Of an earlier start, kept until the next; a gateway that is replaced goes on with its own.
         log.replace(log.with_name(f"{log.name}.1"))
@@ -227,7 +235,7 @@ def _start_all(
             interface, segment = str(facts["interface"]), int(facts["pid"])
             report(f"segment of {facts['slaves']} virtual slaves (process {segment})")
         session = Session(config, bus, interface, segment, began_ns, state, running.segment_control)
-        session.write(directory / "session.pickle")
+        session.write(directory)
         running.start_loop(report)
         running.start_gateway()
     except BaseException:
@@ -248,13 +256,13 @@ def stop(report: Report) -> tuple[str, ...]:
     """
     directory = runtime_directory()
     found = read_processes(directory)
-    if not any(is_ours(pid) for pid in (found.loop, found.gateway, found.segment)):
+    if not any(is_running(pid) for pid in (found.loop, found.gateway, found.segment)):
         raise ControlError("not running", f"no platform is running (runtime directory {directory})")
 
     def waits() -> None:
         report(f"another process starts or stops the platform: waiting for it, at most {STOP_WAITS_S:g} s")
 
-    with _alone(directory, STOP_WAITS_S, waits):
+    with _locked(directory, STOP_WAITS_S, waits):
         _record_unseen_end(directory, report)
         now = read_processes(directory)  # a gateway may have been replaced meanwhile
         # Another stop may have ended it all: how the loop ended then is to be told all the same.

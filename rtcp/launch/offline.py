@@ -6,15 +6,18 @@ library must not take the command with it. `virtual` starts a segment for as lon
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rtcp.config.virtual import VIRTUAL
@@ -105,7 +108,7 @@ def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str
 def _question(question: Mapping[str, Any]) -> dict[str, Any]:
     """Put one question to a child process and return its answer."""
     child = subprocess.Popen(
-        [sys.executable, "-m", "rtcp.launch.offline_child"],
+        [sys.executable, "-m", "rtcp.launch.offline"],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -190,3 +193,74 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     for stream in (process.stdin, process.stdout, process.stderr):
         if stream is not None:
             stream.close()
+
+
+# -- the process that opens the bus: a JSON object on standard input, one on standard output ------------------------
+
+
+def answer(question: dict[str, Any]) -> dict[str, Any]:
+    """Open the bus, ask, close it.
+
+    Args:
+        question: `interface`, `namespace_pid` (None: our own namespaces), `do` and the arguments of that.
+
+    Returns:
+        `slaves`, `hex` or nothing, as was asked; or `error`, a sentence, and its `kind`.
+
+    Raises:
+        BusError: as the bus raises it.
+    """
+    from rtcp.fieldbus.soem import SoemBus  # here: the command itself does without SOEM
+
+    bus = SoemBus(question["interface"], namespace_pid=question["namespace_pid"])
+    bus.open()
+    try:
+        slaves = bus.scan()
+        if question["do"] == "scan":
+            return {"slaves": [dataclasses.asdict(slave) for slave in slaves]}
+        position, index, subindex = question["slave"], question["index"], question["subindex"]
+        if not 1 <= position <= len(slaves):
+            return {
+                "error": f"no slave at position {position}: the bus {question['interface']} has {len(slaves)}",
+                "kind": "invalid",
+            }
+        if question["do"] == "sdo_read":
+            return {"hex": bus.sdo_read(position, index, subindex).hex()}
+        bus.sdo_write(position, index, subindex, bytes.fromhex(question["hex"]))
+        return {}
+    finally:
+        bus.close()
+
+
+def _plain(value: object) -> object:
+    """Turn what JSON does not know into what it does: bytes into hex, sets and enums into lists and names."""
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, set | frozenset):
+        return sorted(value)
+    return str(value)
+
+
+def main() -> int:
+    """Answer the question on standard input; errors of the bus are answers too."""
+    # An interrupted command ends this process: the bus is closed on the way out.
+    signal.signal(signal.SIGTERM, _leave)
+    from rtcp.fieldbus.errors import BusError, SdoAborted
+
+    question = json.loads(sys.stdin.buffer.read())
+    try:
+        found = answer(question)
+    except SdoAborted as error:
+        found = {"error": str(error), "kind": "refused"}
+    except BusError as error:
+        found = {"error": str(error), "kind": "fault"}
+    print(json.dumps(found, default=_plain), flush=True)
+    return 0
+
+
+def _leave(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

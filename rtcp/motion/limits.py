@@ -137,7 +137,7 @@ class Limits:
     def check(self, new: Values, position: list[float], velocity: list[float]) -> Refused | None:
         """Return why `new` cannot come into force for an arm at `position` (rad) with `velocity` (rad/s), or None.
 
-        The boxes are compared with the configuration's only; where the arm is in them `SetPointGuard.refuses` says.
+        The boxes are compared with the configuration's only; where the arm is in them `TrajectoryGuard.refuses` says.
         """
         if len(new.low) != len(self.low):
             return Refused(Wrong.NO_LIMIT, -1, float(len(new.low)), float(len(self.low)))

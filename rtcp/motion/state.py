@@ -16,27 +16,36 @@ class Phase(IntEnum):
     """On the way to rest under its limits, having been told to stop."""
 
 
-class MotionState:
+class ArmState:
     """The arm as a mode sees it at the beginning of a cycle; lists have one number a joint, rad, rad/s, rad/s^2, Nm.
 
-    `position`, `velocity`, `acceleration` are what was commanded in the last cycle, after the guards: a mode that goes
-    on from them is continuous whatever the guards did. `actual`, `speed`, `torque` are measured.
+    `commanded`, `commanded_velocity`, `commanded_acceleration` are those of the last cycle, after the guards: a
+    controller that continues from them is continuous whatever the guards did. `actual`, `actual_velocity`,
+    `actual_torque` are measured.
     """
 
-    __slots__ = ("acceleration", "actual", "now_ns", "position", "speed", "torque", "velocity")
+    __slots__ = (
+        "actual",
+        "actual_torque",
+        "actual_velocity",
+        "commanded",
+        "commanded_acceleration",
+        "commanded_velocity",
+        "now_ns",
+    )
 
     def __init__(self, joints: int) -> None:
-        self.position = [0.0] * joints
-        self.velocity = [0.0] * joints
-        self.acceleration = [0.0] * joints
+        self.commanded = [0.0] * joints
+        self.commanded_velocity = [0.0] * joints
+        self.commanded_acceleration = [0.0] * joints
         self.actual = [0.0] * joints
-        self.speed = [0.0] * joints
-        self.torque = [0.0] * joints
+        self.actual_velocity = [0.0] * joints
+        self.actual_torque = [0.0] * joints
         self.now_ns = 0
         """Instant of the cycle, CLOCK_MONOTONIC or simulated time."""
 
 
-class Target:
+class Setpoint:
     """What a mode wants of this cycle: set-points of the next, rad and rad/s; `torque`: Nm that is added in CST."""
 
     __slots__ = ("position", "torque", "velocity")
@@ -73,9 +82,9 @@ class Reason(IntEnum):
     """The trajectory generator refused its input: a defect."""
 
 
-class Mode(Protocol):
+class Controller(Protocol):
     """A mode of motion. One `update` a cycle while it is the active one; nothing in it allocates without bound, blocks
-    or logs. It is started by its own method from a `MotionState`, and begins at the state's position, velocity and
+    or logs. It is started by its own method from a `ArmState`, and begins at the state's position, velocity and
     acceleration.
     """
 
@@ -89,12 +98,12 @@ class Mode(Protocol):
     elapsed_s: float
     duration_s: float
     """Progress; 0 and 0 where there is none to tell."""
-    clamps: bool
+    tolerates_saturation: bool
     """True where a guard that cuts the target is the way the mode works (jogging, velocity); False where it means that
     the motion cannot go on, and is stopped."""
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle, `dt` s later. The target is the mode's own and used up at once."""
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Come to rest under the limits: phase STOP, then HOLD. Does nothing at rest."""

@@ -74,7 +74,7 @@ class Discipline:
         """Take in one frame: the master's time just before sending and the reference's when it passed."""
         if reference_ns == self._reference:
             # The reference slave did not answer: what came back is what was sent.
-            self.coast()
+            self.holdover()
             self._standing += 1
             if self._standing == UNHEARD_CYCLES:
                 self.locked = False
@@ -110,7 +110,7 @@ class Discipline:
         self.filtered_ns += _SHOWN_GAIN * (min(max(residual, -period / 2), period / 2) - self.filtered_ns)
         self._judge()
 
-    def coast(self) -> None:
+    def holdover(self) -> None:
         """Let a cycle pass without an observation (no frame came back)."""
         if self.aligned:
             self._difference += self._rate

@@ -19,7 +19,8 @@ import pytest
 
 from rtcp.config.find import default_config
 from rtcp.ipc.client import ControlClient, ControlError
-from rtcp.ipc.paths import control_socket
+from rtcp.ipc.runtime_directory import control_socket
+from rtcp.ipc.session import read_processes
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
@@ -142,8 +143,7 @@ class Platform:
 
     def pids(self) -> dict[str, int]:
         """Return the process ids that the platform wrote down."""
-        found: dict[str, int] = json.loads((self.directory / "processes.json").read_text())
-        return found
+        return {name: int(pid) for name, pid in vars(read_processes(self.directory)).items()}
 
     def logs(self) -> str:
         """Return what the processes wrote."""

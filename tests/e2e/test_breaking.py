@@ -12,7 +12,7 @@ import pytest
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.ipc.observer import Observer, record_type
-from rtcp.ipc.paths import blackboard_file, control_socket, segment_control
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import inputs, outputs

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.paths import segment_control
+from rtcp.ipc.runtime_directory import segment_control
 from rtcp.ipc.session import read_session
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform, kill, lives
@@ -134,7 +134,7 @@ def test_a_command_gives_a_detached_loop_its_gateway_back_which_records_what_hap
     platform.be_patient(200)
     platform.rtcp("start", "--detach")
     platform.rtcp("enable")
-    session = read_session(platform.directory / "session.pickle")
+    session = read_session(platform.directory)
     state = platform.directory / "state"
     assert (session.state, session.segment_control) == (state, segment_control(platform.directory))
     before = platform.pids()

@@ -11,7 +11,7 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.telemetry.recording import recording
 from rtcp.telemetry.square import SPEED_M_S, judge, place
 from tests.e2e.conftest import Platform

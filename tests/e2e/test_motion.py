@@ -15,7 +15,7 @@ from kinematics.forward import forward
 from rtcp.config import default_config, load
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from tests.e2e.conftest import Platform, kill
 
 pytestmark = pytest.mark.alone

@@ -14,7 +14,7 @@ import yaml
 
 from rtcp.config.find import default_config
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file
+from rtcp.ipc.runtime_directory import blackboard_file
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 

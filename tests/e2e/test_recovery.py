@@ -12,7 +12,7 @@ import pytest
 
 from rtcp.ipc.client import ControlError
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, segment_control
+from rtcp.ipc.runtime_directory import blackboard_file, segment_control
 from rtcp.virtual.faults.client import SegmentClient
 from tests.e2e.conftest import Platform
 from tests.e2e.wire import outputs

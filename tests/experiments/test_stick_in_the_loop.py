@@ -29,7 +29,7 @@ class Arm:
     @property
     def tool(self) -> tuple[float, float, float]:
         assert CONFIG.arm is not None
-        return forward(CONFIG.arm, self.simulation.parts.arm.state.position).position
+        return forward(CONFIG.arm, self.simulation.parts.arm.state.commanded).position
 
     def stick(self, code: int, seconds: float, *, toggle: bool = True) -> None:
         box = self.simulation.box
@@ -155,7 +155,7 @@ def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
     simulation.box.inputs &= ~0x200
     simulation.run(1.5)
     assert simulation.state is State.EMERGENCY_STOP
-    assert max(map(abs, simulation.parts.arm.state.speed)) < 0.01
+    assert max(map(abs, simulation.parts.arm.state.actual_velocity)) < 0.01
     assert simulation.parts.arm.first_with_torque() == -1
     simulation.run(0.2)
     assert {slave.state.name for slave in simulation.bus.read_states()} == {"PRE_OP"}

@@ -20,7 +20,7 @@ one alone, for a shared host at times lets a gateway wait."""
 @contextlib.contextmanager
 def bench_of(platform: Platform) -> Iterator[Bench]:
     """A bench for a platform that runs."""
-    config = read_session(platform.directory / "session.pickle").config
+    config = read_session(platform.directory).config
     with Bench(platform.directory, config) as bench:
         yield bench
 

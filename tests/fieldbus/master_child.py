@@ -313,7 +313,7 @@ def killed(bus: SoemBus, count: int, pid: int) -> Any:
 def interrupted(bus: SoemBus, count: int, pid: int) -> Any:
     """A scan in a process of its own is ended by a signal, as `rtcp scan` does on Ctrl-C; the bus is its alone."""
     bus.close()
-    child = subprocess.Popen([sys.executable, "-m", "rtcp.launch.offline_child"], stdin=subprocess.PIPE)
+    child = subprocess.Popen([sys.executable, "-m", "rtcp.launch.offline"], stdin=subprocess.PIPE)
     assert child.stdin is not None
     child.stdin.write(json.dumps({"do": "scan", "interface": INTERFACE, "namespace_pid": pid}).encode())
     child.stdin.close()

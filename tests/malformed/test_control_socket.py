@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.paths import control_socket
+from rtcp.ipc.runtime_directory import control_socket
 from tests.e2e.conftest import Platform, lives
 
 pytestmark = pytest.mark.alone

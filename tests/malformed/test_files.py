@@ -24,8 +24,18 @@ from rtcp.gateway.limit_keeper import _read as read_kept_limits
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
 from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.paths import blackboard_file, processes_file, starts_file
-from rtcp.ipc.session import Pid, Processes, Session, SessionError, identify, read_processes, read_session
+from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.session import (
+    Pid,
+    Processes,
+    Session,
+    SessionError,
+    identify,
+    processes_file,
+    read_processes,
+    read_session,
+    session_file,
+)
 from rtcp.virtual.server import make_segment
 from tests.malformed.files import damaged
 
@@ -153,10 +163,9 @@ def test_damaged_files_of_process_ids_name_no_process_that_is_not_ours(tmp_path:
     random = Random(1)
     mine = identify(os.getpid())
     Processes(mine, mine, Pid(0)).write(tmp_path)
-    contents = {path: path.read_bytes() for path in (processes_file(tmp_path), starts_file(tmp_path))}
+    content = processes_file(tmp_path).read_bytes()
     for _ in range(500):
-        for path, content in contents.items():
-            path.write_bytes(damaged(content, random))
+        processes_file(tmp_path).write_bytes(damaged(content, random))
         found = read_processes(tmp_path)
         for pid in (found.loop, found.gateway, found.segment):
             assert isinstance(pid, Pid)
@@ -213,39 +222,40 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
 
 SESSIONS: dict[str, bytes] = {
     "nothing": b"",
-    "no pickle": b"hello",
-    "another object": b"\x80\x04N.",
-    "a class that is not there": b"crtcp.nowhere\nNothing\n.",
+    "no JSON": b"hello",
+    "no text": b"\xff\xfe",
+    "another value": b"[]",
+    "too deep": b"[" * 100_000,
     "half": b"",
 }
 
 
 @pytest.mark.parametrize("how", SESSIONS)
 def test_a_damaged_session_is_a_sentence_of_the_process_that_reads_it(tmp_path: Path, how: str) -> None:
-    file = tmp_path / "session.pickle"
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(file)
+    file = session_file(tmp_path)
+    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     assert file.stat().st_mode & 0o077 == 0
-    assert read_session(file).bus == "virtual"
+    assert read_session(tmp_path).bus == "virtual"
     file.write_bytes(file.read_bytes()[:500] if how == "half" else SESSIONS[how])
-    with pytest.raises(SessionError, match=r"session.pickle .*(holds no session|is damaged)"):
-        read_session(file)
+    with pytest.raises(SessionError, match=r"session\.json is damaged: "):
+        read_session(tmp_path)
 
 
 def test_a_session_that_others_may_write_is_not_read(tmp_path: Path) -> None:
-    file = tmp_path / "session.pickle"
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(file)
+    file = session_file(tmp_path)
+    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     file.chmod(0o666)
     with pytest.raises(SessionError, match="others may write"):
-        read_session(file)
+        read_session(tmp_path)
 
 
-@pytest.mark.parametrize("name", ["session.pickle", "started.json", "blackboard"])
+@pytest.mark.parametrize("name", ["session", "started.json", "blackboard"])
 def test_a_gateway_that_finds_a_damaged_file_says_so_without_a_traceback(tmp_path: Path, name: str) -> None:
-    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path / "session.pickle")
+    Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     (tmp_path / "started.json").write_text("{}")
     file = blackboard_file(tmp_path)
     Blackboard(file, 6, 500_000).close()
-    damage = file if name == "blackboard" else tmp_path / name
+    damage = {"blackboard": file, "session": session_file(tmp_path)}.get(name, tmp_path / name)
     damage.write_bytes(b"{")
     done = subprocess.run(
         [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(tmp_path), "--ready-fd", "1"],

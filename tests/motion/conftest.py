@@ -7,10 +7,10 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config import default_config, load
-from rtcp.motion.controllers.jog import JogMode
-from rtcp.motion.guards.envelope import SetPointGuard, Verdict
+from rtcp.motion.controllers.jog import JogController
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import MotionState, Phase
+from rtcp.motion.state import ArmState, Phase
 
 ARM = load(default_config())
 MODEL = ARM.arm
@@ -23,33 +23,42 @@ class Driven:
 
     def __init__(self, q: list[float]) -> None:
         self.limits = Limits(ARM)
-        self.guards = SetPointGuard(ARM, self.limits, PERIOD)
-        self.jog = JogMode(ARM, MODEL, self.limits, self.guards, PERIOD)
-        self.state = MotionState(6)
-        self.state.position[:] = q
-        self.guards.latch(self.state)
+        self.trajectory_guard = TrajectoryGuard(ARM, self.limits, PERIOD)
+        self.jog = JogController(ARM, MODEL, self.limits, self.trajectory_guard, PERIOD)
+        self.state = ArmState(6)
+        self.state.commanded[:] = q
+        self.trajectory_guard.latch(self.state)
         self.path: list[tuple[float, float, float]] = []
         self.least_distance = 1e9
 
     @property
     def tool(self) -> tuple[float, float, float]:
-        return forward(MODEL, self.state.position).position
+        return forward(MODEL, self.state.commanded).position
 
     @property
     def still(self) -> bool:
-        return not any(self.state.velocity)
+        return not any(self.state.commanded_velocity)
 
     @property
     def singularities(self) -> tuple[float, float, float]:
-        return singularity_distances(MODEL, self.state.position)[:3]
+        return singularity_distances(MODEL, self.state.commanded)[:3]
 
     def cycle(self) -> None:
         state, limits = self.state, self.limits
-        before, speed = list(state.position), list(state.velocity)
+        before, speed = list(state.commanded), list(state.commanded_velocity)
         target = self.jog.update(state, PERIOD)
-        verdict = self.guards.apply(state, target, self.jog.clamps)
-        assert verdict is Verdict.PASS, (verdict, self.guards.held, self.guards.code, self.guards.value, before, speed)
-        for i, (old, new, v, w) in enumerate(zip(before, state.position, speed, state.velocity, strict=True)):
+        verdict = self.trajectory_guard.apply(state, target, self.jog.tolerates_saturation)
+        assert verdict is GuardResult.PASS, (
+            verdict,
+            self.trajectory_guard.held,
+            self.trajectory_guard.code,
+            self.trajectory_guard.value,
+            before,
+            speed,
+        )
+        for i, (old, new, v, w) in enumerate(
+            zip(before, state.commanded, speed, state.commanded_velocity, strict=True)
+        ):
             assert abs(w) <= limits.velocity[i] * (1.0 + 1e-6)
             assert abs(w - v) <= limits.acceleration[i] * PERIOD * (1.0 + 1e-6)
             assert abs(new - old - w * PERIOD) < 1e-12
@@ -70,7 +79,7 @@ class Driven:
         return self
 
     def distance(self) -> float:
-        return self.guards.zones.distance(frames(MODEL, self.state.position))[0]
+        return self.trajectory_guard.zones.distance(frames(MODEL, self.state.commanded))[0]
 
     def until_rest(self, at_most_s: float = 1.0) -> float:
         """Release the stick; return how long it takes to HOLD."""
@@ -78,7 +87,7 @@ class Driven:
         while self.jog.phase is not Phase.HOLD:
             self.jog.command(ZERO, "base")
             self.cycle()
-            assert self.state.now_ns - start < at_most_s * 1e9, self.state.velocity
+            assert self.state.now_ns - start < at_most_s * 1e9, self.state.commanded_velocity
         return (self.state.now_ns - start) * 1e-9
 
 

@@ -9,9 +9,9 @@ from math import isfinite
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.config.operation import Box, KeepOut
-from rtcp.motion.guards.envelope import SetPointGuard, Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
-from rtcp.motion.state import MotionState, Target
+from rtcp.motion.state import ArmState, Setpoint
 
 from .reference import depth, points
 
@@ -25,42 +25,51 @@ class Judge:
     def __init__(self, config: ArmConfig, start: Sequence[float], dt: float) -> None:
         self.config, self.dt = config, dt
         self.limits = Limits(config)
-        self.guard = SetPointGuard(config, self.limits, dt)
-        self.state = MotionState(len(config.joints))
-        self.state.position = list(start)
+        self.guard = TrajectoryGuard(config, self.limits, dt)
+        self.state = ArmState(len(config.joints))
+        self.state.commanded = list(start)
         self.guard.latch(self.state)
         self.mean = [0.0] * len(start)
-        self.target = Target(len(start))
+        self.target = Setpoint(len(start))
         self._depths = self.depths()
 
     def depths(self) -> list[float]:
         """How far beyond each box's bounds each point is, m; negative: on the right side."""
         if self.config.arm is None:
             return []
-        tool, wrist, elbow = points(self.state.position)
+        tool, wrist, elbow = points(self.state.commanded)
         found = [-1.0 if self.limits.box is None else -depth(tool, self.limits.box)]
         return found + [depth(point, box) for box in self.limits.keep_out for point in (tool, wrist, elbow)]
 
-    def ask(self, position: Iterable[float], clamps: bool, velocity: Iterable[float] | None = None) -> Verdict:
+    def ask(
+        self, position: Iterable[float], tolerates_saturation: bool, velocity: Iterable[float] | None = None
+    ) -> GuardResult:
         """One cycle with a target, judged."""
         state, limits, dt = self.state, self.limits, self.dt
         target = self.target
         target.position = list(position)
-        here = list(state.position)
+        here = list(state.commanded)
         target.velocity = [(q - p) / dt for q, p in zip(target.position, here, strict=True)]
         if velocity is not None:
             target.velocity = list(velocity)
-        verdict = self.guard.apply(state, target, clamps)
+        verdict = self.guard.apply(state, target, tolerates_saturation)
         for i in range(len(here)):
-            q, u = state.position[i], limits.acceleration[i] * dt
+            q, u = state.commanded[i], limits.acceleration[i] * dt
             mean = (q - here[i]) / dt
-            assert all(map(isfinite, (q, state.velocity[i], state.acceleration[i])))
+            assert all(map(isfinite, (q, state.commanded_velocity[i], state.commanded_acceleration[i])))
             assert limits.low[i] - ROUNDING_RAD <= q <= limits.high[i] + ROUNDING_RAD, (i, q)
             assert abs(mean) <= limits.velocity[i] * (1 + 1e-6) + 1e-10, (i, mean)
-            assert abs(state.velocity[i]) <= limits.velocity[i] * (1 + 1e-6), (i, state.velocity[i])
+            assert abs(state.commanded_velocity[i]) <= limits.velocity[i] * (1 + 1e-6), (i, state.commanded_velocity[i])
             assert abs(mean - self.mean[i]) <= u * (1 + 1e-4) + 1e-10, (i, mean, self.mean[i])
-            assert abs(state.velocity[i] - mean) <= u * (1 + 1e-4) + 1e-10, (i, state.velocity[i], mean)
-            assert abs(state.acceleration[i]) <= limits.acceleration[i] * (1 + 1e-4), (i, state.acceleration[i])
+            assert abs(state.commanded_velocity[i] - mean) <= u * (1 + 1e-4) + 1e-10, (
+                i,
+                state.commanded_velocity[i],
+                mean,
+            )
+            assert abs(state.commanded_acceleration[i]) <= limits.acceleration[i] * (1 + 1e-4), (
+                i,
+                state.commanded_acceleration[i],
+            )
             self.mean[i] = mean
         now = self.depths()
         for was, deep in zip(self._depths, now, strict=True):
@@ -73,9 +82,9 @@ class Judge:
         longest = max(v / a for v, a in zip(self.limits.velocity, self.limits.acceleration, strict=True))
         for cycle in range(int(longest / self.dt) + 3):
             if not self.guard.stopping:
-                assert not any(self.state.velocity)
+                assert not any(self.state.commanded_velocity)
                 return cycle
-            self.ask([float("nan")] * len(self.mean), clamps=False)
+            self.ask([float("nan")] * len(self.mean), tolerates_saturation=False)
         raise AssertionError("the stop does not end")
 
     def change(self, new: Values) -> bool:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
 from rtcp.motion.controllers.gripper import GripperMotion
-from rtcp.motion.state import Target
+from rtcp.motion.state import Setpoint
 
 DT = 0.0005
 JOINT = Joint("finger", "drive7", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=2.0)
@@ -93,7 +93,7 @@ def test_it_yields_no_further_than_its_range(motion):
     motion.grip(False)
     run(motion, 0.3)
     run(motion, 5 * DT, 3.0)
-    motion._state.position[0] = JOINT.position.min
+    motion._state.commanded[0] = JOINT.position.min
     assert set(run(motion, 0.1, 3.0)) == {JOINT.position.min}
 
 
@@ -120,7 +120,7 @@ def test_no_set_point_passes_that_is_not_one_step_away(motion, monkeypatch, want
     motion.grip(False)
 
     def astray(state, dt):
-        target = Target(1)
+        target = Setpoint(1)
         target.position[0] = wanted
         return target
 

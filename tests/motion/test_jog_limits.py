@@ -44,7 +44,7 @@ def before_wall(jogged, axis: int, sign: int):
         wall = WALLED[axis + 3 if sign > 0 else axis]
         shoulder, elbow, wrist = drive.singularities
         if drive.distance() > 0.08 and abs(wall - drive.tool[axis]) < 0.2 and min(2 * shoulder, elbow, wrist) > 0.5:
-            drive.guards.latch(drive.state)
+            drive.trajectory_guard.latch(drive.state)
             return drive, wall
 
 
@@ -107,14 +107,14 @@ def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side
     q[joint] = (limit.upper if side > 0 else limit.lower) - 0.3 * side
     drive = jogged(q)
     drive.limits.box, drive.limits.keep_out = None, ()
-    drive.guards.latch(drive.state)
+    drive.trajectory_guard.latch(drive.state)
     for _ in range(30):
-        drive.run(of_joints(drive.state.position, [0.3 * side if i == joint else 0.0 for i in range(6)]), 0.1)
+        drive.run(of_joints(drive.state.commanded, [0.3 * side if i == joint else 0.0 for i in range(6)]), 0.1)
     drive.until_rest()
-    reached = drive.state.position[joint]
+    reached = drive.state.commanded[joint]
     assert limit.lower <= reached <= limit.upper
-    drive.run(of_joints(drive.state.position, [-0.3 * side if i == joint else 0.0 for i in range(6)]), 0.7)
-    assert (drive.state.position[joint] - reached) * -side > 0.02
+    drive.run(of_joints(drive.state.commanded, [-0.3 * side if i == joint else 0.0 for i in range(6)]), 0.7)
+    assert (drive.state.commanded[joint] - reached) * -side > 0.02
     drive.until_rest()
 
 
@@ -160,7 +160,7 @@ def test_straight_up_where_all_three_are_singular_the_tool_comes_down(jogged, si
     assert x * sideways >= 0.0
     assert abs(x) < 1e-5 or abs(x) > 0.02
     assert drive.until_rest() < 0.8
-    assert forward(MODEL, drive.state.position).rotation == pytest.approx((1, 0, 0, 0, 1, 0, 0, 0, 1), abs=1e-4)
+    assert forward(MODEL, drive.state.commanded).rotation == pytest.approx((1, 0, 0, 0, 1, 0, 0, 0, 1), abs=1e-4)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -180,7 +180,7 @@ def test_straight_up_it_stands_where_it_cannot_go(jogged, axis, sign):
 @pytest.mark.parametrize("bend", [-0.04, -0.001, 1e-5, 0.001, 0.03])
 def test_a_nearly_stretched_elbow_comes_in_again(jogged, bend):
     drive = jogged([0.2, -0.8, bend, 0.1, 0.7, 0.0])
-    wrist = drive.guards.poses[4].position
+    wrist = drive.trajectory_guard.poses[4].position
     out = [w - s for w, s in zip(wrist, (0.0, 0.0, 0.17), strict=True)]
     drive.run([-0.1 * component for component in out] + [0.0] * 3, 2.0)
     assert drive.singularities[1] > 0.3

@@ -145,14 +145,14 @@ def test_boxes_that_the_arm_stands_in_or_would_come_to_rest_in_are_refused() -> 
     assert refused == (Wrong.OUTSIDE, -1, pytest.approx(-1e-4), -1.0)
     sign = -1.0 if tool[1] > 0 else 1.0
     for _ in range(150):
-        judge.ask([judge.state.position[0] + sign * 0.5 * judge.dt, *q[1:]], clamps=True)
-    here = points(judge.state.position)[0][0]
+        judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)
+    here = points(judge.state.commanded)[0][0]
     assert here > tool[0]
     assert judge.guard.refuses(judge.state, up_to(here + 0.2)) is None
     assert judge.guard.refuses(judge.state, up_to(here + 1e-3)) is not None
     assert judge.change(up_to(here + 0.03))
     for _ in range(300):
-        judge.ask([judge.state.position[0] + sign * 0.5 * judge.dt, *q[1:]], clamps=True)
+        judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)
 
 
 def test_an_arm_that_stands_in_a_box_already_may_still_be_slowed_down() -> None:

@@ -16,7 +16,7 @@ from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.motion.guards.braking import touched
-from rtcp.motion.guards.envelope import Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import Reason
@@ -39,12 +39,16 @@ def box_before(point: Point, axis: int, side: float, gap: float, shift: Sequence
     return [m - size for m in middle] + [m + size for m in middle]
 
 
-def driven(judge: Judge, direction: Sequence[float], cycles: int, clamps: bool = True) -> list[Verdict]:
+def driven(
+    judge: Judge, direction: Sequence[float], cycles: int, tolerates_saturation: bool = True
+) -> list[GuardResult]:
     """Ask for joint speeds in a direction, as parts of each joint's limit."""
     verdicts = []
     for _ in range(cycles):
         steps = [part * v * judge.dt for part, v in zip(direction, judge.limits.velocity, strict=True)]
-        verdicts.append(judge.ask([q + way for q, way in zip(judge.state.position, steps, strict=True)], clamps))
+        verdicts.append(
+            judge.ask([q + way for q, way in zip(judge.state.commanded, steps, strict=True)], tolerates_saturation)
+        )
     return verdicts
 
 
@@ -81,9 +85,9 @@ def test_who_began_free_never_enters_a_keep_out_box(
     box = box_before(points(q)[which], axis, side, gap, shift, size)
     assume(max(depth(point, box) for point in points(q)) <= 0.0)
     judge = Judge(with_boxes(WIDE, box), q, dt)
-    for direction, cycles, clamps in legs:
-        driven(judge, direction, cycles, clamps)
-    judge.ask([nan] * 6, clamps=False)
+    for direction, cycles, tolerates_saturation in legs:
+        driven(judge, direction, cycles, tolerates_saturation)
+    judge.ask([nan] * 6, tolerates_saturation=False)
     judge.stop()
 
 
@@ -100,8 +104,8 @@ def test_who_began_inside_its_box_never_leaves_it(
     tool = points(q)[0]
     box = [p - g for p, g in zip(tool, gaps[:3], strict=True)] + [p + g for p, g in zip(tool, gaps[3:], strict=True)]
     judge = Judge(with_boxes(box), q, dt)
-    for direction, cycles, clamps in legs:
-        driven(judge, direction, cycles, clamps)
+    for direction, cycles, tolerates_saturation in legs:
+        driven(judge, direction, cycles, tolerates_saturation)
 
 
 @given(
@@ -131,14 +135,14 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     # Joint 1 moves the tool along y; the box begins beside it.
     box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
     judge = Judge(with_boxes(WIDE, box), q, dt)
-    while points(judge.state.position)[0][1] < box[4] + 0.01:
-        assert driven(judge, away, 1)[0] <= Verdict.CLAMPED
+    while points(judge.state.commanded)[0][1] < box[4] + 0.01:
+        assert driven(judge, away, 1)[0] <= GuardResult.CLAMPED
     # And the way back in ends before the box.
-    while driven(judge, [-part for part in away], 1)[0] is not Verdict.STOPPED:
-        assert points(judge.state.position)[0][1] > box[4]
+    while driven(judge, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
+        assert points(judge.state.commanded)[0][1] > box[4]
     assert judge.guard.code is Reason.KEEP_OUT
     assert judge.guard.axis == 0
-    here = -depth(points(judge.state.position)[0], box)
+    here = -depth(points(judge.state.commanded)[0], box)
     assert 0.0 <= here < 0.004
 
 
@@ -190,7 +194,7 @@ def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
                 break
         if judge.guard.stopping and judge.guard.code is Reason.KEEP_OUT:
             stops += 1
-            assert judge.guard.nearest_box(judge.state.position)[0] >= 0.0
+            assert judge.guard.nearest_box(judge.state.commanded)[0] >= 0.0
             assert judge.guard.value >= 0.0
     assert stops > 10
 
@@ -199,9 +203,9 @@ def test_a_stop_before_the_tools_own_box_names_it() -> None:
     tool = points(Q)[0]
     judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
     verdicts = driven(judge, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 400)
-    assert Verdict.STOPPED in verdicts
+    assert GuardResult.STOPPED in verdicts
     assert (judge.guard.code, judge.guard.axis) == (Reason.KEEP_OUT, -1)
-    assert -0.05 < points(judge.state.position)[0][0] - tool[0] < 0.05
+    assert -0.05 < points(judge.state.commanded)[0][0] - tool[0] < 0.05
 
 
 @given(shares=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4), direction=DIRECTION, dt=CYCLES_S)
@@ -211,18 +215,20 @@ def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction:
     limits = judge.limits
     for share in shares:
         driven(judge, direction, 30)
-        tool = points(judge.state.position)[0]
+        tool = points(judge.state.commanded)[0]
         walls = [t + 0.2 * share for t in tool]
         judge.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
 
 
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
-    monkeypatch.setattr("rtcp.motion.guards.envelope.frames", lambda *given: counted.append(1) or frames(*given))
+    monkeypatch.setattr(
+        "rtcp.motion.guards.trajectory_guard.frames", lambda *given: counted.append(1) or frames(*given)
+    )
     judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
     driven(judge, [0.5] * 6, 200)
     assert len(counted) <= 1
-    assert judge.guard.poses == frames(MODEL, judge.state.position)
+    assert judge.guard.poses == frames(MODEL, judge.state.commanded)
 
 
 def test_to_probe_beside_a_box_changes_nothing() -> None:
@@ -232,7 +238,7 @@ def test_to_probe_beside_a_box_changes_nothing() -> None:
     step = [Q[0] + 1e-6, *Q[1:]]
     assert guard.probe(judge.state, step, [0.0] * 6)
     assert guard.poses is poses
-    assert judge.ask(step, clamps=False) is Verdict.PASS
+    assert judge.ask(step, tolerates_saturation=False) is GuardResult.PASS
     assert guard.poses == frames(MODEL, step)
 
 
@@ -294,5 +300,5 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
         side = -sign if tool[0] > 0 else sign
         driven(judge, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
         driven(judge, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
-        here = points(judge.state.position)[0][1]
+        here = points(judge.state.commanded)[0][1]
         assert sign * here < sign * y, (gap, sign)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from kinematics.forward import frames
-from rtcp.motion.guards.envelope import Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult
 
 from .judge import ARM, MODEL, Judge, with_boxes
 
@@ -22,10 +22,12 @@ def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: 
     for sign in (1.0, -1.0):
         for _ in range(60):
             way = [sign * 0.5 * judge.dt if i == axis else 0.0 for i in range(6)]
-            verdict = judge.ask([q + w for q, w in zip(judge.state.position, way, strict=True)], clamps=True)
+            verdict = judge.ask(
+                [q + w for q, w in zip(judge.state.commanded, way, strict=True)], tolerates_saturation=True
+            )
             if axis == 5:
-                assert verdict <= Verdict.CLAMPED
-        judge.ask([float("nan")] * 6, clamps=False)
+                assert verdict <= GuardResult.CLAMPED
+        judge.ask([float("nan")] * 6, tolerates_saturation=False)
         judge.stop()
 
 
@@ -41,5 +43,5 @@ def test_a_plate_that_the_first_cycle_would_cross_is_not_crossed(dt: float, gap:
     judge = Judge(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
     speed = ARM.joints[0].velocity if x > 0 else -ARM.joints[0].velocity
     for _ in range(50):
-        judge.ask([judge.state.position[0] + speed * dt, *q[1:]], clamps=True)
-        assert frames(MODEL, judge.state.position)[6].position[1] <= low + 1e-9
+        judge.ask([judge.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
+        assert frames(MODEL, judge.state.commanded)[6].position[1] <= low + 1e-9

@@ -38,7 +38,7 @@ def run(discipline: Discipline, reference: Reference, cycles: int, *, lost: int 
             woken += reference.random.randrange(3_000_000)
         wakeups.append(planned)
         if lost and cycle % lost == 0:
-            discipline.coast()
+            discipline.holdover()
         else:
             discipline.observe(woken, reference.seen_by_frame(woken))
         planned = discipline.next_wakeup(planned)
@@ -159,7 +159,7 @@ class Line:
         """Let no frame come back."""
         locked = []
         for _ in range(cycles):
-            self.discipline.coast()
+            self.discipline.holdover()
             self.planned = self.discipline.next_wakeup(self.planned)
             locked.append(self.discipline.locked)
         return locked

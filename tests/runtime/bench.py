@@ -165,7 +165,7 @@ class Followed(Discipline):
     def observe(self, woken: int, dc_time: int) -> None:
         pass
 
-    def coast(self) -> None:
+    def holdover(self) -> None:
         pass
 
 
@@ -332,7 +332,7 @@ class Bench:
         elif state is State.STOPPED_BY_LIMIT:
             # The limits close in on a move that was planned under wider ones.
             self.set_in_motion()
-            self.arm.limits.high[0] = self.arm.state.position[0] + 0.3
+            self.arm.limits.high[0] = self.arm.state.commanded[0] + 0.3
             self.until(State.STOPPED_BY_LIMIT)
         elif state is State.HOMING:
             self.hold()

@@ -17,7 +17,7 @@ from rtcp.config import default_config, load
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
 from tests.runtime.bench import CONFIG, PERIOD_S, Bench
 from tests.runtime.played_loop import Loop
@@ -70,7 +70,7 @@ def gateway_directory() -> Iterator[Path]:
 def gateway_loop(gateway_directory: Path) -> Iterator[Loop]:
     directory = gateway_directory
     config = load(default_config())
-    Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory / "session.pickle")
+    Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
     (directory / "started.json").write_text("{}")
     made = Loop(blackboard_file(directory))
     reading, writing = os.pipe()

@@ -16,8 +16,8 @@ from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.messages import FAULTS
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.stops import Rung, bounds
-from rtcp.motion.guards.guard import BACK_RAD_S
-from rtcp.motion.state import MotionState, Reason, Target
+from rtcp.motion.guards.output_limiter import BACK_RAD_S
+from rtcp.motion.state import ArmState, Reason, Setpoint
 
 from .bench import (
     _WIRE,
@@ -183,10 +183,10 @@ def joint_says_where_it_is(bench: Bench) -> None:
 def generator_refuses(bench: Bench) -> None:
     generator = bench.set_in_motion().arm.motions.generator
 
-    def refuse(state: MotionState, dt: float) -> Target:
+    def refuse(state: ArmState, dt: float) -> Setpoint:
         generator.reason = Reason.GENERATOR
-        target = Target(2)
-        target.position = list(state.position)
+        target = Setpoint(2)
+        target.position = list(state.commanded)
         return target
 
     generator.update = refuse
@@ -719,8 +719,8 @@ def test_a_move_arrives_where_it_was_told_to(bench: Bench) -> None:
 def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(bench: Bench) -> None:
     bench.hold()
 
-    def jump(state: MotionState, dt: float) -> Target:
-        target = Target(2)
+    def jump(state: ArmState, dt: float) -> Setpoint:
+        target = Setpoint(2)
         target.position = [1.0, -2.5]
         return target
 

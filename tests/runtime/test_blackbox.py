@@ -23,7 +23,7 @@ from rtcp.ipc.codes import Code, Command
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
 from rtcp.ipc.machine import State
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import stopping_mark
+from rtcp.ipc.runtime_directory import stop_marker
 from rtcp.ipc.session import Pid, Processes, Session, identify
 from rtcp.launch import launcher
 from rtcp.launch.simulation import Simulation
@@ -458,12 +458,12 @@ def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_onl
         assert played.recordings == []
         processes.write(tmp_path)
         launcher._record_unseen_end(tmp_path, told.append)
-        played.session.write(tmp_path / "session.pickle")
+        played.session.write(tmp_path)
     launcher._record_unseen_end(tmp_path, told.append)
     (recording,) = played.recordings
     assert "ended unexpectedly" in recording.about.what
     assert (recording.about.before, recording.about.at) == ("moving", 499)
-    stopping_mark(tmp_path).touch()
+    stop_marker(tmp_path).touch()
     recording_file = listed(played.directory)[0].path
     recording_file.unlink()
     launcher._record_unseen_end(tmp_path, told.append)

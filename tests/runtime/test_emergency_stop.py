@@ -166,7 +166,7 @@ def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(bench: Benc
 
     def too_much(data: object) -> None:
         decode(data)  # type: ignore[arg-type]
-        bench.arm.state.torque[0] = 1.6 * CONFIG.joints[0].torque
+        bench.arm.state.actual_torque[0] = 1.6 * CONFIG.joints[0].torque
 
     bench.arm.decode = too_much  # type: ignore[method-assign]
     for _ in range(cycles):

@@ -152,7 +152,7 @@ def test_a_joint_that_is_brought_back_into_its_range_is_told_with_how_far_and_ho
 ) -> None:
     limits = bench.arm.limits
     limits.velocity[1] = velocity
-    bench.arm.guard.take(limits)
+    bench.arm.output_limiter.take(limits)
     enable_beyond(bench).until(State.HOLDING)
     assert bench.codes[-2:] == [Code.LED_BACK, Code.ENABLED]
     assert bench.said[-2] == (

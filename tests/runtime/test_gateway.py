@@ -12,7 +12,7 @@ import pytest
 
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.machine import Command
-from rtcp.ipc.paths import control_socket
+from rtcp.ipc.runtime_directory import control_socket
 from tests.runtime.played_loop import JOINTS, Loop
 
 LINE_LIMIT = 65536

@@ -19,7 +19,7 @@ from rtcp.gateway import server as gateway
 from rtcp.gateway.blackbox_file import About, listed
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.codes import Code
-from rtcp.ipc.paths import blackboard_file, control_socket
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
 from tests.runtime.played_loop import Loop
 
@@ -29,7 +29,7 @@ class Gateways:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory / "session.pickle")
+        Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
         (directory / "started.json").write_text("{}")
         self.loop = Loop(blackboard_file(directory))
         self._started: list[subprocess.Popen[bytes]] = []

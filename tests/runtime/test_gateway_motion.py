@@ -14,7 +14,7 @@ from rtcp.config import default_config, load
 from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.codes import Code, JogFrame, MotionMode, Refusal
 from rtcp.ipc.machine import Command, State
-from rtcp.ipc.paths import control_socket
+from rtcp.ipc.runtime_directory import control_socket
 from rtcp.motion.state import Reason
 from tests.runtime.played_loop import JOINTS, Loop
 

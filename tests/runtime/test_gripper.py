@@ -11,7 +11,7 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.control.gripper import DrivenGripper, gripper_of
 from rtcp.devices.cia402 import DriveState, TargetState
-from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED
+from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 

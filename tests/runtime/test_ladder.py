@@ -385,7 +385,7 @@ def test_a_cycle_with_a_wrong_working_counter_sends_the_last_targets_again(
             bench.move(1.8, 1.8)
             bench.run(0.6)
         if state is State.STOPPED_BY_LIMIT:
-            bench.arm.limits.high[0] = bench.arm.state.position[0] + 0.3
+            bench.arm.limits.high[0] = bench.arm.state.commanded[0] + 0.3
             bench.until(State.STOPPED_BY_LIMIT)
         elif state in (State.STOPPING, State.DISABLING):
             bench.do(Command.STOP if state is State.STOPPING else Command.DISABLE)

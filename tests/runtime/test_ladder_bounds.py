@@ -120,12 +120,12 @@ def arm() -> Iterator[Callable[..., Simulation]]:
         if situation == "moving":
             do(simulation, Command.MOVE, [*([0.3] * 6), 0.0, 0.0, 0.0, 0.0, 1.0, 0.5])
             simulation.run(0.55)
-            assert min(simulation.parts.arm.state.velocity) == pytest.approx(0.5, abs=1e-6)
+            assert min(simulation.parts.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
         elif situation == "jogging":
             for _ in range(2):
                 do(simulation, Command.JOG, [0.0, 0.0, -JOG_SPEED, *([0.0] * 8), 0.5])
                 simulation.run(0.4)
-            assert max(map(abs, simulation.parts.arm.state.velocity)) > 0.15
+            assert max(map(abs, simulation.parts.arm.state.commanded_velocity)) > 0.15
         return simulation
 
     yield bring

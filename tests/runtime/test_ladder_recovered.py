@@ -212,7 +212,7 @@ def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_hav
     fast = [0.0, -0.3, 2.4, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
     assert arm.order(Command.MOVE, fast).refusal == 0
     arm.run(1.6)
-    assert arm.parts.arm.state.speed[AXIS] > 0.4
+    assert arm.parts.arm.state.actual_velocity[AXIS] > 0.4
     stood = arm.parts.arm.state.actual[AXIS]
     without_supply(arm)
     reset(arm)

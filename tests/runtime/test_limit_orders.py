@@ -69,7 +69,7 @@ def test_the_acceleration_of_the_next_move_is_the_new_one(bench: Bench) -> None:
     give(bench, of_first("acceleration", 0.2))
     bench.move(1.0, 0.0)
     bench.run(0.5)
-    assert 0.0 < bench.arm.state.velocity[0] <= 0.2 * 0.5
+    assert 0.0 < bench.arm.state.commanded_velocity[0] <= 0.2 * 0.5
 
 
 def test_the_last_clamp_before_the_drives_keeps_to_them_too(bench: Bench) -> None:
@@ -78,13 +78,13 @@ def test_the_last_clamp_before_the_drives_keeps_to_them_too(bench: Bench) -> Non
     drive = bench.arm.drives[0]
     before = drive.target_position
     drive.target_position = before + 1.0
-    bench.arm.guard.check(bench.arm.drives)
+    bench.arm.output_limiter.check(bench.arm.drives)
     assert drive.target_position == pytest.approx(before + 0.1 * PERIOD_S, rel=1e-4)
 
 
 def test_a_move_under_way_that_leads_beyond_the_new_limit_is_stopped_before_it(bench: Bench) -> None:
     bench.set_in_motion()
-    high = bench.arm.state.position[0] + 0.1
+    high = bench.arm.state.commanded[0] + 0.1
     assert give(bench, of_first("high", high)).refusal == Refusal.NONE
     bench.until(State.STOPPED_BY_LIMIT)
     bench.run(0.2)
@@ -114,7 +114,7 @@ def test_limits_that_cannot_be_are_refused_and_nothing_changes(
 
 def test_a_range_that_the_arm_would_run_out_of_or_a_speed_that_it_has_passed_is_refused(bench: Bench) -> None:
     bench.set_in_motion()
-    here = bench.arm.state.position[0]
+    here = bench.arm.state.commanded[0]
     # From 0.3 rad/s with 2 rad/s^2 the stop takes 0.0225 rad.
     assert give(bench, of_first("high", here + 0.02)).refusal == Refusal.LIMITS_OUTSIDE
     answer = give(bench, of_first("velocity", 0.1))
@@ -137,10 +137,10 @@ def test_boxes_that_the_arm_stands_in_are_refused(bench_board: tuple[Blackboard,
     config = load(default_config())
     arm = Arm(config, [])
     widest = arm.limits.widest
-    arm.state.position[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
-    arm.guards.latch(arm.state)
+    arm.state.commanded[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
+    arm.trajectory_guard.latch(arm.state)
     orders = LimitOrders(arm, bench_board[0])
-    x = arm.guards.poses[6].position[0]
+    x = arm.trajectory_guard.poses[6].position[0]
     assert widest.box is not None
     for side, expected in (
         (x - 0.01, (Refusal.LIMITS_OUTSIDE, -1, pytest.approx(-0.01), -1.0)),
@@ -160,10 +160,10 @@ def test_a_keep_out_box_that_the_arm_stands_in_is_refused_by_its_name(
     which = [box.name for box in config.cartesian.keep_out].index(name)
     arm = Arm(config, [])
     widest = arm.limits.widest
-    arm.state.position[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
-    arm.guards.latch(arm.state)
+    arm.state.commanded[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
+    arm.trajectory_guard.latch(arm.state)
     # The box alone grows over the tool, to beyond the other side of the arm's base and no further than it.
-    tool = arm.guards.poses[6].position
+    tool = arm.trajectory_guard.poses[6].position
     boxes = list(widest.keep_out)
     low, high = boxes[which][:3], boxes[which][3:]
     grown = [min(a, b - 0.05) for a, b in zip(low, tool, strict=True)]
@@ -185,12 +185,12 @@ def loaded(bench: Bench) -> Bench:
     bench.hold()
     bench.models[0].mechanics.external_torque = 5.0
     bench.run(0.5)
-    assert abs(bench.arm.state.torque[0]) == pytest.approx(5.0, abs=WIDEST.torque[0] * 0.05)
+    assert abs(bench.arm.state.actual_torque[0]) == pytest.approx(5.0, abs=WIDEST.torque[0] * 0.05)
     return bench
 
 
 def test_less_torque_than_a_joint_holds_is_refused_and_nothing_changes(loaded: Bench) -> None:
-    held = abs(loaded.arm.state.torque[0])
+    held = abs(loaded.arm.state.actual_torque[0])
     answer = give(loaded, of_first("torque", 2.0))
     assert (answer.refusal, answer.axis) == (Refusal.LIMITS_WEAK, 0)
     assert loaded.refused(answer) == (
@@ -210,7 +210,7 @@ def test_a_torque_that_is_not_lowered_is_no_matter_whatever_is_held(loaded: Benc
     assert give(loaded, of_first("torque", 10.0)).refusal == Refusal.NONE
     loaded.models[0].mechanics.external_torque = 12.0
     loaded.run(0.3)
-    assert abs(loaded.arm.state.torque[0]) > 10.0
+    assert abs(loaded.arm.state.actual_torque[0]) > 10.0
     assert give(loaded, replace(of_first("torque", 10.0), velocity=(0.2, 0.2))).refusal == Refusal.NONE
 
 
@@ -218,7 +218,7 @@ def test_without_torque_any_torque_limit_is_taken(loaded: Bench, bench_board: tu
     loaded.do(Command.DISABLE)
     loaded.until(State.READY)
     # Whatever a drive without torque shows.
-    loaded.arm.state.torque[0] = 5.0
+    loaded.arm.state.actual_torque[0] = 5.0
     new = of_first("torque", 2.0)
     plan = rows(new)
     assert LimitOrders(loaded.arm, bench_board[0]).take(1, [bench_board[1].write_plan(plan), len(plan)]) == (

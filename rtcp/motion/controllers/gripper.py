@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from rtcp.config.model import Joint
-from rtcp.motion.controllers.generator import JointGenerator
-from rtcp.motion.state import MotionState, Phase
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.state import ArmState, Phase
 
 _FIRM_CYCLES = 5
 """So many cycles in a row at the torque limit are a grip, and no friction when it starts."""
@@ -23,8 +23,8 @@ class GripperMotion:
 
     def __init__(self, joint: Joint, open_position: float, closed_position: float, period_s: float) -> None:
         """Make the motion of `joint`; positions in rad inside its range, the cycle in s."""
-        self._generator = JointGenerator(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
-        self._state = MotionState(1)
+        self._generator = JointMoveController(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
+        self._state = ArmState(1)
         self._period_s = period_s
         # A way that begins in motion takes the last cycle's mean acceleration for the present one, and errs by so much.
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
@@ -41,7 +41,7 @@ class GripperMotion:
     @property
     def position(self) -> float:
         """The set-point, rad."""
-        return self._state.position[0]
+        return self._state.commanded[0]
 
     @property
     def moving(self) -> bool:
@@ -56,8 +56,8 @@ class GripperMotion:
     def latch(self, position: float) -> None:
         """Rest at `position`, rad, or at the end of the range that it is beyond: without torque it is where it is."""
         state = self._state
-        state.position[0] = self.clamped(position)
-        state.velocity[0] = state.acceleration[0] = 0.0
+        state.commanded[0] = self.clamped(position)
+        state.commanded_velocity[0] = state.commanded_acceleration[0] = 0.0
         self._generator.hold()
         self._firm = 0
         self.gripped = False
@@ -76,7 +76,7 @@ class GripperMotion:
     def stop(self) -> None:
         """Come to rest under its limits."""
         state = self._state
-        if any(state.velocity) or any(state.acceleration):
+        if any(state.commanded_velocity) or any(state.commanded_acceleration):
             self._generator.stop(state)
         else:
             # On a way that has not begun: the generator's stop does nothing at rest.
@@ -85,24 +85,24 @@ class GripperMotion:
     def update(self, torque: float) -> float:
         """Return the set-point of the next cycle, rad; `torque`: measured, Nm."""
         state = self._state
-        before = state.velocity[0]
+        before = state.commanded_velocity[0]
         # A drive pushes in the direction of its set-point: what resists shows as torque in that direction.
         firm = self.moving and (torque if before > 0.0 else -torque) >= self._firm_torque
         self._firm = self._firm + 1 if firm else 0
         if self._firm >= _FIRM_CYCLES:
-            here = state.position[0]
+            here = state.commanded[0]
             self.latch(here)
             self.gripped = True
             self._direction = 1.0 if before > 0.0 else -1.0
             return here
         if self.gripped and torque * self._direction > self._firm_torque:
-            state.position[0] -= self._direction * self._yielding
+            state.commanded[0] -= self._direction * self._yielding
         target = self._generator.update(state, self._period_s)
-        position = self._next(state.position[0], target.position[0])
+        position = self._next(state.commanded[0], target.position[0])
         velocity = target.velocity[0]
-        state.position[0] = position
-        state.velocity[0] = velocity
-        state.acceleration[0] = (velocity - before) / self._period_s
+        state.commanded[0] = position
+        state.commanded_velocity[0] = velocity
+        state.commanded_acceleration[0] = (velocity - before) / self._period_s
         return position
 
     def clamped(self, position: float) -> float:

@@ -24,9 +24,9 @@ from rtcp.motion.controllers.jog_elbow import bend
 from rtcp.motion.controllers.jog_inverse import ELBOW, JogInverse
 from rtcp.motion.controllers.jog_ramp import JogRamp
 from rtcp.motion.controllers.jog_speeds import FULL, JogSpeeds
-from rtcp.motion.guards.envelope import SetPointGuard
+from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import MotionState, Phase, Reason, Target
+from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 FOR_EVER = 1 << 62
 _BRAKING = 0.7
@@ -39,33 +39,33 @@ _AT_REST = 2e-3
 """m/s, rad/s: what is slower is not taken for a motion that is wanted."""
 
 
-class JogMode:
+class JogController:
     """The mode `jog`, for a stick and for commands.
 
     Args:
         config: Cartesian and jog limits; it must have a geometry.
         model: the geometry; without a spherical wrist the arm stands.
         limits: of the joints; read every cycle.
-        guards: knows the boxes and the frames of what is commanded.
+        trajectory_guard: knows the boxes and the frames of what is commanded.
         period_s: the cycle, s.
     """
 
     def __init__(
-        self, config: ArmConfig, model: ArmModel, limits: Limits, guards: SetPointGuard, period_s: float
+        self, config: ArmConfig, model: ArmModel, limits: Limits, trajectory_guard: TrajectoryGuard, period_s: float
     ) -> None:
         cartesian = config.cartesian
         singularity = cartesian.singularity
         self._model = model
         self._limits = limits
-        self._guards = guards
+        self._trajectory_guard = trajectory_guard
         self._inverse = JogInverse(model)
         nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
         braking = _BRAKING * cartesian.acceleration
-        self._bounds = JogBounds(limits, guards, self._inverse, braking, nearest, period_s)
+        self._bounds = JogBounds(limits, trajectory_guard, self._inverse, braking, nearest, period_s)
         self._ramp = JogRamp(cartesian)
         self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
         self._zero = [0.0] * 6
-        self._target = Target(6)
+        self._target = Setpoint(6)
         self._asked = [0.0] * 6
         self._wanted = [0.0] * 6
         self._joints = JogSpeeds(limits)
@@ -76,13 +76,13 @@ class JogMode:
         self._last = [0.0] * 6
         self._posed = False
         self._wrist = singularity.wrist
-        self.clamps = True
+        self.tolerates_saturation = True
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
         self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: MotionState) -> None:
+    def start(self, state: ArmState) -> None:
         """Begin at `state`; nothing is asked for yet."""
         self.phase, self.reason = Phase.MOVE, Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
@@ -116,7 +116,7 @@ class JogMode:
         for i in range(6):
             asked[i] = part * twist[i]
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Come to rest."""
         if self.phase is Phase.MOVE:
             self._asked[:] = self._zero
@@ -127,10 +127,10 @@ class JogMode:
         self._asked[:] = self._zero
         self.phase = Phase.HOLD
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle."""
         target = self._target
-        position = state.position
+        position = state.commanded
         if not self.phase:
             target.position, target.velocity = position, self._zero
             return target
@@ -138,14 +138,14 @@ class JogMode:
             self.stop(state)
         inverse, bounds, ramp, joints = self._inverse, self._bounds, self._ramp, self._joints
         jumped = self._fresh or position != self._last
-        poses = self._guards.poses
+        poses = self._trajectory_guard.poses
         if jumped or not self._posed:
             poses = frames(self._model, position)
         if not (inverse.usable and inverse.at(poses)):
             return self._brake(state, dt)
         if jumped:
             # The beginning, or the guards have changed what was commanded: go on from where the arm is.
-            ramp.begin(_reached(poses, state.velocity))
+            ramp.begin(_reached(poses, state.commanded_velocity))
             self._line = None
             self._fresh = False
         wanted = self._turned(poses[6])
@@ -169,7 +169,7 @@ class JogMode:
             self.phase = Phase.HOLD
         return self._answer(position, dt)
 
-    def _answer(self, position: Sequence[float], dt: float) -> Target:
+    def _answer(self, position: Sequence[float], dt: float) -> Setpoint:
         target, speeds = self._target, self._joints.speeds
         target.position = self._last = [q + v * dt for q, v in zip(position, speeds, strict=True)]
         target.velocity = speeds
@@ -235,18 +235,18 @@ class JogMode:
             rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
         self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
 
-    def _brake(self, state: MotionState, dt: float) -> Target:
+    def _brake(self, state: ArmState, dt: float) -> Setpoint:
         """Each joint brakes as fast as it may: there is no inverse."""
         speeds = self._joints.speeds
         speeds[:] = self._zero
-        self._joints.clip(state.velocity, FULL * dt)
+        self._joints.clip(state.commanded_velocity, FULL * dt)
         self._line = None
         self._fresh = True
         self._posed = False
         self.reason = Reason.NO_SOLUTION
         if not any(speeds) and (self.phase is Phase.STOP or not any(self._asked)):
             self.phase = Phase.HOLD
-        return self._answer(state.position, dt)
+        return self._answer(state.commanded, dt)
 
 
 def _reached(poses: Sequence[Pose], speeds: Sequence[float]) -> list[float]:

@@ -11,7 +11,7 @@ from math import sqrt
 
 from kinematics.pose import Pose
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
-from rtcp.motion.guards.envelope import SetPointGuard
+from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.guards.zones import ELBOW, TOOL, Clearance
 from rtcp.motion.limits import Limits
 
@@ -32,7 +32,7 @@ class JogBounds:
 
     Args:
         limits: of the joints and where the boxes are; read every cycle.
-        guards: its zones tell the clearances.
+        trajectory_guard: its zones tell the clearances.
         inverse: what the joints do at this configuration.
         braking: deceleration before a box, m/s^2.
         singularity: nearest distances, m, rad, rad; 0: none.
@@ -42,14 +42,14 @@ class JogBounds:
     def __init__(
         self,
         limits: Limits,
-        guards: SetPointGuard,
+        trajectory_guard: TrajectoryGuard,
         inverse: JogInverse,
         braking: float,
         singularity: Sequence[float],
         dt: float,
     ) -> None:
         self._limits, self._inverse, self._dt = limits, inverse, dt
-        self._zones = guards.zones
+        self._zones = trajectory_guard.zones
         self._braking = braking
         self._nearest = tuple(singularity)
         self.near: Sequence[Clearance] = ()
@@ -86,9 +86,9 @@ class JogBounds:
         low, high, acceleration = limits.low, limits.high, limits.acceleration
         for i in range(6):
             v = speeds[i]
-            room = (high[i] - q[i] if v > 0.0 else q[i] - low[i]) - JOINT_MARGIN_RAD
+            stopping_distance = (high[i] - q[i] if v > 0.0 else q[i] - low[i]) - JOINT_MARGIN_RAD
             # v^2 > 2 a room, with room for the steps of time
-            if v * v > 1.8 * _BRAKES * acceleration[i] * room and v:
+            if v * v > 1.8 * _BRAKES * acceleration[i] * stopping_distance and v:
                 return True
         return False
 
@@ -129,15 +129,15 @@ class JogBounds:
             r0, r1, r2, r3, r4, r5 = row
             speed = r0 * a + r1 * b + r2 * c + r3 * d + r4 * e + r5 * f
             if speed > 0.0:
-                room = high[i] - JOINT_MARGIN_RAD - q[i]
+                stopping_distance = high[i] - JOINT_MARGIN_RAD - q[i]
             else:
-                room = q[i] - low[i] - JOINT_MARGIN_RAD
+                stopping_distance = q[i] - low[i] - JOINT_MARGIN_RAD
                 speed = -speed
                 r0, r1, r2, r3, r4, r5 = -r0, -r1, -r2, -r3, -r4, -r5
             rate = _BRAKES * acceleration[i]
-            if room * rate * 2.0 > fastest[i] * fastest[i] * 1.1:
+            if stopping_distance * rate * 2.0 > fastest[i] * fastest[i] * 1.1:
                 continue
-            excess = speed - stopping(room, rate, dt)
+            excess = speed - stopping(stopping_distance, rate, dt)
             if excess > most:
                 worst, most, self.axis = (r0, r1, r2, r3, r4, r5), excess, i
         for clearance in self.near:
@@ -210,19 +210,19 @@ class JogBounds:
                     travel += towards * (v if v > 0.0 else -v) / acceleration[i]
             travel *= 0.5
             distance = clearance.distance
-            room = max(distance - _GUARD_M, 0.4 * distance)
-            if room > 0.0 and travel * share * share > room:
-                share = sqrt(room / travel)
+            stopping_distance = max(distance - _GUARD_M, 0.4 * distance)
+            if stopping_distance > 0.0 and travel * share * share > stopping_distance:
+                share = sqrt(stopping_distance / travel)
                 self.box = clearance.box
         return share
 
 
-def stopping(room: float, rate: float, dt: float) -> float:
-    """Return the speed from which one comes to rest within `room` with the deceleration `rate`, in steps of `dt`."""
-    if room <= 0.0:
+def stopping(stopping_distance: float, rate: float, dt: float) -> float:
+    """Return the speed that comes to rest within `stopping_distance` at the deceleration `rate`, in steps of `dt`."""
+    if stopping_distance <= 0.0:
         return 0.0
     half = 0.5 * rate * dt
-    return sqrt(half * half + 2.0 * rate * room) - half
+    return sqrt(half * half + 2.0 * rate * stopping_distance) - half
 
 
 def _lever(pose: Pose, px: float, py: float, pz: float, x: float, y: float, z: float) -> float:

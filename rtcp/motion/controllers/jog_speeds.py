@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from rtcp.motion.controllers.jog_bounds import stopping
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import MotionState
+from rtcp.motion.state import ArmState
 
 FULL = 0.98
 """Part of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
@@ -49,14 +49,14 @@ class JogSpeeds:
                 twist[i] *= part
                 speeds[i] *= part
 
-    def follow(self, state: MotionState, dt: float) -> bool:
+    def follow(self, state: ArmState, dt: float) -> bool:
         """Bring the joint speeds, and the twist with them, within what the accelerations allow after `state`.
 
         Returns:
             Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
                 goes towards its speed as fast as it may; so it does, too, where its limits leave no more.
         """
-        speeds, last, limits = self.speeds, state.velocity, self._limits
+        speeds, last, limits = self.speeds, state.commanded_velocity, self._limits
         acceleration = limits.acceleration
         step = FULL * dt
         together = True
@@ -65,7 +65,7 @@ class JogSpeeds:
             if change > most or change < -most:
                 together = self._scaled_together(last, step)
                 break
-        q, low, high, fastest = state.position, limits.low, limits.high, limits.velocity
+        q, low, high, fastest = state.commanded, limits.low, limits.high, limits.velocity
         for i in range(6):
             v, rate, most = speeds[i], acceleration[i], fastest[i]
             if v > most or v < -most:
@@ -73,9 +73,9 @@ class JogSpeeds:
                 most = max(most, least)
                 speeds[i] = v = most if v > most else -most if v < -most else v
                 together = False
-            room = high[i] - q[i] if v > 0.0 else q[i] - low[i]
-            if v * v > 1.8 * rate * room:
-                most = stopping(room - _LAST_RAD, rate, dt)
+            stopping_distance = high[i] - q[i] if v > 0.0 else q[i] - low[i]
+            if v * v > 1.8 * rate * stopping_distance:
+                most = stopping(stopping_distance - _LAST_RAD, rate, dt)
                 least = abs(last[i]) - step * rate if v * last[i] > 0.0 else 0.0
                 most = max(most, least)
                 if v > most or v < -most:

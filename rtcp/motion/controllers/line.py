@@ -11,11 +11,11 @@ from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Vector
-from rtcp.motion.controllers.generator import JointGenerator
+from rtcp.motion.controllers.joint_move import JointMoveController
 from rtcp.motion.guards.distance import Singularities
 from rtcp.motion.planning.rows import Refused, Wrong, damaged_line, read_row
 from rtcp.motion.planning.slerp import quaternion, rotation, turn_between, turned_by
-from rtcp.motion.state import MotionState, Phase, Reason, Target
+from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 if TYPE_CHECKING:
     from rtcp.config.operation import SingularityLimits
@@ -32,7 +32,7 @@ _FADED = 0.25
 """What was left at the start fades out over so much of the first piece."""
 
 
-class LineMode:
+class LineController:
     """The mode `cartesian`: one inverse solution a cycle, on one branch.
 
     Args:
@@ -53,7 +53,7 @@ class LineMode:
         self._model = model
         self._inverse = InverseKinematics(model)
         self._limits = limits
-        self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self._brake = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
         self._brakes = False
         self._otg = Ruckig(1, period_s)
         self._way, self._halt = InputParameter(1), InputParameter(1)
@@ -61,7 +61,7 @@ class LineMode:
         self._halt.target_velocity = [0.0]
         self._active = self._way
         self._output = OutputParameter(1)
-        self._target = Target(n)
+        self._target = Setpoint(n)
         self._zero = [0.0] * n
         self._joints = range(n)
         self._velocity = [0.0] * n
@@ -78,13 +78,13 @@ class LineMode:
         self._axis: Vector = (0.0, 0.0, 1.0)
         self._angle = 0.0
         self._rotation = rotation((1.0, 0.0, 0.0, 0.0))
-        self.clamps = False
+        self.tolerates_saturation = False
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
         self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: MotionState, rows: memoryview[float], count: int) -> Refused | None:
+    def start(self, state: ArmState, rows: memoryview[float], count: int) -> Refused | None:
         """Begin a plan of `count` straight pieces (`rtcp.motion.planning.rows`) from `state`; return why not, or None.
 
         The arm has to be at rest, and the tool where the first piece begins: all that it does was checked beforehand.
@@ -93,10 +93,10 @@ class LineMode:
         first = read_row(rows, 0)
         if (wrong := damaged_line(first, 0)) is not None:
             return wrong
-        for i, v in enumerate(state.velocity):
+        for i, v in enumerate(state.commanded_velocity):
             if not -_STILL_RAD_S <= v <= _STILL_RAD_S:
                 return Refused(Wrong.MOVING, i, v, 0.0)
-        tool = forward(self._model, state.position)
+        tool = forward(self._model, state.commanded)
         far = hypot(*(a - b for a, b in zip(tool.position, first[0:3], strict=True)))
         if not far <= AT_START_M:
             return Refused(Wrong.START, -1, far, AT_START_M)
@@ -112,7 +112,7 @@ class LineMode:
         self._begin(state, first)
         return None
 
-    def _begin(self, state: MotionState, row: list[float]) -> None:
+    def _begin(self, state: ArmState, row: list[float]) -> None:
         """Make a row the current piece."""
         self._piece, self._ended = row, False
         x, y, z = row[0:3]
@@ -120,13 +120,13 @@ class LineMode:
         self._way_m = row[7] - x, row[8] - y, row[9] - z
         self._axis, self._angle = turn_between(row[3:7], row[10:14])
         self._rotation = rotation(row[3:7])
-        self._near = list(state.position)
+        self._near = list(state.commanded)
         self._rest_counts = False
         found = self._inverse.solve_near(Pose(self._from, self._rotation), self._near).q
         if found is not None:
             # What the arm stands beside the line fades out along it: no jump, and no second line.
             for i in self._joints:
-                self._rest[i] = rest = state.position[i] - found[i]
+                self._rest[i] = rest = state.commanded[i] - found[i]
                 self._rest_counts = self._rest_counts or not -_EXACT < rest < _EXACT
             self._near = list(found)
         way = self._way
@@ -136,13 +136,13 @@ class LineMode:
         self._otg.reset()
         self._active = way
 
-    def _stop_joints(self, state: MotionState) -> None:
+    def _stop_joints(self, state: ArmState) -> None:
         brake, limits = self._brake, self._limits
         brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
         brake.hold()
         brake.stop(state)
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Brake along the line, as fast as the piece's acceleration and jerk allow."""
         if self.phase is not Phase.MOVE:
             return
@@ -153,11 +153,11 @@ class LineMode:
         halt.max_velocity, halt.max_acceleration, halt.max_jerk = way.max_velocity, way.max_acceleration, way.max_jerk
         self._active = halt
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle."""
         if not self.phase:
             target = self._target
-            target.position, target.velocity = state.position, self._zero
+            target.position, target.velocity = state.commanded, self._zero
             return target
         if self._brakes:
             target = self._brake.update(state, dt)
@@ -168,7 +168,7 @@ class LineMode:
             return self._give_up(state, dt, Reason.PLAN, self.axis, self.value, self.limit)
         return self._along(state, dt)
 
-    def _begin_next(self, state: MotionState) -> bool:
+    def _begin_next(self, state: ArmState) -> bool:
         """Begin the next piece where the last has ended; False where it is damaged or begins elsewhere."""
         assert self._rows is not None
         self._row += 1
@@ -185,7 +185,7 @@ class LineMode:
         self._begin(state, row)
         return True
 
-    def _along(self, state: MotionState, dt: float) -> Target:
+    def _along(self, state: ArmState, dt: float) -> Setpoint:
         output = self._output
         try:
             result = self._otg.update(self._active, output)
@@ -211,7 +211,7 @@ class LineMode:
             left = _left(fraction / _FADED)
             for i in self._joints:
                 position[i] += self._rest[i] * left
-        velocity, before, limits, over = self._velocity, state.position, self._limits.velocity, 1.0 / dt
+        velocity, before, limits, over = self._velocity, state.commanded, self._limits.velocity, 1.0 / dt
         for i in self._joints:
             velocity[i] = v = (position[i] - before[i]) * over
             if not -limits[i] * 1.000001 <= v <= limits[i] * 1.000001:
@@ -239,7 +239,7 @@ class LineMode:
         self._wait = self._every
         return True
 
-    def _give_up(self, state: MotionState, dt: float, reason: Reason, axis: int, value: float, limit: float) -> Target:
+    def _give_up(self, state: ArmState, dt: float, reason: Reason, axis: int, value: float, limit: float) -> Setpoint:
         self.phase, self.reason, self.axis, self.value, self.limit = Phase.STOP, reason, axis, value, limit
         self._stop_joints(state)
         self._brakes = True

@@ -7,7 +7,7 @@ from math import sqrt
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rtcp.motion.state import MotionState
+    from rtcp.motion.state import ArmState
 
 _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
@@ -29,21 +29,21 @@ def allowed_acceleration(acceleration: float, speed: float, fastest: float, most
 
 
 def allowed_accelerations(
-    state: MotionState, fastest: Sequence[float], most: Sequence[float], jerk: Sequence[float]
+    state: ArmState, fastest: Sequence[float], most: Sequence[float], jerk: Sequence[float]
 ) -> list[float]:
     """Return `allowed_acceleration` of every joint of a state; bounds of shape (n,)."""
     return [
-        allowed_acceleration(now, state.velocity[i], fastest[i], most[i], jerk[i])
-        for i, now in enumerate(state.acceleration)
+        allowed_acceleration(now, state.commanded_velocity[i], fastest[i], most[i], jerk[i])
+        for i, now in enumerate(state.commanded_acceleration)
     ]
 
 
-def stoppable_speed(room: float, acceleration: float, jerk: float) -> float:
-    """Return the speed, rad/s, that comes to rest within `room` rad, with a ramp of the acceleration before it.
+def stoppable_speed(stopping_distance: float, acceleration: float, jerk: float) -> float:
+    """Return the speed, rad/s, that comes to rest within `stopping_distance` rad, after an acceleration ramp.
 
-    v^2 / 2a + v a / 2j = room, solved for v.
+    v^2 / 2a + v a / 2j = stopping_distance, solved for v.
     """
-    if not room > 0.0:
+    if not stopping_distance > 0.0:
         return 0.0
     ramp = 0.5 * acceleration * acceleration / jerk
-    return sqrt(ramp * ramp + 2.0 * acceleration * room) - ramp
+    return sqrt(ramp * ramp + 2.0 * acceleration * stopping_distance) - ramp

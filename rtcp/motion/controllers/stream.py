@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from rtcp.motion.controllers.generator import JointGenerator
+from rtcp.motion.controllers.joint_move import JointMoveController
 from rtcp.motion.controllers.room import allowed_accelerations, stoppable_speed
-from rtcp.motion.state import MotionState, Phase, Reason, Target
+from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -27,7 +27,7 @@ _DRIFT = 1e-4
 """The sender's clock may run so much slower than ours, as a fraction."""
 
 
-class StreamMode:
+class StreamController:
     """The mode `stream`.
 
     Args:
@@ -39,11 +39,11 @@ class StreamMode:
     def __init__(self, limits: Limits, period_s: float, timeout_s: float = TIMEOUT_S) -> None:
         n = len(limits.velocity)
         self._limits = limits
-        self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self._brake = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
         self._brakes = False
         self._otg = Ruckig(n, period_s)
         self._way, self._output, self._plan = InputParameter(n), OutputParameter(n), Trajectory(n)
-        self._target = Target(n)
+        self._target = Setpoint(n)
         self._zero = [0.0] * n
         self._joints = range(n)
         self._timeout_ns = round(timeout_s * 1e9)
@@ -56,7 +56,7 @@ class StreamMode:
         self._lag_s = 0.0
         self._samples = 0
         self._fresh = self._tracks = False
-        self.clamps = False
+        self.tolerates_saturation = False
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
@@ -66,7 +66,7 @@ class StreamMode:
         self.late_s = 0.0
         """How late the last one that was dropped came, s; 0 for one that was none."""
 
-    def start(self, state: MotionState) -> None:
+    def start(self, state: ArmState) -> None:
         """Begin at `state`; the next target that `feed` takes is the first."""
         self.phase, self.reason = Phase.MOVE, Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
@@ -76,7 +76,7 @@ class StreamMode:
         self._fresh = self._tracks = self._brakes = False
         # Until the first target comes, what moves comes to rest.
         self._rest_from(state)
-        self._wanted = list(state.position)
+        self._wanted = list(state.commanded)
         self._speed = list(self._zero)
 
     def feed(self, q: Sequence[float], stamp_s: float, now_ns: int) -> bool:
@@ -88,7 +88,7 @@ class StreamMode:
         Args:
             q: rad, shape (n,) at least; what is beyond is not looked at.
             stamp_s: the sender's clock, s; only differences count.
-            now_ns: as `MotionState.now_ns`.
+            now_ns: as `ArmState.now_ns`.
         """
         self.late_s = 0.0
         if self.phase is not Phase.MOVE or not isfinite(stamp_s) or not self._inside(q):
@@ -142,26 +142,26 @@ class StreamMode:
         for i in self._joints:
             v = (q[i] - wanted[i]) * over
             # Where the target is, the joint must still be able to stop inside its range.
-            room = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
-            stops = stoppable_speed(0.9 * room, limits.acceleration[i], limits.jerk[i])
+            stopping_distance = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
+            stops = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i])
             bound = limits.velocity[i] * _INSIDE
             bound = stops if stops < bound else bound
             speed[i] = bound if v > bound else -bound if v < -bound else v
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Come to rest under the limits; further targets are dropped."""
         if self.phase is Phase.MOVE:
             self.phase = Phase.STOP
             self._rest_from(state)
             self._brakes = True
 
-    def _rest_from(self, state: MotionState) -> None:
+    def _rest_from(self, state: ArmState) -> None:
         brake, limits = self._brake, self._limits
         brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
         brake.hold()
         brake.stop(state)
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle."""
         target = self._target
         if self._brakes:
@@ -170,7 +170,7 @@ class StreamMode:
                 self._brakes, self.phase = False, Phase.HOLD
             return target
         if not self.phase:
-            target.position, target.velocity = state.position, self._zero
+            target.position, target.velocity = state.commanded, self._zero
             return target
         silent_ns = state.now_ns - self._came_ns
         if silent_ns > self._timeout_ns:
@@ -204,22 +204,22 @@ class StreamMode:
             output.pass_to_input(self._way)
         return target
 
-    def _aim(self, state: MotionState) -> None:
+    def _aim(self, state: ArmState) -> None:
         """Plan from the state to the newest target, with the speed that it has; where that cannot be, to rest at it."""
         way, limits = self._way, self._limits
         self._brake.hold()
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
-        if not self._tracks or state.position != self._last:
-            way.current_position, way.current_velocity = state.position, state.velocity
+        if not self._tracks or state.commanded != self._last:
+            way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
             way.current_acceleration = allowed_accelerations(state, limits.velocity, limits.acceleration, limits.jerk)
         self._tracks = True
-        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.velocity, strict=True)]
+        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
         way.target_position, way.target_velocity = self._wanted, self._speed
         if not self._stays_inside(state):
             self._aim_to_rest()
 
-    def _stays_inside(self, state: MotionState) -> bool:
+    def _stays_inside(self, state: ArmState) -> bool:
         """Whether there is a way to the target at its speed, and the run-up for it lies inside the range."""
         try:
             if self._otg.calculate(self._way, self._plan) < 0:
@@ -228,20 +228,20 @@ class StreamMode:
             return False
         low, high, extrema = self._limits.low, self._limits.high, self._plan.position_extrema
         for i in self._joints:
-            here = state.position[i]
+            here = state.commanded[i]
             if extrema[i].min < min(low[i], here) - _SLACK or extrema[i].max > max(high[i], here) + _SLACK:
                 return False
         return True
 
-    def _may_go_on(self, state: MotionState) -> bool:
+    def _may_go_on(self, state: ArmState) -> bool:
         """Whether a target may just be late, and the joints can still stop inside their range."""
         if (state.now_ns - self._came_ns) * 1e-9 > _LATE * self._interval_s:
             return False
-        limits, speed, position = self._limits, self._speed, state.position
+        limits, speed, position = self._limits, self._speed, state.commanded
         for i in self._joints:
             v = speed[i]
-            room = limits.high[i] - position[i] if v > 0.0 else position[i] - limits.low[i]
-            most = stoppable_speed(0.9 * room, limits.acceleration[i], limits.jerk[i])
+            stopping_distance = limits.high[i] - position[i] if v > 0.0 else position[i] - limits.low[i]
+            most = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i])
             if not -most <= v <= most:
                 return False
         return True

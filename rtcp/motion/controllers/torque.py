@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from kinematics.gravity import gravity_torques
 from kinematics.model import ArmModel
 from rtcp.config.model import Joint
-from rtcp.motion.controllers.generator import JointGenerator
-from rtcp.motion.state import MotionState, Phase, Reason, Target
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -29,12 +29,12 @@ _MARGIN_RAD = 0.02
 """So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
 
 
-class TorqueMode:
+class TorqueController:
     """The mode `torque`.
 
     While `direct` is true the set-point follows the arm under the joints' speed and acceleration; what would carry the
-    arm away from it faster than that fades out, so that the arm keeps to them too. `Target.torque` is the whole torque
-    of each joint (`TorqueLaw.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the
+    arm away from it faster than that fades out, so that the arm keeps to them too. `Setpoint.torque` is the whole
+    torque of each joint (`CstWriter.pass_on`). While it stops, and at rest, it is an ordinary mode whose set-point the
     law holds.
 
     Args:
@@ -50,8 +50,8 @@ class TorqueMode:
         self._model = model if model is not None and model.links and n == 6 else None
         self._stiffness = [joint.cst_stiffness for joint in joints]
         self._damping = [joint.cst_damping for joint in joints]
-        self._brake = JointGenerator(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self._target = Target(n)
+        self._brake = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
+        self._target = Setpoint(n)
         self._zero = [0.0] * n
         self._joints = range(n)
         self._position = [0.0] * n
@@ -67,28 +67,28 @@ class TorqueMode:
         self._stiff = self._damped = 0.0
         self._until_ns = 0
         self.direct = False
-        self.clamps = True
+        self.tolerates_saturation = True
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
         self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: MotionState) -> None:
+    def start(self, state: ArmState) -> None:
         """Begin with the torques that hold the arm now, so that it does not sag."""
         carried = self._carried(state.actual)
         # In motion a torque holds nothing: what held the arm before is kept.
-        rests = not any(abs(v) > _STILL_RAD_S for v in state.speed)
+        rests = not any(abs(v) > _STILL_RAD_S for v in state.actual_velocity)
         for i in self._joints:
             if rests:
-                self._bias[i] = state.torque[i] - carried[i]
+                self._bias[i] = state.actual_torque[i] - carried[i]
             self._given[i] = self._wanted[i] = 0.0
             q, limits = state.actual[i], self._limits
             self._extra_low[i] = max(0.0, limits.low[i] + _MARGIN_RAD - q)
             self._extra_high[i] = max(0.0, q - limits.high[i] + _MARGIN_RAD)
         self._stiff = self._damped = 0.0
-        self._about[:] = state.position
+        self._about[:] = state.commanded
         # A stiffness may be asked for before the first `update`: it is about here, not about an earlier motion's end.
-        self._position[:] = state.position
+        self._position[:] = state.commanded
         self._until_ns = state.now_ns
         self.direct = True
         self.phase, self.reason = Phase.MOVE, Reason.NONE
@@ -102,7 +102,7 @@ class TorqueMode:
         Args:
             torques: bounded by each joint's limit.
             hold_s: s.
-            now_ns: as `MotionState.now_ns`.
+            now_ns: as `ArmState.now_ns`.
             stiffness: 0 to 1, of the joints' `cst_stiffness`, about where the arm is when it rises from 0.
             damping: 0 to 1, of the joints' `cst_damping`.
         """
@@ -116,7 +116,7 @@ class TorqueMode:
         self._stiff, self._damped = min(max(stiffness, 0.0), 1.0), min(max(damping, 0.0), 1.0)
         self._until_ns = now_ns + round(hold_s * 1e9)
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Bring the arm to rest under its limits, held by the law of CST from now on."""
         if self.phase is Phase.MOVE:
             brake, limits = self._brake, self._limits
@@ -125,7 +125,7 @@ class TorqueMode:
             brake.stop(state)
             self.phase, self.direct = Phase.STOP, False
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle: where the arm is, and the torque."""
         target = self._target
         if self.phase is Phase.STOP:
@@ -133,7 +133,7 @@ class TorqueMode:
             self.phase = self._brake.phase
             return target
         if not self.phase:
-            target.position, target.velocity = state.position, self._zero
+            target.position, target.velocity = state.commanded, self._zero
             return target
         if state.now_ns > self._until_ns:
             self.reason = Reason.COMMAND_ENDED
@@ -145,7 +145,7 @@ class TorqueMode:
         position, torque, given = self._position, self._torque, self._given
         follows, speeds = self._follows, self._speed
         for i in self._joints:
-            q, v = state.actual[i], state.speed[i]
+            q, v = state.actual[i], state.actual_velocity[i]
             step = most[i] * dt / _RATE_S
             change = self._wanted[i] - given[i]
             given[i] += step if change > step else -step if change < -step else change
@@ -157,7 +157,7 @@ class TorqueMode:
             # Towards the edge nothing is left of a torque, whether the joint moves or stands.
             left = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
             # Nor where the arm runs away from its set-point, which keeps to the acceleration.
-            ahead = v - state.velocity[i]
+            ahead = v - state.commanded_velocity[i]
             slack = 1.0 - (ahead if pushed > 0.0 else -ahead) / _AHEAD_RAD_S
             left = slack if slack < left else left
             pushed *= 0.0 if left < 0.0 else left if left < 1.0 else 1.0
@@ -174,8 +174,8 @@ class TorqueMode:
             whole = carried[i] + self._bias[i] + pushed - self._damping[i] * drag + self._stiffness[i] * wall
             torque[i] = most[i] if whole > most[i] else -most[i] if whole < -most[i] else whole
             position[i] = q
-            speeds[i] = speed = _chase(q - state.position[i], v, state.velocity[i], top, slow, dt)
-            follows[i] = state.position[i] + speed * dt
+            speeds[i] = speed = _chase(q - state.commanded[i], v, state.commanded_velocity[i], top, slow, dt)
+            follows[i] = state.commanded[i] + speed * dt
         target.position, target.velocity, target.torque = follows, speeds, torque
         return target
 
@@ -183,9 +183,9 @@ class TorqueMode:
         return self._zero if self._model is None else gravity_torques(self._model, position)
 
 
-def _bound(room: float, fastest: float, slowing: float) -> float:
-    """The speed that stops within `room` rad."""
-    bound = sqrt(2.0 * slowing * room) if room > 0.0 else 0.0
+def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
+    """The speed that stops within `stopping_distance` rad."""
+    bound = sqrt(2.0 * slowing * stopping_distance) if stopping_distance > 0.0 else 0.0
     return bound if bound < fastest else fastest
 
 

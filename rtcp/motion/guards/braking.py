@@ -19,20 +19,20 @@ _ROUNDING_M = 1e-12
 _INSIDE_SAMPLES = 8
 
 
-def fastest_stoppable(room: float, u: float, dt: float) -> float:
-    """Return the greatest mean speed of a cycle after which the stop ends within `room` of where the cycle began.
+def fastest_stoppable(stopping_distance: float, u: float, dt: float) -> float:
+    """Return the greatest mean speed of a cycle after which the stop ends within `stopping_distance`.
 
     With n = floor(w / u) the cycle and its stop travel ((n + 1) w - u n (n + 1) / 2) dt, which is solved for w.
 
     Args:
-        room: rad; nothing is left of it below 0.
+        stopping_distance: rad; nothing is left of it below 0.
         u: what the speed falls by in a cycle, rad/s.
         dt: the cycle, s.
     """
-    if room <= 0.0:
+    if stopping_distance <= 0.0:
         return 0.0
-    n = int(0.5 * (sqrt(1.0 + 8.0 * room / (u * dt)) - 1.0))
-    return room / ((n + 1) * dt) + 0.5 * n * u
+    n = int(0.5 * (sqrt(1.0 + 8.0 * stopping_distance / (u * dt)) - 1.0))
+    return stopping_distance / ((n + 1) * dt) + 0.5 * n * u
 
 
 def travel(

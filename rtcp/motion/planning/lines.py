@@ -57,7 +57,7 @@ def plan_lines(
     speed: float | None = None,
     zone_at: ZoneAt | None = None,
 ) -> Plan:
-    """Return the plan of straight lines for `LineMode`, from where the arm is to each stop in turn, at rest at each.
+    """Return the plan of straight lines for `LineController`, from the arm's position to each stop, at rest at each.
 
     Args:
         model: the arm.

@@ -1,4 +1,4 @@
-"""Polynomials of one joint between two knots, over the fraction x = (t - t0) / T from 0 to 1, and their exact extremes.
+"""Polynomials of one joint between two waypoints over the fraction x = (t - t0) / T, and their exact extremes.
 
 Coefficients rise: c[0] + c[1] x + .. Derivatives are by x: a speed is the first over T, an acceleration the second over
 T^2.

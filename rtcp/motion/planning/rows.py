@@ -1,8 +1,8 @@
 """Plans as rows of 20 doubles, written outside the cycle (`rtcp.motion.planning`) and read in it, row by row.
 
-A knot of a trajectory (`KNOT`), for n <= 6 joints:
+A waypoint of a trajectory (`WAYPOINT`), for n <= 6 joints:
 
-    column 0          t, s from the start of the motion; rising from knot to knot
+    column 0          t, s from the start of the motion; rising from waypoint to waypoint
     columns 1 .. 6    position of each joint, rad          (those beyond n are 0)
     columns 7 .. 12   velocity of each joint, rad/s
     columns 13 .. 18  acceleration of each joint, rad/s^2

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.ipc.client import ControlClient, ControlError
-from rtcp.ipc.paths import control_socket
+from rtcp.ipc.runtime_directory import control_socket
 from rtcp.telemetry.trials.bench import NAME, Bench, TrialFailed
 
 START = (0.0, 0.2, 1.57, 0.0, 0.4, 0.0)

@@ -16,7 +16,7 @@ from rtcp.ipc.client import ControlClient, ControlError
 from rtcp.ipc.machine import State
 from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.paths import blackboard_file, control_socket, segment_control
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
 from rtcp.telemetry.steps import target_steps
 from rtcp.virtual.faults.client import SegmentClient
@@ -223,4 +223,4 @@ class Bench:
 
 def _segment_socket(directory: Path) -> Path:
     """Return where the platform's own segment is asked: another one may have the usual place."""
-    return read_session(directory / "session.pickle").segment_control or segment_control(directory)
+    return read_session(directory).segment_control or segment_control(directory)

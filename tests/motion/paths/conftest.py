@@ -13,9 +13,9 @@ import pytest
 
 from rtcp.config import load
 from rtcp.config.model import ArmConfig
-from rtcp.motion.guards.envelope import SetPointGuard, Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import Mode, MotionState, Phase, Target
+from rtcp.motion.state import ArmState, Controller, Phase, Setpoint
 
 PERIOD = 0.0005
 
@@ -25,7 +25,7 @@ class Drive:
     """Runs modes one after another on one state and checks every cycle against the limits."""
 
     config: ArmConfig
-    state: MotionState = field(default_factory=lambda: MotionState(6))
+    state: ArmState = field(default_factory=lambda: ArmState(6))
     period_s: float = PERIOD
     with_jerk: bool = False
     checked: bool = True
@@ -35,39 +35,39 @@ class Drive:
 
     def __post_init__(self) -> None:
         self.limits = Limits(self.config)
-        self.guard = SetPointGuard(replace(self.config, arm=None), self.limits, self.period_s)
+        self.guard = TrajectoryGuard(replace(self.config, arm=None), self.limits, self.period_s)
 
     def at(self, q: Sequence[float]) -> Drive:
         """Stand at `q`."""
-        self.state.position = [float(angle) for angle in q]
-        self.state.actual = list(self.state.position)
+        self.state.commanded = [float(angle) for angle in q]
+        self.state.actual = list(self.state.commanded)
         self.guard.latch(self.state)
         return self
 
-    def cycle(self, mode: Mode) -> None:
+    def cycle(self, mode: Controller) -> None:
         """One cycle: continuous, inside range, speed and acceleration."""
         state, dt, limits = self.state, self.period_s, self.limits
         target = mode.update(state, dt)
-        before = list(state.position)
+        before = list(state.commanded)
         position, velocity = list(target.position), list(target.velocity)
-        if mode.clamps:
+        if mode.tolerates_saturation:
             self.clamped(mode, target, before)
             return
-        acceleration = [(after - before) / dt for before, after in zip(state.velocity, velocity, strict=True)]
+        acceleration = [(after - before) / dt for before, after in zip(state.commanded_velocity, velocity, strict=True)]
         for i in range(6 if self.checked else 0):
             where = (i, state.now_ns, mode.phase, mode.reason)
             assert math.isfinite(position[i]), where
             assert limits.low[i] - 1e-6 <= position[i] <= limits.high[i] + 1e-6, where
             assert abs(velocity[i]) <= limits.velocity[i] * (1 + 1e-6), where
             assert abs(acceleration[i]) <= limits.acceleration[i] * (1 + 1e-3) + 1e-6, where
-            moved, expected = position[i] - state.position[i], 0.5 * (velocity[i] + state.velocity[i]) * dt
+            moved, expected = position[i] - state.commanded[i], 0.5 * (velocity[i] + state.commanded_velocity[i]) * dt
             assert abs(moved - expected) <= limits.acceleration[i] * dt * dt + 1e-9, where
             if self.with_jerk:
-                change = abs(acceleration[i] - state.acceleration[i])
+                change = abs(acceleration[i] - state.commanded_acceleration[i])
                 assert change <= limits.jerk[i] * dt * 1.01 + 1e-4, where
         if self.checked:
-            verdict = self.guard.apply(state, target, mode.clamps)
-            assert verdict is Verdict.PASS, (
+            verdict = self.guard.apply(state, target, mode.tolerates_saturation)
+            assert verdict is GuardResult.PASS, (
                 state.now_ns,
                 self.guard.code,
                 self.guard.axis,
@@ -75,43 +75,43 @@ class Drive:
                 self.guard.limit,
             )
         else:
-            state.position, state.velocity, state.acceleration = position, velocity, acceleration
+            state.commanded, state.commanded_velocity, state.commanded_acceleration = position, velocity, acceleration
         self._measured()
 
-    def clamped(self, mode: Mode, target: Target, before: Sequence[float]) -> None:
+    def clamped(self, mode: Controller, target: Setpoint, before: Sequence[float]) -> None:
         """A mode that the guards may cut: what they make of it keeps to the limits, and they never have to stop it."""
         state, dt, limits = self.state, self.period_s, self.limits
         speeds = list(self.means)
-        verdict = self.guard.apply(state, target, mode.clamps)
-        assert verdict in (Verdict.PASS, Verdict.CLAMPED), (state.now_ns, verdict)
-        self.cuts += verdict is Verdict.CLAMPED
-        self.means = [(after - q) / dt for after, q in zip(state.position, before, strict=True)]
+        verdict = self.guard.apply(state, target, mode.tolerates_saturation)
+        assert verdict in (GuardResult.PASS, GuardResult.CLAMPED), (state.now_ns, verdict)
+        self.cuts += verdict is GuardResult.CLAMPED
+        self.means = [(after - q) / dt for after, q in zip(state.commanded, before, strict=True)]
         for i, (mean, last) in enumerate(zip(self.means, speeds, strict=True)):
             where = (i, state.now_ns, mode.phase, mode.reason)
-            assert limits.low[i] - 1e-6 <= state.position[i] <= limits.high[i] + 1e-6, where
+            assert limits.low[i] - 1e-6 <= state.commanded[i] <= limits.high[i] + 1e-6, where
             assert abs(mean) <= limits.velocity[i] * (1 + 1e-6), where
             assert abs(mean - last) <= limits.acceleration[i] * dt * (1 + 1e-3) + 1e-6, where
         self._measured()
 
     def _measured(self) -> None:
         state = self.state
-        state.actual, state.speed = list(state.position), list(state.velocity)
+        state.actual, state.actual_velocity = list(state.commanded), list(state.commanded_velocity)
         state.now_ns += round(self.period_s * 1e9)
-        self.path.append(list(state.position))
+        self.path.append(list(state.commanded))
 
-    def run(self, mode: Mode, cycles: int) -> None:
+    def run(self, mode: Controller, cycles: int) -> None:
         """So many cycles."""
         for _ in range(cycles):
             self.cycle(mode)
 
-    def until_rest(self, mode: Mode, most_s: float = 60.0) -> float:
+    def until_rest(self, mode: Controller, most_s: float = 60.0) -> float:
         """Run until the mode holds and return how long it took, s; at rest then."""
         began = self.state.now_ns
         while mode.phase is not Phase.HOLD:
             self.cycle(mode)
             assert (self.state.now_ns - began) * 1e-9 < most_s
         self.cycle(mode)
-        assert max(map(abs, self.state.velocity)) < 1e-6
+        assert max(map(abs, self.state.commanded_velocity)) < 1e-6
         return (self.state.now_ns - began) * 1e-9
 
 

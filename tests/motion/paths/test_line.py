@@ -13,7 +13,7 @@ import pytest
 
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
-from rtcp.motion.controllers.line import LineMode
+from rtcp.motion.controllers.line import LineController
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Stop
 from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
@@ -25,8 +25,8 @@ Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
 
 
 @pytest.fixture
-def mode(arm: Any, bounds: Any) -> LineMode:
-    return LineMode(arm.arm, bounds, PERIOD)
+def mode(arm: Any, bounds: Any) -> LineController:
+    return LineController(arm.arm, bounds, PERIOD)
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def off_line(start: Sequence[float], end: Sequence[float], point: Sequence[float
 
 
 def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
-    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     stops = [moved(dy=0.2), moved(dy=0.2, dz=0.1), moved()]
     drive.at(Q)
@@ -65,8 +65,8 @@ def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
     rests, corner = [], 0
     while mode.phase is not Phase.HOLD:
         drive.cycle(mode)
-        if corner < 3 and math.dist(forward(arm.arm, drive.state.position).position, stops[corner].pose[:3]) < 1e-9:
-            rests.append(max(map(abs, drive.state.velocity)))
+        if corner < 3 and math.dist(forward(arm.arm, drive.state.commanded).position, stops[corner].pose[:3]) < 1e-9:
+            rests.append(max(map(abs, drive.state.commanded_velocity)))
             corner += 1
     assert corner == 3
     assert max(rests) < 1e-3
@@ -80,7 +80,9 @@ def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
     assert mode.elapsed_s == pytest.approx(mode.duration_s, abs=0.01)
 
 
-def test_the_tool_keeps_to_speed_and_acceleration(arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+def test_the_tool_keeps_to_speed_and_acceleration(
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
+) -> None:
     drive.at(Q)
     mode.start(drive.state, *rows([moved(dz=-0.2)], speed=0.05))
     drive.until_rest(mode)
@@ -92,7 +94,7 @@ def test_the_tool_keeps_to_speed_and_acceleration(arm: Any, drive: Any, mode: Li
 
 
 def test_a_turn_is_about_one_axis_and_ends_where_it_should(
-    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     goal = moved(drx=0.4, dry=-0.3, drz=0.2)
     drive.at(Q)
@@ -114,7 +116,7 @@ def test_a_turn_is_about_one_axis_and_ends_where_it_should(
 
 @pytest.mark.parametrize("after_s", [0.0005, 0.1, 0.5, 1.0, 1.4])
 def test_a_stop_brakes_along_the_line(
-    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any, after_s: float
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any, after_s: float
 ) -> None:
     goal = moved(dy=0.2, drz=0.2)
     drive.at(Q)
@@ -125,20 +127,20 @@ def test_a_stop_brakes_along_the_line(
     start = forward(arm.arm, Q).position
     assert max(off_line(start, goal.pose[:3], forward(arm.arm, q).position) for q in drive.path[1:]) < 1e-9
     assert mode.reason is Reason.NONE
-    assert math.dist(forward(arm.arm, drive.state.position).position, goal.pose[:3]) > 1e-3
+    assert math.dist(forward(arm.arm, drive.state.commanded).position, goal.pose[:3]) > 1e-3
 
 
 def test_a_small_rest_at_the_start_fades_out_without_a_jump(
-    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-4 for q in Q])
     assert mode.start(drive.state, *plan) is None
     drive.until_rest(mode)
-    assert math.dist(forward(arm.arm, drive.state.position).position, moved(dy=0.2).pose[:3]) < 1e-9
+    assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.2).pose[:3]) < 1e-9
 
 
-def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineController, rows: Any, moved: Any) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-3 for q in Q])
     refused = mode.start(drive.state, *plan)
@@ -149,7 +151,7 @@ def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineMode, row
 
 
 def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
-    arm: Any, drive: Any, mode: LineMode, rows: Any, moved: Any
+    arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     first, second = rows([moved(dy=0.1)]), rows([moved(dz=-0.1)])
     drive.at(Q)
@@ -158,10 +160,10 @@ def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
     refused = mode.start(drive.state, *second)
     assert refused is not None
     assert refused.wrong is Wrong.MOVING
-    assert abs(drive.state.velocity[refused.at]) > 0.01
-    assert refused.value == drive.state.velocity[refused.at]
+    assert abs(drive.state.commanded_velocity[refused.at]) > 0.01
+    assert refused.value == drive.state.commanded_velocity[refused.at]
     drive.until_rest(mode)
-    assert math.dist(forward(arm.arm, drive.state.position).position, moved(dy=0.1).pose[:3]) < 1e-9
+    assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.1).pose[:3]) < 1e-9
     # At rest it is looked at for what it is: this one begins elsewhere.
     refused = mode.start(drive.state, *second)
     assert refused is not None
@@ -170,9 +172,9 @@ def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
 
 def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, bounds: Any, memory: Any) -> None:
     for seed in range(4):
-        chance, drive, mode = random.Random(seed), new_drive().at(Q), LineMode(arm.arm, bounds, PERIOD)
+        chance, drive, mode = random.Random(seed), new_drive().at(Q), LineController(arm.arm, bounds, PERIOD)
         for _ in range(3):
-            q = drive.state.position
+            q = drive.state.commanded
             at = forward(arm.arm, q)
             goal = (*(c + chance.uniform(-0.08, 0.08) for c in at.position), *at.rpy)
             plan = plan_lines(arm.arm, bounds, arm.cartesian, q, [Stop(goal)])
@@ -182,7 +184,9 @@ def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, bound
             drive.until_rest(mode)
 
 
-def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(drive: Any, mode: LineMode, rows: Any, moved: Any) -> None:
+def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(
+    drive: Any, mode: LineController, rows: Any, moved: Any
+) -> None:
     plan, count = rows([moved(dy=0.2)])
     # So far and so fast that the first set-point is out of reach already.
     plan[8], plan[14], plan[15], plan[16] = 200.0, 1e6, 1e8, 1e9
@@ -191,11 +195,11 @@ def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(drive: Any, mode: LineM
     drive.until_rest(mode)
     assert mode.reason is Reason.NO_SOLUTION
     assert mode.value > 1.0
-    assert drive.state.position == list(Q)
+    assert drive.state.commanded == list(Q)
 
 
 def test_a_line_that_stretches_the_arm_stops_before_a_joint_is_too_fast(
-    drive: Any, mode: LineMode, rows: Any, moved: Any
+    drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     plan, count = rows([moved(dy=0.2)])
     # Towards the edge of the reach the elbow's speed grows without bound. The drive checks every cycle.
@@ -214,13 +218,13 @@ def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it
     plan[8], plan[14], plan[15], plan[16] = 1.5, 0.03, 0.1, 1.0
     # Far enough from the stretched elbow that no joint is too fast there.
     near = replace(arm.cartesian.singularity, elbow=0.6)
-    mode = LineMode(arm.arm, bounds, PERIOD, near)
+    mode = LineController(arm.arm, bounds, PERIOD, near)
     drive.at(Q)
     assert mode.start(drive.state, plan, count) is None
     drive.until_rest(mode)
     assert (mode.reason, mode.axis, mode.limit) == (Reason.SINGULARITY, 1, 0.6)
     assert 0.93 * 0.6 < mode.value < 0.95 * 0.6
-    found = singularity_distances(arm.arm, drive.state.position).elbow
+    found = singularity_distances(arm.arm, drive.state.commanded).elbow
     assert found is not None
     assert 0.5 < found < mode.value
 
@@ -233,7 +237,7 @@ def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(
         arm.arm,
         limits=(replace(arm.arm.limits[0], lower=-0.1, upper=0.1), *arm.arm.limits[1:]),
     )
-    mode = LineMode(model, bounds, PERIOD)
+    mode = LineController(model, bounds, PERIOD)
     drive.at(Q)
     assert mode.start(drive.state, plan, count) is None
     drive.until_rest(mode)
@@ -241,7 +245,7 @@ def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(
 
 
 def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
-    drive: Any, mode: LineMode, rows: Any, moved: Any
+    drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     plan, count = rows([moved(dy=0.4)])
     # As if nothing had been slowed down: the tool stays bounded, a joint does not.
@@ -260,7 +264,7 @@ def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
     [(0, math.nan), (3, 2.0), (9, math.inf), (14, 0.0), (14, -1.0), (15, math.nan), (18, -1.0), (KIND, 3.0)],
 )
 def test_a_damaged_piece_is_not_started_and_ends_what_runs(
-    drive: Any, mode: LineMode, rows: Any, moved: Any, column: int, value: float
+    drive: Any, mode: LineController, rows: Any, moved: Any, column: int, value: float
 ) -> None:
     plan, count = rows([moved(dy=0.1), moved()])
     drive.at(Q)
@@ -276,7 +280,7 @@ def test_a_damaged_piece_is_not_started_and_ends_what_runs(
 
 
 def test_a_piece_that_begins_elsewhere_than_the_last_ended_is_damaged(
-    drive: Any, mode: LineMode, rows: Any, moved: Any
+    drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     plan, count = rows([moved(dy=0.1), moved()])
     plan[COLUMNS + 2] += 0.01

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from kinematics import forward
-from rtcp.motion.controllers.line import LineMode
+from rtcp.motion.controllers.line import LineController
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Plan, PlanRefused, Stop
@@ -156,12 +156,12 @@ def test_a_line_is_slowed_down_until_the_joints_keep_their_limits(
     made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.2), moved()], speed=0.25)
     assert 0.1 < made.slowed < 0.9
     assert made.rows[0][14] <= made.slowed * 0.25 / 0.2 * 1.0001
-    mode = LineMode(arm.arm, drive.limits, PERIOD)
+    mode = LineController(arm.arm, drive.limits, PERIOD)
     assert mode.start(drive.state, memory(made.rows), len(made.rows)) is None
     # The drive checks speed and acceleration of each joint in every cycle.
     assert drive.until_rest(mode) == pytest.approx(made.duration_s, abs=0.01)
     assert mode.reason is Reason.NONE
-    assert drive.state.position == pytest.approx(made.end, abs=1e-9)
+    assert drive.state.commanded == pytest.approx(made.end, abs=1e-9)
     fastest = max(max(abs(b - a) for a, b in zip(p, q, strict=True)) for p, q in pairwise(drive.path)) / PERIOD
     # And no slower than they demand.
     assert fastest > 0.8 * 0.15
@@ -173,10 +173,10 @@ def test_a_line_is_accelerated_so_gently_that_the_joints_keep_their_limits(
     drive = new_drive().at(Q)
     drive.limits.acceleration[:] = [0.3] * 6
     made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.1)], speed=0.1)
-    mode = LineMode(arm.arm, drive.limits, PERIOD)
+    mode = LineController(arm.arm, drive.limits, PERIOD)
     assert mode.start(drive.state, memory(made.rows), 1) is None
     drive.until_rest(mode)
-    assert drive.state.position == pytest.approx(made.end, abs=1e-9)
+    assert drive.state.commanded == pytest.approx(made.end, abs=1e-9)
 
 
 def test_a_line_that_no_joint_hinders_keeps_its_speed(plan: Any, moved: Any) -> None:

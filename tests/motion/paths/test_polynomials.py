@@ -1,4 +1,4 @@
-"""Polynomials between knots, their extremes, the spline through points, and turns between orientations."""
+"""Polynomials between waypoints, their extremes, the spline through points, and turns between orientations."""
 
 from __future__ import annotations
 

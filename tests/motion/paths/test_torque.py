@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinematics.model import LinkMass
-from rtcp.motion.controllers.torque import TorqueMode
-from rtcp.motion.guards.envelope import SetPointGuard
+from rtcp.motion.controllers.torque import TorqueController
+from rtcp.motion.drive_writers import CstWriter
+from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.modes import TorqueLaw
-from rtcp.motion.state import MotionState, Phase, Reason
+from rtcp.motion.state import ArmState, Phase, Reason
 
 PERIOD = 0.0005
 MASS, ARM_M, G = 3.0, 0.4, 9.80665
@@ -47,14 +47,14 @@ class Plant:
         self.weight = (MASS + payload) * G * ARM_M
         self.joints = [Joint(position=angle, torque=t) for angle, t in zip(q, self.holding(q), strict=True)]
         self.limits = Limits(arm)
-        self.state = MotionState(6)
-        self.state.position, self.state.actual = list(q), list(q)
-        self.state.torque = self.holding(q)
-        self.guard = SetPointGuard(replace(arm, arm=None), self.limits, PERIOD)
+        self.state = ArmState(6)
+        self.state.commanded, self.state.actual = list(q), list(q)
+        self.state.actual_torque = self.holding(q)
+        self.guard = TrajectoryGuard(replace(arm, arm=None), self.limits, PERIOD)
         self.guard.latch(self.state)
-        self.law = TorqueLaw(arm.joints, PERIOD)
+        self.law = CstWriter(arm.joints, PERIOD)
         self.law.start(self.joints)
-        self.mode = TorqueMode(arm.joints, self.limits, PERIOD, model)
+        self.mode = TorqueController(arm.joints, self.limits, PERIOD, model)
         self.outside = [0.0] * 6
         """Torques from outside, as of a hand, Nm."""
         self.seen: list[tuple[list[float], list[float], list[float]]] = []
@@ -66,22 +66,22 @@ class Plant:
     def cycle(self) -> None:
         state, joints = self.state, self.joints
         target = self.mode.update(state, PERIOD)
-        self.guard.apply(state, target, self.mode.clamps)
+        self.guard.apply(state, target, self.mode.tolerates_saturation)
         if self.mode.direct:
             assert all(-most <= torque <= most for torque, most in zip(target.torque, self.limits.torque, strict=True))
-            self.law.pass_on(state.position, target.torque, joints)
+            self.law.pass_on(state.commanded, target.torque, joints)
         else:
-            self.law.update(state.position, state.velocity, joints)
+            self.law.update(state.commanded, state.commanded_velocity, joints)
         held = self.holding([joint.position for joint in joints])
         for i, joint in enumerate(joints):
             joint.torque = joint.target_torque
             joint.velocity += (joint.torque + self.outside[i] - held[i]) / INERTIA[i] * PERIOD
             joint.position += joint.velocity * PERIOD
         state.actual = [joint.position for joint in joints]
-        state.speed = [joint.velocity for joint in joints]
-        state.torque = [joint.torque for joint in joints]
+        state.actual_velocity = [joint.velocity for joint in joints]
+        state.actual_torque = [joint.torque for joint in joints]
         state.now_ns += round(PERIOD * 1e9)
-        self.seen.append((list(state.actual), list(state.speed), list(state.torque)))
+        self.seen.append((list(state.actual), list(state.actual_velocity), list(state.actual_torque)))
 
     def run(self, seconds: float, torques: Sequence[float] | None = None, **given: float) -> None:
         """So long, with a command said again every 50 ms."""
@@ -131,7 +131,7 @@ def test_without_a_torque_asked_for_the_arm_floats_where_it_is(new_plant: Any, a
     plant.mode.start(plant.state)
     plant.run(1.0, FREE)
     assert plant.state.actual == pytest.approx([0.0, angle, 0.0, 0.0, 0.0, 0.0], abs=1e-6)
-    assert plant.state.torque[1] == pytest.approx(-MASS * G * ARM_M * math.sin(angle))
+    assert plant.state.actual_torque[1] == pytest.approx(-MASS * G * ARM_M * math.sin(angle))
 
 
 def test_gravity_is_carried_wherever_the_arm_is_pushed_to(plant: Plant) -> None:
@@ -157,7 +157,7 @@ def test_a_torque_accelerates_as_the_inertia_says(plant: Plant) -> None:
     plant.mode.start(plant.state)
     plant.run(0.2, [1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     # 1 rad/s^2, but for the ramp of the torque: 1.2 of 49 Nm in 2.4 ms.
-    assert plant.state.speed[0] == pytest.approx(0.2, abs=0.003)
+    assert plant.state.actual_velocity[0] == pytest.approx(0.2, abs=0.003)
 
 
 def test_a_reversal_of_the_whole_torque_keeps_to_the_acceleration_and_the_set_point_follows(plant: Plant) -> None:
@@ -166,7 +166,7 @@ def test_a_reversal_of_the_whole_torque_keeps_to_the_acceleration_and_the_set_po
     for sign in (1.0, -1.0, 1.0):
         for _ in range(10):
             plant.run(0.1, [sign * torque for torque in plant.limits.torque])
-            apart = zip(plant.state.position, plant.state.actual, strict=True)
+            apart = zip(plant.state.commanded, plant.state.actual, strict=True)
             worst = max(worst, *(abs(a - b) for a, b in apart))
     # An emergency stop comes at 0.15 rad (watch.following_error).
     assert worst < 0.05
@@ -192,7 +192,7 @@ def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sig
     plant.check()
     edges = plant.limits.high if sign > 0 else plant.limits.low
     assert plant.state.actual == pytest.approx(edges, abs=0.03)
-    assert max(map(abs, plant.state.speed)) < 1e-3
+    assert max(map(abs, plant.state.actual_velocity)) < 1e-3
     assert max(abs(speeds[0]) for _, speeds, _ in plant.seen) > 0.45
     # From the edge a torque leads back.
     plant.run(1.0, [-sign * torque for torque in plant.limits.torque])
@@ -221,7 +221,7 @@ def test_it_ends_by_itself_when_it_is_not_said_again(plant: Plant) -> None:
     assert plant.mode.phase is Phase.MOVE
     plant.run(1.5)
     assert (plant.mode.phase, plant.mode.reason, plant.mode.direct) == (Phase.HOLD, Reason.COMMAND_ENDED, False)
-    assert max(map(abs, plant.state.speed)) < 2e-3
+    assert max(map(abs, plant.state.actual_velocity)) < 2e-3
     plant.check()
 
 
@@ -270,7 +270,7 @@ def test_stiffness_asked_for_at_once_is_about_where_the_arm_begins(new_plant: An
 def test_damping_slows_a_motion_down(plant: Plant) -> None:
     plant.mode.start(plant.state)
     plant.run(2.0, [6.0, 0.0, 0.0, 0.0, 0.0, 0.0], damping=1.0)
-    assert plant.state.speed[0] == pytest.approx(6.0 / 60.0, rel=0.05)
+    assert plant.state.actual_velocity[0] == pytest.approx(6.0 / 60.0, rel=0.05)
 
 
 def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plant: Any) -> None:
@@ -285,10 +285,10 @@ def test_a_hand_that_leans_on_the_arm_does_not_push_it_out_of_its_range(new_plan
 
 def test_beside_the_edge_it_begins_without_a_push(new_plant: Any) -> None:
     plant = new_plant([3.09, 0.5, -2.395, 0.0, 0.0, 0.0])
-    before = list(plant.state.torque)
+    before = list(plant.state.actual_torque)
     plant.mode.start(plant.state)
     plant.cycle()
-    assert plant.state.torque == pytest.approx(before, abs=0.01)
+    assert plant.state.actual_torque == pytest.approx(before, abs=0.01)
     plant.run(1.0, plant.limits.torque)
     plant.check()
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruckig import ControlInterface, RuckigError
 
-from rtcp.motion.controllers.velocity import VelocityMode
+from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.state import Phase, Reason
 
 PERIOD = 0.0005
@@ -19,54 +19,54 @@ NONE = [0.0] * 6
 
 
 @pytest.fixture
-def mode(bounds: Any) -> VelocityMode:
-    return VelocityMode(bounds, PERIOD)
+def mode(bounds: Any) -> VelocityController:
+    return VelocityController(bounds, PERIOD)
 
 
 def test_a_speed_is_reached_by_a_ramp_of_acceleration_and_jerk(new_drive: Any) -> None:
     drive = new_drive(with_jerk=True)
-    mode = VelocityMode(drive.limits, PERIOD)
+    mode = VelocityController(drive.limits, PERIOD)
     mode.start(drive.state)
     mode.command([0.4, -0.2, 0.0, 0.1, 0.3, -0.4], 1.0, 0)
     # v / a + a / j = 0.4 / 2 + 2 / 20 s for the fastest.
     drive.run(mode, 598)
-    assert drive.state.velocity[0] < 0.4
+    assert drive.state.commanded_velocity[0] < 0.4
     drive.run(mode, 4)
-    assert drive.state.velocity == pytest.approx([0.4, -0.2, 0.0, 0.1, 0.3, -0.4], abs=1e-9)
+    assert drive.state.commanded_velocity == pytest.approx([0.4, -0.2, 0.0, 0.1, 0.3, -0.4], abs=1e-9)
     # Half way up the ramp it has the whole acceleration, and no joint waits for another.
     before, here, after = (q[0] for q in drive.path[298:301])
     assert (after - 2.0 * here + before) / PERIOD**2 == pytest.approx(2.0, rel=1e-3)
     assert mode.phase is Phase.MOVE
 
 
-def test_a_speed_beyond_the_limit_is_cut_to_it(drive: Any, mode: VelocityMode) -> None:
+def test_a_speed_beyond_the_limit_is_cut_to_it(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     mode.command([9.0, -9.0, 0.0, 0.0, 0.0, 0.0], 1.0, 0)
     drive.run(mode, 1500)
-    assert drive.state.velocity[:2] == pytest.approx([0.5, -0.5])
+    assert drive.state.commanded_velocity[:2] == pytest.approx([0.5, -0.5])
 
 
-def test_a_speed_that_is_not_said_again_ends_in_a_stop(drive: Any, mode: VelocityMode) -> None:
+def test_a_speed_that_is_not_said_again_ends_in_a_stop(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     for k in range(4):
         mode.command([0.3] * 6, 0.5, drive.state.now_ns)
         drive.run(mode, 600 + 100 * k)
         assert mode.phase is Phase.MOVE
-    assert drive.state.velocity == pytest.approx([0.3] * 6)
+    assert drive.state.commanded_velocity == pytest.approx([0.3] * 6)
     # 0.05 s are left of the last one, then the ramp: v / a + a / j.
     assert drive.until_rest(mode) == pytest.approx(0.05 + 0.3 / 2.0 + 2.0 / 20.0, abs=0.01)
     assert mode.reason is Reason.COMMAND_ENDED
 
 
-def test_standing_still_it_ends_without_a_reason(drive: Any, mode: VelocityMode) -> None:
+def test_standing_still_it_ends_without_a_reason(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     mode.command(NONE, 0.1, 0)
     drive.run(mode, 300)
     assert (mode.phase, mode.reason) == (Phase.HOLD, Reason.NONE)
-    assert drive.state.position == NONE
+    assert drive.state.commanded == NONE
 
 
-def test_a_stop_ramps_down_and_takes_no_speeds_until_a_new_start(drive: Any, mode: VelocityMode) -> None:
+def test_a_stop_ramps_down_and_takes_no_speeds_until_a_new_start(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     mode.command([0.5] * 6, 1.0, 0)
     drive.run(mode, 1000)
@@ -77,13 +77,13 @@ def test_a_stop_ramps_down_and_takes_no_speeds_until_a_new_start(drive: Any, mod
     mode.start(drive.state)
     mode.command([-0.1] * 6, 1.0, drive.state.now_ns)
     drive.run(mode, 500)
-    assert drive.state.velocity == pytest.approx([-0.1] * 6)
+    assert drive.state.commanded_velocity == pytest.approx([-0.1] * 6)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("speed", [0.05, 0.5])
 def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
-    drive: Any, mode: VelocityMode, sign: float, speed: float
+    drive: Any, mode: VelocityController, sign: float, speed: float
 ) -> None:
     edges = drive.limits.high if sign > 0 else drive.limits.low
     start = [edge - sign * 0.1 for edge in edges]
@@ -92,8 +92,8 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
     for _ in range(25):
         mode.command([sign * speed] * 6, 0.5, drive.state.now_ns)
         drive.run(mode, 200)
-    assert drive.state.position == pytest.approx(edges, abs=1e-6)
-    assert max(map(abs, drive.state.velocity)) < 1e-6
+    assert drive.state.commanded == pytest.approx(edges, abs=1e-6)
+    assert max(map(abs, drive.state.commanded_velocity)) < 1e-6
     fastest = max(abs(b[0] - a[0]) / PERIOD for a, b in pairwise(drive.path))
     assert fastest <= speed * (1 + 1e-6)
     # It does not go to and fro there, and it is the mode that stops it, not the guard.
@@ -103,36 +103,36 @@ def test_a_joint_comes_to_rest_at_the_edge_of_its_range_and_leaves_it_again(
     assert mode.phase is Phase.MOVE
     mode.command([-sign * speed] * 6, 0.5, drive.state.now_ns)
     drive.run(mode, 1000)
-    assert drive.state.velocity == pytest.approx([-sign * speed] * 6)
+    assert drive.state.commanded_velocity == pytest.approx([-sign * speed] * 6)
 
 
-def test_what_the_guards_made_of_it_is_gone_on_from(drive: Any, mode: VelocityMode) -> None:
+def test_what_the_guards_made_of_it_is_gone_on_from(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     mode.command([0.4] * 6, 1.0, 0)
     drive.run(mode, 400)
     # As after a stop before a box: at rest, a little behind.
-    drive.state.velocity, drive.state.acceleration = [0.0] * 6, [0.0] * 6
-    drive.at([q - 0.01 for q in drive.state.position])
-    before = list(drive.state.position)
+    drive.state.commanded_velocity, drive.state.commanded_acceleration = [0.0] * 6, [0.0] * 6
+    drive.at([q - 0.01 for q in drive.state.commanded])
+    before = list(drive.state.commanded)
     assert mode.update(drive.state, PERIOD).position == pytest.approx(before, abs=1e-6)
 
 
-def test_the_other_joints_go_on_while_one_stands_at_its_edge(drive: Any, mode: VelocityMode) -> None:
+def test_the_other_joints_go_on_while_one_stands_at_its_edge(drive: Any, mode: VelocityController) -> None:
     drive.at([3.05, 0.0, 0.0, 0.0, 0.0, 0.0])
     mode.start(drive.state)
     for _ in range(6):
         mode.command([0.4] * 6, 0.5, drive.state.now_ns)
         drive.run(mode, 300)
-    assert drive.state.velocity[1:] == pytest.approx([0.4] * 5)
+    assert drive.state.commanded_velocity[1:] == pytest.approx([0.4] * 5)
 
 
-def test_narrower_limits_count_from_the_next_cycle_on(drive: Any, mode: VelocityMode) -> None:
+def test_narrower_limits_count_from_the_next_cycle_on(drive: Any, mode: VelocityController) -> None:
     mode.start(drive.state)
     drive.limits.high[0] = 0.1
     for _ in range(8):
         mode.command([0.5] * 6, 0.5, drive.state.now_ns)
         drive.run(mode, 250)
-    assert drive.state.position[0] == pytest.approx(0.1, abs=1e-6)
+    assert drive.state.commanded[0] == pytest.approx(0.1, abs=1e-6)
 
 
 class Failing:
@@ -147,7 +147,7 @@ class Failing:
         return self.real.update(way, output)
 
 
-def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode: VelocityMode) -> None:
+def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode: VelocityController) -> None:
     mode._otg = Failing(mode._otg)  # type: ignore[assignment]
     drive.at([2.8, 0.0, 0.0, 0.0, 0.0, 0.0])
     mode.start(drive.state)
@@ -155,7 +155,7 @@ def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode:
         mode.command([0.4] * 6, 0.5, drive.state.now_ns)
         drive.run(mode, 200)
     assert mode.reason is Reason.NONE
-    assert 2.9 < drive.state.position[0] < 3.1
+    assert 2.9 < drive.state.commanded[0] < 3.1
     assert drive.cuts == 0
 
 
@@ -164,7 +164,7 @@ def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode:
 def test_no_speeds_whatever_break_a_limit(new_drive: Any, seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()
     drive.at([chance.uniform(low, high) for low, high in zip(drive.limits.low, drive.limits.high, strict=True)])
-    mode = VelocityMode(drive.limits, PERIOD)
+    mode = VelocityController(drive.limits, PERIOD)
     mode.start(drive.state)
     for _ in range(25):
         mode.command([chance.uniform(-0.6, 0.6) for _ in range(6)], chance.choice((0.02, 0.5)), drive.state.now_ns)

@@ -19,7 +19,7 @@ from rtcp.config.model import ArmConfig
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits, Refused, Values, Wrong
-from rtcp.motion.state import MotionState, Reason, Target
+from rtcp.motion.state import ArmState, Reason, Setpoint
 
 # So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
 # cycle; and of a change that a limit demands.
@@ -29,7 +29,7 @@ _ROUNDING_CHANGE = 5e-5
 _ROUNDING_RAD_S = 1e-10
 
 
-class Verdict(IntEnum):
+class GuardResult(IntEnum):
     """What became of a target."""
 
     PASS = 0
@@ -40,7 +40,7 @@ class Verdict(IntEnum):
     """The guard's stop has come to rest in this cycle."""
 
 
-class SetPointGuard:
+class TrajectoryGuard:
     """Guards the set-points of one arm.
 
     After a cut, `held` is the bit mask of the joints that were clamped; `code`, `axis`, `value` and `limit` say what
@@ -63,7 +63,7 @@ class SetPointGuard:
         """Mean speed of each joint in the last cycle: what its acceleration is counted from."""
         self._next = [0.0] * n
         self._position = [0.0] * n
-        self._state = MotionState(n)
+        self._state = ArmState(n)
         self._poses: Sequence[Pose] | None = None
         self._room = self._room_then = 0.0
         """No watched point is nearer to a boundary, m; 0: not known."""
@@ -78,13 +78,13 @@ class SetPointGuard:
     def poses(self) -> Sequence[Pose]:
         """`frames` of what is commanded; empty without geometry."""
         if self._poses is None:
-            self._poses = () if self._model is None else frames(self._model, self._state.position)
+            self._poses = () if self._model is None else frames(self._model, self._state.commanded)
         return self._poses
 
-    def latch(self, state: MotionState) -> None:
+    def latch(self, state: ArmState) -> None:
         """Begin at rest where `state` is."""
         for i in self._joints:
-            self._mean[i] = state.velocity[i] = state.acceleration[i] = 0.0
+            self._mean[i] = state.commanded_velocity[i] = state.commanded_acceleration[i] = 0.0
         self.stopping = False
         self.held = 0
         self._state = state
@@ -106,13 +106,13 @@ class SetPointGuard:
         here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
         return here if here < 0.0 and nearest == box else max(ahead, 0.0)
 
-    def probe(self, state: MotionState, position: Sequence[float], velocity: Sequence[float]) -> bool:
+    def probe(self, state: ArmState, position: Sequence[float], velocity: Sequence[float]) -> bool:
         """Return whether a target would pass as it is."""
         return not self._bound(state, position) and self._touches(state, position) is None
 
-    def refuses(self, state: MotionState, new: Values) -> Refused | None:
+    def refuses(self, state: ArmState, new: Values) -> Refused | None:
         """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
-        refused = self._limits.check(new, state.position, self._mean)
+        refused = self._limits.check(new, state.commanded, self._mean)
         if refused is not None or self._model is None:
             return refused
         limits, mean = self._limits, self._mean
@@ -121,16 +121,16 @@ class SetPointGuard:
         # Also where the arm is on the wrong side of a box already: nothing becomes worse.
         if same and not (slower and any(mean)):
             return None
-        zones, poses = Zones(self._model, new), frames(self._model, state.position)
+        zones, poses = Zones(self._model, new), frames(self._model, state.commanded)
         distance, which = zones.distance(poses)
         if distance >= 0.0:
-            stop = touched(zones, poses, poses, state.position, mean, new.acceleration, self._dt)
+            stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
             if stop is None:
                 return None
             which, distance = stop
         return Refused(Wrong.OUTSIDE, -1, distance, float(which))
 
-    def apply(self, state: MotionState, target: Target, clamps: bool) -> Verdict:
+    def apply(self, state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:
         """Write what may be commanded of `target` into `state`: position, velocity, acceleration.
 
         A speed that does not go with the position is replaced by the one that does.
@@ -138,7 +138,7 @@ class SetPointGuard:
         Args:
             state: what was commanded in the last cycle.
             target: what the mode wants; numbers that are none are cut as any other.
-            clamps: whether the mode lives with a target that is cut; otherwise a cut is the begin of a stop.
+            tolerates_saturation: whether the controller tolerates a cut setpoint; otherwise a cut starts a stop.
         """
         self._state = state
         if self.stopping:
@@ -147,17 +147,17 @@ class SetPointGuard:
         self.held = held = self._bound(state, wanted)
         position, mean, last, dt = self._position, self._next, self._mean, self._dt
         if held:
-            if not clamps:
+            if not tolerates_saturation:
                 return self._stop(state, Reason.JOINT_LIMIT, *self._excess(state, wanted))
             for i in self._joints:
-                position[i] = state.position[i] + mean[i] * dt if held >> i & 1 else wanted[i]
+                position[i] = state.commanded[i] + mean[i] * dt if held >> i & 1 else wanted[i]
             wanted = position
         found = self._touches(state, wanted)
         if found is not None:
             return self._stop(state, Reason.KEEP_OUT, found[0], self._gap_to(*found), 0.0)
         self._poses, self._room = self._poses_then, self._room_then
-        here, speeds, rates, most = state.position, target.velocity, self._limits.acceleration, self._limits.velocity
-        velocity, acceleration = state.velocity, state.acceleration
+        here, speeds, rates, most = state.commanded, target.velocity, self._limits.acceleration, self._limits.velocity
+        velocity, acceleration = state.commanded_velocity, state.commanded_acceleration
         for i in self._joints:
             w, speed, rate, fastest = mean[i], speeds[i], rates[i], most[i] * (1.0 + _ROUNDING_SPEED)
             u = rate * dt * (1.0 + _ROUNDING_CHANGE)
@@ -168,18 +168,18 @@ class SetPointGuard:
             velocity[i] = speed
             here[i] = wanted[i]
             last[i] = w
-        return Verdict.CLAMPED if held else Verdict.PASS
+        return GuardResult.CLAMPED if held else GuardResult.PASS
 
-    def _bound(self, state: MotionState, wanted: Sequence[float]) -> int:
+    def _bound(self, state: ArmState, wanted: Sequence[float]) -> int:
         """Put the allowed mean speeds into `_next`; return the mask of the joints whose target was cut."""
-        limits, dt, last, allowed, here = self._limits, self._dt, self._mean, self._next, state.position
+        limits, dt, last, allowed, here = self._limits, self._dt, self._mean, self._next, state.commanded
         lows, highs, most, rates = limits.low, limits.high, limits.velocity, limits.acceleration
         held = 0
         for i in self._joints:
             q, v, rate, fastest = here[i], last[i], rates[i], most[i]
             u = rate * dt
             w = (wanted[i] - q) / dt
-            room = (highs[i] - q if w > 0.0 else q - lows[i]) + _ROUNDING_RAD
+            stopping_distance = (highs[i] - q if w > 0.0 else q - lows[i]) + _ROUNDING_RAD
             speed, before = (w, v) if w > 0.0 else (-w, -v)
             slack = u * _ROUNDING_CHANGE
             # No joint slows down faster than it may: what is beyond a limit comes back at that rate.
@@ -188,8 +188,8 @@ class SetPointGuard:
                 slowed - slack <= speed <= before + u + slack
                 and (speed <= fastest * (1.0 + _ROUNDING_SPEED) or speed <= slowed + _ROUNDING_RAD_S)
                 and (
-                    speed * (dt + 0.5 * speed / rate) <= room
-                    or speed <= fastest_stoppable(room, u, dt)
+                    speed * (dt + 0.5 * speed / rate) <= stopping_distance
+                    or speed <= fastest_stoppable(stopping_distance, u, dt)
                     or speed <= slowed + _ROUNDING_RAD_S
                 )
             ):
@@ -209,7 +209,7 @@ class SetPointGuard:
         low = max(min(low, v + u), v - u)
         return min(max(w if isfinite(w) else 0.0, low), high)
 
-    def _touches(self, state: MotionState, position: Sequence[float]) -> tuple[int, float] | None:
+    def _touches(self, state: ArmState, position: Sequence[float]) -> tuple[int, float] | None:
         """Return the box that `position` with the speeds `_next`, or the stop from there, would touch, or None."""
         zones, model, mean, limits = self.zones, self._model, self._next, self._limits
         self._poses_then, self._room_then = None, self._room
@@ -230,7 +230,7 @@ class SetPointGuard:
         self._poses_then = frames(model, position)
         return touched(zones, self.poses, self._poses_then, position, mean, limits.acceleration, self._dt)
 
-    def _excess(self, state: MotionState, wanted: Sequence[float]) -> tuple[int, float, float]:
+    def _excess(self, state: ArmState, wanted: Sequence[float]) -> tuple[int, float, float]:
         """Return the first joint that was cut, what was wanted of it and what is allowed."""
         axis = (self.held & -self.held).bit_length() - 1
         target, limits = wanted[axis], self._limits
@@ -238,27 +238,27 @@ class SetPointGuard:
             return axis, target, limits.high[axis]
         if target < limits.low[axis]:
             return axis, target, limits.low[axis]
-        return axis, (target - state.position[axis]) / self._dt, self._next[axis]
+        return axis, (target - state.commanded[axis]) / self._dt, self._next[axis]
 
-    def _stop(self, state: MotionState, code: Reason, axis: int, value: float, limit: float) -> Verdict:
+    def _stop(self, state: ArmState, code: Reason, axis: int, value: float, limit: float) -> GuardResult:
         self.stopping = True
         self.code, self.axis, self.value, self.limit = code, axis, value, limit
         return self._brake(state)
 
-    def _brake(self, state: MotionState) -> Verdict:
+    def _brake(self, state: ArmState) -> GuardResult:
         limits, dt, mean = self._limits, self._dt, self._mean
         self._poses, self._room = None, 0.0
         moving = False
         for i in self._joints:
             v, u = mean[i], limits.acceleration[i] * dt
             w = v - u if v > u else v + u if v < -u else 0.0
-            state.acceleration[i] = (w - v) / dt
-            state.position[i] += w * dt
-            state.velocity[i] = mean[i] = w
+            state.commanded_acceleration[i] = (w - v) / dt
+            state.commanded[i] += w * dt
+            state.commanded_velocity[i] = mean[i] = w
             moving = moving or w != 0.0
         if moving:
-            return Verdict.STOPPING
+            return GuardResult.STOPPING
         self.stopping = False
         for i in self._joints:
-            state.acceleration[i] = 0.0
-        return Verdict.STOPPED
+            state.commanded_acceleration[i] = 0.0
+        return GuardResult.STOPPED

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.controllers.generator import JointGenerator
-from rtcp.motion.controllers.velocity import VelocityMode
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.guards.braking import fastest_stoppable
-from rtcp.motion.guards.envelope import SetPointGuard, Verdict
+from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
-from rtcp.motion.state import Phase, Reason, Target
+from rtcp.motion.state import Phase, Reason, Setpoint
 
 from .judge import JOINTS_ONLY, Judge
 
@@ -24,7 +24,7 @@ CYCLES_S = st.sampled_from([0.0005, 0.002, 0.01])
 
 # What may be wanted of a joint, from where it is: (judge, joint) -> rad.
 WISHES: dict[str, Callable[[Judge, int], float]] = {
-    "stay": lambda judge, i: judge.state.position[i],
+    "stay": lambda judge, i: judge.state.commanded[i],
     "nan": lambda judge, i: nan,
     "infinite": lambda judge, i: inf,
     "minus infinite": lambda judge, i: -inf,
@@ -50,7 +50,7 @@ SHARES = st.floats(0.0, 1.0)
 
 
 def _at(judge: Judge, i: int, speed: float) -> float:
-    return judge.state.position[i] + speed * judge.dt
+    return judge.state.commanded[i] + speed * judge.dt
 
 
 def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
@@ -88,10 +88,10 @@ def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards
         if kind == "limits":
             judge.change(narrower(judge, given_))  # type: ignore[arg-type]
             continue
-        first, second, clamps, times = given_
+        first, second, tolerates_saturation, times = given_
         for _ in range(times):  # type: ignore[call-overload]
-            judge.ask([WISHES[first](judge, 0), WISHES[second](judge, 1)], clamps)  # type: ignore[index,arg-type]
-    judge.ask([nan, inf], clamps=False)
+            judge.ask([WISHES[first](judge, 0), WISHES[second](judge, 1)], tolerates_saturation)  # type: ignore[index,arg-type]
+    judge.ask([nan, inf], tolerates_saturation=False)
     judge.stop()
 
 
@@ -101,7 +101,7 @@ def test_a_speed_that_does_not_go_with_the_position_is_not_commanded(
 ) -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
     for _ in range(30):
-        judge.ask([way, way], clamps=True, velocity=velocity)
+        judge.ask([way, way], tolerates_saturation=True, velocity=velocity)
 
 
 # -- what fits passes -----------------------------------------------------------------------------------------------
@@ -121,7 +121,7 @@ def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     if jerky:
         # So that the whole move is made with the greatest acceleration there is.
         limits.jerk[:] = [1e4, 1e4]
-    generator = JointGenerator(dt, limits.velocity, limits.acceleration, limits.jerk)
+    generator = JointMoveController(dt, limits.velocity, limits.acceleration, limits.jerk)
     for a, b, speed, each, cycles in [*legs, (1.0, 0.0, 9.0, True, 10**6), (0.0, 1.0, 9.0, False, 10**6)]:
         # Shares beyond a half are the edges themselves.
         goal = [
@@ -133,13 +133,13 @@ def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
         for _ in range(cycles):
             target = generator.update(judge.state, dt)
             position, velocity = list(target.position), list(target.velocity)
-            verdict = judge.ask(position, clamps=False, velocity=velocity)
+            verdict = judge.ask(position, tolerates_saturation=False, velocity=velocity)
             guard = judge.guard
-            assert verdict is Verdict.PASS, (guard.axis, guard.value, guard.limit, judge.mean)
-            assert (judge.state.position, judge.state.velocity) == (position, velocity)
+            assert verdict is GuardResult.PASS, (guard.axis, guard.value, guard.limit, judge.mean)
+            assert (judge.state.commanded, judge.state.commanded_velocity) == (position, velocity)
             if generator.phase is Phase.HOLD:
                 break
-    assert judge.state.position == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
+    assert judge.state.commanded == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
 
 
 @settings(max_examples=40)
@@ -157,8 +157,8 @@ def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start
             w = max(min(w, bound, top), -bound, bottom)
             mean[i] = min(max(w, mean[i] - u), mean[i] + u)
             position[i] += mean[i] * dt
-        assert judge.ask(position, clamps=False) is Verdict.PASS
-        assert judge.state.position == position
+        assert judge.ask(position, tolerates_saturation=False) is GuardResult.PASS
+        assert judge.state.commanded == position
 
 
 # -- cuts -----------------------------------------------------------------------------------------------------------
@@ -170,36 +170,36 @@ def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
     edge = judge.limits.high if sign > 0 else judge.limits.low
     for _ in range(round(12.0 / dt)):
-        verdict = judge.ask([sign * 1e3] * 2, clamps=True)
-    assert (verdict, judge.guard.held) == (Verdict.CLAMPED, 0b11)
-    assert judge.state.position == pytest.approx(edge, abs=1e-12)
-    assert max(map(abs, judge.state.velocity)) < 1e-9
+        verdict = judge.ask([sign * 1e3] * 2, tolerates_saturation=True)
+    assert (verdict, judge.guard.held) == (GuardResult.CLAMPED, 0b11)
+    assert judge.state.commanded == pytest.approx(edge, abs=1e-12)
+    assert max(map(abs, judge.state.commanded_velocity)) < 1e-9
 
 
 def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it() -> None:
     judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.001)
-    mode = VelocityMode(judge.limits, judge.dt)
+    mode = VelocityController(judge.limits, judge.dt)
     mode.start(judge.state)
     for cycle in range(4000):
         if cycle % 100 == 0:
             mode.command([0.5, -1.5], 1.0, judge.state.now_ns)
         target = mode.update(judge.state, judge.dt)
-        verdict = judge.ask(list(target.position), mode.clamps, list(target.velocity))
-        assert verdict in (Verdict.PASS, Verdict.CLAMPED)
+        verdict = judge.ask(list(target.position), mode.tolerates_saturation, list(target.velocity))
+        assert verdict in (GuardResult.PASS, GuardResult.CLAMPED)
         judge.state.now_ns += 1_000_000
-        assert judge.state.position[0] <= judge.limits.high[0] + 1e-7
-        assert judge.state.position[1] >= judge.limits.low[1] - 1e-7
-    assert judge.state.position == pytest.approx([judge.limits.high[0], judge.limits.low[1]], abs=1e-3)
+        assert judge.state.commanded[0] <= judge.limits.high[0] + 1e-7
+        assert judge.state.commanded[1] >= judge.limits.low[1] - 1e-7
+    assert judge.state.commanded == pytest.approx([judge.limits.high[0], judge.limits.low[1]], abs=1e-3)
 
 
 @pytest.mark.parametrize("wish", [nan, inf, -inf])
 def test_what_is_no_number_brakes(wish: float) -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
     for _ in range(100):
-        judge.ask([1.0, 0.2], clamps=True)
+        judge.ask([1.0, 0.2], tolerates_saturation=True)
     speeds = list(judge.mean)
     assert min(speeds) > 0.0
-    assert judge.ask([wish, wish], clamps=True) is Verdict.CLAMPED
+    assert judge.ask([wish, wish], tolerates_saturation=True) is GuardResult.CLAMPED
     bounds = judge.limits.acceleration
     assert judge.mean == pytest.approx([v - a * 0.001 for v, a in zip(speeds, bounds, strict=True)], abs=1e-9)
 
@@ -207,32 +207,32 @@ def test_what_is_no_number_brakes(wish: float) -> None:
 def test_only_the_joint_that_asks_too_much_is_clamped() -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
     fits = 0.5 * judge.limits.acceleration[1] * 0.001**2
-    assert judge.ask([1.0, fits], clamps=True) is Verdict.CLAMPED
+    assert judge.ask([1.0, fits], tolerates_saturation=True) is GuardResult.CLAMPED
     assert judge.guard.held == 0b01
-    assert judge.state.position[1] == fits
+    assert judge.state.commanded[1] == fits
 
 
 def test_a_cut_of_a_mode_that_cannot_live_with_it_is_a_stop_that_looks_at_no_target_until_it_rests() -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
     for _ in range(100):
-        judge.ask([1.0, 0.0], clamps=True)
-    assert judge.ask([99.0, 0.0], clamps=False) is Verdict.STOPPING
+        judge.ask([1.0, 0.0], tolerates_saturation=True)
+    assert judge.ask([99.0, 0.0], tolerates_saturation=False) is GuardResult.STOPPING
     guard = judge.guard
     assert (guard.code, guard.axis, guard.value, guard.limit) == (Reason.JOINT_LIMIT, 0, 99.0, judge.limits.high[0])
-    speed = judge.state.velocity[0]
+    speed = judge.state.commanded_velocity[0]
     cycles = 1
-    while judge.ask([judge.state.position[0] + 1e-6, 0.0], clamps=True) is Verdict.STOPPING:
-        assert judge.state.velocity[0] < speed
-        speed = judge.state.velocity[0]
+    while judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=True) is GuardResult.STOPPING:
+        assert judge.state.commanded_velocity[0] < speed
+        speed = judge.state.commanded_velocity[0]
         cycles += 1
-    assert judge.state.velocity == [0.0, 0.0]
+    assert judge.state.commanded_velocity == [0.0, 0.0]
     assert cycles * 0.001 == pytest.approx(0.1, abs=0.003)
-    assert judge.ask([judge.state.position[0] + 1e-6, 0.0], clamps=False) is Verdict.PASS
+    assert judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
 
 
 def test_a_step_that_is_too_long_is_told_as_a_speed() -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
-    judge.ask([0.0, 0.1], clamps=False)
+    judge.ask([0.0, 0.1], tolerates_saturation=False)
     guard = judge.guard
     assert (guard.axis, guard.value, guard.limit) == (1, pytest.approx(100.0), pytest.approx(0.7e-3))
 
@@ -243,30 +243,30 @@ def test_a_joint_beyond_its_range_comes_back_and_never_goes_further_out(
     beyond: float, dt: float, outward: bool
 ) -> None:
     limits = Limits(JOINTS_ONLY)
-    guard = SetPointGuard(JOINTS_ONLY, limits, dt)
+    guard = TrajectoryGuard(JOINTS_ONLY, limits, dt)
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
     state = judge.state
-    state.position = [limits.high[0] + beyond, limits.low[1] - beyond]
+    state.commanded = [limits.high[0] + beyond, limits.low[1] - beyond]
     guard.latch(state)
-    target, farthest = Target(2), list(state.position)
+    target, farthest = Setpoint(2), list(state.commanded)
     for wish in ([9.0, -9.0] if outward else [0.0, 0.0], [0.0, 0.0]):
         for _ in range(round(1.0 / dt)):
             target.position, target.velocity = list(wish), [0.0, 0.0]
-            guard.apply(state, target, clamps=True)
-            assert state.position[0] <= farthest[0] + 1e-12
-            assert state.position[1] >= farthest[1] - 1e-12
-            assert max(map(abs, state.velocity)) <= 1.5
-            farthest[0] = min(farthest[0], max(state.position[0], limits.high[0]))
-            farthest[1] = max(farthest[1], min(state.position[1], limits.low[1]))
-    assert state.position[0] < limits.high[0]
-    assert state.position[1] > limits.low[1]
+            guard.apply(state, target, tolerates_saturation=True)
+            assert state.commanded[0] <= farthest[0] + 1e-12
+            assert state.commanded[1] >= farthest[1] - 1e-12
+            assert max(map(abs, state.commanded_velocity)) <= 1.5
+            farthest[0] = min(farthest[0], max(state.commanded[0], limits.high[0]))
+            farthest[1] = max(farthest[1], min(state.commanded[1], limits.low[1]))
+    assert state.commanded[0] < limits.high[0]
+    assert state.commanded[1] > limits.low[1]
 
 
 def test_to_probe_changes_nothing() -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
-    judge.ask([1e-6, 0.0], clamps=False)
-    state, speeds = list(judge.state.position), list(judge.state.velocity)
+    judge.ask([1e-6, 0.0], tolerates_saturation=False)
+    state, speeds = list(judge.state.commanded), list(judge.state.commanded_velocity)
     assert judge.guard.probe(judge.state, [3e-6, 0.0], [2e-3, 0.0])
     assert not judge.guard.probe(judge.state, [1.0, 0.0], [0.0, 0.0])
-    assert (judge.state.position, judge.state.velocity) == (state, speeds)
-    assert judge.ask([3e-6, 0.0], clamps=False) is Verdict.PASS
+    assert (judge.state.commanded, judge.state.commanded_velocity) == (state, speeds)
+    assert judge.ask([3e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS

@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from rtcp.motion.controllers.trajectory import TrajectoryMode
-from rtcp.motion.planning.knots import plan_trajectory
+from rtcp.motion.controllers.trajectory import TrajectoryController
 from rtcp.motion.planning.plan import Plan, PlanRefused, Point
 from rtcp.motion.planning.rows import CUBIC, KIND, QUINTIC
+from rtcp.motion.planning.waypoints import plan_trajectory
 from rtcp.motion.state import Phase
 
 PERIOD = 0.0005
@@ -154,11 +154,11 @@ def test_what_was_planned_is_driven_to_its_end_inside_the_limits(new_drive: Any,
             plan = plan_trajectory(points, drive.limits, ZERO)
         except PlanRefused:
             continue
-        mode = TrajectoryMode(drive.limits, PERIOD)
+        mode = TrajectoryController(drive.limits, PERIOD)
         assert mode.start(drive.state, memory(plan.rows), len(plan.rows)) is None
         drive.until_rest(mode)
         assert mode.phase is Phase.HOLD
-        assert drive.state.position == pytest.approx(plan.end, abs=1e-9)
+        assert drive.state.commanded == pytest.approx(plan.end, abs=1e-9)
         driven += 1
         if driven == 4:
             return

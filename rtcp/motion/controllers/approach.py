@@ -1,4 +1,4 @@
-"""The way from any state to the first knot of a trajectory, under the joints' limits (ruckig)."""
+"""The way from any state to the first waypoint of a trajectory, under the joints' limits (ruckig)."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _INSIDE = 1.0 - 1e-9
 _SLACK = 1e-6
 
 
-class Lead:
-    """A way to a knot that takes as long as the knot's time says, or longer where the limits demand it.
+class Approach:
+    """A way to a waypoint that takes as long as the waypoint's time says, or longer where the limits demand it.
 
     Args:
         limits: of the joints; read in each `plan`.
@@ -41,9 +41,13 @@ class Lead:
         return found
 
     def plan(
-        self, position: Sequence[float], velocity: Sequence[float], acceleration: Sequence[float], knot: Sequence[float]
+        self,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        waypoint: Sequence[float],
     ) -> Refused | None:
-        """Plan the way from a state (rad, rad/s, rad/s^2) to a knot; return why not, or None."""
+        """Plan the way from a state (rad, rad/s, rad/s^2) to a waypoint; return why not, or None."""
         way, limits, n = self._way, self._limits, len(position)
         bounds = limits.acceleration
         way.current_position, way.current_velocity = list(position), list(velocity)
@@ -51,15 +55,15 @@ class Lead:
             allowed_acceleration(acceleration[i], velocity[i], limits.velocity[i], bounds[i], limits.jerk[i])
             for i in range(n)
         ]
-        way.target_position, way.target_velocity = list(knot[1 : 1 + n]), list(knot[7 : 7 + n])
+        way.target_position, way.target_velocity = list(waypoint[1 : 1 + n]), list(waypoint[7 : 7 + n])
         # A cubic begins with any acceleration.
-        wanted = knot[13 : 13 + n] if knot[KIND] == QUINTIC else [0.0] * n
+        wanted = waypoint[13 : 13 + n] if waypoint[KIND] == QUINTIC else [0.0] * n
         way.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
         way.max_acceleration = list(bounds)
-        way.minimum_duration = knot[0]
+        way.minimum_duration = waypoint[0]
         if not self._planned():
-            return Refused(Wrong.UNREACHABLE, -1, knot[0], 0.0)
+            return Refused(Wrong.UNREACHABLE, -1, waypoint[0], 0.0)
         extrema = self._spare.position_extrema
         for i in range(n):
             least, largest = extrema[i].min, extrema[i].max

@@ -19,7 +19,7 @@ from ruckig import (
 )
 
 from rtcp.motion.controllers.room import allowed_accelerations
-from rtcp.motion.state import MotionState, Phase, Reason, Target
+from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 LONGEST_S = 600.0
 """A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
@@ -28,7 +28,7 @@ LONGEST_S = 600.0
 _JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
 
 
-class JointGenerator:
+class JointMoveController:
     """The modes `hold` and `joint`, and the stop that all modes share: set-points for `n` joints.
 
     Args:
@@ -51,9 +51,9 @@ class JointGenerator:
         self._stop.synchronization = Synchronization.No
         self._zero = [0.0] * n
         self._active = self._inputs[0]
-        self._target = Target(n)
+        self._target = Setpoint(n)
         self.set_limits(velocity, acceleration, jerk)
-        self.clamps = False
+        self.tolerates_saturation = False
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
         self.axis, self.value, self.limit = -1, 0.0, 0.0
@@ -71,7 +71,7 @@ class JointGenerator:
         self.phase = Phase.HOLD
         self.reason = Reason.NONE
 
-    def move_to(self, state: MotionState, target: Sequence[float], speed: float, *, each: bool = False) -> bool:
+    def move_to(self, state: ArmState, target: Sequence[float], speed: float, *, each: bool = False) -> bool:
         """Move to `target` (rad, shape (n,)); return False where no plan is found.
 
         Without a plan, or with one longer than `LONGEST_S`, what was under way goes on.
@@ -109,11 +109,11 @@ class JointGenerator:
                 continue
         return False
 
-    def stop(self, state: MotionState) -> None:
+    def stop(self, state: ArmState) -> None:
         """Come to rest under the acceleration and jerk limits, from whatever mode; at rest nothing begins any more."""
         if self.phase is Phase.STOP:
             return
-        if not (any(state.velocity) or any(state.acceleration)):
+        if not (any(state.commanded_velocity) or any(state.commanded_acceleration)):
             # A move that has not begun, because no frame came since it was asked for, never does.
             self.hold()
             return
@@ -129,19 +129,19 @@ class JointGenerator:
         self.reason = Reason.NONE
         self.elapsed_s = 0.0
 
-    def _carry_over(self, given: InputParameter, state: MotionState) -> None:
-        given.current_position = state.position
-        given.current_velocity = state.velocity
+    def _carry_over(self, given: InputParameter, state: ArmState) -> None:
+        given.current_position = state.commanded
+        given.current_velocity = state.commanded_velocity
         bounds = self._acceleration_limit
         given.max_acceleration = bounds
         given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
         given.target_acceleration = self._zero
 
-    def update(self, state: MotionState, dt: float) -> Target:
+    def update(self, state: ArmState, dt: float) -> Setpoint:
         """Return the set-points of the next cycle; where ruckig refuses they stand, and the reason says so."""
         target = self._target
         if not self.phase:
-            target.position = state.position
+            target.position = state.commanded
             target.velocity = self._zero
             return target
         output = self._output
@@ -150,7 +150,7 @@ class JointGenerator:
         except (RuckigError, ValueError):
             result = Result.Error
         if result < 0:
-            target.position = state.position
+            target.position = state.commanded
             target.velocity = self._zero
             self.phase = Phase.HOLD
             self.reason = Reason.GENERATOR

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import json
 import os
-import pickle
 import signal
 import socket
 import subprocess
@@ -18,13 +18,24 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.ending import end_of, forget_end, write_end
 from rtcp.ipc.layout import PER_JOINT, SCALARS
-from rtcp.ipc.lock import Busy, alone
-from rtcp.ipc.paths import blackboard_file, control_socket, stopping_mark
-from rtcp.ipc.session import Pid, Processes, Session, SessionError, identify, is_ours, read_processes, read_session
-from rtcp.launch import launcher, running
-from rtcp.launch.running import Running, StartError
+from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket, exclusive, stop_marker
+from rtcp.ipc.session import (
+    Pid,
+    Processes,
+    Session,
+    SessionError,
+    exit_problems,
+    identify,
+    is_running,
+    read_processes,
+    read_session,
+    remove_exit_report,
+    session_file,
+    write_exit_report,
+)
+from rtcp.launch import launcher, platform
+from rtcp.launch.platform import Platform, StartError
 
 JOINTS = 6
 
@@ -54,13 +65,6 @@ def session_of(config: ArmConfig) -> Session:
     return Session(config, "virtual", "ecat0", 0, 77)
 
 
-def older(config: ArmConfig) -> ArmConfig:
-    """A configuration as a version without the section `stops` has made it."""
-    made = replace(config)
-    vars(made).pop("stops")
-    return made
-
-
 @pytest.fixture
 def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
     """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
@@ -72,16 +76,29 @@ def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]
     blackboard_file(directory).unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("how", ["as it was", "with a digest"])
-def test_a_session_of_other_classes_is_a_sentence(tmp_path: Path, config: ArmConfig, how: str) -> None:
-    file = tmp_path / "session.pickle"
-    session_of(config).write(file)
-    assert read_session(file) == session_of(config)
-    form, _ = pickle.loads(file.read_bytes())
-    old = session_of(older(config))
-    file.write_bytes(pickle.dumps(old if how == "as it was" else ("0" * len(form), old)))
-    with pytest.raises(SessionError, match=r"session\.pickle was written by another version of rtcp"):
-        read_session(file)
+@pytest.mark.parametrize("older", [{"version": "0.0.1"}, {"version": None}])
+def test_a_session_of_another_version_is_refused(tmp_path: Path, config: ArmConfig, older: dict[str, None]) -> None:
+    session_of(config).write(tmp_path)
+    assert read_session(tmp_path) == session_of(config)
+    found = json.loads(session_file(tmp_path).read_text())
+    session_file(tmp_path).write_text(json.dumps({**found, **older}))
+    with pytest.raises(SessionError, match=r"session\.json was written by another version of rtcp"):
+        read_session(tmp_path)
+
+
+@pytest.mark.parametrize("wrong", ["without a key", "with a key of another type"])
+def test_a_session_whose_fields_do_not_fit_is_refused_and_the_key_named(
+    tmp_path: Path, config: ArmConfig, wrong: str
+) -> None:
+    session_of(config).write(tmp_path)
+    found = json.loads(session_file(tmp_path).read_text())
+    if wrong == "without a key":
+        del found["session"]["config"]["stops"]
+    else:
+        found["session"]["config"]["stops"] = "none"
+    session_file(tmp_path).write_text(json.dumps(found))
+    with pytest.raises(SessionError, match=r"session\.json is damaged: .*stops"):
+        read_session(tmp_path)
 
 
 @pytest.mark.parametrize("wrong", ["session", "black box"])
@@ -90,9 +107,9 @@ def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
     monkeypatch: pytest.MonkeyPatch, wrong: str,
 ) -> None:  # fmt: skip
     if wrong == "session":
-        (directory / "session.pickle").write_bytes(pickle.dumps(session_of(older(config))))
+        session_file(directory).write_text('{"version": "0.0.1"}')
     else:
-        session_of(config).write(directory / "session.pickle")
+        session_of(config).write(directory)
         monkeypatch.setattr(launcher, "BlackBox", lambda *given: given.nothing)
     sockets = [directory / "segment.sock", directory / "segment-7.sock"]
     for path in sockets:
@@ -115,7 +132,7 @@ def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subproces
     Processes(segment=identify(other.pid)).write(directory)
     told: list[str] = []
     stopper = threading.Thread(target=launcher.stop, args=(told.append,))
-    with alone(directory):
+    with exclusive(directory):
         stopper.start()
         time.sleep(0.3)
         assert other.poll() is None
@@ -127,7 +144,7 @@ def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subproces
 def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
     directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(running, "_ANSWER_S", 0.2)
+    monkeypatch.setattr(platform, "_ANSWER_S", 0.2)
     gateway = subprocess.Popen(["sleep", "600"])
     Processes(loop=identify(other.pid), gateway=identify(gateway.pid)).write(directory)
     told: list[tuple[str, int | None]] = []
@@ -150,7 +167,7 @@ def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
 ) -> None:
     monkeypatch.setattr(launcher, "STOP_WAITS_S", 0.1)
     Processes(segment=identify(other.pid)).write(directory)
-    with alone(directory), pytest.raises(StartError, match=r"another process starts or stops .* has done nothing"):
+    with exclusive(directory), pytest.raises(StartError, match=r"another process starts or stops .* has done nothing"):
         launcher.stop(print)
     assert other.poll() is None
 
@@ -181,11 +198,11 @@ class Replacement:
 
 @pytest.fixture
 def replacement(directory: Path, config: ArmConfig) -> Iterator[Replacement]:
-    session_of(config).write(directory / "session.pickle")
+    session_of(config).write(directory)
     Processes(loop=identify(os.getpid())).write(directory)
     made = Replacement(directory)
     yield made
-    if is_ours(made.gateway):
+    if is_running(made.gateway):
         os.kill(made.gateway, signal.SIGKILL)
     made.until_ended()
 
@@ -194,9 +211,9 @@ def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, rep
     until = time.monotonic() + 20
     while True:
         try:
-            with alone(directory):
+            with exclusive(directory):
                 break
-        except Busy:
+        except LockHeld:
             assert time.monotonic() < until, "the lock is held until the gateway is ready"
             time.sleep(0.01)
     assert replacement.ended == []
@@ -209,13 +226,13 @@ def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, rep
 def test_a_gateway_that_a_stop_ends_while_it_is_waited_for_is_no_error(
     directory: Path, replacement: Replacement
 ) -> None:
-    stopping_mark(directory).touch()
+    stop_marker(directory).touch()
     os.kill(replacement.gateway, signal.SIGKILL)
     assert replacement.until_ended() == 0
 
 
 def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
-    running = Running(directory, config, Processes(), directory / "of the start")
+    running = Platform(directory, config, Processes(), directory / "of the start")
     os.close(running.begin_gateway())
     (child,) = running._children
     try:
@@ -229,7 +246,7 @@ def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Pat
 def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
     directory: Path, config: ArmConfig
 ) -> None:
-    running = Running(directory, config, Processes())
+    running = Platform(directory, config, Processes())
     running._children.append(subprocess.Popen(["sh", "-c", "sleep 0.2; exit 7"]))
     reading, writing = os.pipe()
     os.close(writing)
@@ -251,12 +268,12 @@ def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmCo
 @pytest.mark.parametrize("lived", [True, False])
 def test_a_loop_of_another_start_does_not_answer_for_this_one(directory: Path, lived: bool) -> None:
     this = identify(os.getpid())
-    write_end(directory, this, ["a slave stayed in OP"])
-    assert end_of(directory, this, lived) == ("a slave stayed in OP",)
-    gone = Pid(this, this.started - 1)
-    (sentence,) = end_of(directory, gone, lived)
+    write_exit_report(directory, this, ["a slave stayed in OP"])
+    assert exit_problems(directory, this, lived) == ("a slave stayed in OP",)
+    gone = Pid(this + 1, this.started)
+    (sentence,) = exit_problems(directory, gone, lived)
     assert ("was killed" in sentence) == lived
     assert "left to their watchdog" in sentence
-    forget_end(directory)
-    assert "left to their watchdog" in end_of(directory, gone, lived)[0]
-    assert end_of(directory, Pid(0), lived) == ()
+    remove_exit_report(directory)
+    assert "left to their watchdog" in exit_problems(directory, gone, lived)[0]
+    assert exit_problems(directory, Pid(0), lived) == ()

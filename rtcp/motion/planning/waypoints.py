@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
-from rtcp.motion.controllers.lead import Lead
+from rtcp.motion.controllers.approach import Approach
 from rtcp.motion.controllers.trajectory import AT_START_RAD
 from rtcp.motion.planning.plan import Plan, PlanRefused, Point, ZoneAt
 from rtcp.motion.planning.polynomials import Coefficients, beyond, cubic, derivative, quintic, value
@@ -35,7 +35,7 @@ def plan_trajectory(
     names: Sequence[str] = (),
     zone_at: ZoneAt | None = None,
 ) -> Plan:
-    """Return the plan of a trajectory for `TrajectoryMode`.
+    """Return the plan of a trajectory for `TrajectoryController`.
 
     Points with positions only are joined by quintics that have the velocities and accelerations of the cubic spline
     through them; points with velocities too by cubics; with accelerations too by quintics. All points are of one kind.
@@ -55,16 +55,16 @@ def plan_trajectory(
     joints = len(q_now)
     names = list(names) or [f"joint{i + 1}" for i in range(joints)]
     _check_points(points, names)
-    knots = _knots(points, q_now)
-    first, last = knots[0], knots[-1]
+    waypoints = _waypoints(points, q_now)
+    first, last = waypoints[0], waypoints[-1]
     _check_ends(first, last, len(points), q_now, names)
-    for number, knot in enumerate(knots, 1):
-        _check_knot(knot, f"point {number}", limits, names)
+    for number, waypoint in enumerate(waypoints, 1):
+        _check_waypoint(waypoint, f"point {number}", limits, names)
     if first.t > _AT_ONCE_S:
-        _check_lead(first, limits, q_now, names, zone_at)
-    for number, (before, after) in enumerate(pairwise(knots), 1):
+        _check_approach(first, limits, q_now, names, zone_at)
+    for number, (before, after) in enumerate(pairwise(waypoints), 1):
         _check_piece(before, after, f"between points {number} and {number + 1}", limits, names, zone_at)
-    return Plan(tuple(_row(knot) for knot in knots), last.t, 0.0, 1.0, last.q)
+    return Plan(tuple(_row(waypoint) for waypoint in waypoints), last.t, 0.0, 1.0, last.q)
 
 
 def _check_points(points: Sequence[Point], names: Sequence[str]) -> None:
@@ -114,7 +114,7 @@ class _Knot:
         self.q, self.v, self.a = tuple(q), tuple(v), tuple(a)
 
 
-def _knots(points: Sequence[Point], q_now: Sequence[float]) -> list[_Knot]:
+def _waypoints(points: Sequence[Point], q_now: Sequence[float]) -> list[_Knot]:
     zero = (0.0,) * len(q_now)
     if points[0].v is not None:
         kind = CUBIC if points[0].a is None else QUINTIC
@@ -151,20 +151,20 @@ def _check_ends(first: _Knot, last: _Knot, count: int, q_now: Sequence[float], n
             raise PlanRefused(f"point {count}: the last point must be at rest, {name} has {speed:g} rad/s")
 
 
-def _check_knot(knot: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
+def _check_waypoint(waypoint: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
     for i, name in enumerate(names):
-        q, low, high = knot.q[i], limits.low[i], limits.high[i]
+        q, low, high = waypoint.q[i], limits.low[i], limits.high[i]
         if not low <= q <= high:
             raise PlanRefused(f"{where}: {name} is at {q:.6g} rad, allowed is {low:g} to {high:g} rad")
 
 
-def _check_lead(
+def _check_approach(
     first: _Knot, limits: Limits, q_now: Sequence[float], names: Sequence[str], zone_at: ZoneAt | None
 ) -> None:
-    """The way to the first point, as `TrajectoryMode.start` makes it from rest."""
-    lead, rest = Lead(limits), [0.0] * len(q_now)
+    """The way to the first point, as `TrajectoryController.start` makes it from rest."""
+    approach, rest = Approach(limits), [0.0] * len(q_now)
     _check_derivatives(first, "point 1", limits, names)
-    refused = lead.plan(q_now, rest, rest, _row(first))
+    refused = approach.plan(q_now, rest, rest, _row(first))
     if refused is not None and refused.at >= 0:
         raise PlanRefused(
             f"point 1: on the way there {names[refused.at]} would be at {refused.value:.6g} rad, allowed is "
@@ -172,20 +172,20 @@ def _check_lead(
         )
     if refused is not None:
         raise PlanRefused(f"point 1: no way from where the arm is to this point at {first.t:g} s was found")
-    if lead.duration_s > first.t * (1.0 + _ROUNDING) + 1e-6:
-        least = f"the way there from where the arm is takes {lead.duration_s:.3f} s at least"
+    if approach.duration_s > first.t * (1.0 + _ROUNDING) + 1e-6:
+        least = f"the way there from where the arm is takes {approach.duration_s:.3f} s at least"
         raise PlanRefused(f"point 1: its time is {first.t:g} s, {least}")
     if zone_at is not None:
-        steps = _steps(lead.duration_s, limits)
+        steps = _steps(approach.duration_s, limits)
         for k in range(steps + 1):
-            at = lead.duration_s * k / steps
-            _check_zone(lead.at(at)[0], at, "on the way to point 1", zone_at)
+            at = approach.duration_s * k / steps
+            _check_zone(approach.at(at)[0], at, "on the way to point 1", zone_at)
 
 
-def _check_derivatives(knot: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
+def _check_derivatives(waypoint: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
     for what, unit, found, allowed in (
-        ("moves at", "rad/s", knot.v, limits.velocity),
-        ("accelerates with", "rad/s^2", knot.a, limits.acceleration),
+        ("moves at", "rad/s", waypoint.v, limits.velocity),
+        ("accelerates with", "rad/s^2", waypoint.a, limits.acceleration),
     ):
         for name, number, most in zip(names, found, allowed, strict=True):
             if abs(number) > most * (1.0 + _ROUNDING):
@@ -242,6 +242,6 @@ def _check_zone(q: Sequence[float], at_s: float, where: str, zone_at: ZoneAt) ->
         raise PlanRefused(f"{where}: the arm would be in {box} at {at_s:.3f} s")
 
 
-def _row(knot: _Knot) -> tuple[float, ...]:
-    rest = (0.0,) * (MOST_JOINTS - len(knot.q))
-    return (knot.t, *knot.q, *rest, *knot.v, *rest, *knot.a, *rest, knot.kind)
+def _row(waypoint: _Knot) -> tuple[float, ...]:
+    rest = (0.0,) * (MOST_JOINTS - len(waypoint.q))
+    return (waypoint.t, *waypoint.q, *rest, *waypoint.v, *rest, *waypoint.a, *rest, waypoint.kind)

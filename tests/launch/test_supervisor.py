@@ -13,29 +13,28 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.lock import Busy, alone
-from rtcp.ipc.paths import stopping_mark
-from rtcp.ipc.session import Pid, Processes, identify, is_ours, read_processes
-from rtcp.launch import keeper
-from rtcp.launch.keeper import GatewayKeeper
-from rtcp.launch.running import Running
+from rtcp.ipc.runtime_directory import LockHeld, exclusive, stop_marker
+from rtcp.ipc.session import Pid, Processes, identify, is_running, read_processes
+from rtcp.launch import supervisor
+from rtcp.launch.platform import Platform
+from rtcp.launch.supervisor import GatewaySupervisor
 
 
 class Kept:
-    """A platform of which this process plays the loop, and what its keeper tells."""
+    """A platform of which this process plays the loop, and what its supervisor reports."""
 
     def __init__(self, directory: Path) -> None:
         self.told: list[str] = []
-        self.running = Running(directory, load(default_config()), Processes(loop=identify(os.getpid())))
+        self.running = Platform(directory, load(default_config()), Processes(loop=identify(os.getpid())))
         self.running.processes.gateway = Pid(1 << 22, 1)
         self.running.processes.write(directory)
-        self.keeper = GatewayKeeper(self.running, self.told.append)
+        self.supervisor = GatewaySupervisor(self.running, self.told.append)
 
     def look_until(self, met: Callable[[], bool]) -> None:
         end = time.monotonic() + 60
         while not met():
             assert time.monotonic() < end, self.told
-            self.keeper.look()
+            self.supervisor.look()
             time.sleep(0.01)
 
     @property
@@ -45,10 +44,10 @@ class Kept:
 
 @pytest.fixture
 def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kept]:
-    monkeypatch.setattr(keeper, "STARTS", 2)
+    monkeypatch.setattr(supervisor, "STARTS", 2)
     made = Kept(tmp_path)
     yield made
-    made.keeper.close()
+    made.supervisor.close()
     for child in made.running._children:
         child.kill()
         child.wait()
@@ -59,7 +58,7 @@ def test_a_gateway_that_cannot_live_is_started_only_so_often_and_its_log_keeps_e
 ) -> None:
     kept.look_until(lambda: "left alone" in (kept.told or [""])[-1])
     for _ in range(3):
-        kept.keeper.look()
+        kept.supervisor.look()
     assert kept.starts == 2
     assert len(kept.told) == 3
     assert kept.told[0] == f"the gateway (process {1 << 22}) has ended: it is started anew"
@@ -67,37 +66,37 @@ def test_a_gateway_that_cannot_live_is_started_only_so_often_and_its_log_keeps_e
     assert kept.told[2].endswith(f"; {tmp_path / 'gateway.log'} says why")
     assert (tmp_path / "gateway.log").read_text().count("No such file") == 2
     # The minute has passed.
-    monkeypatch.setattr(keeper, "WINDOW_S", 0.0)
+    monkeypatch.setattr(supervisor, "WINDOW_S", 0.0)
     kept.look_until(lambda: kept.starts == 3)
 
 
 def test_it_is_written_down_whose_gateway_the_new_one_is(kept: Kept, tmp_path: Path) -> None:
-    kept.keeper.look()
+    kept.supervisor.look()
     written = read_processes(tmp_path)
     assert written.loop == os.getpid()
     assert written.gateway == kept.running.processes.gateway
-    assert is_ours(written.gateway)
+    assert is_running(written.gateway)
 
 
 def test_whoever_holds_the_lock_is_left_to_it(kept: Kept, tmp_path: Path) -> None:
-    with alone(tmp_path):
-        kept.keeper.look()
-        with pytest.raises(Busy), alone(tmp_path):
+    with exclusive(tmp_path):
+        kept.supervisor.look()
+        with pytest.raises(LockHeld), exclusive(tmp_path):
             pass
     assert kept.told == []
-    kept.keeper.look()
+    kept.supervisor.look()
     assert kept.starts == 1
 
 
 def test_none_is_started_while_the_platform_is_being_stopped(kept: Kept, tmp_path: Path) -> None:
-    stopping_mark(tmp_path).touch()
-    kept.keeper.look()
+    stop_marker(tmp_path).touch()
+    kept.supervisor.look()
     assert kept.told == []
 
 
 def test_a_gateway_that_a_command_has_started_meanwhile_is_taken_over(kept: Kept, tmp_path: Path) -> None:
     Processes(loop=kept.running.processes.loop, gateway=identify(os.getpid())).write(tmp_path)
-    kept.keeper.look()
+    kept.supervisor.look()
     assert kept.told == []
     assert kept.running.processes.gateway == os.getpid()
 
@@ -106,7 +105,7 @@ def open_files() -> set[str]:
     return set(os.listdir("/proc/self/fd"))
 
 
-@pytest.mark.parametrize("what", ["gateway.log", "starts.new"])
+@pytest.mark.parametrize("what", ["gateway.log", "processes.new"])
 def test_a_gateway_that_cannot_be_started_is_said_once_and_counts_as_a_start(
     kept: Kept, tmp_path: Path, what: str
 ) -> None:
@@ -114,7 +113,7 @@ def test_a_gateway_that_cannot_be_started_is_said_once_and_counts_as_a_start(
     (tmp_path / what).mkdir()
     before = open_files()
     for _ in range(5):
-        kept.keeper.look()
+        kept.supervisor.look()
     assert [sentence.partition(":")[0] for sentence in kept.told] == [
         "the gateway cannot be started anew",
         f"the gateway (process {1 << 22}) has ended, 2 times within 60 s",
@@ -125,8 +124,8 @@ def test_a_gateway_that_cannot_be_started_is_said_once_and_counts_as_a_start(
     assert [child.poll() for child in kept.running._children] == [-signal.SIGKILL] * len(kept.running._children)
     # It is tried again when the minute has passed.
     (tmp_path / what).rmdir()
-    kept.keeper._starts.clear()
-    kept.keeper.look()
+    kept.supervisor._starts.clear()
+    kept.supervisor.look()
     assert kept.starts == 1
 
 
@@ -134,7 +133,7 @@ def test_no_file_left_to_open_does_not_end_the_launcher(kept: Kept) -> None:
     allowed = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, allowed[1]))
     try:
-        kept.keeper.look()
+        kept.supervisor.look()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, allowed)
     assert "Too many open files" in kept.told[0]

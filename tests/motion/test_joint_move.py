@@ -7,8 +7,8 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.controllers.generator import JointGenerator
-from rtcp.motion.state import MotionState, Phase, Reason
+from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.state import ArmState, Phase, Reason
 
 PERIOD = 0.0005
 SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6
@@ -18,8 +18,8 @@ class Driven:
     """The generator with the state that the loop keeps for it, where no guard cuts anything."""
 
     def __init__(self) -> None:
-        self.made = JointGenerator(PERIOD, SPEED, ACCELERATION, JERK)
-        self.state = MotionState(6)
+        self.made = JointMoveController(PERIOD, SPEED, ACCELERATION, JERK)
+        self.state = ArmState(6)
 
     @property
     def phase(self) -> Phase:
@@ -27,11 +27,11 @@ class Driven:
 
     @property
     def position(self) -> list[float]:
-        return self.state.position
+        return self.state.commanded
 
     @property
     def velocity(self) -> list[float]:
-        return self.state.velocity
+        return self.state.commanded_velocity
 
     def move_to(self, target: list[float], speed: float, *, each: bool = False) -> bool:
         return self.made.move_to(self.state, target, speed, each=each)
@@ -42,8 +42,10 @@ class Driven:
     def update(self) -> bool:
         state = self.state
         target = self.made.update(state, PERIOD)
-        state.acceleration = [(new - old) / PERIOD for new, old in zip(target.velocity, state.velocity, strict=True)]
-        state.position, state.velocity = list(target.position), list(target.velocity)
+        state.commanded_acceleration = [
+            (new - old) / PERIOD for new, old in zip(target.velocity, state.commanded_velocity, strict=True)
+        ]
+        state.commanded, state.commanded_velocity = list(target.position), list(target.velocity)
         return self.made.reason is Reason.NONE
 
 
@@ -115,8 +117,8 @@ def test_latching_holds_there() -> None:
     made.move_to([1.0] * 6, 0.5)
     for _ in range(500):
         made.update()
-    made.state.velocity = [0.0] * 6
-    made.state.acceleration = [0.0] * 6
+    made.state.commanded_velocity = [0.0] * 6
+    made.state.commanded_acceleration = [0.0] * 6
     made.made.hold()
     held = list(made.position)
     assert made.phase is Phase.HOLD
@@ -155,7 +157,7 @@ def test_a_distance_on_the_border_of_two_profiles_is_planned_and_reached() -> No
     border = 2 * ACCELERATION[0] ** 3 / JERK[0] ** 2
     for start in range(0, 5000, 37):
         made = generator()
-        made.state.position = [start * 1e-4] * 6
+        made.state.commanded = [start * 1e-4] * 6
         target = [start * 1e-4 + border, *([start * 1e-4] * 5)]
         assert made.move_to(target, 0.5), start
         while made.phase is Phase.MOVE:

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.operation import WatchConfig
-from rtcp.motion.guards.watch import FOLLOWING_ERROR, SPEED, TORQUE, Found, Watch
+from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED, TORQUE, Found, Supervision
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import MotionState
+from rtcp.motion.state import ArmState
 
 from .judge import JOINTS_ONLY
 
@@ -24,14 +24,14 @@ BOUNDS = {SPEED: 1.5 * 1.5, TORQUE: 2.0 * CONFIG.joints[1].torque, FOLLOWING_ERR
 KINDS = pytest.mark.parametrize("kind", [SPEED, TORQUE, FOLLOWING_ERROR], ids=["speed", "torque", "following error"])
 
 
-def put(state: MotionState, kind: int, axis: int, value: float) -> None:
+def put(state: ArmState, kind: int, axis: int, value: float) -> None:
     """Let a joint measure so much."""
     if kind == SPEED:
-        state.speed[axis] = value
+        state.actual_velocity[axis] = value
     elif kind == TORQUE:
-        state.torque[axis] = value
+        state.actual_torque[axis] = value
     else:
-        state.actual[axis] = state.position[axis] + value
+        state.actual[axis] = state.commanded[axis] + value
 
 
 class Seen:
@@ -39,8 +39,8 @@ class Seen:
 
     def __init__(self) -> None:
         self.limits = Limits(CONFIG)
-        self.watch = Watch(CONFIG, self.limits)
-        self.state = MotionState(2)
+        self.watch = Supervision(CONFIG, self.limits)
+        self.state = ArmState(2)
 
     def look(self, kind: int, *values: float) -> list[Found | None]:
         """Look once for each of these values of the second joint."""

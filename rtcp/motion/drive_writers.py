@@ -36,7 +36,7 @@ class Commanded(Protocol):
     target_torque: float
 
 
-class ModeLaw(Protocol):
+class DriveWriter(Protocol):
     """One mode for all joints."""
 
     mode: DriveMode
@@ -48,7 +48,7 @@ class ModeLaw(Protocol):
         """Write the targets of the drives for the set-points `position` (rad) and `velocity` (rad/s)."""
 
 
-class PositionLaw:
+class CspWriter:
     """CSP: the set-point itself."""
 
     mode = DriveMode.CSP
@@ -64,7 +64,7 @@ class PositionLaw:
             drive.target_torque = 0.0
 
 
-class VelocityLaw:
+class CsvWriter:
     """CSV: the set-point's velocity and a proportional pull back to its position."""
 
     mode = DriveMode.CSV
@@ -89,7 +89,7 @@ class VelocityLaw:
             drive.target_torque = 0.0
 
 
-class TorqueLaw:
+class CstWriter:
     """CST: stiffness, damping and a bounded integral about the set-point (an impedance that ends where it should)."""
 
     mode = DriveMode.CST

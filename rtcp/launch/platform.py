@@ -13,27 +13,32 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.client import ControlClient, ControlError
-from rtcp.ipc.ending import LEFT, end_of
-from rtcp.ipc.journal import open_log
-from rtcp.ipc.paths import (
+from rtcp.ipc.runtime_directory import (
     blackboard_file,
     control_socket,
     free_segment_control,
+    is_listening,
     limits_file,
-    listens,
-    processes_file,
-    stopping_mark,
+    open_log,
+    stop_marker,
 )
-from rtcp.ipc.session import NONE, Processes, end, forget_processes, identify, is_ours, read_processes
-from rtcp.launch.keeper import GatewayKeeper
-from rtcp.launch.notifier import Notifier
+from rtcp.ipc.session import (
+    EXIT_INCOMPLETE,
+    NO_PROCESS,
+    Processes,
+    exit_problems,
+    identify,
+    is_running,
+    processes_file,
+    read_processes,
+    terminate,
+)
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 
 _SEGMENT_S = 60.0
@@ -45,7 +50,7 @@ _STOP_S = 20.0
 _ENDING_S = 0.5
 _LOOP_END_S = 10.0
 """For a controlled stop, the drives' torque and the way to INIT: a loop that is killed leaves them to a watchdog."""
-_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 Report = Callable[[str], None]
 Kind = Literal["refused", "fault", "usage", "timeout"]
 
@@ -58,7 +63,7 @@ class StartError(Exception):
         self.kind = kind
 
 
-class Running:
+class Platform:
     """A platform that runs; made by `start`.
 
     Args:
@@ -183,45 +188,18 @@ class Running:
 
     # -- running and stopping -----------------------------------------------------------------------------------
 
-    def wait(self, report: Report) -> int:
-        """Wait until the platform is stopped or its loop ends; return the exit code. Its gateway is kept there.
-
-        SIGINT, SIGTERM and SIGHUP stop it in an orderly way (0), and so does `rtcp stop` (0); what could not be left as
-        it should is told (5); a loop that ends by itself is a fault (5), whereupon the rest is stopped too.
-        """
-        stopped: list[int] = []
-        before = {number: signal.signal(number, lambda got, frame: stopped.append(got)) for number in _SIGNALS}
-        notifier = Notifier.of_environment(blackboard_file(self.directory))
-        keeper = GatewayKeeper(self, report)
-        try:
-            notifier.ready()
-            while not stopped and is_ours(self.processes.loop):
-                notifier.look()
-                keeper.look()
-                time.sleep(0.1)
-            notifier.stopping("stopping" if stopped else "the loop has ended")
-            if not stopped and self._ended_orderly():
-                self._reap(10.0)
-                return 5 if self.exit_code(self.processes.loop) == LEFT else 0
-            left = self.stop(report)
-            return 0 if stopped and not left else 5
-        finally:
-            notifier.close()
-            keeper.close()
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def _ended_orderly(self) -> bool:
-        """Whether another `rtcp stop` ended the loop: the directory, maybe a new platform's by now, is left alone."""
+    def ended_in_order(self) -> bool:
+        """Return whether an `rtcp stop` ended the loop; then a new platform may own the directory already."""
         loop = next((child for child in self._children if child.pid == self.processes.loop), None)
-        if loop is not None and loop.wait() not in (0, LEFT):
+        if loop is not None and loop.wait() not in (0, EXIT_INCOMPLETE):
             return False
-        return stopping_mark(self.directory).exists() or not processes_file(self.directory).exists()
+        return stop_marker(self.directory).exists() or not processes_file(self.directory).exists()
 
-    def _reap(self, patience_s: float) -> None:
+    def reap(self, timeout_s: float) -> None:
+        """Wait for the processes that this one has started."""
         for child in self._children:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                child.wait(timeout=patience_s)
+                child.wait(timeout=timeout_s)
 
     def stop(self, report: Report | None = None) -> tuple[str, ...]:
         """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended. May be called twice.
@@ -229,7 +207,7 @@ class Running:
         Return, and tell `report`, in sentences what of that could not be done.
         """
         left = end_platform(self.directory, self.processes, report)
-        self._reap(2.0)
+        self.reap(2.0)
         if report is not None:
             for sentence in left:
                 report(f"stopped, but: {sentence}")
@@ -241,24 +219,24 @@ def end_platform(directory: Path, found: Processes, report: Report | None = None
 
     `report` is told why the gateway did not do it.
     """
-    lived, answers = is_ours(found.loop), is_ours(found.gateway)
+    lived, answers = is_running(found.loop), is_running(found.gateway)
     error = ask_gateway(directory)
     if error is not None and answers and report is not None:
         report(f"the gateway did not stop the platform: {error}; its processes are ended one by one")
     clear(directory, found)
-    return end_of(directory, found.loop, lived)
+    return exit_problems(directory, found.loop, lived)
 
 
 def clear(directory: Path, found: Processes) -> None:
     """End what is left of a platform and remove its files."""
     now = read_processes(directory)
     # A gateway that has been replaced since.
-    newer = now.gateway if now.loop == found.loop else NONE
-    end(found.loop, _LOOP_END_S)
+    newer = now.gateway if now.loop == found.loop else NO_PROCESS
+    terminate(found.loop, _LOOP_END_S)
     for pid in (found.gateway, newer, found.segment):
-        end(pid, 5.0)
-    forget_processes(directory)
-    sockets = [path for path in directory.glob("segment*.sock") if not listens(path)]
+        terminate(pid, 5.0)
+    processes_file(directory).unlink(missing_ok=True)
+    sockets = [path for path in directory.glob("segment*.sock") if not is_listening(path)]
     # Narrowed limits are told apart by their loop's process, whose number may come again.
     for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets):
         path.unlink(missing_ok=True)
@@ -286,7 +264,7 @@ def undisturbed() -> Iterator[None]:
         yield
         return
     came: list[int] = []
-    before = {number: signal.signal(number, lambda got, frame: came.append(got)) for number in _SIGNALS}
+    before = {number: signal.signal(number, lambda got, frame: came.append(got)) for number in SIGNALS}
     try:
         yield
     finally:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import Joint, Range
-from rtcp.motion.guards.guard import BACK_RAD_S, Guard
+from rtcp.motion.guards.output_limiter import BACK_RAD_S, OutputLimiter
 from rtcp.motion.limits import Limits
 
 from .judge import ARM
@@ -38,7 +38,7 @@ CHANGE = 2.0 * PERIOD
 
 
 def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
-    guard = Guard(Limits(CONFIG), PERIOD)
+    guard = OutputLimiter(Limits(CONFIG), PERIOD)
     guard.latch(0, last)
     guard.check([drive])
     return drive, guard.held
@@ -46,7 +46,7 @@ def guarded(last: float, drive: Drive) -> tuple[Drive, int]:
 
 def in_the_end(last: float, drive: Drive) -> tuple[Drive, int]:
     """What becomes of a velocity that is wanted for so long that its change bounds it no more."""
-    guard = Guard(Limits(CONFIG), PERIOD)
+    guard = OutputLimiter(Limits(CONFIG), PERIOD)
     guard.latch(0, last)
     wanted = drive.target_velocity
     for _ in range(1000):
@@ -90,7 +90,7 @@ def test_beyond_the_range_speed_only_leads_back() -> None:
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50), st.floats(-1.0, 2.0))
 def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float], start: float) -> None:
-    guard, drive, before = Guard(Limits(CONFIG), PERIOD), Drive(), start
+    guard, drive, before = OutputLimiter(Limits(CONFIG), PERIOD), Drive(), start
     guard.latch(0, start)
     for target in wanted:
         drive.target_position = target
@@ -102,7 +102,7 @@ def test_whatever_is_asked_targets_stay_in_range_and_in_steps(wanted: list[float
 
 def test_limits_that_change_are_those_that_count_from_then_on() -> None:
     limits = Limits(CONFIG)
-    guard, drive = Guard(limits, PERIOD), Drive(target_position=9.0)
+    guard, drive = OutputLimiter(limits, PERIOD), Drive(target_position=9.0)
     guard.latch(0, 1.0)
     limits.apply(replace(limits.widest, high=(0.9,), velocity=(0.1,), torque=(2.0,)))
     guard.take(limits)
@@ -122,7 +122,7 @@ def led_back(last: float, wanted: float, velocity: float = 0.5) -> list[float]:
     """The targets from `last`, outside the range, until they are inside."""
     limits = Limits(CONFIG)
     limits.apply(replace(limits.widest, velocity=(velocity,)))
-    guard, drive, targets = Guard(limits, PERIOD), Drive(position=last), [last]
+    guard, drive, targets = OutputLimiter(limits, PERIOD), Drive(position=last), [last]
     guard.latch(0, last)
     while not -1.0 <= targets[-1] <= 2.0:
         drive.target_position = wanted
@@ -157,7 +157,7 @@ def test_a_target_is_led_back_no_faster_than_gently_or_than_its_joint_may_and_un
 
 @given(st.lists(st.floats(allow_nan=True, allow_infinity=True), min_size=1, max_size=50))
 def test_a_target_velocity_changes_by_no_more_than_acceleration_x_cycle(wanted: list[float]) -> None:
-    guard, drive = Guard(Limits(CONFIG), PERIOD), Drive()
+    guard, drive = OutputLimiter(Limits(CONFIG), PERIOD), Drive()
     before = 0.0
     for speed in wanted:
         drive.target_velocity = speed

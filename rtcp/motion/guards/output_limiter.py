@@ -11,26 +11,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import copysign
 
+from rtcp.motion.drive_writers import Commanded
 from rtcp.motion.guards.braking import fastest_stoppable
 from rtcp.motion.limits import Limits
-from rtcp.motion.modes import Commanded
 
 BACK_RAD_S = 0.05
 """A joint that stands beyond its range is led back to the edge no faster: nobody has asked it to move. At a reach of
 1.3 m it is 65 mm/s, below the 250 mm/s of reduced speed (ISO 10218-1)."""
 
 
-class Guard:
+class OutputLimiter:
     """Clamps the targets of all drives, once a cycle, after the mode.
 
-    `held` is a bit mask of the joints whose target was changed in the last call; `last` are the target positions sent
+    `held` is a bit mask of the joints whose target was changed in the last call; `sent` are the target positions sent
     last, rad.
     """
 
     def __init__(self, limits: Limits, period_s: float) -> None:
         self._period_s = period_s
         self.take(limits)
-        self.last = [0.0] * len(self._low)
+        self.sent = [0.0] * len(self._low)
         self._pace = [0.0] * len(self._low)
         """Speed, rad/s, of the next step back of a joint that is led back into its range; 0 of all others."""
         self._velocity = [0.0] * len(self._low)
@@ -47,16 +47,16 @@ class Guard:
 
     def latch(self, axis: int, position: float) -> None:
         """Take `position` (rad) as the target sent last: while a drive has no torque, its target is where it is."""
-        self.last[axis] = position
+        self.sent[axis] = position
         self._pace[axis] = self._velocity[axis] = 0.0
 
     def check(self, drives: Sequence[Commanded]) -> None:
         """Clamp every target of every drive in place."""
-        last = self.last
+        sent = self.sent
         held = 0
         for i, drive in enumerate(drives):
             wanted = drive.target_position
-            before = last[i]
+            before = sent[i]
             lowest, highest = self._low[i], self._high[i]
             if lowest <= before <= highest:
                 step = self._step[i]
@@ -68,7 +68,7 @@ class Guard:
             if not (low <= wanted <= high):
                 held |= 1 << i
                 wanted = high if wanted > high else low if wanted < low else min(max(before, low), high)
-            last[i] = drive.target_position = wanted
+            sent[i] = drive.target_position = wanted
             speed = drive.target_velocity
             bound = self._speed[i]
             if not (-bound <= speed <= bound):
@@ -105,7 +105,7 @@ class Guard:
         The first after `latch` is the last itself. From there on the speed is bounded by `BACK_RAD_S` and the joint's
         own, and rises and falls under the joint's acceleration.
         """
-        before, dt = self.last[i], self._period_s
+        before, dt = self.sent[i], self._period_s
         edge = self._high[i] if before > self._high[i] else self._low[i]
         pace = self._pace[i]
         left = max(abs(before - edge) - pace * dt, 0.0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from rtcp.config.model import ArmConfig
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import MotionState
+from rtcp.motion.state import ArmState
 
 SPEED, TORQUE, FOLLOWING_ERROR = 0, 1, 2
 
@@ -20,7 +20,7 @@ class Found(NamedTuple):
     limit: float
 
 
-class Watch:
+class Supervision:
     """Counts the cycles in a row in which a joint is beyond a limit.
 
     Args:
@@ -42,13 +42,13 @@ class Watch:
             for i in self._joints:
                 counts[i] = 0
 
-    def look(self, state: MotionState) -> Found | None:
+    def look(self, state: ArmState) -> Found | None:
         """Look at the cycle's measurements; return what has been beyond its limit for too long, or None."""
         limits, error = self._limits, self._error
         speeds, torques, errors = self._counts
         for i in self._joints:
             bound = self._speed * limits.velocity[i]
-            value = state.speed[i]
+            value = state.actual_velocity[i]
             if -bound <= value <= bound:
                 speeds[i] = 0
             else:
@@ -56,14 +56,14 @@ class Watch:
                 if speeds[i] >= self._cycles:
                     return Found(SPEED, i, value, bound)
             bound = self._torque * limits.torque[i]
-            value = state.torque[i]
+            value = state.actual_torque[i]
             if -bound <= value <= bound:
                 torques[i] = 0
             else:
                 torques[i] += 1
                 if torques[i] >= self._cycles:
                     return Found(TORQUE, i, value, bound)
-            value = state.actual[i] - state.position[i]
+            value = state.actual[i] - state.commanded[i]
             if -error <= value <= error:
                 errors[i] = 0
             else:

@@ -12,30 +12,27 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from rtcp.ipc.journal import place_of_log
-from rtcp.ipc.lock import Busy, alone
-from rtcp.ipc.paths import stopping_mark
-from rtcp.ipc.session import is_ours, read_processes
+from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, exclusive, log_location, stop_marker
+from rtcp.ipc.session import EXIT_INCOMPLETE, is_running, read_processes
+from rtcp.launch.notifier import Notifier
+from rtcp.launch.platform import SIGNALS, Platform
 
-if TYPE_CHECKING:
-    from rtcp.launch.running import Running
-
+_POLL_S = 0.1
 STARTS, WINDOW_S = 5, 60.0
 """At most so many starts in so many seconds: a gateway that cannot live is not started for ever."""
 
 
-class GatewayKeeper:
+class GatewaySupervisor:
     """Looks after the gateway of a platform in the foreground.
 
     Args:
-        running: the platform.
+        platform: the platform.
         report: is told in a sentence what happened.
     """
 
-    def __init__(self, running: Running, report: Callable[[str], None]) -> None:
-        self._running = running
+    def __init__(self, platform: Platform, report: Callable[[str], None]) -> None:
+        self._platform = platform
         self._report = report
         self._starts: deque[float] = deque()
         self._gave_up = False
@@ -55,21 +52,21 @@ class GatewayKeeper:
 
     def _look(self, now: float) -> None:
         self._hear()
-        if is_ours(self._running.processes.gateway):
+        if is_running(self._platform.processes.gateway):
             return
         while self._starts and now - self._starts[0] > WINDOW_S:
             self._starts.popleft()
         if len(self._starts) >= STARTS:
             if not self._gave_up:
                 self._gave_up = True
-                where = place_of_log(self._running.directory / "gateway.log")
+                where = log_location(self._platform.directory / "gateway.log")
                 again = f"it is left alone for a while; {where} says why"
                 self._tell(f"{self._fate()}, {STARTS} times within {WINDOW_S:g} s: {again}")
             return
         try:
-            with alone(self._running.directory):
+            with exclusive(self._platform.directory):
                 self._start(now)
-        except Busy:
+        except LockHeld:
             pass  # whoever has the lock is stopping the platform, or giving it a gateway
 
     def close(self) -> None:
@@ -79,18 +76,18 @@ class GatewayKeeper:
             self._ready = None
 
     def _start(self, now: float) -> None:
-        running = self._running
-        found = read_processes(running.directory)
-        if found.loop != running.processes.loop or stopping_mark(running.directory).exists():
+        platform = self._platform
+        found = read_processes(platform.directory)
+        if found.loop != platform.processes.loop or stop_marker(platform.directory).exists():
             return
-        if is_ours(found.gateway):
-            running.processes = found  # a command was quicker
+        if is_running(found.gateway):
+            platform.processes = found  # a command was quicker
             return
         self._starts.append(now)
         self._gave_up = False
         fate = self._fate()
         self.close()
-        self._ready = running.begin_gateway()
+        self._ready = platform.begin_gateway()
         self._trouble = ""
         self._tell(f"{fate}: it is started anew")
 
@@ -110,14 +107,43 @@ class GatewayKeeper:
         if self._ready is None or not select.select([self._ready], [], [], 0.0)[0]:
             return
         if os.read(self._ready, 4096):
-            self._tell(f"the gateway (process {self._running.processes.gateway}) answers again")
+            self._tell(f"the gateway (process {self._platform.processes.gateway}) answers again")
         self.close()
 
     def _fate(self) -> str:
-        gateway = self._running.processes.gateway
-        code = self._running.exit_code(gateway)
+        gateway = self._platform.processes.gateway
+        code = self._platform.exit_code(gateway)
         how = "" if code is None else f" by {_name(-code)}" if code < 0 else f" with code {code}"
         return f"the gateway (process {gateway}) has ended{how}"
+
+
+def supervise(platform: Platform, report: Callable[[str], None]) -> int:
+    """Wait until the platform is stopped or its loop ends, restart its gateway, notify systemd; return the exit code.
+
+    SIGINT, SIGTERM and SIGHUP stop it (0), and so does `rtcp stop` (0). 5: something is not left as it should be, or
+    the loop ended by itself; the rest is then stopped too.
+    """
+    received: list[int] = []
+    before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in SIGNALS}
+    notifier = Notifier.of_environment(blackboard_file(platform.directory))
+    gateway = GatewaySupervisor(platform, report)
+    try:
+        notifier.ready()
+        while not received and is_running(platform.processes.loop):
+            notifier.look()
+            gateway.look()
+            time.sleep(_POLL_S)
+        notifier.stopping("stopping" if received else "the loop has ended")
+        if not received and platform.ended_in_order():
+            platform.reap(10.0)
+            return 5 if platform.exit_code(platform.processes.loop) == EXIT_INCOMPLETE else 0
+        problems = platform.stop(report)
+        return 0 if received and not problems else 5
+    finally:
+        notifier.close()
+        gateway.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _name(number: int) -> str:
