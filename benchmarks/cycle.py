@@ -32,7 +32,7 @@ from rich.table import Table
 
 from rtcp.config.find import find_config
 from rtcp.config.schema import load
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import Platform, StartOptions, start
@@ -132,7 +132,7 @@ def keep_moving(active: str, stop: threading.Event, moving: threading.Event) -> 
                 moving.set()
             try:
                 ACTIVE[active](client, turn)
-            except ControlError as error:
+            except RtcpError as error:
                 sys.stderr.write(f"the arm stopped moving: {error.message}\n")
                 moving.set()
                 return

@@ -30,7 +30,7 @@ from rtcp.cli import (
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.errors import ConfigError
-from rtcp.ipc.client import ControlError
+from rtcp.ipc.client import RtcpError
 
 app = typer.Typer(
     name="rtcp",
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         app(args=None if arguments is None else list(arguments), prog_name="rtcp")
     except SystemExit as ending:
         return _flushed(ending.code if isinstance(ending.code, int) else ExitCode.DONE)
-    except ControlError as error:
+    except RtcpError as error:
         complain(error.message)
         return _flushed(code_of(error.kind))
     except ConfigError as error:

@@ -11,12 +11,12 @@ from rtcp.cli.connection import connect
 from rtcp.cli.errors import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.cli.launch import refuse_a_second_platform
 from rtcp.config.virtual import VIRTUAL
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.launch import offline
 
 
 class BusAccess(Protocol):
-    """What `scan` and `sdo` need of a bus; every method may raise `ControlError` or `OfflineError`."""
+    """What `scan` and `sdo` need of a bus; every method may raise `RtcpError` or `OfflineError`."""
 
     name: str
     """`virtual` or the network interface."""
@@ -96,14 +96,14 @@ def bus_access(command: str, bus: str | None, config: Path | None) -> Iterator[B
 
     Raises:
         CommandError: in place of what went wrong inside; a segment that was started has been ended by then.
-        ControlError: as the platform answers.
+        RtcpError: as the platform answers.
         ConfigError: when the configuration was needed and is wrong.
     """
     try:
         with orderly_signals():
             try:
                 client = connect(command)
-            except ControlError as error:
+            except RtcpError as error:
                 if error.kind != "not running":
                     raise
                 refuse_a_second_platform()

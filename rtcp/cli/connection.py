@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.cli.output import complain
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
@@ -23,7 +23,7 @@ def connect(command: str) -> ControlClient:
     A loop that lives and has lost its gateway is given a new one first, and that is told on standard error.
 
     Raises:
-        ControlError: as `ControlClient` does, `not running` above all.
+        RtcpError: as `ControlClient` does, `not running` above all.
     """
     name = f"rtcp {command} (pid {os.getpid()})"
     directory = runtime_directory()
@@ -31,7 +31,7 @@ def connect(command: str) -> ControlClient:
     while True:
         try:
             return ControlClient(name)
-        except ControlError as error:
+        except RtcpError as error:
             if error.kind != "not running" or time.monotonic() > until or not _is_our_loop(directory):
                 raise
             _replace_gateway(directory, error)
@@ -42,7 +42,7 @@ def ask(command: str, verb: str, arguments: Mapping[str, Any] | None = None) -> 
     """Send one request on a connection of its own and return the result.
 
     Raises:
-        ControlError: what the platform answered, or that there is none.
+        RtcpError: what the platform answered, or that there is none.
     """
     with connect(command) as client:
         return client.call(verb, arguments)
@@ -58,7 +58,7 @@ def _is_our_loop(directory: Path) -> bool:
     return loop_lives() and directory.stat().st_uid == os.geteuid()
 
 
-def _replace_gateway(directory: Path, error: ControlError) -> None:
+def _replace_gateway(directory: Path, error: RtcpError) -> None:
     from rtcp.launch.launcher import replace_gateway  # here: it is seldom needed, and loads slowly
     from rtcp.launch.platform import StartError
 
@@ -67,6 +67,6 @@ def _replace_gateway(directory: Path, error: ControlError) -> None:
             complain(f"the gateway had ended and was started anew (process {process}); nothing was enabled by that")
     except StartError as refused:
         if refused.kind != "refused":
-            raise ControlError("not running", f"{error.message}; {refused}") from refused
+            raise RtcpError("not running", f"{error.message}; {refused}") from refused
     except (OSError, TypeError):
         raise error from None  # what the loop was started with cannot be read: no platform of this version

@@ -57,7 +57,7 @@ class SquareDrive:
         """Move to the first corner, then along the four sides, while every cycle is recorded.
 
         Raises:
-            ControlError: as the platform ended a motion.
+            RtcpError: as the platform ended a motion.
             CommandError: nothing moved.
         """
         from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory

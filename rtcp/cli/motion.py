@@ -96,7 +96,7 @@ def move(
     """Move to `target`, rad, over an open connection and return the result once the joints are there.
 
     Raises:
-        ControlError: as the platform ended the move.
+        RtcpError: as the platform ended the move.
     """
     return client.call("move", {"q": list(target), "speed": speed}, follow, timeout_s=SILENCE_S)
 

@@ -13,7 +13,7 @@ from rtcp.cli.errors import CommandError, ExitCode, code_of
 from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
 from rtcp.cli.output import report
-from rtcp.ipc.client import ControlError
+from rtcp.ipc.client import RtcpError
 
 PATIENCE_S = 5.0
 """For a machine that is still starting: its frames have to come back first, or to be missed for long enough."""
@@ -73,7 +73,7 @@ def _outcome(ready: str) -> tuple[str, bool]:
         with connect("start") as client:
             while (status := client.call("status"))["state"] == "starting" and time.monotonic() < until:
                 time.sleep(_ASK_S)
-    except ControlError as error:
+    except RtcpError as error:
         return f"started, but: {error.message}", False
     state, message = str(status["state"]), str(status["message"])
     if state == "ready":

@@ -12,7 +12,7 @@ import typer
 from rtcp.cli.connection import connect, loop_lives
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import console, emit, emit_json, show
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 
 REFRESH_S = 0.1
 """Time between two pictures of `--watch` on a terminal, and between two lines of JSON."""
@@ -71,12 +71,12 @@ def _again(client: ControlClient) -> ControlClient:
 
     Raises:
         CommandError: the loop has ended too.
-        ControlError: it lives, and nobody answers for it.
+        RtcpError: it lives, and nobody answers for it.
     """
     client.close()
     try:
         return connect("status")
-    except ControlError as error:
+    except RtcpError as error:
         if loop_lives():
             raise
         raise CommandError("the platform has ended", ExitCode.NOT_RUNNING) from error
@@ -89,7 +89,7 @@ def _pictures(client: ControlClient, interval_s: float) -> Iterator[dict[str, An
         while True:
             try:
                 status = client.call("status")
-            except ControlError as error:
+            except RtcpError as error:
                 if error.kind != "lost":
                     raise
                 client = _again(client)

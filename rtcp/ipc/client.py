@@ -30,17 +30,68 @@ _PEER = struct.Struct("3i")
 _KINDS_ON_THE_WIRE = frozenset({"refused", "fault", "timeout", "invalid", "internal"})
 
 
-class ControlError(Exception):
-    """A request that did not succeed: `message` is a sentence for people, `kind` is for programs.
+class RtcpError(Exception):
+    """A request that did not succeed. `RtcpError("refused", ...)` makes a `Refused`, and so on for each kind.
 
-    `not running` and `lost` arise at this end (nobody answers; the connection ended before the answer); the other kinds
-    are the platform's own.
+    Attributes:
+        kind: for programs: refused, fault, timeout, invalid, internal (the platform's own); not running, lost (found at
+            this end: nobody answers; the connection ended before the answer).
+        message: for people: what happened, where, what to do.
+        reason: name of the refusal (`rtcp.ipc.refusals`) or event (`rtcp.ipc.events`) behind it; empty: none.
+        fields: its fields by name, SI units.
     """
 
-    def __init__(self, kind: ErrorKind, message: str) -> None:
-        super().__init__(message)
+    def __new__(
+        cls, kind: ErrorKind, message: str, reason: str = "", fields: Mapping[str, Any] | None = None
+    ) -> RtcpError:
+        """Make an instance of the kind's class."""
+        return super().__new__(_CLASSES.get(kind, RtcpError), kind, message, reason, fields)
+
+    def __init__(
+        self, kind: ErrorKind, message: str, reason: str = "", fields: Mapping[str, Any] | None = None
+    ) -> None:
+        super().__init__(kind, message, reason, fields)
         self.kind: ErrorKind = kind
         self.message = message
+        self.reason = reason
+        self.fields: dict[str, Any] = dict(fields or {})
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class Refused(RtcpError):
+    """The platform runs and will not do this now; nothing was begun."""
+
+
+class Faulted(RtcpError):
+    """It was begun and went wrong: a fault, an emergency stop, a motion that ended before its goal."""
+
+
+class TimedOut(RtcpError):
+    """It took too long, or no answer came."""
+
+
+class Invalid(RtcpError):
+    """A parameter is wrong; nothing was begun."""
+
+
+class NotRunning(RtcpError):
+    """No platform listens at the control socket."""
+
+
+class ConnectionLost(RtcpError):
+    """The connection ended before the answer."""
+
+
+_CLASSES: dict[str, type[RtcpError]] = {
+    "refused": Refused,
+    "fault": Faulted,
+    "timeout": TimedOut,
+    "invalid": Invalid,
+    "not running": NotRunning,
+    "lost": ConnectionLost,
+}
 
 
 class ControlClient:
@@ -57,7 +108,7 @@ class ControlClient:
             path: the control socket; that of the runtime directory when None.
 
         Raises:
-            ControlError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
+            RtcpError: `not running` when nobody listens, `refused` when the socket is another user's, `invalid`
                 when its path is too long for a socket.
         """
         self._path = control_socket(runtime_directory()) if path is None else path
@@ -94,7 +145,7 @@ class ControlClient:
             timeout_s: longest silence, not longest duration: a progress report starts it anew.
 
         Raises:
-            ControlError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
+            RtcpError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
                 connection ends first.
         """
         self._request += 1
@@ -121,7 +172,7 @@ class ControlClient:
         except TimeoutError as error:
             raise self._silence(verb, self._socket.gettimeout()) from error
         except OSError as error:
-            raise ControlError(
+            raise RtcpError(
                 "lost", f"the platform closed the connection before it took the request {verb!r}"
             ) from error
 
@@ -134,21 +185,21 @@ class ControlClient:
             except OSError:
                 chunk = b""
             if not chunk:
-                raise ControlError("lost", f"the platform closed the connection before it answered {verb!r}")
+                raise RtcpError("lost", f"the platform closed the connection before it answered {verb!r}")
             self._received += chunk
         line = bytes(self._received[:end])
         del self._received[: end + 1]
         try:
             reply = json.loads(line)
         except ValueError as error:
-            raise ControlError("internal", f"the answer to {verb!r} is not JSON: {line[:80]!r}") from error
+            raise RtcpError("internal", f"the answer to {verb!r} is not JSON: {line[:80]!r}") from error
         if not isinstance(reply, dict):
-            raise ControlError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
+            raise RtcpError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
         return reply
 
-    def _silence(self, verb: str, timeout_s: float | None) -> ControlError:
+    def _silence(self, verb: str, timeout_s: float | None) -> RtcpError:
         gateway, _, _ = _PEER.unpack(self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
-        return ControlError(
+        return RtcpError(
             "timeout",
             f"the platform has not answered {verb!r} for {timeout_s:g} s: if its gateway (process {gateway}) hangs, "
             f"`kill -9 {gateway}` and `rtcp start` give the loop another, `rtcp stop` ends all of it",
@@ -158,7 +209,7 @@ class ControlClient:
 def _connect(path: Path) -> socket.socket:
     length = len(os.fsencode(path))
     if length > LONGEST_SOCKET_PATH:
-        raise ControlError(
+        raise RtcpError(
             "invalid",
             f"the control socket's path {path} has {length} bytes, a socket's path at most {LONGEST_SOCKET_PATH}: "
             "set RTCP_RUNTIME_DIR to a shorter one",
@@ -169,15 +220,15 @@ def _connect(path: Path) -> socket.socket:
         connection.connect(os.fspath(path))
     except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError) as error:
         connection.close()
-        raise ControlError("not running", _who_runs(path)) from error
+        raise RtcpError("not running", _who_runs(path)) from error
     except PermissionError as error:
         connection.close()
-        raise ControlError("refused", f"the control socket {path} is another user's: only its owner may use it") from (
+        raise RtcpError("refused", f"the control socket {path} is another user's: only its owner may use it") from (
             error
         )
     except OSError as error:
         connection.close()
-        raise ControlError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}") from error
+        raise RtcpError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}") from error
     return connection
 
 
@@ -188,9 +239,9 @@ def _who_runs(path: Path) -> str:
     return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
 
 
-def _refusal(verb: str, error: object) -> ControlError:
+def _refusal(verb: str, error: object) -> RtcpError:
     """Turn the `error` of an answer into an exception, whatever shape it came in."""
     found = error if isinstance(error, dict) else {}
     kind = found.get("kind")
     message = str(found.get("message") or f"the platform refused {verb!r} without saying why")
-    return ControlError(cast("ErrorKind", kind) if kind in _KINDS_ON_THE_WIRE else "fault", message)
+    return RtcpError(cast("ErrorKind", kind) if kind in _KINDS_ON_THE_WIRE else "fault", message)

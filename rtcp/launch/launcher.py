@@ -22,7 +22,7 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import check_name
 from rtcp.gateway.blackbox import BlackBox
 from rtcp.gateway.blackbox_file import faults_directory
-from rtcp.ipc.client import LONGEST_SOCKET_PATH, ControlError
+from rtcp.ipc.client import LONGEST_SOCKET_PATH, RtcpError
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import (
     LockHeld,
@@ -251,13 +251,13 @@ def stop(report: Report) -> tuple[str, ...]:
     Return in sentences what is not left as it should be: drives disabled, slaves in INIT.
 
     Raises:
-        ControlError: `not running` where nothing runs.
+        RtcpError: `not running` where nothing runs.
         StartError: while another start or stop is under way, for longer than is waited for.
     """
     directory = runtime_directory()
     found = read_processes(directory)
     if not any(is_running(pid) for pid in (found.loop, found.gateway, found.segment)):
-        raise ControlError("not running", f"no platform is running (runtime directory {directory})")
+        raise RtcpError("not running", f"no platform is running (runtime directory {directory})")
 
     def waits() -> None:
         report(f"another process starts or stops the platform: waiting for it, at most {STOP_WAITS_S:g} s")

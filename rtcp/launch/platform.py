@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.runtime_directory import (
     blackboard_file,
     control_socket,
@@ -248,11 +248,11 @@ def ask_gateway(directory: Path) -> Exception | None:
         with ControlClient("rtcp stop", control_socket(directory)) as client:
             try:
                 client.call("status", timeout_s=_ANSWER_S)
-            except ControlError as error:
+            except RtcpError as error:
                 if error.kind == "timeout":
                     return TimeoutError(f"it has not answered for {_ANSWER_S:g} s")
             client.call("stop", timeout_s=_STOP_S)
-    except (ControlError, OSError) as error:
+    except (RtcpError, OSError) as error:
         return error
     return None
 

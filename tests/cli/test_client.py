@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 
 
 @pytest.fixture
@@ -36,9 +36,9 @@ def replies(listener: socket.socket, *chunks: bytes) -> None:
     threading.Thread(target=serve, daemon=True).start()
 
 
-def error_of(listener: socket.socket, *chunks: bytes) -> ControlError:
+def error_of(listener: socket.socket, *chunks: bytes) -> RtcpError:
     replies(listener, *chunks)
-    with ControlClient() as client, pytest.raises(ControlError) as raised:
+    with ControlClient() as client, pytest.raises(RtcpError) as raised:
         client.call("status")
     return raised.value
 
@@ -77,7 +77,7 @@ def test_an_answer_to_another_request_is_passed_over(listener: socket.socket) ->
 
 def test_a_refusal_keeps_its_kind_and_its_sentence(platform: Any) -> None:
     platform.refusals["enable"] = ("refused", "the arm is commanded by a panel")
-    with ControlClient() as client, pytest.raises(ControlError) as raised:
+    with ControlClient() as client, pytest.raises(RtcpError) as raised:
         client.call("enable")
     assert (raised.value.kind, raised.value.message) == ("refused", "the arm is commanded by a panel")
 
@@ -104,7 +104,7 @@ def test_an_answer_that_is_no_json_is_shown(listener: socket.socket) -> None:
 
 
 def test_silence_ends_in_a_timeout_that_names_the_verb(listener: socket.socket) -> None:
-    with ControlClient() as client, pytest.raises(ControlError, match=r"'reset' for 0\.05 s") as raised:
+    with ControlClient() as client, pytest.raises(RtcpError, match=r"'reset' for 0\.05 s") as raised:
         client.call("reset", timeout_s=0.05)
     assert raised.value.kind == "timeout"
     assert f"its gateway (process {os.getpid()})" in raised.value.message
@@ -113,13 +113,13 @@ def test_silence_ends_in_a_timeout_that_names_the_verb(listener: socket.socket) 
 def test_a_socket_that_nobody_serves_is_not_running(listener: socket.socket, directory: Path) -> None:
     listener.close()
     assert (directory / "control.sock").exists()
-    with pytest.raises(ControlError, match="nobody listens") as raised:
+    with pytest.raises(RtcpError, match="nobody listens") as raised:
         ControlClient()
     assert raised.value.kind == "not running"
 
 
 def test_a_path_too_long_for_a_socket_is_named_with_the_limit(tmp_path: Path) -> None:
-    with pytest.raises(ControlError, match="at most 107") as raised:
+    with pytest.raises(RtcpError, match="at most 107") as raised:
         ControlClient(path=tmp_path / ("x" * 120) / "control.sock")
     assert raised.value.kind == "invalid"
 
@@ -127,6 +127,6 @@ def test_a_path_too_long_for_a_socket_is_named_with_the_limit(tmp_path: Path) ->
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open any socket")
 def test_the_socket_of_another_user_is_refused(listener: socket.socket, directory: Path) -> None:
     (directory / "control.sock").chmod(0)
-    with pytest.raises(ControlError, match="only its owner") as raised:
+    with pytest.raises(RtcpError, match="only its owner") as raised:
         ControlClient()
     assert raised.value.kind == "refused"

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from rtcp.config.find import default_config
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ipc.session import read_processes
 
@@ -211,5 +211,5 @@ def enabled(shared: Platform) -> Iterator[Platform]:
     shared.call("mode", name="csp")
     shared.call("enable")
     yield shared
-    with contextlib.suppress(ControlError):
+    with contextlib.suppress(RtcpError):
         shared.call("disable")

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.ipc.observer import Observer, record_type
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
@@ -276,7 +276,7 @@ def test_a_gateway_that_hangs_stops_the_motion_is_named_and_can_be_killed_and_re
     observer.close()
     with (
         ControlClient(path=control_socket(running.directory)) as client,
-        pytest.raises(ControlError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
+        pytest.raises(RtcpError, match=rf"its gateway \(process {before['gateway']}\) hangs"),
     ):
         client.call("status", timeout_s=0.5)
     kill(before["gateway"])

@@ -13,7 +13,7 @@ import pytest
 
 from kinematics.forward import forward
 from rtcp.config import default_config, load
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from tests.e2e.conftest import Platform, kill
@@ -160,7 +160,7 @@ def test_a_second_jogger_is_refused_with_the_firsts_name(bent: Platform, client:
     client.call("jog", {"v": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
     with (
         ControlClient("another", control_socket(bent.directory)) as other,
-        pytest.raises(ControlError, match="the arm is commanded by a test") as raised,
+        pytest.raises(RtcpError, match="the arm is commanded by a test") as raised,
     ):
         other.call("jog", {"v": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
     assert raised.value.kind == "refused"
@@ -177,7 +177,7 @@ def test_a_stream_is_followed_and_its_end_stops_the_arm(bent: Platform, client: 
 
 
 def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: ControlClient) -> None:
-    with pytest.raises(ControlError, match="the arm is in mode joint"):
+    with pytest.raises(RtcpError, match="the arm is in mode joint"):
         client.call("velocity", {"numbers": [0.1, 0, 0, 0, 0, 0]})
     client.call("motion", {"name": "velocity"})
     start = client.call("status")["joints"]["target"][0]

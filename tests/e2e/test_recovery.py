@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtcp.ipc.client import ControlError
+from rtcp.ipc.client import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, segment_control
 from rtcp.virtual.faults.client import SegmentClient
@@ -81,7 +81,7 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
         time.sleep(0.3)
         assert enabled.status()["state"] == "fault"
         assert not torque(segment)[2]
-        with pytest.raises(ControlError, match="fault"):
+        with pytest.raises(RtcpError, match="fault"):
             enabled.call("enable")
     records, _ = observer.since(first)
     observer.close()
@@ -128,7 +128,7 @@ def test_a_fall_that_is_over_at_once_still_needs_a_reset(enabled: Platform, segm
     assert time.monotonic() - began < 5.0
     slave = found["slaves"][2]
     assert (found["state"], slave["lost"], slave["recovered"]) == ("fault", before["lost"] + 1, before["recovered"] + 1)
-    with pytest.raises(ControlError, match="fault"):
+    with pytest.raises(RtcpError, match="fault"):
         enabled.call("enable")
     assert enabled.status()["state"] == "fault"
     told = [one["sentence"] for one in found["events"]]
@@ -150,7 +150,7 @@ def test_a_reset_while_a_slave_is_still_away_fails_and_a_later_one_does_not(
 ) -> None:
     away = segment.fault({"fault": "power", "slave": 7})
     enabled.until(lambda found: found["state"] == "fault", "the fault")
-    with pytest.raises(ControlError):
+    with pytest.raises(RtcpError):
         enabled.call("reset")
     assert enabled.status()["state"] == "fault"
     assert enabled.status()["slaves"][6]["state"] == "no answer"

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.machine import Command
 from rtcp.ipc.runtime_directory import control_socket
 from tests.runtime.played_loop import JOINTS, Loop
@@ -82,7 +82,7 @@ WRONG = {
 def test_an_argument_of_another_kind_is_refused_in_a_sentence_and_never_made_into_the_right_one(
     client: ControlClient, loop: Loop, verb: str, arguments: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(ControlError) as raised:
+    with pytest.raises(RtcpError) as raised:
         client.call(verb, arguments)
     assert raised.value.kind == "invalid"
     assert sentence in raised.value.message
@@ -125,7 +125,7 @@ def test_requests_before_a_line_over_64_kib_are_answered_first(directory: Path, 
 
 
 def test_a_client_whose_request_is_too_long_is_told_so(client: ControlClient) -> None:
-    with pytest.raises(ControlError, match=f"longer than {LINE_LIMIT} bytes") as raised:
+    with pytest.raises(RtcpError, match=f"longer than {LINE_LIMIT} bytes") as raised:
         client.call("sdo_write", {**OBJECT, "hex": "00" * 1_000_000})
     assert raised.value.kind == "invalid"
 

@@ -11,7 +11,7 @@ import pytest
 
 from kinematics.forward import forward
 from rtcp.config import default_config, load
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.codes import Code, JogFrame, MotionMode, Refusal
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.runtime_directory import control_socket
@@ -89,7 +89,7 @@ def test_a_line_is_written_as_a_plan_and_its_speed_is_that_of_the_tool(
     goal = tool_at(BENT)
     goal[1] += 0.1
     loop.event_at_the_end = (Code.ARRIVED,)
-    with pytest.raises(ControlError, match="ended before it arrived"):
+    with pytest.raises(RtcpError, match="ended before it arrived"):
         # The played loop does not follow the line: that it is not there is noticed.
         client.call("move_pose", {"pose": goal, "line": line, "speed": 0.05})
     ((kind, slot, count, *_),) = loop.commands
@@ -112,7 +112,7 @@ UNREACHABLE = {
 def test_what_the_arm_cannot_do_is_refused_before_the_loop_is_asked(
     client: ControlClient, loop: Loop, verb: str, arguments: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(ControlError, match=sentence) as raised:
+    with pytest.raises(RtcpError, match=sentence) as raised:
         client.call(verb, arguments)
     assert raised.value.kind == "refused"
     assert loop.commands == []
@@ -133,7 +133,7 @@ def test_a_trajectory_that_begins_elsewhere_is_approached_only_when_asked(
 ) -> None:
     file = tmp_path / "t.csv"
     file.write_text("t,q1,q2,q3,q4,q5,q6\n0,0.5,0.3,1.57,0,0.8,0\n2,0.6,0.3,1.57,0,0.8,0\n")
-    with pytest.raises(ControlError, match="at time 0 s joint1 must be where it is"):
+    with pytest.raises(RtcpError, match="at time 0 s joint1 must be where it is"):
         client.call("run", {"file": str(file)})
     assert loop.commands == []
     client.call("run", {"file": str(file), "approach": True})
@@ -144,7 +144,7 @@ def test_a_trajectory_that_begins_elsewhere_is_approached_only_when_asked(
 def test_a_mistake_in_a_motion_file_is_named_with_its_line(client: ControlClient, loop: Loop, tmp_path: Path) -> None:
     file = tmp_path / "t.csv"
     file.write_text("t,q1,q2,q3,q4,q5,q6\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n")
-    with pytest.raises(ControlError, match=r"t\.csv:3: t: found 1 after 1; times must rise") as raised:
+    with pytest.raises(RtcpError, match=r"t\.csv:3: t: found 1 after 1; times must rise") as raised:
         client.call("run", {"file": str(file)})
     assert raised.value.kind == "invalid"
     assert loop.commands == []
@@ -153,14 +153,14 @@ def test_a_mistake_in_a_motion_file_is_named_with_its_line(client: ControlClient
 def test_a_motion_that_a_guard_stops_ends_in_the_guards_sentence(client: ControlClient, loop: Loop) -> None:
     loop.event_at_the_end = (Code.ENDED + Reason.KEEP_OUT, 0, 0.01, 0.0)
     loop.ends_in = State.STOPPED_BY_LIMIT
-    with pytest.raises(ControlError, match="the move was stopped by a limit: the arm stopped before") as raised:
+    with pytest.raises(RtcpError, match="the move was stopped by a limit: the arm stopped before") as raised:
         client.call("move", {"q": [0.1] * JOINTS})
     assert raised.value.kind == "fault"
 
 
 def test_a_motion_that_ends_early_is_no_arrival(client: ControlClient, loop: Loop) -> None:
     loop.event_at_the_end = (Code.NOT_PERMITTED,)
-    with pytest.raises(ControlError, match="the move ended before it arrived: the enabling switch was let go"):
+    with pytest.raises(RtcpError, match="the move ended before it arrived: the enabling switch was let go"):
         client.call("move", {"q": [0.1] * JOINTS})
 
 
@@ -181,7 +181,7 @@ def test_a_jog_keeps_one_lease_until_its_connection_closes(
         for _ in range(3):
             jogger.call("jog", {"v": [0.1, 0, 0, 0, 0, 0], "frame": "tool", "hold_s": 0.2})
         assert client.call("status")["lease"]["holder"] == "a jogger"
-        with pytest.raises(ControlError, match="the arm is commanded by a jogger"):
+        with pytest.raises(RtcpError, match="the arm is commanded by a jogger"):
             client.call("move", {"q": BENT})
     wait_until(lambda: client.call("status")["lease"]["holder"] == "")
     jog = (Command.JOG, 0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, JogFrame.TOOL, 0.2)
@@ -230,7 +230,7 @@ def test_limits_are_changed_all_at_once_and_shown(client: ControlClient, loop: L
 def test_limits_that_the_loop_refuses_are_not_in_force(client: ControlClient, loop: Loop) -> None:
     before = client.call("limits")["limits"]
     loop.refusals[Command.LIMITS] = (Refusal.LIMITS_OUTSIDE, 1, 0.3, 0.1)
-    with pytest.raises(ControlError, match="nothing was changed"):
+    with pytest.raises(RtcpError, match="nothing was changed"):
         client.call("limits", {"set": {"joint2.max": 0.1}})
     assert client.call("limits")["limits"] == before
 
@@ -262,7 +262,7 @@ def test_the_stick_is_let_go_of_when_its_holders_connection_closes(
 ) -> None:
     with ControlClient("a stick", control_socket(gateway_directory)) as stick:
         stick.call("stick", {"pressed": ["left"], "hold_s": 1.0})
-        with pytest.raises(ControlError, match="the stick is held by a stick"):
+        with pytest.raises(RtcpError, match="the stick is held by a stick"):
             client.call("stick", {"pressed": ["right"]})
     wait_until(lambda: forced(loop)[-1] == (MASK, 0), patience_s=0.5)
 

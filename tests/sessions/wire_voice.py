@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 
 NAME = "a random session"
 PATIENCE_S = 30.0
@@ -75,7 +75,7 @@ class Voice:
         if _is_json(arguments):
             try:
                 result = self._client.call(verb, arguments, timeout_s=PATIENCE_S)
-            except ControlError as error:
+            except RtcpError as error:
                 kind, message = error.kind, error.message
                 if kind == "lost":
                     self.hang_up()

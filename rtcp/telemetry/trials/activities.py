@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.telemetry.trials.bench import NAME, Bench, TrialFailed
 
@@ -48,7 +48,7 @@ class Activity:
         if self.motion != "joint":
             try:
                 bench.call("motion", name=self.motion)
-            except ControlError as error:
+            except RtcpError as error:
                 raise TrialFailed(f"{self.name} cannot begin: {error.message}") from error
         if not self.moves:
             return
@@ -69,7 +69,7 @@ class Activity:
         with contextlib.suppress(OSError), ControlClient(f"{NAME}, {self.name}", self._socket) as client:
             try:
                 self._ask(client)
-            except ControlError as error:
+            except RtcpError as error:
                 self.refusal = error.message
 
     @property
@@ -103,7 +103,7 @@ class Moving(Activity):
     def end(self) -> None:
         """End the move under way, too."""
         self._ended.set()
-        with contextlib.suppress(ControlError, OSError), ControlClient(NAME, self._socket) as client:
+        with contextlib.suppress(RtcpError, OSError), ControlClient(NAME, self._socket) as client:
             client.call("halt")
         super().end()
 

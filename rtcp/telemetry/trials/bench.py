@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient, ControlError
+from rtcp.ipc.client import ControlClient, RtcpError
 from rtcp.ipc.machine import State
 from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Observer
@@ -172,7 +172,7 @@ class Bench:
         self.injected += 1
 
     def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
-        """Ask the platform; raises ControlError."""
+        """Ask the platform; raises RtcpError."""
         return self.client.call(verb, arguments, timeout_s=60.0)
 
     def bring_up(self) -> tuple[int, str]:
@@ -188,7 +188,7 @@ class Bench:
                     self.call("reset")
                 if self.state() != "holding":
                     self.call("enable")
-            except ControlError as error:
+            except RtcpError as error:
                 sentence = error.message
                 self.until(lambda: False, _RESET_PAUSE_S)
                 continue
@@ -214,7 +214,7 @@ class Bench:
             try:
                 self.call("motion", name="joint")
                 self.call("move", q=list(q), speed=_SPEED)
-            except ControlError as error:
+            except RtcpError as error:
                 sentence = error.message
                 continue
             return ""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from rtcp.ipc.client import ControlError
+from rtcp.ipc.client import RtcpError
 from rtcp.telemetry.trials.activities import ACTIVITIES
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.resources import Resources, grown, resources
@@ -152,7 +152,7 @@ class Soak:
         try:
             outcome = carry_out(bench, [fault], activity, _WATCH_S)
             bench.follow()
-        except (TrialFailed, ControlError, SegmentRefused, SegmentAway, OSError) as error:
+        except (TrialFailed, RtcpError, SegmentRefused, SegmentAway, OSError) as error:
             summary.failures.append(f"{where}: {error}")
             self._report(f"{where}: {error}")
             with contextlib.suppress(SegmentRefused, SegmentAway, OSError):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlError
+from rtcp.ipc.client import RtcpError
 from rtcp.ipc.stops import Rung, bounds, unheard
 from rtcp.telemetry.trials.activities import ACTIVITIES, START, Activity
 from rtcp.telemetry.trials.bench import Bench
@@ -110,7 +110,7 @@ def carry_out(
         doing.begin(bench)
         return _break(bench, faults, doing, watch_s, reset_first)
     finally:
-        with contextlib.suppress(ControlError):
+        with contextlib.suppress(RtcpError):
             doing.end()
 
 
@@ -134,11 +134,11 @@ def _break(
     if reset_first and state not in GOES_ON:
         try:
             bench.call("reset")
-        except ControlError as error:
+        except RtcpError as error:
             still_broken = error.message
         state = bench.state()
     said = tuple(bench.said_since(mark))
-    with contextlib.suppress(ControlError):
+    with contextlib.suppress(RtcpError):
         doing.end()
     by_itself = _clear(bench, watched=state not in GOES_ON)
     mended = time.monotonic()
