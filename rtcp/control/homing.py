@@ -1,19 +1,13 @@
-"""The homing of one joint as the machine leads it: its drive homes by itself, the arm's set-points follow or stand."""
+"""The homing of one joint: its drive homes by itself, its set-point follows, those of the other joints stand."""
 
 from __future__ import annotations
 
 from rtcp.control.arm import Arm
 from rtcp.devices.homing import Homing, HomingPhase
-from rtcp.ipc.codes import Code
-
-_CODES = {
-    HomingPhase.HOMED: Code.HOMED,
-    HomingPhase.FAILED: Code.HOMING_FAILED,
-    HomingPhase.STOPPED: Code.STOPPED,
-}
+from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
 
 
-class HomingArm:
+class HomingSequence:
     """One homing at a time; `step` once a cycle until it has `ended`.
 
     Args:
@@ -32,25 +26,25 @@ class HomingArm:
         self._homing.start(self._arm.drives[axis])
 
     def stop(self) -> None:
-        """Let the drive come to rest and go back to CSP."""
+        """Bring the drive to rest and back to CSP."""
         self._homing.stop()
 
     def abandon(self) -> None:
-        """Let go of the drive, which is led elsewhere."""
+        """Release the drive, which is commanded elsewhere."""
         self._homing.abandon()
 
-    def leads_back(self) -> bool:
-        """Lead a joint whose home is a little beyond its range back to the edge; return whether it is there."""
+    def returned_to_range(self) -> bool:
+        """Move a joint whose home is a little outside its range to the edge; return whether it is there."""
         arm, axis = self._arm, self.axis
         if arm.beyond_range(axis) > 0.0:
             low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.commanded
             position[axis] = min(max(position[axis], low), high)
             arm.trajectory_guard.latch(arm.state)
             arm.command()
-        return arm.first_led_back() < 0
+        return arm.first_returning() < 0
 
     def step(self) -> None:
-        """Let the drive go on; its set-point is where it says it is, the other joints' stand, the gripper's go on."""
+        """Run a cycle; the set-point of the joint is where its drive shows it, those of the others stand."""
         arm, axis, homing = self._arm, self.axis, self._homing
         if homing.ended:
             return
@@ -72,13 +66,13 @@ class HomingArm:
         return self._homing.phase is HomingPhase.STUCK
 
     @property
-    def running(self) -> bool:
+    def still_moving(self) -> bool:
         """Whether the drive does not come to rest."""
         return self._homing.phase is HomingPhase.RUNNING
 
     @property
-    def leaves(self) -> bool:
-        """Whether the drive no longer searches: it comes to rest, or goes back to CSP."""
+    def leaving(self) -> bool:
+        """Whether the drive no longer searches: it comes to rest, or returns to CSP."""
         return self._homing.phase not in (HomingPhase.ENTERING, HomingPhase.SEARCHING)
 
     @property
@@ -87,12 +81,9 @@ class HomingArm:
         return self._homing.ended
 
     @property
-    def homed(self) -> bool:
-        """Whether it has succeeded."""
-        return self._homing.phase is HomingPhase.HOMED
-
-    @property
-    def outcome(self) -> tuple[Code, int, float]:
-        """How it ended: an event, its joint, and the position (rad) or the statusword that it is told with."""
+    def outcome(self) -> Event:
+        """How it ended."""
         homing = self._homing
-        return _CODES[homing.phase], self.axis, homing.position if self.homed else float(homing.shown)
+        if homing.phase is HomingPhase.HOMED:
+            return Homed(self.axis, homing.position)
+        return HomingFailed(self.axis, homing.shown) if homing.phase is HomingPhase.FAILED else Stopped()
