@@ -12,7 +12,9 @@ from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.options import ConfigFile
 from rtcp.cli.output import emit_json
 from rtcp.config.virtual import VIRTUAL
-from rtcp.realtime.doctor import Case, Finding, Host, Severity, examine
+from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
+from rtcp.realtime.doctor import Case, Finding, Severity, examine
+from rtcp.realtime.host import Host
 from rtcp.realtime.scheduling import choose_cpu
 
 CODES = {
@@ -73,6 +75,7 @@ def _case(bus: str | None, config: Path | None) -> Case:
         priority=arm.cycle.priority,
         interface=None if name == VIRTUAL else _checked(name),
         wait_us=arm.bus.receive_fraction * arm.cycle.period_us,
+        blackboard=blackboard_file(runtime_directory()),
     )
 
 
@@ -87,7 +90,7 @@ def _as_json(case: Case, worst: Severity, findings: list[Finding]) -> dict[str, 
                 "severity": finding.severity.name.lower(),
                 "found": finding.found,
                 "why": finding.why,
-                "mend": list(finding.mend),
+                "remedy": list(finding.remedy),
             }
             for finding in findings
         ],

@@ -24,7 +24,7 @@ _SENTENCES = {
 def show_findings(case: Case, findings: Sequence[Finding]) -> None:
     """Print the findings as they are ordered, the ways to mend them, and a line that sums them up."""
     show(_table(findings))
-    to_mend = [finding for finding in findings if finding.mend]
+    to_mend = [finding for finding in findings if finding.remedy]
     if to_mend:
         emit("\nWhat mends it, as root:")
     for finding in to_mend:
@@ -32,7 +32,7 @@ def show_findings(case: Case, findings: Sequence[Finding]) -> None:
         head.append(f"  {finding.key}: {finding.why}", "not bold default")
         emit("")
         show(head)
-        for line in finding.mend:
+        for line in finding.remedy:
             emit(f"    {line}")  # never broken: a command is copied whole, however long
     emit("")
     show(_sum(case, findings))

@@ -80,6 +80,8 @@ class DeviceDescription:
     """Inputs of the master, assigned through 0x1C13."""
     configurable_pdos: bool = True
     """False where the device's mapping is fixed: it is then read and compared, never written."""
+    complete_access: bool = True
+    """False where the device answers SDO complete access of its PDO assignment wrongly though its EEPROM offers it."""
     sdo: tuple[StartupSdo, ...] = ()
     assign_activate: U16 = 0
     """DC AssignActivate word of the ESI (0x0300: SYNC0; 0x0700: SYNC0 and SYNC1); 0: no distributed clocks."""

@@ -24,7 +24,7 @@ _SYNC_DELAY_NS = 100_000_000
 _SETTLED_NS = 2_000
 _SETTLE_S = 1.5
 _UNTIL_2000_NS = 946_684_800 * 1_000_000_000
-_SYNC1 = 0x0400
+_SYNC_ATTEMPTS = 4
 
 
 def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig], period_ns: int) -> None:
@@ -47,32 +47,7 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
         label = slave_label(position, config.name)
         if not clocks:
             raise BusError(f"{label}: `assign_activate` is 0x{word:04X} but no slave has a distributed clock")
-        shift = round(config.device.sync0_shift_us * 1000)
-        # Twice at most: a segment that was silent for long has its first SYNC0 in the past (SOEM#757).
-        for _ in range(2):
-            if word & _SYNC1:
-                master.slaves[position - 1].dc_sync(True, period_ns, shift, 0)
-            else:
-                master.slaves[position - 1].dc_sync(True, period_ns, shift)
-            if first_sync_is_ahead(port, station_of(position)):
-                break
-        else:
-            raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
-        active = port.read(station_of(position), DC_ACTIVATE, 1)
-        if active is None or active[0] != word >> 8:
-            shown = "nothing" if active is None else f"0x{active[0]:02X}"
-            raise BusError(f"{label}: `assign_activate` 0x{word:04X} reads back from register 0x0981 as {shown}")
-
-
-def first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
-    """Whether the next SYNC0 of the slave is still to come: one whose time has passed never comes."""
-    now = port.read(station, _DC_SYSTEM_TIME, 4)
-    start = port.read(station, _DC_START, 4)
-    if now is None or start is None:
-        return False
-    # The low 32 bits alone: an ESC may have no more.
-    ahead = int.from_bytes(start, "little") - int.from_bytes(now, "little") & 0xFFFFFFFF
-    return 0 < ahead < 0x80000000
+        start_sync(port, station_of(position), label, config.device, period_ns)
 
 
 def take_over_time(
@@ -143,26 +118,45 @@ def _difference(register: bytes) -> int:
 
 
 def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescription, period_ns: int) -> None:
-    """Start SYNC0 of one slave on the grid of the others, as SOEM does it for all (ec_dcsync0).
+    """Start SYNC0 of one slave on the grid of the others: multiples of the period, shifted by `sync0_shift_us`.
 
     Raises:
         BusError: its first SYNC0 lies in the past, or the slave does not keep the activation.
     """
     shift = round(device.sync0_shift_us * 1000)
-    port.put(station, DC_ACTIVATE, b"\0", label)
-    port.put(station, _DC_CYCLIC_UNIT, b"\0", label)
-    now = port.read(station, _DC_SYSTEM_TIME, 8)
-    if now is None:
-        raise BusError(f"{label} stopped answering while its SYNC0 was started")
-    begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
     cycles = struct.pack("<II", period_ns, 0)
-    port.put(station, _DC_START, begin.to_bytes(8, "little"), label)
-    port.put(station, _DC_CYCLES, cycles, label)
-    if port.read(station, _DC_CYCLES, len(cycles)) != cycles:
-        raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
     activation = bytes((device.assign_activate >> 8,))
-    port.put(station, DC_ACTIVATE, activation, label)
-    if not first_sync_is_ahead(port, station):
+    for _ in range(_SYNC_ATTEMPTS):
+        port.put(station, DC_ACTIVATE, b"\0", label)
+        port.put(station, _DC_CYCLIC_UNIT, b"\0", label)
+        now = port.read(station, _DC_SYSTEM_TIME, 8)
+        if now is None:
+            raise BusError(f"{label} stopped answering while its SYNC0 was started")
+        begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
+        port.put(station, _DC_START, begin.to_bytes(8, "little"), label)
+        port.put(station, _DC_CYCLES, cycles, label)
+        if port.read(station, _DC_CYCLES, len(cycles)) != cycles:
+            raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
+        port.put(station, DC_ACTIVATE, activation, label)
+        # A SYNC0 whose time had passed at the activation never comes (SOEM#757): frames may have been lost meanwhile.
+        if first_sync_is_ahead(port, station):
+            break
+    else:
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
-    if port.read(station, DC_ACTIVATE, 1) != activation:
-        raise BusError(f"{label}: it does not keep `assign_activate` 0x{device.assign_activate:04X} (register 0x0981)")
+    active = port.read(station, DC_ACTIVATE, 1)
+    if active != activation:
+        shown = "nothing" if active is None else f"0x{active[0]:02X}"
+        raise BusError(
+            f"{label}: `assign_activate` 0x{device.assign_activate:04X} reads back from register 0x0981 as {shown}"
+        )
+
+
+def first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
+    """Whether the next SYNC0 of the slave is still to come."""
+    now = port.read(station, _DC_SYSTEM_TIME, 4)
+    start = port.read(station, _DC_START, 4)
+    if now is None or start is None:
+        return False
+    # The low 32 bits alone: an ESC may have no more.
+    ahead = int.from_bytes(start, "little") - int.from_bytes(now, "little") & 0xFFFFFFFF
+    return 0 < ahead < 0x80000000

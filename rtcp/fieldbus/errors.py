@@ -21,7 +21,3 @@ class SdoAborted(BusError):
 
 class ForeignSlave(BusError):
     """Another device answers at the place of a slave; nothing is written to it."""
-
-
-class MappingMisread(BusError):
-    """SOEM read another PDO mapping than the slave has: a frame was lost or came late."""

@@ -18,10 +18,10 @@ from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import DC_ACTIVATE, start_clocks
 from rtcp.fieldbus.emergency import Emergency
-from rtcp.fieldbus.errors import BusError, MappingMisread
+from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, claim, enter
 from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
-from rtcp.fieldbus.pdo import layout, layout_faults
+from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, layout, layout_faults
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
@@ -29,7 +29,11 @@ from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_
 from rtcp.fieldbus.supervision import SlaveWatcher
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
-_MAP_TRIES = 3
+_BELOW_SAFEOP = 0x03
+"""Bits of the AL state that INIT, PRE-OP and BOOT have, OP and SAFE-OP have not."""
+_MAP_ATTEMPTS = 8
+_MAILBOXES, _MAILBOXES_SIZE = 0x0800, 16
+"""Sync managers 0 and 1 (ETG.1000.4, 6.7)."""
 
 
 _SOEM_LAST_INDEX = 15
@@ -147,15 +151,17 @@ class SoemBus:
         faults = [fault for config in slaves for fault in layout_faults(config.device)]
         if faults:
             raise BusError(*dict.fromkeys(faults))
-        for tries_left in reversed(range(_MAP_TRIES)):
-            self._set_up(slaves, period_ns)
-            try:
-                self._map(slaves)
+        failures = [0] * len(slaves)
+        for attempt in range(1, _MAP_ATTEMPTS + 1):
+            # SOEM appends to a mapping that it has begun: each attempt starts from INIT.
+            self._set_up(slaves, period_ns, failures)
+            misread = self._map(slaves)
+            if not misread:
                 break
-            except MappingMisread:
-                # SOEM maps on from where it is: only from INIT on does it map anew.
-                if not tries_left:
-                    raise
+            if attempt == _MAP_ATTEMPTS:
+                raise BusError(*(sentence for sentences in misread.values() for sentence in sentences))
+            for position in misread:
+                failures[position - 1] += 1
         start_clocks(self._master, self.port, slaves, period_ns)
         data = self._process_data(period_ns)
         # Valid outputs, all zero, are in the slaves' buffers before any of them may use them.
@@ -173,14 +179,27 @@ class SoemBus:
         self.port.tries = TRIES
         return data
 
-    def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int) -> None:
-        """Lead the slaves from INIT to PRE-OP, each set up as the configuration says; raises BusError."""
+    def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
+        """Bring the slaves from INIT to PRE-OP, each set up as the configuration says; raises BusError.
+
+        SOEM reads a slave's mapping by complete access first, after a failure by single subindices, and so on in turn:
+        some slaves answer complete access wrongly; single subindices take many frames, of which one is lost sooner.
+        Of several slaves of one identity it reads the first one's, and copies it where it knows of no mailbox.
+        """
         self.notes.clear()
         self._discover()
         faults = identity_faults(self._master.slaves, slaves)
         if faults:
             raise BusError(*faults)
         self._names[:] = [config.name for config in slaves]
+        first_of: dict[tuple[object, ...], int] = {}
+        for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
+            device = config.device
+            first = first_of.setdefault((slave.man, slave.id, slave.rev, device.rpdo, device.tpdo), i)
+            if failures[i] <= failures[first] and i != first:
+                self._hide_mailbox(slave, i + 1)
+            elif failures[i] % 2 or not device.complete_access:
+                slave._disable_complete_access()
         if faults := list(self._to_preop()):
             raise BusError(*faults)
         for i, config in enumerate(slaves):
@@ -190,6 +209,24 @@ class SoemBus:
                 faults += error.sentences
         if faults:
             raise BusError(*faults)
+
+    def _hide_mailbox(self, slave: Any, position: int) -> None:
+        """Let SOEM forget the mailbox of a slave that is in INIT; its registers keep it. Raises BusError."""
+        if self._infos[position - 1] is None:
+            return
+        station, label = station_of(position), slave_label(position, self._names[position - 1])
+        registers = self.port.read(station, _MAILBOXES, _MAILBOXES_SIZE)
+        if registers is None:
+            raise BusError(f"{label} stopped answering while it was set up")
+        for mailbox in ("out", "in"):
+            # Writes the registers first, in a frame that is not sent again; what SOEM knows changes only after that.
+            for _ in range(PATIENT_TRIES):
+                with contextlib.suppress(pysoem.WkcError):
+                    slave.amend_mbx(mailbox, 0, 0)
+                    break
+        # An ESC takes address and length of a sync manager only while it is off.
+        self.port.put(station, _MAILBOXES, bytes(_MAILBOXES_SIZE), label)
+        self.port.put(station, _MAILBOXES, registers, label)
 
     def _discover(self) -> None:
         if self._master is None:
@@ -219,29 +256,41 @@ class SoemBus:
     def _configure_slave(self, i: int, config: SlaveConfig, period_ns: int) -> list[str]:
         return finish(configure_slave(self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), config, period_ns))
 
-    def _map(self, slaves: Sequence[SlaveConfig]) -> None:
-        """Let SOEM read the mapping and make the process image of it; raises BusError, `MappingMisread` by chance."""
+    def _map(self, slaves: Sequence[SlaveConfig]) -> dict[int, list[str]]:
+        """Let SOEM lay out the process image; return sentences for each position whose images have a wrong length.
+
+        The result counts, not the errors that SOEM reports: the mappings were compared entry by entry before, and SOEM
+        makes good many an error by reading again.
+        """
+        reported: dict[int, list[str]] = {}
         try:
             self._master.config_map()
         except pysoem.ConfigMapError as error:
-            # An emergency that SOEM meets is in its list too, as an error of no kind.
-            known = (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError)
-            met = [fault for fault in error.error_list if isinstance(fault, known)]
-            if met:
-                # SOEM may meet the same one hundreds of times.
-                told = (f"slave {fault.slave_pos}: its PDO mapping could not be read: {fault.desc}" for fault in met)
-                refused = any(isinstance(fault, pysoem.SdoError) for fault in met)
-                raise (BusError if refused else MappingMisread)(*dict.fromkeys(told)) from error
-        faults = []
-        for i, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True)):
-            label = slave_label(i + 1, config.name)
-            images = (("rpdo", config.device.rpdo, slave.output), ("tpdo", config.device.tpdo, slave.input))
-            for key, pdos, image in images:
+            for fault in error.error_list:
+                # An emergency that SOEM meets is in its list too, as an error of no kind.
+                if isinstance(fault, pysoem.SdoError):
+                    what = f"object 0x{fault.index:04X}:{fault.subindex}: {fault.desc}"
+                elif isinstance(fault, (pysoem.MailboxError, pysoem.PacketError)):
+                    what = str(fault.desc)
+                else:
+                    continue
+                reported.setdefault(fault.slave_pos, []).append(what)
+        faults: dict[int, list[str]] = {}
+        for position, (config, slave) in enumerate(zip(slaves, self._master.slaves, strict=True), 1):
+            images = (
+                ("rpdo", RX_ASSIGN, config.device.rpdo, slave.output),
+                ("tpdo", TX_ASSIGN, config.device.tpdo, slave.input),
+            )
+            for key, assignment, pdos, image in images:
                 if len(image) != (expected := layout(pdos).bytes):
-                    faults.append(f"{label}: expected {expected} bytes of {key}, found {len(image)} bytes")
-        if faults:
-            # The slave's own mapping was compared before, entry by entry.
-            raise MappingMisread(*faults)
+                    # SOEM may report the same error hundreds of times.
+                    causes = "; ".join(dict.fromkeys(reported.get(position, ())))
+                    faults.setdefault(position, []).append(
+                        f"{slave_label(position, config.name)}: SOEM could not read the PDO mapping assigned through "
+                        f"0x{assignment:04X} (key `{key}`): expected {expected} bytes, found {len(image)}"
+                        + (f" ({causes})" if causes else "")
+                    )
+        return faults
 
     def _process_data(self, period_ns: int) -> SoemProcessData:
         assert self._socket is not None
@@ -320,10 +369,16 @@ class SoemBus:
 
     def _to_init(self, port: RegisterPort) -> None:
         everyone = self._stations(None)
-        if al_state.broadcast_state(port, AlState.SAFEOP) < 0:
+        # Drives come to rest on the way from OP to SAFE-OP. A slave below SAFE-OP would refuse that with an AL error.
+        reported = port.read_all(al_state.AL_STATUS, 2)
+        if reported.wkc < 0:
             raise BusError("no frame comes back")
-        # Slaves that were below SAFE-OP refuse it: what matters is that none is left in OP.
-        al_state.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
+        if reported.data[0] & _BELOW_SAFEOP == 0:
+            al_state.broadcast_state(port, AlState.SAFEOP)
+            al_state.wait_for_state(port, everyone, AlState.SAFEOP, _LEAVE_OP_S)
+        elif in_op := {one: label for one, label in everyone.items() if al_state.read_al(port, one)[0] is AlState.OP}:
+            al_state.request_state(port, in_op, AlState.SAFEOP)
+            al_state.wait_for_state(port, in_op, AlState.SAFEOP, _LEAVE_OP_S)
         al_state.broadcast_state(port, AlState.INIT)
         left = al_state.wait_for_state(port, everyone, AlState.INIT, _INIT_S)
         port.write_all(DC_ACTIVATE, b"\0")

@@ -1,11 +1,10 @@
-"""Percentiles of the cycle over a sliding minute, in bounded memory.
-
-One histogram a second, sixty of them: what is older than the window falls out a second at a time.
-"""
+"""Percentiles of the cycle over a sliding minute, in bounded memory, and why the cycle skips ticks."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 import numpy.typing as npt
@@ -43,7 +42,10 @@ def percentiles(samples_us: npt.NDArray[np.float64]) -> Percentiles:
 
 
 class SlidingPercentiles:
-    """Percentiles of the samples of the last `WINDOW_S` seconds, to 0.5 us up to 4 ms; the maximum exact."""
+    """Percentiles of the samples of the last `WINDOW_S` seconds, to 0.5 us up to 4 ms; the maximum exact.
+
+    One histogram a second: what is older than the window falls out a second at a time.
+    """
 
     def __init__(self) -> None:
         self._counts = np.zeros((WINDOW_S, _BINS + 1), dtype=np.int64)
@@ -84,3 +86,92 @@ class SlidingPercentiles:
         largest = float(self._largest.max())
         at = [min(float(np.searchsorted(cumulative, total * q)) * _BIN_US, largest) for q in (0.5, 0.99, 0.999)]
         return Percentiles(at[0], at[1], at[2], largest)
+
+
+# -- skipped ticks ----------------------------------------------------------------------------------------------
+
+SKIPPED_SHARE = 0.001
+"""Share of skipped ticks from which on `diagnose` reports them."""
+_PERIOD_STEP_US = 50
+_MARGIN = 1.1
+"""A suggested period is this much longer than the slow cycles."""
+
+
+class Part(str, Enum):
+    """A part of the cycle, in the words of `rtcp status`."""
+
+    WAKEUP = "wake-up"
+    EXCHANGE = "exchange"
+    COMPUTE = "compute"
+
+
+_CAUSES = {
+    Part.WAKEUP: "the host wakes the loop late: isolate its CPU, use a PREEMPT_RT kernel (`rtcp doctor`)",
+    Part.EXCHANGE: "frames return late: check coalescing and interrupt of the network card (`rtcp doctor`)",
+    Part.COMPUTE: "the cycle computes too long: set the CPU's governor to performance (`rtcp doctor`)",
+}
+
+
+@dataclass(frozen=True)
+class SkippedTicks:
+    """Which part of the cycle makes the loop skip ticks, and what to do."""
+
+    missed: int
+    cycles: int
+    period_us: float
+    part: Part
+    """The part that takes longest in the slow cycles."""
+    part_us: float
+    """What it takes there."""
+    suggested_period_us: int
+    """Period, us, that the slow cycles fit into."""
+
+    @property
+    def share(self) -> float:
+        """Skipped ticks per tick, 0 to 1."""
+        return self.missed / (self.missed + self.cycles)
+
+    @property
+    def remedy(self) -> str:
+        """What to do, in a sentence."""
+        return f"{_CAUSES[self.part]}, or set cycle.period_us to {self.suggested_period_us} or more"
+
+    @property
+    def message(self) -> str:
+        """What happens, in a sentence."""
+        skipped = f"{100 * self.share:.2g} % of the ticks are skipped (limit {100 * SKIPPED_SHARE:g} %)"
+        return f"{skipped}: in slow cycles {self.part.value} takes {self.part_us:.0f} of {self.period_us:g} us"
+
+
+def diagnose(
+    period_us: float, cycles: int, missed: int, wakeup: Percentiles, exchange: Percentiles, compute: Percentiles
+) -> SkippedTicks | None:
+    """Return why the cycle skips ticks, None while it skips less than `SKIPPED_SHARE` of them.
+
+    Args:
+        period_us: the cycle.
+        cycles: cycles that ran.
+        missed: ticks that were skipped beside them.
+        wakeup: how late the cycles woke; this and the following in us, over the same time.
+        exchange: from the wake-up to the returned frame.
+        compute: from the returned frame to the end of the cycle.
+    """
+    if missed < SKIPPED_SHARE * (cycles + missed) or missed <= 0:
+        return None
+    parts = {Part.WAKEUP: wakeup, Part.EXCHANGE: exchange, Part.COMPUTE: compute}
+    # As many cycles as skip ticks are slow.
+    slow = {part: found.p99 if missed > 0.01 * cycles else found.p999 for part, found in parts.items()}
+    worst = max(slow, key=slow.__getitem__)
+    # The others as usual: two parts are seldom slow in the same cycle. A wake-up must come within half a period.
+    needed_us = slow[worst] + sum(found.p50 for part, found in parts.items() if part is not worst)
+    needed_us = max(needed_us * _MARGIN, 2 * slow[Part.WAKEUP], period_us + 1)
+    suggested = math.ceil(needed_us / _PERIOD_STEP_US) * _PERIOD_STEP_US
+    return SkippedTicks(missed, cycles, period_us, worst, slow[worst], suggested)
+
+
+def diagnose_records(records: npt.NDArray[np.void], period_ns: int) -> SkippedTicks | None:
+    """Return `diagnose` of successive cycle records, as `rtcp.ipc.observer.Observer.since` gives them."""
+    if len(records) < 2:
+        return None
+    times = (percentiles(records[name] / 1e3) for name in ("wakeup_ns", "exchange_ns", "compute_ns"))
+    return diagnose(period_ns / 1e3, len(records), int(records["missed"][-1]) - int(records["missed"][0]), *times)

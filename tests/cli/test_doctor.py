@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli import doctor
-from rtcp.realtime.doctor import Host
+from rtcp.realtime.host import Host
 
 CPUS = "sys/devices/system/cpu"
 
@@ -83,7 +83,7 @@ def test_json_tells_the_worst_severity_and_each_finding_whole(
         "severity": "warning",
         "found": "real-time threads may have 500 of every 1000 ms of a CPU",
         "why": "a real-time thread that has used its share waits until the period is over",
-        "mend": [
+        "remedy": [
             "sysctl -w kernel.sched_rt_runtime_us=950000",
             "echo 'kernel.sched_rt_runtime_us=950000' >> /etc/sysctl.d/90-rtcp.conf   # kept after a restart",
         ],

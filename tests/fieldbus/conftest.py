@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -17,14 +18,14 @@ MODELS = ("diewu-io", *("cubemars-orh70",) * 3, "cubemars-orh60", "cubemars-orh5
 class Segment:
     """A virtual segment in a process of its own, and masters that are started against it."""
 
-    def __init__(self, file: Path, count: int) -> None:
+    def __init__(self, file: Path, count: int, program: Sequence[str] = ("-m", "rtcp.virtual")) -> None:
         file.write_text("slaves:\n" + "".join(f"  - model: {model}\n" for model in MODELS[:count]))
         self.count = count
         # Short: a Unix socket's path has 107 bytes at most.
         self.directory = Path(tempfile.mkdtemp(prefix="rtcp-segment-", dir="/tmp"))
         self.control = self.directory / "segment.sock"
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "rtcp.virtual", "--config", str(file), "--control", str(self.control)],
+            [sys.executable, *program, "--config", str(file), "--control", str(self.control)],
             stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self.process.stdout is not None
@@ -59,8 +60,8 @@ class Segment:
 def start_segment(tmp_path):
     running: list[Segment] = []
 
-    def start(count: int) -> Segment:
-        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", count))
+    def start(count: int, **program: Sequence[str]) -> Segment:
+        running.append(Segment(tmp_path / f"segment{len(running)}.yaml", count, **program))
         return running[-1]
 
     yield start

@@ -5,6 +5,7 @@ Takes a scenario and its arguments as JSON in its first argument, writes what ca
 
 from __future__ import annotations
 
+import ctypes
 import dataclasses
 import fcntl
 import json
@@ -24,7 +25,6 @@ from rtcp.config.schema import load
 from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of
-from rtcp.fieldbus.errors import MappingMisread
 from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.registers import RegisterPort
 from rtcp.fieldbus.soem import SoemBus
@@ -87,6 +87,35 @@ def fresh(cycle: Cycle) -> tuple[int, int]:
             break
         time.sleep(0.001)
     return cycle.data.dc_time, time.monotonic_ns()
+
+
+class AlStatusListener:
+    """Records every AL status that a frame brings back to the master, SOEM's frames included."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, 0)
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 23)
+        # Classic BPF: accept frames whose first datagram addresses register 0x0130.
+        lines = ((0x28, 0, 0, 20), (0x15, 0, 1, 0x3001), (0x06, 0, 0, 0xFFFF), (0x06, 0, 0, 0))
+        program = ctypes.create_string_buffer(b"".join(struct.pack("=HBBI", *line) for line in lines))
+        attach = struct.pack("@HP", len(lines), ctypes.addressof(program))
+        self.socket.setsockopt(socket.SOL_SOCKET, 26, attach)
+        self.socket.bind((INTERFACE, 0x88A4))
+        self.socket.setblocking(False)
+
+    def errors(self) -> list[str]:
+        """Return the AL status of each answer that shows an error, in hexadecimal."""
+        found = []
+        while True:
+            try:
+                frame = self.socket.recv(1518)
+            except BlockingIOError:
+                self.socket.close()
+                return found
+            length = int.from_bytes(frame[22:24], "little") & 0x07FF
+            wkc = int.from_bytes(frame[26 + length : 28 + length], "little")
+            if wkc and frame[26] & 0x10:
+                found.append(frame[26 : 26 + length].hex())
 
 
 def registers_after() -> dict[str, Any]:
@@ -157,28 +186,27 @@ def refused(bus: SoemBus, count: int, how: str) -> Any:
         absent = StartupSdo(0x5FFF, 1, "uint16", 7, "no such thing")
         slaves[1] = with_device(slaves[1], sdo=(absent,))
         slaves[2] = with_device(slaves[2], sdo=(absent,))
-    elif how == "clock":
-        slaves[1] = with_device(slaves[1], assign_activate=0x0100)
     bus.configure(slaves, 1_000_000)
     return None
 
 
-def up(bus: SoemBus, count: int) -> Any:
+def up(bus: SoemBus, count: int, complete_access: bool = True) -> Any:
     """All the way to SAFE-OP, as the loop's process goes it."""
     bus.scan()
-    data = bus.configure(arm(count), 1_000_000)
-    return {"expected_wkc": data.expected_wkc, "tries": bus.port.tries}
+    make, attempts = bus._map, []
+    bus._map = lambda slaves: attempts.append(1) or make(slaves)  # type: ignore[method-assign,func-returns-value]
+    data = bus.configure([with_device(one, complete_access=complete_access) for one in arm(count)], 1_000_000)
+    return {"expected_wkc": data.expected_wkc, "tries": bus.port.tries, "attempts": len(attempts)}
 
 
 def misread(bus: SoemBus, count: int, times: int) -> Any:
     """SOEM's map ends as after a lost frame, so many times, once it is made; then all the way to OP."""
     make, left, tries = bus._map, iter(range(times)), []
 
-    def fails(slaves: Any) -> None:
-        make(slaves)
+    def fails(slaves: Any) -> dict[int, list[str]]:
+        faults = make(slaves)
         tries.append(len(slaves))
-        if next(left, None) is not None:
-            raise MappingMisread("slave 1: its PDO mapping could not be read: Unexpected frame returned")
+        return faults if next(left, None) is None else {1: ["slave 1: SOEM could not read the PDO mapping"]}
 
     bus._map = fails  # type: ignore[method-assign]
     result = op(bus, count, 1_000_000)
@@ -357,6 +385,7 @@ def main() -> None:
     answer: dict[str, Any] = {}
     enter(question["pid"])
     flags = interface_flags(PROMISCUOUS if question["promiscuous"] else 0)
+    listener = AlStatusListener()
     try:
         with bus:
             answer["result"] = SCENARIOS[question["scenario"]](bus, question["count"], **question["arguments"])
@@ -365,6 +394,7 @@ def main() -> None:
     answer["left"] = bus.notes
     bus.close()
     answer["flags"] = [flags, interface_flags()]
+    answer["al_errors"] = listener.errors()
     answer["after"] = registers_after()
     print(json.dumps(answer))
 

@@ -13,7 +13,7 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Command, finish
 from rtcp.virtual.server import make_segment
 from tests.fieldbus.direct import Direct
-from tests.fieldbus.master_child import arm
+from tests.fieldbus.master_child import arm, with_device
 
 LABEL, STATION = "slave 3 (drive2)", 0x1003
 PERIOD = 1_000_000
@@ -68,3 +68,34 @@ def test_a_cycle_of_sync0_that_is_not_kept_is_told(port: Direct, monkeypatch: py
     with pytest.raises(BusError, match=r"does not keep the cycle of SYNC0, 1000 us \(register 0x09A0\)"):
         start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
     assert port.read(STATION, 0x0981, 1) == b"\0"
+
+
+def test_an_activation_that_is_not_kept_is_told(port: Direct, monkeypatch: pytest.MonkeyPatch) -> None:
+    put = port.put
+
+    def keeps_sync1_off(station: int, address: int, data: bytes, label: str) -> None:
+        put(station, address, b"\x03" if (address, data) == (0x0981, b"\x07") else data, label)
+
+    monkeypatch.setattr(port, "put", keeps_sync1_off)
+    device = with_device(arm(3)[2], assign_activate=0x0700).device
+    with pytest.raises(BusError, match="`assign_activate` 0x0700 reads back from register 0x0981 as 0x03"):
+        start_sync(port, STATION, LABEL, device, PERIOD)
+
+
+def test_sync0_that_would_have_begun_in_the_past_is_started_again(
+    port: Direct, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clocks, "_SYNC_DELAY_NS", -5_000_000)
+    with pytest.raises(BusError, match="its first SYNC0 lies in the past"):
+        start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+    delays = iter((-5_000_000, 100_000_000))
+    put = port.put
+
+    def stalls_once(station: int, address: int, data: bytes, label: str) -> None:
+        if address == 0x0980:
+            monkeypatch.setattr(clocks, "_SYNC_DELAY_NS", next(delays))
+        put(station, address, data, label)
+
+    monkeypatch.setattr(port, "put", stalls_once)
+    start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
+    assert port.read(STATION, 0x0981, 1) == b"\x03"

@@ -1,14 +1,15 @@
 from __future__ import annotations
 
 import os
+from types import SimpleNamespace
 
 import pytest
 from pysoem import pysoem
 
 from rtcp.fieldbus import AlState, BusError
-from rtcp.fieldbus.errors import MappingMisread
 from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.soem import SoemBus
+from tests.fieldbus.master_child import arm
 
 
 def test_an_interface_that_does_not_exist_is_told_with_those_that_do():
@@ -49,18 +50,22 @@ def test_a_closed_bus_refuses_everything_in_a_sentence():
             use()
 
 
-UNEXPECTED = pysoem.PacketError(2, 1)
-REFUSED = pysoem.SdoError(3, 0x1C12, 0, 0x08000020, "Data cannot be transferred")
+def test_a_map_is_judged_by_its_images_and_names_what_soem_reported_of_a_slave_whose_image_is_wrong():
+    errors = [
+        pysoem.PacketError(1, 1), *[pysoem.SdoError(2, 0x1C12, 1, 0x06020000, "The object does not exist")] * 200,
+    ]  # fmt: skip
 
-
-@pytest.mark.parametrize(("met", "by_chance"), [([UNEXPECTED], True), ([UNEXPECTED, REFUSED], False)])
-def test_a_map_is_misread_by_chance_only_where_no_slave_has_refused_an_object(met, by_chance):
     class Master:
+        slaves = (SimpleNamespace(output=bytes(2), input=bytes(6)), SimpleNamespace(output=bytes(14), input=bytes(15)))
+
         def config_map(self):
-            raise pysoem.ConfigMapError(met)
+            raise pysoem.ConfigMapError(errors)
 
     bus = SoemBus("nonsense0")
     bus._master = Master()
-    with pytest.raises(BusError, match="slave 2: its PDO mapping could not be read: Unexpected frame") as told:
-        bus._map([])
-    assert isinstance(told.value, MappingMisread) is by_chance
+    assert bus._map(arm(2)) == {
+        2: [
+            "slave 2 (drive1): SOEM could not read the PDO mapping assigned through 0x1C12 (key `rpdo`): expected 15 "
+            "bytes, found 14 (object 0x1C12:1: The object does not exist)"
+        ]
+    }

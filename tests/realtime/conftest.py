@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.realtime.doctor import Case, Finding, Host, Severity, examine
-from rtcp.realtime.doctor.card import Card, Coalescing
+from rtcp.realtime.doctor import Case, Finding, Severity, examine
+from rtcp.realtime.host import Coalescing, Host
 
 CPUS = "sys/devices/system/cpu"
 ETH0 = "sys/class/net/eth0"
@@ -135,17 +135,24 @@ HOSTS = {"good": GOOD_PC, "jetson": JETSON, "laptop": LAPTOP}
 
 
 @dataclass
-class FakeCard(Card):
-    """A card whose driver answers as the test says."""
+class Card:
+    """What the card's driver and the kernel answer to ioctl."""
 
     held: Coalescing | None = field(default_factory=lambda: Coalescing(0, 0, False))
     ipv4: str | None = None
 
-    def coalescing(self, interface: str) -> Coalescing | None:
-        return self.held
 
-    def address(self, interface: str) -> str | None:
-        return self.ipv4
+@dataclass(frozen=True)
+class FakeHost(Host):
+    """Files in a folder and a card that answers as the test says."""
+
+    card: Card = field(default_factory=Card)
+
+    def coalescing(self, interface: str) -> Coalescing | None:
+        return self.card.held
+
+    def ipv4_address(self, interface: str) -> str | None:
+        return self.card.ipv4
 
 
 class Patient:
@@ -153,16 +160,15 @@ class Patient:
 
     def __init__(self, root: Path) -> None:
         self.root = root
-        self.card = FakeCard()
+        self.card = Card()
         self.during: Callable[[], None] = lambda: None
         """What happens while the doctor counts frames."""
         self.case = Case(
-            Host(root, lambda seconds: self.during()),
+            FakeHost(root, lambda seconds: self.during(), self.card),
             cpu=3,
             priority=80,
             interface="eth0",
             wait_us=150.0,
-            card=self.card,
         )
 
     def put(self, files: dict[str, str | None]) -> None:

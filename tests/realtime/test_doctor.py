@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.realtime.doctor import Case, Host, Severity, examine
+from rtcp.realtime.doctor import Case, Severity, examine
+from rtcp.realtime.host import Host
 
 CPUS = "sys/devices/system/cpu"
 CLOCK = "sys/devices/system/clocksource/clocksource0"
@@ -42,13 +43,13 @@ def test_what_makes_cycles_late_on_a_laptop(laptop: Any) -> None:
 def test_every_finding_that_stands_in_the_way_comes_with_what_mends_it(
     patient: Callable[[str], Any], kind: str
 ) -> None:
-    bare = [f.key for f in patient(kind).findings().values() if f.severity >= Severity.WARNING and not f.mend]
+    bare = [f.key for f in patient(kind).findings().values() if f.severity >= Severity.WARNING and not f.remedy]
     assert bare == []
 
 
 @pytest.mark.parametrize("kind", ["good", "jetson", "laptop"])
 def test_no_finding_that_is_well_comes_with_something_to_mend(patient: Callable[[str], Any], kind: str) -> None:
-    assert [f.key for f in patient(kind).findings().values() if f.severity is Severity.OK and f.mend] == []
+    assert [f.key for f in patient(kind).findings().values() if f.severity is Severity.OK and f.remedy] == []
 
 
 def test_this_machine_is_examined_without_an_exception() -> None:
@@ -93,7 +94,7 @@ def test_a_kernel_that_is_merely_preemptible_is_told_from_a_real_time_kernel(lap
 
 
 def test_a_jetson_gets_the_repository_of_its_own_release(jetson: Any) -> None:
-    assert "jetson/rt-kernel r36.4 main" in jetson.finding("preempt-rt").mend[0]
+    assert "jetson/rt-kernel r36.4 main" in jetson.finding("preempt-rt").remedy[0]
 
 
 @pytest.mark.parametrize(("identity", "command"), [("ubuntu", "pro enable"), ("debian", "linux-image-rt-amd64")])
@@ -105,7 +106,7 @@ def test_a_distribution_gets_the_name_of_its_own_real_time_kernel(good: Any, ide
             "etc/os-release": f"ID={identity}",
         }
     )
-    assert command in good.finding("preempt-rt").mend[0]
+    assert command in good.finding("preempt-rt").remedy[0]
 
 
 @pytest.mark.parametrize(
@@ -123,19 +124,19 @@ def test_the_throttle_is_told_in_milliseconds(laptop: Any) -> None:
 
 def test_a_setting_is_made_now_and_for_good(laptop: Any) -> None:
     laptop.put({"proc/sys/kernel/sched_rt_runtime_us": "500000"})
-    assert laptop.finding("rt-throttling").mend == (
+    assert laptop.finding("rt-throttling").remedy == (
         "sysctl -w kernel.sched_rt_runtime_us=950000",
         "echo 'kernel.sched_rt_runtime_us=950000' >> /etc/sysctl.d/90-rtcp.conf   # kept after a restart",
     )
 
 
 def test_a_slow_clock_beside_a_fast_one_is_exchanged(laptop: Any) -> None:
-    assert laptop.finding("clock-source").mend[0] == f"echo tsc > /{CLOCK}/current_clocksource"
+    assert laptop.finding("clock-source").remedy[0] == f"echo tsc > /{CLOCK}/current_clocksource"
 
 
 def test_a_slow_clock_is_a_warning_also_where_there_is_no_other(good: Any) -> None:
     good.put({f"{CLOCK}/current_clocksource": "hpet", f"{CLOCK}/available_clocksource": "hpet acpi_pm"})
-    assert "tsc=reliable" in " ".join(good.finding("clock-source").mend)
+    assert "tsc=reliable" in " ".join(good.finding("clock-source").remedy)
 
 
 def test_a_virtual_machine_is_known_by_its_cpus_flag(good: Any) -> None:
@@ -162,7 +163,7 @@ def test_a_cpu_that_the_host_does_not_have_is_bad(good: Any) -> None:
 def test_an_isolated_cpu_that_the_cycle_does_not_use_is_named(good: Any) -> None:
     finding = good.finding("isolated-cpu", cpu=1)
     assert finding.found == "isolated is CPU 3, and the cycle is to run on CPU 1"
-    assert finding.mend == ("# in the arm's file: cycle: {cpu: 3}",)
+    assert finding.remedy == ("# in the arm's file: cycle: {cpu: 3}",)
 
 
 @pytest.mark.parametrize(
@@ -183,12 +184,12 @@ def test_the_kernels_command_line_is_changed_where_this_host_keeps_it(good: Any,
     good.put({"etc/default/grub": None, f"{CPUS}/isolated": ""})
     good.put({file: ""})
     words = "isolcpus=managed_irq,domain,3 nohz_full=3 rcu_nocbs=3 irqaffinity=0-2"
-    assert good.finding("isolated-cpu").mend[0] == command.format(words=words)
+    assert good.finding("isolated-cpu").remedy[0] == command.format(words=words)
 
 
 def test_where_the_boot_loader_is_not_known_the_words_are_told(good: Any) -> None:
     good.put({"etc/default/grub": None, f"{CPUS}/isolated": ""})
-    assert good.finding("isolated-cpu").mend[0].startswith("# in the boot loader's settings")
+    assert good.finding("isolated-cpu").remedy[0].startswith("# in the boot loader's settings")
 
 
 def test_a_host_with_one_cpu_cannot_isolate_it(good: Any) -> None:
@@ -202,7 +203,7 @@ def test_a_host_with_one_cpu_cannot_isolate_it(good: Any) -> None:
 def test_a_process_that_may_not_use_the_cycles_cpu_is_told_how_it_may(laptop: Any) -> None:
     finding = laptop.finding("cpu-permitted")
     assert finding.found == "this process may use CPUs 0-2, not CPU 3: the loop would not be pinned"
-    assert finding.mend[0].startswith("taskset -c 0-3 rtcp start")
+    assert finding.remedy[0].startswith("taskset -c 0-3 rtcp start")
 
 
 def test_the_ticks_cpus_are_compared_with_the_cycles(good: Any) -> None:
@@ -216,8 +217,8 @@ def test_a_governor_is_told_with_its_frequencies(laptop: Any) -> None:
 
 def test_the_governor_is_set_for_the_cycles_cpu_and_kept(laptop: Any) -> None:
     path = f"/{CPUS}/cpu3/cpufreq/scaling_governor"
-    assert laptop.finding("governor").mend[0] == f"echo performance > {path}"
-    assert f"'w {path} - - - - performance'" in laptop.finding("governor").mend[1]
+    assert laptop.finding("governor").remedy[0] == f"echo performance > {path}"
+    assert f"'w {path} - - - - performance'" in laptop.finding("governor").remedy[1]
 
 
 def test_deep_sleep_is_no_harm_where_the_loop_can_forbid_it(good: Any) -> None:
@@ -235,7 +236,7 @@ def test_an_idle_state_that_is_switched_off_does_not_count(laptop: Any) -> None:
 
 
 def test_deep_sleep_is_allowed_to_be_forbidden_at_every_boot(laptop: Any) -> None:
-    assert "'z /dev/cpu_dma_latency 0660 root rtcp -'" in laptop.finding("idle-states").mend[1]
+    assert "'z /dev/cpu_dma_latency 0660 root rtcp -'" in laptop.finding("idle-states").remedy[1]
 
 
 @pytest.mark.parametrize("key", ["governor", "idle-states"])

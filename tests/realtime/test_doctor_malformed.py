@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.realtime.doctor.cpu_list import format_cpus, parse_cpus
+from rtcp.realtime.host import format_cpus, parse_cpus
 
 GARBAGE: dict[str, Callable[[bytes], bytes]] = {
     "nothing": lambda text: b"",

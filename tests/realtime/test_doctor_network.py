@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from rtcp.realtime.doctor import Severity, card
-from rtcp.realtime.doctor.card import Card, Coalescing
-from rtcp.realtime.doctor.host import NotKnown
+from rtcp.realtime import host
+from rtcp.realtime.doctor import Severity
+from rtcp.realtime.host import Coalescing, Host, NotKnown
 
 ETH0 = "sys/class/net/eth0"
 NETWORK = ("card-interrupt", "interface", "driver", "coalescing", "other-traffic", "ip-address", "network-services")
@@ -31,8 +31,8 @@ def test_a_device_that_interrupts_the_cycles_cpu_is_named(laptop: Any) -> None:
 
 
 def test_the_interrupts_are_sent_to_the_other_cpus(laptop: Any) -> None:
-    mend = laptop.finding("other-interrupts").mend[0]
-    assert mend.startswith("for n in 9; do echo 0-2 > /proc/irq/$n/smp_affinity_list; done")
+    remedy = laptop.finding("other-interrupts").remedy[0]
+    assert remedy.startswith("for n in 9; do echo 0-2 > /proc/irq/$n/smp_affinity_list; done")
 
 
 def test_an_interrupt_that_went_elsewhere_meanwhile_does_not_count(laptop: Any) -> None:
@@ -50,7 +50,7 @@ def test_the_cards_own_interrupt_is_no_other_devices(good: Any) -> None:
 
 
 def test_irqbalance_is_a_warning(laptop: Any) -> None:
-    assert laptop.finding("irqbalance").mend == ("systemctl disable --now irqbalance",)
+    assert laptop.finding("irqbalance").remedy == ("systemctl disable --now irqbalance",)
 
 
 def test_irqbalance_leaves_an_isolated_cpu_alone(good: Any) -> None:
@@ -70,7 +70,7 @@ def test_a_thread_of_the_cards_interrupt_without_real_time_is_outranked(good: An
 
 
 def test_the_thread_of_the_cards_interrupt_is_raised_by_its_number(laptop: Any) -> None:
-    assert laptop.finding("card-interrupt").mend == ("chrt -f -p 90 417",)
+    assert laptop.finding("card-interrupt").remedy == ("chrt -f -p 90 417",)
 
 
 def test_on_another_cpu_the_cards_interrupt_need_not_outrank_the_loop(laptop: Any) -> None:
@@ -105,7 +105,7 @@ def test_of_an_interface_that_is_not_there_nothing_else_is_known(good: Any, key:
 
 def test_an_interface_that_is_switched_off_is_switched_on(good: Any) -> None:
     good.put({f"{ETH0}/operstate": "down", f"{ETH0}/flags": "0x1002"})
-    assert good.finding("interface").mend == ("ip link set eth0 up",)
+    assert good.finding("interface").remedy == ("ip link set eth0 up",)
 
 
 def test_an_interface_without_a_link_is_bad(good: Any) -> None:
@@ -177,7 +177,7 @@ def test_a_card_that_holds_frames_back_longer_than_the_loop_waits_is_bad(
 
 def test_coalescing_is_switched_off_on_this_interface_now_and_for_good(good: Any) -> None:
     good.card.held = Coalescing(3, 0, True)
-    now, kept = good.finding("coalescing").mend
+    now, kept = good.finding("coalescing").remedy
     assert now == "ethtool -C eth0 adaptive-rx off adaptive-tx off rx-usecs 0 tx-usecs 0"
     assert "OriginalName=eth0" in kept
 
@@ -188,11 +188,11 @@ def test_three_us_of_an_intel_card_are_a_rate_that_follows_the_traffic(good: Any
 
 
 def test_the_kernel_is_asked_for_the_coalescing_of_an_interface_that_has_none() -> None:
-    assert Card().coalescing("lo") is None
+    assert Host().coalescing("lo") is None
 
 
 def test_the_kernel_is_asked_for_an_address() -> None:
-    assert Card().address("lo") == "127.0.0.1"
+    assert Host().ipv4_address("lo") == "127.0.0.1"
 
 
 def test_the_kernels_answer_is_read_at_the_places_of_its_structure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -202,13 +202,13 @@ def test_the_kernels_answer_is_read_at_the_places_of_its_structure(monkeypatch: 
         words = [0x0E, *range(101, 110), 1, *[0] * 12]
         ctypes.memmove(struct.unpack_from("P", request, 16)[0], struct.pack("23I", *words), 92)
 
-    monkeypatch.setattr(card, "_ask", answer)
-    assert Card().coalescing("eth0") == Coalescing(receive_us=101, send_us=105, adaptive=True)
+    monkeypatch.setattr(host, "_ioctl", answer)
+    assert Host().coalescing("eth0") == Coalescing(receive_us=101, send_us=105, adaptive=True)
 
 
 def test_an_interface_that_the_kernel_does_not_have_is_not_known() -> None:
     with pytest.raises(NotKnown, match="ethtool -c eth77: No such device"):
-        Card().coalescing("eth77")
+        Host().coalescing("eth77")
 
 
 # -- who else uses the cable ----------------------------------------------------------------------------------------
@@ -233,23 +233,23 @@ def test_an_ipv4_address_is_told_and_taken_away(good: Any) -> None:
     good.card.ipv4 = "192.168.1.7"
     finding = good.finding("ip-address")
     assert finding.found == "eth0 has 192.168.1.7: the system sends its own frames there"
-    assert finding.mend == ("ip -4 address flush dev eth0",)
+    assert finding.remedy == ("ip -4 address flush dev eth0",)
 
 
 def test_an_ipv6_address_is_switched_off_for_good(laptop: Any) -> None:
-    assert laptop.finding("ip-address").mend[0] == "sysctl -w net.ipv6.conf.eth0.disable_ipv6=1"
+    assert laptop.finding("ip-address").remedy[0] == "sysctl -w net.ipv6.conf.eth0.disable_ipv6=1"
 
 
 def test_a_dot_in_an_interfaces_name_is_written_as_sysctl_wants_it(good: Any) -> None:
     good.put({"sys/class/net/eth0.5/ifindex": "9", "proc/net/if_inet6": "fe80 09 40 20 80 eth0.5"})
-    assert "net.ipv6.conf.eth0/5.disable_ipv6=1" in good.finding("ip-address", interface="eth0.5").mend[0]
+    assert "net.ipv6.conf.eth0/5.disable_ipv6=1" in good.finding("ip-address", interface="eth0.5").remedy[0]
 
 
 def test_the_hosts_way_to_its_own_network_is_not_cut_off(good: Any) -> None:
     good.card.ipv4 = "192.168.1.7"
     good.put({"proc/net/route": "Iface\tDestination\tGateway\neth0\t00000000\t0101A8C0\n"})
     finding = good.finding("ip-address")
-    assert (finding.severity, finding.mend) == (Severity.BAD, ("rtcp doctor --bus NAME",))
+    assert (finding.severity, finding.remedy) == (Severity.BAD, ("rtcp doctor --bus NAME",))
 
 
 def test_an_interface_that_networkmanager_leaves_alone_is_well(good: Any) -> None:
@@ -258,7 +258,7 @@ def test_an_interface_that_networkmanager_leaves_alone_is_well(good: Any) -> Non
 
 
 def test_networkmanager_is_told_to_leave_this_interface_alone(laptop: Any) -> None:
-    assert laptop.finding("network-services").mend[0] == "nmcli device set eth0 managed no"
+    assert laptop.finding("network-services").remedy[0] == "nmcli device set eth0 managed no"
 
 
 def test_avahi_is_named(laptop: Any) -> None:
