@@ -32,7 +32,8 @@ from rich.table import Table
 
 from rtcp.config.find import find_config
 from rtcp.config.schema import load
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import Platform, StartOptions, start

@@ -1,3 +1,54 @@
-"""Real-time control platform for EtherCAT robot arms."""
+"""Real-time control platform for EtherCAT robot arms.
+
+    import rtcp
+
+    with rtcp.connect() as robot:
+        robot.enable()
+        robot.move_joints([0.0, 0.3, 1.2, 0.0, 0.4, 0.0])
+
+These names are those of `rtcp.api`, which is imported when the first of them is used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rtcp.api import (
+        AsyncRobot,
+        ConnectionLost,
+        Faulted,
+        Invalid,
+        NotRunning,
+        Refused,
+        Robot,
+        RtcpError,
+        State,
+        TimedOut,
+        connect,
+        connect_async,
+    )
 
 __version__ = "0.1.0"
+__all__ = [
+    "AsyncRobot",
+    "ConnectionLost",
+    "Faulted",
+    "Invalid",
+    "NotRunning",
+    "Refused",
+    "Robot",
+    "RtcpError",
+    "State",
+    "TimedOut",
+    "connect",
+    "connect_async",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'rtcp' has no attribute {name!r}")
+    import rtcp.api
+
+    return getattr(rtcp.api, name)

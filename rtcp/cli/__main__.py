@@ -30,7 +30,7 @@ from rtcp.cli import (
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.errors import ConfigError
-from rtcp.ipc.client import RtcpError
+from rtcp.ipc.errors import RtcpError
 
 app = typer.Typer(
     name="rtcp",

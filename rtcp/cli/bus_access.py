@@ -11,7 +11,8 @@ from rtcp.cli.connection import connect
 from rtcp.cli.errors import CommandError, code_of, interruption_code, orderly_signals
 from rtcp.cli.launch import refuse_a_second_platform
 from rtcp.config.virtual import VIRTUAL
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.launch import offline
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.cli.output import complain
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 

@@ -13,7 +13,7 @@ from rtcp.cli.errors import CommandError, ExitCode, code_of
 from rtcp.cli.launch import launch, serve
 from rtcp.cli.options import BusName, ConfigFile, Poll
 from rtcp.cli.output import report
-from rtcp.ipc.client import RtcpError
+from rtcp.ipc.errors import RtcpError
 
 PATIENCE_S = 5.0
 """For a machine that is still starting: its frames have to come back first, or to be missed for long enough."""

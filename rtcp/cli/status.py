@@ -12,7 +12,8 @@ import typer
 from rtcp.cli.connection import connect, loop_lives
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import console, emit, emit_json, show
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 
 REFRESH_S = 0.1
 """Time between two pictures of `--watch` on a terminal, and between two lines of JSON."""

@@ -10,12 +10,12 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, cast
+from typing import Any, cast
 
+from rtcp.ipc.errors import ErrorKind, RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
-ErrorKind = Literal["refused", "fault", "timeout", "invalid", "internal", "not running", "lost"]
 Progress = Callable[[Mapping[str, Any]], None]
 
 ANSWER_TIMEOUT_S = 15.0
@@ -28,70 +28,6 @@ _PEER = struct.Struct("3i")
 """Process, user and group at the other end (unix(7), SO_PEERCRED)."""
 
 _KINDS_ON_THE_WIRE = frozenset({"refused", "fault", "timeout", "invalid", "internal"})
-
-
-class RtcpError(Exception):
-    """A request that did not succeed. `RtcpError("refused", ...)` makes a `Refused`, and so on for each kind.
-
-    Attributes:
-        kind: for programs: refused, fault, timeout, invalid, internal (the platform's own); not running, lost (found at
-            this end: nobody answers; the connection ended before the answer).
-        message: for people: what happened, where, what to do.
-        reason: name of the refusal (`rtcp.ipc.refusals`) or event (`rtcp.ipc.events`) behind it; empty: none.
-        fields: its fields by name, SI units.
-    """
-
-    def __new__(
-        cls, kind: ErrorKind, message: str, reason: str = "", fields: Mapping[str, Any] | None = None
-    ) -> RtcpError:
-        """Make an instance of the kind's class."""
-        return super().__new__(_CLASSES.get(kind, RtcpError), kind, message, reason, fields)
-
-    def __init__(
-        self, kind: ErrorKind, message: str, reason: str = "", fields: Mapping[str, Any] | None = None
-    ) -> None:
-        super().__init__(kind, message, reason, fields)
-        self.kind: ErrorKind = kind
-        self.message = message
-        self.reason = reason
-        self.fields: dict[str, Any] = dict(fields or {})
-
-    def __str__(self) -> str:
-        return self.message
-
-
-class Refused(RtcpError):
-    """The platform runs and will not do this now; nothing was begun."""
-
-
-class Faulted(RtcpError):
-    """It was begun and went wrong: a fault, an emergency stop, a motion that ended before its goal."""
-
-
-class TimedOut(RtcpError):
-    """It took too long, or no answer came."""
-
-
-class Invalid(RtcpError):
-    """A parameter is wrong; nothing was begun."""
-
-
-class NotRunning(RtcpError):
-    """No platform listens at the control socket."""
-
-
-class ConnectionLost(RtcpError):
-    """The connection ended before the answer."""
-
-
-_CLASSES: dict[str, type[RtcpError]] = {
-    "refused": Refused,
-    "fault": Faulted,
-    "timeout": TimedOut,
-    "invalid": Invalid,
-    "not running": NotRunning,
-    "lost": ConnectionLost,
-}
 
 
 class ControlClient:
@@ -112,7 +48,7 @@ class ControlClient:
                 when its path is too long for a socket.
         """
         self._path = control_socket(runtime_directory()) if path is None else path
-        self._name = name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
+        self._name = client_name(name)
         self._request = 0
         self._received = bytearray()
         self._socket = _connect(self._path)
@@ -206,30 +142,36 @@ class ControlClient:
         )
 
 
+def client_name(name: str) -> str:
+    """Return the name under which others hear of this client: `name`, or the process."""
+    return name or f"{Path(sys.argv[0]).name} (pid {os.getpid()})"
+
+
 def _connect(path: Path) -> socket.socket:
-    length = len(os.fsencode(path))
-    if length > LONGEST_SOCKET_PATH:
-        raise RtcpError(
-            "invalid",
-            f"the control socket's path {path} has {length} bytes, a socket's path at most {LONGEST_SOCKET_PATH}: "
-            "set RTCP_RUNTIME_DIR to a shorter one",
-        )
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     connection.settimeout(ANSWER_TIMEOUT_S)
     try:
         connection.connect(os.fspath(path))
-    except (FileNotFoundError, ConnectionRefusedError, NotADirectoryError) as error:
-        connection.close()
-        raise RtcpError("not running", _who_runs(path)) from error
-    except PermissionError as error:
-        connection.close()
-        raise RtcpError("refused", f"the control socket {path} is another user's: only its owner may use it") from (
-            error
-        )
     except OSError as error:
         connection.close()
-        raise RtcpError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}") from error
+        raise connection_error(path, error) from error
     return connection
+
+
+def connection_error(path: Path, error: OSError) -> RtcpError:
+    """Return why the control socket cannot be reached."""
+    length = len(os.fsencode(path))
+    if length > LONGEST_SOCKET_PATH:
+        return RtcpError(
+            "invalid",
+            f"the path of the control socket, {path}, has {length} bytes, at most {LONGEST_SOCKET_PATH} are possible: "
+            "set RTCP_RUNTIME_DIR to a shorter one",
+        )
+    if isinstance(error, FileNotFoundError | ConnectionRefusedError | NotADirectoryError):
+        return RtcpError("not running", _who_runs(path))
+    if isinstance(error, PermissionError):
+        return RtcpError("refused", f"the control socket {path} is another user's: only its owner may use it")
+    return RtcpError("lost", f"the control socket {path} cannot be reached: {error.strerror or error}")
 
 
 def _who_runs(path: Path) -> str:

@@ -22,7 +22,8 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import check_name
 from rtcp.gateway.blackbox import BlackBox
 from rtcp.gateway.blackbox_file import faults_directory
-from rtcp.ipc.client import LONGEST_SOCKET_PATH, RtcpError
+from rtcp.ipc.client import LONGEST_SOCKET_PATH
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import (
     LockHeld,

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import (
     blackboard_file,
     control_socket,

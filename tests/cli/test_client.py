@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 
 
 @pytest.fixture

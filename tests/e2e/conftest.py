@@ -18,7 +18,8 @@ from typing import Any
 import pytest
 
 from rtcp.config.find import default_config
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.ipc.session import read_processes
 

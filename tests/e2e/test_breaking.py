@@ -9,7 +9,8 @@ import time
 import numpy as np
 import pytest
 
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.ipc.observer import Observer, record_type
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control

@@ -13,7 +13,8 @@ import pytest
 
 from kinematics.forward import forward
 from rtcp.config import default_config, load
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from tests.e2e.conftest import Platform, kill

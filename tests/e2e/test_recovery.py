@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtcp.ipc.client import RtcpError
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, segment_control
 from rtcp.virtual.faults.client import SegmentClient

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.machine import Command
 from rtcp.ipc.runtime_directory import control_socket
 from tests.runtime.played_loop import JOINTS, Loop

@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 
 NAME = "a random session"
 PATIENCE_S = 30.0

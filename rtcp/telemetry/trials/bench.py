@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient, RtcpError
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.machine import State
 from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Observer

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
-from rtcp.ipc.client import RtcpError
+from rtcp.ipc.errors import RtcpError
 from rtcp.telemetry.trials.activities import ACTIVITIES
 from rtcp.telemetry.trials.bench import Bench, TrialFailed
 from rtcp.telemetry.trials.resources import Resources, grown, resources

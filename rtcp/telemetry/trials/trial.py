@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import RtcpError
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.stops import Rung, bounds, unheard
 from rtcp.telemetry.trials.activities import ACTIVITIES, START, Activity
 from rtcp.telemetry.trials.bench import Bench

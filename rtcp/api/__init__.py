@@ -1,0 +1,47 @@
+"""The Python API: `import rtcp; with rtcp.connect() as robot: robot.enable()` (`docs/api.md`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero
+from rtcp.api.robot import Robot, connect
+from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
+
+if TYPE_CHECKING:
+    from rtcp.api.async_robot import AsyncRobot, connect_async
+
+__all__ = [
+    "Arrival",
+    "AsyncRobot",
+    "ConnectionLost",
+    "ControlMode",
+    "DriveMode",
+    "EventRecord",
+    "Faulted",
+    "GripperRest",
+    "Invalid",
+    "JogFrame",
+    "NotRunning",
+    "Progress",
+    "Refused",
+    "Robot",
+    "RtcpError",
+    "State",
+    "Status",
+    "Streamed",
+    "TimedOut",
+    "Zero",
+    "connect",
+    "connect_async",
+]
+
+
+def __getattr__(name: str) -> Any:
+    # asyncio loads slowly, and a command has no use for it.
+    if name in ("AsyncRobot", "connect_async"):
+        from rtcp.api import async_robot
+
+        return getattr(async_robot, name)
+    raise AttributeError(f"module 'rtcp.api' has no attribute {name!r}")

@@ -1,0 +1,190 @@
+"""A robot, commanded from asyncio: the methods of `Robot`, each awaited; several may be under way at once."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from rtcp.api import methods
+from rtcp.api.methods import Call
+from rtcp.api.results import Progress
+from rtcp.api.robot import documented
+from rtcp.ipc import jsonrpc
+from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
+from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.runtime_directory import control_socket, runtime_directory
+from rtcp.ipc.states import State
+
+P = ParamSpec("P")
+T = TypeVar("T")
+_REPLY_LIMIT = 1 << 24
+"""Bytes of an answer."""
+
+
+def _awaited(
+    method: Callable[Concatenate[Any, P], Call[T]],
+) -> Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]]:
+    @documented(method)
+    async def call(self: AsyncRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._carry_out(method(self, *args, **kwargs))
+
+    return call
+
+
+class AsyncRobot:
+    """A connection to the running platform: `async with rtcp.connect_async() as robot: await robot.enable()`.
+
+    A call that is cancelled ends its motion. Motions of one connection wait for each other; `halt`, `disable`, `status`
+    and `events` do not wait. Leaving the block stops what it moves.
+
+    Args:
+        name: who commands, as others are told when they are refused; empty: this process.
+        path: the control socket; None: that of the runtime directory.
+    """
+
+    def __init__(self, name: str = "", path: Path | None = None) -> None:
+        self._name = client_name(name)
+        self._path = control_socket(runtime_directory()) if path is None else path
+        self._numbers = itertools.count(1)
+        self._pending: dict[int, _Pending] = {}
+        self._writer: asyncio.StreamWriter | None = None
+        self._receiving: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> AsyncRobot:
+        """Connect.
+
+        Raises:
+            NotRunning: nobody listens.
+            Refused: the socket is another user's.
+        """
+        try:
+            reader, self._writer = await asyncio.open_unix_connection(self._path, limit=_REPLY_LIMIT)
+        except OSError as error:
+            raise connection_error(self._path, error) from error
+        self._writer.write(jsonrpc.line({"method": "identify", "params": {"name": self._name}}))
+        self._receiving = asyncio.create_task(self._receive(reader))
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connection; a second time is harmless."""
+        if self._receiving is not None:
+            self._receiving.cancel()
+        if self._writer is not None:
+            self._writer.close()
+            with contextlib.suppress(ConnectionError):
+                await self._writer.wait_closed()
+
+    async def state(self) -> State:
+        """Return the state of the machine now."""
+        return (await self.status()).state
+
+    async def _carry_out(self, call: Call[T]) -> T:
+        writer, number = self._writer, next(self._numbers)
+        if writer is None or writer.is_closing():
+            raise RtcpError("lost", f"the connection is closed: {call.method!r} was not sent")
+        pending = self._pending[number] = _Pending(call)
+        try:
+            writer.write(jsonrpc.request(number, call.method, call.params))
+            return call.result(jsonrpc.result(await pending.reply(), call.method))
+        except (asyncio.CancelledError, RtcpError):
+            if not pending.answer.done() or pending.answer.cancelled():
+                writer.write(jsonrpc.line({"method": "cancel", "params": {"request": number}}))
+            raise
+        finally:
+            del self._pending[number]
+
+    async def _receive(self, reader: asyncio.StreamReader) -> None:
+        with contextlib.suppress(ConnectionError):
+            while line := await reader.readline():
+                reply = jsonrpc.read_reply(line, "a request")
+                progress = jsonrpc.progress(reply)
+                pending = self._pending.get(progress["request"] if progress else reply.get("id"))  # type: ignore[arg-type]
+                if pending is not None:
+                    pending.receive(progress, reply)
+        for pending in self._pending.values():
+            pending.lose()
+        if self._writer is not None:
+            self._writer.close()
+
+    status = _awaited(methods.status)
+    events = _awaited(methods.events)
+    scan = _awaited(methods.scan)
+    enable = _awaited(methods.enable)
+    disable = _awaited(methods.disable)
+    reset = _awaited(methods.reset)
+    halt = _awaited(methods.halt)
+    mode = _awaited(methods.mode)
+    stop = _awaited(methods.stop)
+    move_joints = _awaited(methods.move_joints)
+    move_pose = _awaited(methods.move_pose)
+    move_line = _awaited(methods.move_line)
+    run = _awaited(methods.run)
+    run_trajectory = _awaited(methods.run_trajectory)
+    run_path = _awaited(methods.run_path)
+    jog = _awaited(methods.jog)
+    move_at_velocity = _awaited(methods.move_at_velocity)
+    apply_torque = _awaited(methods.apply_torque)
+    stream = _awaited(methods.stream)
+    set_output = _awaited(methods.set_output)
+    gripper = _awaited(methods.gripper)
+    limits = _awaited(methods.limits)
+    set_limits = _awaited(methods.set_limits)
+    zero = _awaited(methods.zero)
+    home = _awaited(methods.home)
+    sdo_read = _awaited(methods.sdo_read)
+    sdo_write = _awaited(methods.sdo_write)
+    joystick = _awaited(methods.joystick)
+    command = _awaited(methods.command)
+
+
+class _Pending:
+    """A request whose answer has not come."""
+
+    def __init__(self, call: Call[Any]) -> None:
+        self._call = call
+        self._heard = asyncio.Event()
+        self.answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
+
+    async def reply(self) -> Mapping[str, Any]:
+        """Return the answer; raises TimedOut after `ANSWER_TIMEOUT_S` without a word on it."""
+        while not self.answer.done():
+            self._heard.clear()
+            try:
+                await asyncio.wait_for(self._heard.wait(), ANSWER_TIMEOUT_S)
+            except asyncio.TimeoutError:
+                message = f"the platform has not answered {self._call.method!r} for {ANSWER_TIMEOUT_S:g} s"
+                raise RtcpError("timeout", message) from None
+        return self.answer.result()
+
+    def receive(self, progress: Mapping[str, Any] | None, reply: Mapping[str, Any]) -> None:
+        """Pass progress on, or keep the answer."""
+        self._heard.set()
+        try:
+            if progress is None:
+                self.answer.set_result(reply)
+            elif self._call.progress is not None:
+                self._call.progress(Progress.from_json(progress))
+        except Exception as error:  # a callback's own: it ends its request, not the connection
+            self.answer.set_exception(error)
+
+    def lose(self) -> None:
+        """The connection has ended before the answer."""
+        self._heard.set()
+        if not self.answer.done():
+            message = f"the platform closed the connection before it answered {self._call.method!r}"
+            self.answer.set_exception(RtcpError("lost", message))
+
+
+def connect_async(name: str = "", path: Path | None = None) -> AsyncRobot:
+    """Return a robot that connects when its `async with` block begins; arguments as of `AsyncRobot`."""
+    return AsyncRobot(name, path)

@@ -1,0 +1,156 @@
+"""What the platform answers, as frozen dataclasses. SI units; one number a joint, base to tool."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rtcp.ipc.states import ControlMode, DriveMode, State
+
+Positions = tuple[float, ...]
+"""rad, or rad/s, or Nm: one number a joint."""
+
+
+@dataclass(frozen=True)
+class Status:
+    """The platform at one instant."""
+
+    state: State
+    message: str
+    """What happened last; in a fault: why."""
+    drive_mode: DriveMode | None
+    """None: the drives show another mode than those the cycle uses."""
+    control_mode: ControlMode | None
+    """None: before the first cycle."""
+    joint_names: tuple[str, ...]
+    positions: Positions
+    """Actual positions, rad."""
+    velocities: Positions
+    """Actual velocities, rad/s."""
+    torques: Positions
+    """Actual torques, Nm."""
+    commanded_positions: Positions
+    """Set-points of the controller, rad."""
+    sent_positions: Positions
+    """Target positions in the frame, rad: what left on the wire."""
+    holder: str
+    """Who commands the arm; empty: nobody."""
+    raw: Mapping[str, Any]
+    """Everything that `rtcp status --json` prints."""
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Status:
+        """Read the answer of the method `status`."""
+        joints = found["joints"]
+        return cls(
+            state=State[found["state"].upper()],
+            message=found["message"],
+            drive_mode=_mode(DriveMode, found["drive_mode"]),
+            control_mode=_mode(ControlMode, found["control_mode"]),
+            joint_names=tuple(found["joint_names"]),
+            positions=tuple(joints["actual_position"]),
+            velocities=tuple(joints["actual_velocity"]),
+            torques=tuple(joints["actual_torque"]),
+            commanded_positions=tuple(joints["commanded_position"]),
+            sent_positions=tuple(joints["sent_position"]),
+            holder=found["lease"]["holder"],
+            raw=found,
+        )
+
+
+def _mode(kind: Any, name: str) -> Any:
+    return kind.__members__.get(name.upper())
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a motion is."""
+
+    fraction: float
+    """0 to 1."""
+    remaining_s: float
+    positions: Positions
+    """Actual positions, rad."""
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Progress:
+        """Read the parameters of the notification `progress`."""
+        return cls(
+            float(found.get("fraction", 0.0)), float(found.get("remaining_s", 0.0)), tuple(found.get("positions", ()))
+        )
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """Where a motion ended."""
+
+    positions: Positions
+    """Actual positions, rad."""
+    error: float
+    """Largest distance of a joint from its goal, rad."""
+    duration_s: float | None = None
+    """Planned duration; None: it was not planned in advance."""
+    length_m: float | None = None
+    """Length of the path of the tool."""
+    slowed: float | None = None
+    """Fraction of the wanted speed that the joints' limits allowed."""
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Arrival:
+        """Read the answer of a motion."""
+        return cls(
+            tuple(found["positions"]),
+            found["error"],
+            found.get("duration_s"),
+            found.get("length_m"),
+            found.get("slowed"),
+        )
+
+
+@dataclass(frozen=True)
+class Streamed:
+    """The arm when a streaming command was accepted."""
+
+    state: State
+    positions: Positions
+    """Actual positions, rad."""
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any]) -> Streamed:
+        """Read the answer of a streaming command."""
+        return cls(State[found["state"].upper()], tuple(found["positions"]))
+
+
+@dataclass(frozen=True)
+class GripperRest:
+    """Where the gripper came to rest; both fields are None for a gripper on a digital output."""
+
+    position: float | None
+    """rad"""
+    holds: bool | None
+    """Something keeps it from its end position."""
+
+
+@dataclass(frozen=True)
+class Zero:
+    """The zero of a joint, rad of its drive."""
+
+    joint: str
+    offset: float
+    before: float
+    file: str
+    """Where it is kept."""
+
+
+@dataclass(frozen=True)
+class EventRecord:
+    """Something that happened in the loop (`rtcp.ipc.events`)."""
+
+    number: int
+    """Counted from the start of the platform."""
+    time: str
+    """ISO 8601, local time."""
+    name: str
+    fields: Mapping[str, Any]
+    message: str

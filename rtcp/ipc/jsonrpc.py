@@ -1,0 +1,126 @@
+"""JSON-RPC 2.0 as the control socket speaks it: one message a line (`docs/protocol.md`); both ends use this file.
+
+No library: those on PyPI bring HTTP or Content-Length framing, or answer a request only when it is complete, while a
+motion reports its progress before (`docs/dependencies.md`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, cast
+
+from rtcp.ipc.errors import ErrorKind, RtcpError
+
+VERSION = "2.0"
+LINE_LIMIT = 1 << 16
+"""Bytes of a request."""
+PARSE_ERROR, INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS, INTERNAL_ERROR = -32700, -32600, -32601, -32602, -32603
+"""JSON-RPC 2.0 specification, section 5.1."""
+CODES = {
+    "refused": -32000,
+    "fault": -32001,
+    "timeout": -32002,
+    "invalid": INVALID_PARAMS,
+    "internal": INTERNAL_ERROR,
+}
+"""Code of each kind of error; -32099 to -32000 are the server's own."""
+RequestId = int | str | None
+
+
+class InvalidMessage(ValueError):
+    """A line that is no request; `code` says which part of the specification it breaks."""
+
+    def __init__(self, code: int, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def line(message: Mapping[str, Any]) -> bytes:
+    """Return a message as it is sent.
+
+    Raises:
+        ValueError: a number in it is not finite.
+    """
+    return json.dumps({"jsonrpc": VERSION, **message}, allow_nan=False).encode() + b"\n"
+
+
+def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
+    """Return a request; raises RtcpError (`invalid`) for what JSON cannot express."""
+    try:
+        return line({"id": number, "method": method, "params": dict(params)})
+    except (TypeError, ValueError) as error:
+        raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {error}") from error
+
+
+def failure(number: RequestId, error: RtcpError, code: int = 0) -> dict[str, Any]:
+    """Return the answer to a request that failed."""
+    data = {"kind": error.kind, "reason": error.reason, "fields": error.fields}
+    found = {"code": code or CODES.get(error.kind, INTERNAL_ERROR), "message": error.message, "data": data}
+    return {"id": number, "error": found}
+
+
+def read_request(given: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
+    """Return id, method, parameters, and whether it is a notification.
+
+    Raises:
+        InvalidMessage: it is no JSON or no request.
+    """
+    try:
+        found = json.loads(given, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError) as error:
+        raise InvalidMessage(PARSE_ERROR, f"the request is no JSON: {error}") from None
+    if not isinstance(found, dict):
+        raise InvalidMessage(INVALID_REQUEST, f"the request must be an object, not {type(found).__name__}")
+    number, method, params = found.get("id"), found.get("method"), found.get("params", {})
+    if type(number) not in (int, str, type(None)):
+        raise InvalidMessage(INVALID_REQUEST, f"id: found {type(number).__name__}, allowed is an integer or a text")
+    if found.get("jsonrpc") != VERSION:
+        raise InvalidMessage(INVALID_REQUEST, f'jsonrpc: found {found.get("jsonrpc")!r}, allowed is "{VERSION}"')
+    if not isinstance(method, str):
+        raise InvalidMessage(INVALID_REQUEST, f"method: found {type(method).__name__}, allowed is a text")
+    if not isinstance(params, dict):
+        raise InvalidMessage(INVALID_REQUEST, f"params: found {type(params).__name__}, allowed is an object")
+    return number, method, params, number is None
+
+
+def _refuse_constant(found: str) -> float:
+    """NaN and Infinity, which Python accepts, are no JSON."""
+    raise ValueError(f"{found} is no number")
+
+
+def read_reply(given: bytes, method: str) -> dict[str, Any]:
+    """Return an answer or a notification; raises RtcpError (`internal`) for what is neither."""
+    try:
+        reply = json.loads(given)
+    except ValueError as error:
+        raise RtcpError("internal", f"the answer to {method!r} is not JSON: {given[:80]!r}") from error
+    if not isinstance(reply, dict):
+        raise RtcpError("internal", f"the answer to {method!r} is not an object: {given[:80]!r}")
+    return reply
+
+
+def progress(reply: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the parameters of the notification `progress`; None where the message is an answer."""
+    params = reply.get("params")
+    return params if reply.get("method") == "progress" and isinstance(params, dict) else None
+
+
+def result(reply: Mapping[str, Any], method: str) -> dict[str, Any]:
+    """Return the result of an answer; raises RtcpError for the error in it, whatever its form."""
+    if "result" in reply:
+        found = reply["result"]
+        return found if isinstance(found, dict) else {}
+    error = _object(reply.get("error"))
+    data = _object(error.get("data"))
+    kind = data.get("kind")
+    raise RtcpError(
+        cast(ErrorKind, kind) if kind in CODES else "fault",
+        str(error.get("message") or f"the platform refused {method!r} without saying why"),
+        str(data.get("reason") or ""),
+        _object(data.get("fields")),
+    )
+
+
+def _object(found: object) -> dict[str, Any]:
+    return found if isinstance(found, dict) else {}
