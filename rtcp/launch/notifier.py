@@ -12,7 +12,7 @@ import socket
 import time
 from pathlib import Path
 
-from rtcp.ipc.machine import TABLE, State
+from rtcp.ipc.states import State
 from rtcp.ipc.observer import BlackboardError, Observer
 
 PINGS_A_WATCHDOG = 3

@@ -25,7 +25,7 @@ DRIVEN = replace(
 DT = ARM.cycle.period_us * 1e-6
 
 
-class Bench:
+class LoopRig:
     """The gripper and its drive; between its fingers may lie something hard."""
 
     def __init__(self, config: ArmConfig = DRIVEN, position: float = 1.0) -> None:
@@ -72,7 +72,7 @@ class Bench:
             path.append(mechanics.position)
         return path
 
-    def enabled(self) -> Bench:
+    def enabled(self) -> LoopRig:
         self.goal = TargetState.ENABLED
         self.run(0.1)
         assert self.gripper.enabled
@@ -85,102 +85,102 @@ def test_a_gripper_on_an_output_has_no_drive() -> None:
 
 
 def test_enabling_moves_nothing() -> None:
-    bench = Bench(position=0.7).enabled()
-    assert max(abs(position - 0.7) for position in bench.run(0.5)) < 1e-3
+    rig = LoopRig(position=0.7).enabled()
+    assert max(abs(position - 0.7) for position in rig.run(0.5)) < 1e-3
 
 
 @pytest.mark.parametrize(("close", "goal"), [(True, 0.0), (False, 1.4)])
 def test_it_closes_and_opens(close: bool, goal: float) -> None:
-    bench = Bench().enabled()
-    assert bench.gripper.grip(close)
-    bench.run(3.0)
-    assert bench.model.mechanics.position == pytest.approx(goal, abs=2e-3)
+    rig = LoopRig().enabled()
+    assert rig.gripper.grip(close)
+    rig.run(3.0)
+    assert rig.model.mechanics.position == pytest.approx(goal, abs=2e-3)
 
 
 def test_it_counts_from_its_own_zero_offset() -> None:
-    bench = Bench(replace(DRIVEN, zero_offsets=(*[9.0] * 6, 0.25))).enabled()
-    bench.gripper.grip(True)
-    bench.run(3.0)
-    assert bench.model.mechanics.position == pytest.approx(0.25, abs=2e-3)
+    rig = LoopRig(replace(DRIVEN, zero_offsets=(*[9.0] * 6, 0.25))).enabled()
+    rig.gripper.grip(True)
+    rig.run(3.0)
+    assert rig.model.mechanics.position == pytest.approx(0.25, abs=2e-3)
 
 
 def test_it_holds_what_is_hard_without_a_fault_and_lets_go() -> None:
-    bench = Bench().enabled()
-    bench.object_at = 0.5
-    bench.gripper.grip(True)
-    bench.run(5.0)
-    assert bench.gripper.motion.gripped
-    assert bench.gripper.enabled
-    assert bench.model.mechanics.position == pytest.approx(0.5, abs=0.01)
-    held = abs(bench.gripper.drive.torque)
+    rig = LoopRig().enabled()
+    rig.object_at = 0.5
+    rig.gripper.grip(True)
+    rig.run(5.0)
+    assert rig.gripper.motion.gripped
+    assert rig.gripper.enabled
+    assert rig.model.mechanics.position == pytest.approx(0.5, abs=0.01)
+    held = abs(rig.gripper.drive.torque)
     assert FINGER.torque * 0.5 < held < FINGER.torque * 3
-    bench.gripper.grip(False)
-    bench.run(3.0)
-    assert bench.model.mechanics.position == pytest.approx(1.4, abs=2e-3)
+    rig.gripper.grip(False)
+    rig.run(3.0)
+    assert rig.model.mechanics.position == pytest.approx(1.4, abs=2e-3)
 
 
 def test_it_takes_no_order_without_torque() -> None:
-    bench = Bench(position=0.7)
-    assert not bench.gripper.grip(True)
-    bench.enabled()
-    assert bench.run(0.5)[-1] == pytest.approx(0.7, abs=1e-3)
+    rig = LoopRig(position=0.7)
+    assert not rig.gripper.grip(True)
+    rig.enabled()
+    assert rig.run(0.5)[-1] == pytest.approx(0.7, abs=1e-3)
 
 
 def test_a_stop_on_its_way_holds_it_there() -> None:
-    bench = Bench().enabled()
-    bench.gripper.grip(True)
-    bench.run(0.5)
-    bench.gripper.stop()
-    bench.run(0.5)
-    here = bench.model.mechanics.position
+    rig = LoopRig().enabled()
+    rig.gripper.grip(True)
+    rig.run(0.5)
+    rig.gripper.stop()
+    rig.run(0.5)
+    here = rig.model.mechanics.position
     assert 0.1 < here < 0.9
-    assert bench.run(0.5)[-1] == pytest.approx(here, abs=1e-3)
+    assert rig.run(0.5)[-1] == pytest.approx(here, abs=1e-3)
 
 
 def test_after_a_fault_on_its_way_it_goes_nowhere_by_itself() -> None:
-    bench = Bench().enabled()
-    bench.gripper.grip(True)
-    bench.run(0.5)
-    bench.model.inject_fault(0x7305)
-    bench.goal = TargetState.QUICK_STOPPED
-    bench.run(0.5)
-    assert bench.gripper.drive.state is DriveState.FAULT
-    here = bench.model.mechanics.position
-    bench.goal = TargetState.RESET
-    bench.run(0.2)
-    bench.enabled()
-    assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
+    rig = LoopRig().enabled()
+    rig.gripper.grip(True)
+    rig.run(0.5)
+    rig.model.inject_fault(0x7305)
+    rig.goal = TargetState.QUICK_STOPPED
+    rig.run(0.5)
+    assert rig.gripper.drive.state is DriveState.FAULT
+    here = rig.model.mechanics.position
+    rig.goal = TargetState.RESET
+    rig.run(0.2)
+    rig.enabled()
+    assert rig.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
 
 
 def test_enabled_out_of_a_quick_stop_it_stands_where_it_came_to_rest() -> None:
-    bench = Bench().enabled()
-    bench.model.objects[0x605A, 0].value = 6
-    bench.gripper.grip(True)
-    bench.run(0.5)
-    bench.goal = TargetState.QUICK_STOPPED
-    bench.run(0.5)
-    assert bench.gripper.drive.state is DriveState.QUICK_STOP_ACTIVE
-    here = bench.model.mechanics.position
-    bench.enabled()
-    path = bench.run(0.5)
+    rig = LoopRig().enabled()
+    rig.model.objects[0x605A, 0].value = 6
+    rig.gripper.grip(True)
+    rig.run(0.5)
+    rig.goal = TargetState.QUICK_STOPPED
+    rig.run(0.5)
+    assert rig.gripper.drive.state is DriveState.QUICK_STOP_ACTIVE
+    here = rig.model.mechanics.position
+    rig.enabled()
+    path = rig.run(0.5)
     assert max(abs(position - here) for position in path) < 2e-3
 
 
 def test_a_joint_that_is_enabled_while_others_are_not_rests() -> None:
-    bench = Bench().enabled()
-    bench.gripper.grip(True)
-    bench.run(0.5)
-    bench.gripper.follow()
-    assert not bench.gripper.motion.moving
+    rig = LoopRig().enabled()
+    rig.gripper.grip(True)
+    rig.run(0.5)
+    rig.gripper.follow()
+    assert not rig.gripper.motion.moving
 
 
 @pytest.mark.parametrize(
     ("position", "outside"), [(-0.11, False), (-0.13, True), (1.51, False), (1.53, True), (0.5, False)]
 )
 def test_outside_its_range_it_is_not_to_be_enabled(position: float, outside: bool) -> None:
-    bench = Bench(position=position)
-    assert bench.gripper.outside is outside
-    assert bench.gripper.drive.target_position == min(max(bench.gripper.drive.position, -0.1), 1.5)
+    rig = LoopRig(position=position)
+    assert rig.gripper.outside is outside
+    assert rig.gripper.drive.target_position == min(max(rig.gripper.drive.position, -0.1), 1.5)
 
 
 @pytest.mark.parametrize("wrong", [0.16, -0.16, nan])
@@ -213,11 +213,11 @@ def test_a_speed_beyond_its_limit_counts_whatever_it_holds(wrong: float) -> None
 
 
 def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:
-    bench = Bench().enabled()
-    bench.gripper.grip(True)
-    bench.run(0.5)
-    bench.goal = TargetState.DISABLED
-    bench.run(1.0)
-    here = bench.model.mechanics.position
-    bench.enabled()
-    assert bench.run(0.5)[-1] == pytest.approx(here, abs=2e-3)
+    rig = LoopRig().enabled()
+    rig.gripper.grip(True)
+    rig.run(0.5)
+    rig.goal = TargetState.DISABLED
+    rig.run(1.0)
+    here = rig.model.mechanics.position
+    rig.enabled()
+    assert rig.run(0.5)[-1] == pytest.approx(here, abs=2e-3)

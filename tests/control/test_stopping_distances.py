@@ -15,8 +15,8 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.machine import Command, State
-from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
+from rtcp.ipc.commands import Enable, Jog, MoveJoints, SetDriveMode
+from rtcp.ipc.states import DriveMode, State
 from rtcp.launch.simulation import NAME, Frame, Simulation
 from rtcp.telemetry.stops_page import section
 
@@ -112,18 +112,18 @@ def arm() -> Iterator[Callable[..., Simulation]]:
         simulation.acquire()
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
         if mode != 8:
-            do(simulation, Command.MODE, [mode])
-        do(simulation, Command.ENABLE)
+            do(simulation, SetDriveMode(DriveMode(mode)))
+        do(simulation, Enable)
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-        assert simulation.until(lambda: not simulation.parts.behaviour.switching, 1.0)
+        assert simulation.until(lambda: not simulation.parts.machine.changing_mode, 1.0)
         simulation.run(0.1)
         if situation == "moving":
-            do(simulation, Command.MOVE, [*([0.3] * 6), 0.0, 0.0, 0.0, 0.0, 1.0, 0.5])
+            do(simulation, MoveJoints, [*([0.3] * 6), 0.0, 0.0, 0.0, 0.0, 1.0, 0.5])
             simulation.run(0.55)
             assert min(simulation.parts.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
         elif situation == "jogging":
             for _ in range(2):
-                do(simulation, Command.JOG, [0.0, 0.0, -JOG_SPEED, *([0.0] * 8), 0.5])
+                do(simulation, Jog, [0.0, 0.0, -JOG_SPEED, *([0.0] * 8), 0.5])
                 simulation.run(0.4)
             assert max(map(abs, simulation.parts.arm.state.commanded_velocity)) > 0.15
         return simulation
@@ -134,13 +134,13 @@ def arm() -> Iterator[Callable[..., Simulation]]:
 
 
 def do(simulation: Simulation, command: Command, numbers: Sequence[float] = ()) -> None:
-    assert simulation.order(command, numbers).refusal == 0
+    assert simulation.send(command, numbers).refusal is None
 
 
 def lose_the_box(simulation: Simulation) -> None:
     simulation.bus.drop(1, SAFE_OP, AL_WATCHDOG)
     # The service thread sees it some time later; the bound counts from the cycle that is told.
-    simulation.parts.behaviour._service.lost_slave = 1
+    simulation.parts.machine._service.lost_slave = 1
 
 
 def brakes(simulation: Simulation) -> list[float]:
@@ -164,7 +164,7 @@ def test_held_cycles_send_no_new_target_and_carry_no_joint_farther_than_its_spee
     simulation.run(cycles * PERIOD_S)
     assert all(row == measured.before for row in measured.sent)
     assert simulation.state is (State.HOLDING if situation == "holding" else State.MOVING)
-    limits = bounds(CONFIG, Rung.HOLD)
+    limits = bounds(CONFIG, StopReaction.HOLD)
     measured.not_beyond(f"hold, {situation}", limits)
 
 
@@ -179,7 +179,7 @@ def test_in_csv_and_cst_held_cycles_keep_to_the_same_way(
     simulation.data.lose(cycles, True)
     simulation.run(cycles * PERIOD_S)
     assert all(row == measured.before for row in measured.sent)
-    limits = bounds(CONFIG, Rung.HOLD)
+    limits = bounds(CONFIG, StopReaction.HOLD)
     if mode == 10:
         # A torque that is held is no speed: what it makes of it is the inertia's affair, and a tenth is granted here.
         limits = tuple(bound._replace(way_rad=1.1 * bound.way_rad) for bound in limits)
@@ -193,7 +193,7 @@ def test_frames_that_stay_away_are_held_and_then_a_quick_stop(arm: Callable[...,
     simulation.data.lose(100_000, True)
     simulation.run(0.6)
     assert simulation.state is State.FAULT
-    held, stop = bounds(CONFIG, Rung.HOLD), bounds(CONFIG, Rung.QUICK_STOP)
+    held, stop = bounds(CONFIG, StopReaction.HOLD), bounds(CONFIG, StopReaction.QUICK_STOP)
     both = [Bound(a.time_s + b.time_s, a.way_rad + b.way_rad) for a, b in zip(held, stop, strict=True)]
     measured.within(f"frames lost on the way back, {situation}", both)
 
@@ -213,7 +213,7 @@ def test_drives_that_hear_nothing_are_stopped_by_their_watchdog(arm: Callable[..
 
 
 @pytest.mark.parametrize("situation", ["moving", "jogging"])
-@pytest.mark.parametrize("rung", [Rung.CONTROLLED_STOP, Rung.QUICK_STOP, Rung.TORQUE_OFF], ids=lambda rung: rung.words)
+@pytest.mark.parametrize("rung", [StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF], ids=lambda rung: rung.words)
 def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
     arm: Callable[..., Simulation], situation: str, rung: Rung
 ) -> None:
@@ -221,10 +221,10 @@ def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
     measured = Measured(simulation)
     simulation.observer.release(simulation.lease)
     simulation.run(0.6)
-    assert simulation.state is (State.HOLDING if rung is Rung.CONTROLLED_STOP else State.FAULT)
-    assert [model.powered for model in simulation.models] == [rung is not Rung.TORQUE_OFF] * 6
+    assert simulation.state is (State.HOLDING if rung is StopReaction.CONTROLLED_STOP else State.FAULT)
+    assert [model.powered for model in simulation.models] == [rung is not StopReaction.TORQUE_OFF] * 6
     limits = bounds(CONFIG, rung, brakes(simulation))
-    if situation == "jogging" and rung is Rung.CONTROLLED_STOP:
+    if situation == "jogging" and rung is StopReaction.CONTROLLED_STOP:
         # The tool's own ramp may be longer; no joint passes its speed meanwhile.
         slow = tool_bounds(CONFIG, JOG_SPEED, CONFIG.jog.angular_speed)[0].time_s
         limits = tuple(
@@ -234,14 +234,14 @@ def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
     measured.within(f"{rung.words}, {situation}", limits)
 
 
-@pytest.mark.parametrize("rung", [Rung.QUICK_STOP, Rung.TORQUE_OFF], ids=lambda rung: rung.words)
+@pytest.mark.parametrize("rung", [StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF], ids=lambda rung: rung.words)
 def test_an_arm_that_holds_stays_where_it_is_on_every_rung(arm: Callable[..., Simulation], rung: Rung) -> None:
     simulation = arm("holding", slave_lost=rung.name.lower())
     measured = Measured(simulation)
     lose_the_box(simulation)
     simulation.run(0.2)
     assert simulation.state is State.FAULT
-    assert [model.powered for model in simulation.models] == [rung is Rung.QUICK_STOP] * 6
+    assert [model.powered for model in simulation.models] == [rung is StopReaction.QUICK_STOP] * 6
     measured.within(f"{rung.words}, holding", bounds(CONFIG, rung, brakes(simulation)))
     assert max(measured.ways) < 0.001
 
@@ -252,21 +252,21 @@ def test_an_arm_that_holds_stays_where_it_is_on_every_rung(arm: Callable[..., Si
 def test_each_rung_is_bound_by_what_the_configuration_says() -> None:
     slow = replace(CONFIG, joints=tuple(replace(joint, acceleration=1.0) for joint in CONFIG.joints))
     few = replace(CONFIG, bus=replace(CONFIG.bus, lost_cycles=10))
-    assert bounds(slow, Rung.CONTROLLED_STOP)[0].time_s > bounds(CONFIG, Rung.CONTROLLED_STOP)[0].time_s
-    assert bounds(few, Rung.HOLD)[0].time_s == pytest.approx(0.25 * bounds(CONFIG, Rung.HOLD)[0].time_s)
+    assert bounds(slow, StopReaction.CONTROLLED_STOP)[0].time_s > bounds(CONFIG, StopReaction.CONTROLLED_STOP)[0].time_s
+    assert bounds(few, StopReaction.HOLD)[0].time_s == pytest.approx(0.25 * bounds(CONFIG, StopReaction.HOLD)[0].time_s)
     late = 3 * PERIOD_S + 0.03
-    assert bounds(CONFIG, Rung.QUICK_STOP)[0].time_s == pytest.approx(0.5 / 10.0 + late)
-    assert bounds(CONFIG, Rung.QUICK_STOP)[0].way_rad == pytest.approx(0.5**2 / 20.0 + 0.5 * late)
-    assert bounds(CONFIG, Rung.TORQUE_OFF, [50.0] * 6)[0].time_s == pytest.approx(0.01 + late)
+    assert bounds(CONFIG, StopReaction.QUICK_STOP)[0].time_s == pytest.approx(0.5 / 10.0 + late)
+    assert bounds(CONFIG, StopReaction.QUICK_STOP)[0].way_rad == pytest.approx(0.5**2 / 20.0 + 0.5 * late)
+    assert bounds(CONFIG, StopReaction.TORQUE_OFF, [50.0] * 6)[0].time_s == pytest.approx(0.01 + late)
 
 
 def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
     with pytest.raises(ValueError, match="joint1: what its brake can do is not known"):
-        bounds(CONFIG, Rung.TORQUE_OFF)
+        bounds(CONFIG, StopReaction.TORQUE_OFF)
     bare = replace(CONFIG.slaves[1].device, sdo=())
     without = replace(CONFIG, slaves=tuple(replace(slave, device=bare) for slave in CONFIG.slaves))
     with pytest.raises(ValueError, match="0x6085 is not among its start-up SDOs"):
-        bounds(without, Rung.QUICK_STOP)
+        bounds(without, StopReaction.QUICK_STOP)
 
 
 # -- what the docs say ----------------------------------------------------------------------------------------------

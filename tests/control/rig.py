@@ -1,4 +1,4 @@
-"""A bench: the loop's parts, a small arm of real device models, and everything that goes over the wire between."""
+"""A rig: the loop's parts, a small arm of real device models, and everything that goes over the wire between."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from typing import NamedTuple
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.control.assembly import assemble
 from rtcp.control.bus_service import BusService
+from rtcp.control.cycle import Cycle
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.machine import Code, Command, State
-from rtcp.ipc.messages import Sentences
-from rtcp.ipc.observer import Answer, Event, Observer
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveJoints, Reset, SetDriveMode, Shutdown
+from rtcp.ipc.events import Emergency, Event
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import Answer, EventRecord, Observer
+from rtcp.ipc.states import DriveMode, State
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
 from rtcp.virtual.models import CubemarsDrive, create
@@ -29,8 +31,8 @@ DEBOUNCE_S = 0.005
 """Of the emergency stop's input, which a reset waits for as well."""
 LOST_CYCLES = 40
 CSP, CSV, CST = 8, 9, 10
-EMERGENCIES = {Code.PRESSED, Code.OVER_SPEED, Code.OVER_TORQUE, Code.FOLLOWING_ERROR}
-"""Codes of the emergency stop: told in test_emergency_stop.py."""
+EMERGENCIES = {kind for kind in Event.kinds if issubclass(kind, Emergency)}
+"""Events of the emergency stop: tested in test_emergency_stop.py."""
 CONTROLWORD, QUICK_STOP_OPTION, MODES_OF_OPERATION = 0x6040, 0x605A, 0x6060
 VOLTAGE_OFF, QUICK_STOP, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02, 0x07, 0x0F
 UNDER_VOLTAGE = 0x3220
@@ -152,7 +154,7 @@ class Said(NamedTuple):
 _WIRE = struct.Struct("<Hiiib")
 
 
-class Cycle(NamedTuple):
+class Seen(NamedTuple):
     """What is seen of a cycle from outside."""
 
     state: State
@@ -169,10 +171,10 @@ class Followed(Discipline):
         pass
 
 
-class Bench:
+class LoopRig:
     """The loop's parts without the loop: each call of `cycle` does what `Loop.run` does once, in its order.
 
-    The service thread is not started; the bench does what it would do: slaves reach OP, and come back after a reset.
+    The service thread is not started; the rig does what it would do: slaves reach OP, and come back after a reset.
     """
 
     def __init__(
@@ -190,37 +192,43 @@ class Bench:
             board.slave(position, AlState.OP, 0)
         if not with_box:
             config = replace(config, slaves=(replace(config.slaves[0], device=NO_BOX), *config.slaves[1:]))
-        parts = assemble(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
-        self.arm, self.box, self.operator = parts.arm, parts.box, parts.operator
-        self.behaviour, self.orders, self.loop = parts.behaviour, parts.orders, parts.loop
         self.now_ns = monotonic_ns()
-        self.sentences = Sentences(CONFIG)
-        self.log: list[Cycle] = []
+        self.loop = Cycle(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
+        self.arm, self.box, self.operator = self.loop.arm, self.loop.box, self.loop.operator
+        self.machine, self.context = self.loop.machine, self.loop.machine.context
+        self.names = Names(config)
+        self.log: list[Seen] = []
         self._events_before = max((event.number for event in observer.events_since(0)), default=0)
-        self.lease = observer.acquire("the bench", 3600.0)
+        self.lease = observer.acquire("the rig", 3600.0)
 
     @property
     def state(self) -> State:
-        return self.behaviour.state
+        return self.machine.state
 
     @property
-    def events(self) -> list[Event]:
+    def events(self) -> list[EventRecord]:
         return self.observer.events_since(self._events_before)
 
     @property
-    def codes(self) -> list[int]:
-        return [event.code if event.code > Code.ENDED else Code(event.code) for event in self.events]
+    def kinds(self) -> list[type[Event]]:
+        """The kinds of all events so far."""
+        return [type(record.event) for record in self.events]
+
+    @property
+    def last(self) -> Event:
+        """The last event."""
+        return self.events[-1].event
 
     def cycle(self) -> None:
-        data, behaviour = self.data, self.behaviour
-        if self.slaves_come_back and behaviour.state is State.RESETTING:
+        data = self.data
+        if self.slaves_come_back and self.state is State.RESETTING:
             self.service.lost_slave = 0
             self.service.all_op = True
         self.now_ns = monotonic_ns()
         self.loop.cycle(self.now_ns, self.now_ns)
         self.log.append(
-            Cycle(
-                behaviour.state,
+            Seen(
+                self.state,
                 tuple(
                     Said(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
                     for slot in range(1, len(data.devices))
@@ -238,7 +246,7 @@ class Bench:
             if condition():
                 return n * PERIOD_S
             self.cycle()
-        raise AssertionError(f"not within {seconds} s, but {self.state.name}; {self.said}")
+        raise AssertionError(f"not within {seconds} s, but {self.state.name}; {self.messages}")
 
     def until(self, state: State, seconds: float = 5.0) -> float:
         """Run until the machine is in `state`; return the time it took."""
@@ -246,32 +254,33 @@ class Bench:
 
     def finish(self) -> float:
         """Run until the loop may end; return the time it took."""
-        return self.wait(lambda: self.behaviour.done)
+        return self.wait(lambda: self.machine.closed)
 
-    def order(self, command: int, numbers: Sequence[float] = (), lease: int | None = None) -> Answer:
-        """Give a command as a commander does, run one cycle and return the answer to it."""
-        number = self.observer.command(self.lease if lease is None else lease, command, numbers)
+    def send(self, command: Command, lease: int | None = None) -> Answer:
+        """Send a command, run one cycle and return the answer to it."""
+        number = self.observer.command(self.lease if lease is None else lease, command)
         self.cycle()
         answer = self.observer.answer(number)
         assert answer is not None
         return answer
 
-    def do(self, command: Command, numbers: Sequence[float] = ()) -> None:
-        """Give a command that is taken."""
-        answer = self.order(command, numbers)
-        assert answer.refusal == 0, self.sentences.refusal(*vars(answer).values())
+    def do(self, command: Command) -> None:
+        """Send a command that is accepted."""
+        refusal = self.send(command).refusal
+        assert refusal is None, self.names.message(refusal)
 
     def move(self, *target: float, speed: float = SPEED) -> None:
-        self.do(Command.MOVE, move_numbers(*target, speed=speed))
+        self.do(move_to(*target, speed=speed))
 
     def refused(self, answer: Answer) -> str:
-        """Return the sentence of a refusal."""
-        return self.sentences.refusal(answer.refusal, answer.axis, answer.value, answer.limit)
+        """Return the message of a refusal."""
+        assert answer.refusal is not None
+        return self.names.message(answer.refusal)
 
     @property
-    def said(self) -> list[str]:
-        """All events so far, in words."""
-        return [self.sentences.event(event.code, event.axis, event.value, event.limit) for event in self.events]
+    def messages(self) -> list[str]:
+        """The messages of all events so far."""
+        return [self.names.message(record.event) for record in self.events]
 
     def press(self, pressed: bool = True) -> None:
         """Press the emergency stop, or release it, and let it be seen."""
@@ -280,26 +289,26 @@ class Bench:
 
     # -- ways to the states -------------------------------------------------------------------------------------
 
-    def start(self) -> Bench:
+    def start(self) -> LoopRig:
         self.service.all_op = True
         self.until(State.READY)
-        # What the inputs mean counts once it has lasted.
+        # Inputs count once they are debounced.
         self.run(0.01)
         return self
 
-    def enable(self) -> Bench:
-        self.do(Command.ENABLE)
+    def enable(self) -> LoopRig:
+        self.do(Enable())
         self.until(State.HOLDING)
         return self
 
-    def hold(self, mode: int = CSP) -> Bench:
+    def hold(self, mode: int = CSP) -> LoopRig:
         self.start()
-        self.do(Command.MODE, [mode])
+        self.do(SetDriveMode(DriveMode(mode)))
         self.enable()
-        self.wait(lambda: not self.behaviour.switching)
+        self.wait(lambda: not self.machine.changing_mode)
         return self
 
-    def set_in_motion(self, mode: int = CSP) -> Bench:
+    def set_in_motion(self, mode: int = CSP) -> LoopRig:
         """Both joints, at full speed on a long way."""
         self.hold(mode)
         self.move(1.8, 1.8)
@@ -307,22 +316,22 @@ class Bench:
         assert all(drive.velocity > 0.9 * SPEED for drive in self.arm.drives)
         return self
 
-    def bring_to(self, state: State) -> Bench:
+    def bring_to(self, state: State) -> LoopRig:
         """Lead the machine into `state` from its beginning, by what leads there on a robot."""
         if state is State.STARTING:
             self.cycle()
         elif state is State.READY:
             self.start()
         elif state is State.ENABLING:
-            self.start().do(Command.ENABLE)
+            self.start().do(Enable())
         elif state is State.HOLDING:
             self.hold()
         elif state is State.MOVING:
             self.set_in_motion()
         elif state is State.STOPPING:
-            self.set_in_motion().do(Command.STOP)
+            self.set_in_motion().do(Halt())
         elif state is State.DISABLING:
-            self.set_in_motion().do(Command.DISABLE)
+            self.set_in_motion().do(Disable())
         elif state is State.FAULT:
             self.hold()
             self.service.lost_slave = 3
@@ -339,13 +348,13 @@ class Bench:
             # A search that finds nothing: the speed is too small.
             self.models[0].objects[0x6098, 0].value = 34
             self.models[0].objects[0x6099, 2].value = 1
-            self.do(Command.HOME, [0])
+            self.do(Home(0))
         elif state is State.RESETTING:
             self.bring_to(State.FAULT)
             self.slaves_come_back = False
-            self.do(Command.RESET)
+            self.do(Reset())
         else:
-            self.set_in_motion().do(Command.SHUTDOWN)
+            self.set_in_motion().do(Shutdown())
         assert self.state is state
         return self
 
@@ -369,6 +378,6 @@ class Bench:
         )
 
 
-def move_numbers(*target: float, speed: float = SPEED) -> list[float]:
-    """The numbers of a move as they lie in the command ring: targets first, speed last of twelve."""
-    return [*target, *([0.0] * (11 - len(target))), speed]
+def move_to(*target: float, speed: float = SPEED) -> MoveJoints:
+    """A move of all joints, which arrive together."""
+    return MoveJoints(target, speed, True)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from rtcp.gateway.robot_status import robot_status
-from rtcp.ipc.codes import Command, MotionMode
+from rtcp.ipc.commands import Disable, Halt, Shutdown
 from rtcp.ipc.layout import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
-from rtcp.ipc.machine import ALLOWED, TABLE, WITHOUT_LEASE, Event, State
+from rtcp.ipc.states import ControlMode, State
 from rtcp.telemetry.machine_drawing import diagram, page
 
 ROOT = Path(__file__).parents[2]
@@ -61,7 +61,7 @@ def test_a_stop_by_a_limit_is_left_by_reset_alone_where_the_arm_stays_enabled() 
 
 
 def test_whoever_has_no_lease_can_only_make_the_arm_safer() -> None:
-    assert {Command.DISABLE, Command.STOP, Command.SHUTDOWN} == WITHOUT_LEASE
+    assert {Disable, Halt, Shutdown} == WITHOUT_LEASE
 
 
 def test_the_page_in_the_docs_is_drawn_from_the_table() -> None:
@@ -78,7 +78,7 @@ def test_the_picture_shows_every_state() -> None:
 
 @pytest.mark.parametrize("state", State)
 def test_motion_is_possible_only_while_the_arm_holds_or_moves(state: State) -> None:
-    found = robot_status(state, MotionMode.JOINT, ALLOWED_TO_MOVE, 0, 0)
+    found = robot_status(state, ControlMode.JOINT, ALLOWED_TO_MOVE, 0, 0)
     assert found["motion_possible"] is (state in (State.HOLDING, State.MOVING))
 
 
@@ -86,16 +86,16 @@ def test_motion_is_possible_only_while_the_arm_holds_or_moves(state: State) -> N
 def test_motion_is_not_possible_with_the_emergency_stop_pressed_or_while_the_drives_change_their_mode(
     flag: int,
 ) -> None:
-    assert not robot_status(State.HOLDING, MotionMode.JOINT, ALLOWED_TO_MOVE | flag, 0, 0)["motion_possible"]
+    assert not robot_status(State.HOLDING, ControlMode.JOINT, ALLOWED_TO_MOVE | flag, 0, 0)["motion_possible"]
 
 
 def test_motion_is_not_possible_without_the_enabling_switch() -> None:
-    assert not robot_status(State.HOLDING, MotionMode.JOINT, FLAG_ENABLED, 0, 0)["motion_possible"]
+    assert not robot_status(State.HOLDING, ControlMode.JOINT, FLAG_ENABLED, 0, 0)["motion_possible"]
 
 
 def test_the_stick_makes_the_mode_manual() -> None:
-    assert robot_status(State.HOLDING, MotionMode.JOYSTICK, 0, 0, 0)["mode"] == "manual"
-    for mode in set(MotionMode) - {MotionMode.JOYSTICK}:
+    assert robot_status(State.HOLDING, ControlMode.JOYSTICK, 0, 0, 0)["mode"] == "manual"
+    for mode in set(ControlMode) - {ControlMode.JOYSTICK}:
         assert robot_status(State.HOLDING, mode, 0, 0, 0)["mode"] == "auto"
 
 

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped
+from rtcp.ipc.refusals import NoLease, NotPermitted
+from rtcp.ipc.commands import Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
+from rtcp.ipc.states import State
+
 import itertools
 import struct
 from collections.abc import Callable, Iterator
@@ -13,9 +18,6 @@ from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.operation import InputConfig
 from rtcp.config.segment import SegmentSlave
-from rtcp.ipc.codes import Code, Command, Refusal
-from rtcp.ipc.machine import State
-from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Event
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
@@ -77,17 +79,17 @@ class Hand:
         return self.model.mechanics.position
 
     def told_of(self, code: Code) -> list[Event]:
-        return [event for event in self.simulation.events if event.code == code]
+        return [event for event in self.simulation.events if type(event.event) == code]
 
     def sentence(self, code: Code) -> str:
         (event,) = self.told_of(code)
-        return Sentences(CONFIG).event(event.code, event.axis, event.value, event.limit)
+        return Names(CONFIG).event(type(event.event), event.axis, event.value, event.limit)
 
     def close(self) -> None:
-        assert self.simulation.order(Command.GRIPPER, [0.0]).refusal == Refusal.NONE
+        assert self.simulation.send(MoveGripper(False)).refusal is None
 
     def open(self) -> None:
-        assert self.simulation.order(Command.GRIPPER, [1.0]).refusal == Refusal.NONE
+        assert self.simulation.send(MoveGripper(True)).refusal is None
 
     def on_its_way(self) -> None:
         self.close()
@@ -128,7 +130,7 @@ def with_hand() -> Iterator[Callable[..., Hand]]:
         hand.until(State.READY)
         simulation.run(0.1)
         simulation.acquire()
-        assert simulation.order(Command.ENABLE).refusal == Refusal.NONE
+        assert simulation.send(Enable()).refusal is None
         hand.until(State.HOLDING)
         hand.path.clear()
         return hand
@@ -153,14 +155,14 @@ def test_it_closes_and_opens_under_the_lease_and_tells_each_time_where_it_rests(
     hand.open()
     hand.rest()
     assert hand.position == pytest.approx(OPEN, abs=2e-3)
-    told = [(event.axis, event.value, event.limit) for event in hand.told_of(Code.GRIPPER_AT)]
+    told = [(event.axis, event.value, event.limit) for event in hand.told_of(GripperAtRest)]
     assert told == [(AXIS, pytest.approx(CLOSED), 0.0), (AXIS, pytest.approx(OPEN), 0.0)]
     assert kept_to_its_limits(hand.path)
     assert hand.state is State.HOLDING
 
 
 def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
-    assert hand.simulation.order(Command.GRIPPER, [0.0], lease=hand.simulation.lease + 1).refusal == Refusal.NO_LEASE
+    assert hand.simulation.send(MoveGripper(False), lease=hand.simulation.lease + isinstance(1).refusal, NoLease)
     hand.simulation.run(0.2)
     assert max(abs(position - START) for position in hand.path) < 1e-4
 
@@ -171,7 +173,7 @@ def test_where_it_already_is_it_tells_so_all_the_same(with_hand: Callable[..., H
     hand.simulation.run(0.1)
     hand.open()
     hand.simulation.run(0.1)
-    assert [event.value for event in hand.told_of(Code.GRIPPER_AT)] == [pytest.approx(OPEN, abs=2e-4)] * 2
+    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
 
 
 def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
@@ -179,13 +181,13 @@ def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
     hand.simulation.models[0].objects[0x6098, 0].value = 34
     hand.simulation.models[0].objects[0x6099, 2].value = 150
     hand.on_its_way()
-    assert hand.simulation.order(Command.HOME, [0.0]).refusal == Refusal.NONE
+    assert hand.simulation.send(Home(0)).refusal is None
     hand.rest()
     assert hand.state is State.HOMING
     assert hand.position == pytest.approx(CLOSED, abs=2e-3)
-    assert [event.value for event in hand.told_of(Code.GRIPPER_AT)] == [pytest.approx(CLOSED)]
+    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(CLOSED)]
     hand.until(State.HOLDING)
-    assert hand.told_of(Code.HOMED)
+    assert hand.told_of(Homed)
     assert kept_to_its_limits(hand.path)
 
 
@@ -195,9 +197,9 @@ def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
     hand.rest()
     hand.simulation.run(2.0)
     assert hand.state is State.HOLDING
-    (rest,) = hand.told_of(Code.GRIPPER_AT)
+    (rest,) = hand.told_of(GripperAtRest)
     assert (rest.value, rest.limit) == (pytest.approx(0.5, abs=0.05), 1.0)
-    assert hand.sentence(Code.GRIPPER_AT) == f"finger rests at {rest.value:.6g} rad, it holds something"
+    assert hand.sentence(GripperAtRest) == f"finger rests at {rest.value:.6g} rad, it holds something"
     assert 0.5 * FINGER.torque < abs(hand.gripper.drive.torque) < 1.2 * FINGER.torque
     assert kept_to_its_limits(hand.path[: hand.path.index(rest.value)])
     hand.open()
@@ -211,7 +213,7 @@ def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
 
 def stopped_on_its_way(hand: Hand) -> None:
     """It has come to rest under its limits, between where it was and where it should be, has said so, and stays."""
-    (rest,) = hand.told_of(Code.GRIPPER_AT)
+    (rest,) = hand.told_of(GripperAtRest)
     assert CLOSED + 0.1 < rest.value < START - 0.05
     assert rest.limit == 0.0
     assert kept_to_its_limits(hand.path)
@@ -245,7 +247,7 @@ def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_a
     hand.simulation.acquire()
     hand.until(State.FAULT)
     hand.simulation.run(0.2)
-    assert len(hand.told_of(Code.LEASE_ENDED)) == 1
+    assert len(hand.told_of(LeaseExpired)) == 1
     assert not hand.moving
     assert abs(hand.model.mechanics.velocity) < 0.01
     assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
@@ -255,7 +257,7 @@ def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand
     hand.simulation.models[0].objects[0x6098, 0].value = 34
     hand.simulation.models[0].objects[0x6099, 2].value = 1
     hand.on_its_way()
-    assert hand.simulation.order(Command.HOME, [0.0]).refusal == Refusal.NONE
+    assert hand.simulation.send(Home(0)).refusal is None
     hand.simulation.run(0.1)
     hand.simulation.acquire()
     hand.simulation.run(0.02)
@@ -268,7 +270,7 @@ def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand
 
 def test_it_stops_when_the_enabling_switch_is_let_go(with_hand: Callable[..., Hand]) -> None:
     hand = with_hand(replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(11))))
-    assert hand.simulation.order(Command.GRIPPER, [0.0]).refusal == Refusal.NOT_PERMITTED
+    assert hand.simulation.send(MoveGripper, isinstance([0.0]).refusal, NotPermitted)
     hand.inputs(put=ENABLING_SWITCH)
     hand.simulation.run(0.05)
     hand.on_its_way()
@@ -280,7 +282,7 @@ def test_it_stops_when_the_enabling_switch_is_let_go(with_hand: Callable[..., Ha
 
 def test_it_stops_by_halt(hand: Hand) -> None:
     hand.on_its_way()
-    assert hand.simulation.order(Command.STOP).refusal == Refusal.NONE
+    assert hand.simulation.send(Halt()).refusal is None
     hand.rest()
     stopped_on_its_way(hand)
 
@@ -288,10 +290,10 @@ def test_it_stops_by_halt(hand: Hand) -> None:
 def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
     hand.simulation.data.lose(5, heard=True)
     hand.close()
-    assert hand.simulation.order(Command.STOP).refusal == Refusal.NONE
+    assert hand.simulation.send(Halt()).refusal is None
     hand.simulation.run(0.5)
     assert max(abs(position - START) for position in hand.path) < 1e-4
-    assert [event.value for event in hand.told_of(Code.GRIPPER_AT)] == [pytest.approx(START, abs=1e-4)]
+    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
 
 
 @pytest.fixture
@@ -327,17 +329,17 @@ def test_it_stops_when_the_stick_that_closes_it_is_given_to_the_chair(by_stick: 
     stopped_on_its_way(by_stick)
 
 
-@pytest.mark.parametrize("command", [Command.DISABLE, Command.SHUTDOWN])
+@pytest.mark.parametrize("command", [Disable, Shutdown])
 def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command: Command) -> None:
     hand.on_its_way()
     hand.path.clear()
     hand.told.clear()
-    hand.simulation.order(command)
+    hand.simulation.send(command)
     assert hand.simulation.until(lambda: hand.state is State.READY or hand.simulation.done, 10.0)
     off = next(at for at, told in enumerate(hand.told) if told[:2] != ENABLED)
     assert off > 10
     assert hand.told[off - 1][2:6] == hand.told[off - 2][2:6]
-    (rest,) = hand.told_of(Code.GRIPPER_AT)
+    (rest,) = hand.told_of(GripperAtRest)
     assert CLOSED + 0.1 < rest.value < START - 0.05
     assert not hand.model.powered
     assert kept_to_its_limits(hand.path[:off])
@@ -349,11 +351,11 @@ def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command:
 def goes_nowhere_by_itself(hand: Hand) -> None:
     """Reset and enabled again it stays where it is; of what became of its way nobody was told that it had an end."""
     assert not hand.moving
-    assert hand.told_of(Code.GRIPPER_AT) == []
-    assert hand.simulation.order(Command.RESET).refusal == Refusal.NONE
+    assert hand.told_of(GripperAtRest) == []
+    assert hand.simulation.send(Reset()).refusal is None
     hand.until(State.READY)
     here = hand.position
-    assert hand.simulation.order(Command.ENABLE).refusal == Refusal.NONE
+    assert hand.simulation.send(Enable()).refusal is None
     hand.until(State.HOLDING)
     hand.simulation.run(1.0)
     assert hand.position == pytest.approx(here, abs=2e-3)
@@ -373,7 +375,7 @@ def test_a_fault_of_its_own_drive_stops_the_arm_and_names_its_joint(hand: Hand) 
     hand.on_its_way()
     hand.model.inject_fault(0x7305)
     hand.until(State.FAULT)
-    assert hand.sentence(Code.DRIVE_FAULT).startswith("finger: the drive is in fault")
+    assert hand.sentence(DriveFault).startswith("finger: the drive is in fault")
     hand.simulation.run(1.0)
     goes_nowhere_by_itself(hand)
 
@@ -398,7 +400,7 @@ def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Han
         beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
     assert beyond == CONFIG.watch.cycles
     assert hand.state is State.EMERGENCY_STOP
-    assert hand.sentence(Code.OVER_SPEED).startswith("finger")
+    assert hand.sentence(OverSpeed).startswith("finger")
 
 
 def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
@@ -410,20 +412,20 @@ def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_i
         beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.watch.following_error
     assert beyond == CONFIG.watch.cycles
     assert hand.state is State.EMERGENCY_STOP
-    assert hand.sentence(Code.FOLLOWING_ERROR).startswith("finger")
+    assert hand.sentence(FollowingError).startswith("finger")
 
 
 def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
     hand.on_its_way()
-    hand.simulation.order(Command.SHUTDOWN)
+    hand.simulation.send(Shutdown())
     hand.model.mechanics.external_torque = -60.0
-    assert hand.simulation.until(lambda: bool(hand.told_of(Code.OVER_SPEED)), 1.0)
+    assert hand.simulation.until(lambda: bool(hand.told_of(OverSpeed)), 1.0)
     hand.simulation.run(0.01)
     assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
 
 
 def disabled(hand: Hand) -> Hand:
-    assert hand.simulation.order(Command.DISABLE).refusal == Refusal.NONE
+    assert hand.simulation.send(Disable()).refusal is None
     hand.until(State.READY)
     return hand
 
@@ -431,7 +433,7 @@ def disabled(hand: Hand) -> Hand:
 def test_it_does_not_follow_a_false_position_while_it_is_being_enabled(hand: Hand) -> None:
     disabled(hand)
     data, said = hand.simulation.data, hand.simulation.data.input
-    assert hand.simulation.order(Command.ENABLE).refusal == Refusal.NONE
+    assert hand.simulation.send(Enable()).refusal is None
     assert hand.simulation.until(lambda: hand.told[-1][:2] == ENABLED, 1.0)
 
     def false(slot: int) -> bytes:
@@ -452,17 +454,17 @@ def test_it_does_not_follow_a_false_position_while_it_is_being_enabled(hand: Han
 
 def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_names_its_joint(hand: Hand) -> None:
     disabled(hand)
-    assert hand.simulation.order(Command.ENABLE).refusal == Refusal.NONE
+    assert hand.simulation.send(Enable()).refusal is None
     hand.model.mechanics.position += 0.1
     hand.until(State.FAULT)
-    assert hand.sentence(Code.POSITION_JUMPED).startswith("finger was followed to 1 rad while being enabled")
+    assert hand.sentence(PositionJumped).startswith("finger was followed to 1 rad while being enabled")
 
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:
     watch = hand.gripper.watch
     watch._fast = watch._off = CONFIG.watch.cycles - 1
-    hand.simulation.order(Command.DISABLE)
+    hand.simulation.send(Disable())
     hand.until(State.READY)
-    hand.simulation.order(Command.ENABLE)
+    hand.simulation.send(Enable())
     hand.until(State.HOLDING)
     assert (watch._fast, watch._off) == (0, 0)

@@ -8,14 +8,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from rtcp.control.assembly import drives_of
 
 from rtcp.config.model import ArmConfig, SlaveConfig
-from rtcp.control.assembly import drives_of
 from rtcp.control.process import stop_blindly
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.fieldbus.pdo import layout
 
-from .bench import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, Bench
+from .rig import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
 DISABLE_OPERATION_OPTION = 0x605C
 STILL_RAD_S = 0.01
@@ -38,25 +38,25 @@ class Defective:
 class Watched:
     """What each frame of a process image finds: of every drive its true speed, and whether it has torque."""
 
-    def __init__(self, bench: Bench) -> None:
+    def __init__(self, rig: LoopRig) -> None:
         self.seen: list[list[tuple[float, bool]]] = []
-        self._bench = bench
-        self._receive = bench.data.receive
-        bench.data.receive = self.receive  # type: ignore[method-assign]
+        self._rig = rig
+        self._receive = rig.data.receive
+        rig.data.receive = self.receive  # type: ignore[method-assign]
 
     def receive(self) -> int:
         wkc = self._receive()
-        self.seen.append([(abs(model.mechanics.velocity), model.powered) for model in self._bench.models])
+        self.seen.append([(abs(model.mechanics.velocity), model.powered) for model in self._rig.models])
         return wkc
 
 
-def set_in_motion(bench: Bench, mode: int = CSP) -> Watched:
+def set_in_motion(rig: LoopRig, mode: int = CSP) -> Watched:
     """Both joints at full speed, with drives whose torque goes at once on `disable operation`."""
-    for model in bench.models:
+    for model in rig.models:
         model.objects[DISABLE_OPERATION_OPTION, 0].value = 0
         model.objects[0x6085, 0].value = 100_000
-    bench.set_in_motion(mode)
-    return Watched(bench)
+    rig.set_in_motion(mode)
+    return Watched(rig)
 
 
 def ramps_down_under_torque(watched: Watched) -> bool:
@@ -67,35 +67,35 @@ def ramps_down_under_torque(watched: Watched) -> bool:
 
 
 @pytest.mark.parametrize("mode", [CSP, CSV, CST])
-def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(bench: Bench, mode: int) -> None:
-    watched = set_in_motion(bench, mode)
-    stop_blindly(bench.data, CONFIG, bench.arm)
+def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(rig: LoopRig, mode: int) -> None:
+    watched = set_in_motion(rig, mode)
+    stop_blindly(rig.data, CONFIG, rig.arm)
     assert ramps_down_under_torque(watched)
 
 
 @pytest.mark.parametrize("step", ["decode", "advance", "encode"])
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_defect_in_one_drive_keeps_neither_it_nor_the_others_from_ramping_down(
-    bench: Bench, axis: int, step: str
+    rig: LoopRig, axis: int, step: str
 ) -> None:
-    watched = set_in_motion(bench)
-    slot, drive = bench.arm.pairs[axis]
-    bench.arm.pairs[axis] = (slot, Defective(drive, step))  # type: ignore[assignment]
-    stop_blindly(bench.data, CONFIG, bench.arm)
+    watched = set_in_motion(rig)
+    slot, drive = rig.arm.pairs[axis]
+    rig.arm.pairs[axis] = (slot, Defective(drive, step))  # type: ignore[assignment]
+    stop_blindly(rig.data, CONFIG, rig.arm)
     assert ramps_down_under_torque(watched)
 
 
-def test_a_frame_that_cannot_be_sent_is_followed_by_others(bench: Bench) -> None:
-    watched = set_in_motion(bench)
-    send, tries = bench.data.send, iter(range(1000))
+def test_a_frame_that_cannot_be_sent_is_followed_by_others(rig: LoopRig) -> None:
+    watched = set_in_motion(rig)
+    send, tries = rig.data.send, iter(range(1000))
 
     def sends() -> None:
         if next(tries) < 3:
             raise OSError("a defect for the test")
         send()
 
-    bench.data.send = sends  # type: ignore[method-assign]
-    stop_blindly(bench.data, CONFIG, bench.arm)
+    rig.data.send = sends  # type: ignore[method-assign]
+    stop_blindly(rig.data, CONFIG, rig.arm)
     assert ramps_down_under_torque(watched)
 
 

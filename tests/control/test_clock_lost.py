@@ -9,7 +9,9 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.machine import Code, Command, State
+from rtcp.ipc.commands import Enable, MoveJoints, Reset
+from rtcp.ipc.events import ClockLost, ResetTimeout
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.realtime.discipline import UNHEARD_CYCLES
 
@@ -47,9 +49,9 @@ def moving(request: pytest.FixtureRequest) -> Iterator[Simulation]:
     with Simulation(config, seed=5) as simulation:
         simulation.acquire()
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        assert simulation.order(Command.ENABLE).refusal == 0
+        assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-        assert simulation.order(Command.MOVE, ONE_TURN).refusal == 0
+        assert simulation.send(MoveJoints, ONE_TURN).refusal is None
         simulation.run(1.0)
         yield simulation
 
@@ -74,13 +76,13 @@ def test_a_reference_clock_that_stands_stops_the_arm_by_its_rung_and_a_reset_wai
     # Down to standstill by the set-points, or at once by the drives.
     assert (words.count(ENABLE_OPERATION) > 50) is (moving.config.stops.clock_lost == "controlled_stop")
     assert words[-1] == QUICK_STOP
-    assert [event.code for event in moving.events].count(Code.CLOCK_LOST) == 1
+    assert [type(event.event) for event in moving.events].count(ClockLost) == 1
     assert moving.data.wkc == moving.data.expected_wkc
-    assert moving.order(Command.RESET).refusal == 0
+    assert moving.order(Reset()).refusal is None
     assert moving.until(lambda: moving.state is State.FAULT, 4.0)
     # No drive was told to reset: that they are stopped by quick stop is not why it did not succeed.
-    assert (moving.events[-1].code, moving.events[-1].axis) == (Code.RESET_STUCK, -1)
-    assert moving.order(Command.RESET).refusal == 0
+    assert (moving.events[-1].code, moving.events[-1].event.axis) == (ResetTimeout, -1)
+    assert moving.order(Reset()).refusal is None
     moving.run(2.0)
     assert moving.state is State.RESETTING
     reference.stands = False

@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.ipc.machine import Code, Command, State
-from rtcp.ipc.messages import Sentences
+from rtcp.ipc.commands import Enable, Halt, MoveJoints, Reset
+from rtcp.ipc.events import MovedSinceFault
 from rtcp.launch.inprocess_slave import InProcessSlave
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create
@@ -55,10 +55,10 @@ def arm(request: pytest.FixtureRequest) -> Iterator[Simulation]:
     with Simulation(CONFIG, seed=3, positions=BENT, follow_clock=False) as simulation:
         simulation.acquire()
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-        assert simulation.order(Command.ENABLE).refusal == 0
+        assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
         if request.param == "moving":
-            assert simulation.order(Command.MOVE, FULL_SPEED).refusal == 0
+            assert simulation.send(MoveJoints, FULL_SPEED).refusal is None
         simulation.run(0.5)
         yield simulation
 
@@ -133,11 +133,11 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
     without_supply(arm)
     arm.run(0.2)
     seen = Seen(arm)
-    assert arm.order(Command.RESET).refusal == 0
+    assert arm.order(Reset()).refusal is None
     assert arm.until(lambda: arm.state is State.READY, 4.0)
     arm.run(0.1)
     assert ENABLE_OPERATION not in {sent[0] for _, sent, _, _ in seen.cycles}
-    assert arm.order(Command.ENABLE).refusal == 0
+    assert arm.order(Enable()).refusal is None
     assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
     arm.run(0.2)
     told = {sent[1] for _, sent, _, _ in seen.cycles if sent[0] == ENABLE_OPERATION}
@@ -150,16 +150,16 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
 
 def told(simulation: Simulation) -> list[str]:
     """The sentences about joints that stand elsewhere than at the fault."""
-    sentences = Sentences(CONFIG)
+    sentences = Names(CONFIG)
     return [
-        sentences.event(event.code, event.axis, event.value, event.limit)
+        sentences.event(type(event.event), event.axis, event.value, event.limit)
         for event in simulation.events
-        if event.code == Code.STANDS_ELSEWHERE
+        if type(event.event) == MovedSinceFault
     ]
 
 
 def reset(simulation: Simulation) -> None:
-    assert simulation.order(Command.RESET).refusal == 0
+    assert simulation.send(Reset()).refusal is None
     assert simulation.until(lambda: simulation.state is State.READY, 4.0)
 
 
@@ -187,9 +187,9 @@ def test_a_joint_that_comes_back_at_another_position_is_told_with_both_when_the_
     assert said.startswith("joint3 stands at 1.05 rad, at the fault it stood at 1.2")
     assert "its drive has lost its zero: check that before `rtcp enable`" in said
     # It is what was said last: `rtcp status` shows it.
-    assert arm.events[-1].code == Code.STANDS_ELSEWHERE
+    assert arm.events[-1].code == MovedSinceFault
     # It is told once, and no refusal: it may have been turned by hand.
-    assert arm.order(Command.ENABLE).refusal == 0
+    assert arm.order(Enable()).refusal is None
     assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
     out_of_op(arm)
     reset(arm)
@@ -207,10 +207,10 @@ def test_a_joint_that_comes_back_where_it_stood_is_not_told(
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
 def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_have_run_on_to(arm: Simulation) -> None:
-    arm.order(Command.STOP)
+    arm.order(Halt())
     assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
     fast = [0.0, -0.3, 2.4, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
-    assert arm.order(Command.MOVE, fast).refusal == 0
+    assert arm.order(MoveJoints, fast).refusal is None
     arm.run(1.6)
     assert arm.parts.arm.state.actual_velocity[AXIS] > 0.4
     stood = arm.parts.arm.state.actual[AXIS]
