@@ -89,7 +89,7 @@ class Notifier:
         found = observer.latest()
         if found is None:
             return
-        words = TABLE[State(int(found["state"][0]))].words
+        words = State(int(found["state"][0])).words
         if words != self._told:
             self._told = words
             self._send(f"STATUS={words}")

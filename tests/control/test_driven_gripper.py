@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped
-from rtcp.ipc.refusals import NoLease, NotPermitted
-from rtcp.ipc.commands import Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
-from rtcp.ipc.states import State
-
 import itertools
 import struct
 from collections.abc import Callable, Iterator
@@ -18,7 +13,12 @@ from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.operation import InputConfig
 from rtcp.config.segment import SegmentSlave
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
+from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Event
+from rtcp.ipc.refusals import NoLease, NotPermitted
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import CubemarsDrive
 
@@ -78,12 +78,12 @@ class Hand:
         """Where the fingers really are, rad."""
         return self.model.mechanics.position
 
-    def told_of(self, code: Code) -> list[Event]:
-        return [event for event in self.simulation.events if type(event.event) == code]
+    def reports_of(self, kind: type[Event]) -> list[Event]:
+        return [record.event for record in self.simulation.events if isinstance(record.event, kind)]
 
-    def sentence(self, code: Code) -> str:
-        (event,) = self.told_of(code)
-        return Names(CONFIG).event(type(event.event), event.axis, event.value, event.limit)
+    def message(self, kind: type[Event]) -> str:
+        (event,) = self.reports_of(kind)
+        return Names(CONFIG).message(event)
 
     def close(self) -> None:
         assert self.simulation.send(MoveGripper(False)).refusal is None
@@ -155,14 +155,14 @@ def test_it_closes_and_opens_under_the_lease_and_tells_each_time_where_it_rests(
     hand.open()
     hand.rest()
     assert hand.position == pytest.approx(OPEN, abs=2e-3)
-    told = [(event.axis, event.value, event.limit) for event in hand.told_of(GripperAtRest)]
+    told = [(event.axis, event.value, event.limit) for event in hand.reports_of(GripperAtRest)]
     assert told == [(AXIS, pytest.approx(CLOSED), 0.0), (AXIS, pytest.approx(OPEN), 0.0)]
     assert kept_to_its_limits(hand.path)
     assert hand.state is State.HOLDING
 
 
 def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
-    assert hand.simulation.send(MoveGripper(False), lease=hand.simulation.lease + isinstance(1).refusal, NoLease)
+    assert hand.simulation.send(MoveGripper(False), lease=hand.simulation.lease + 1).refusal == NoLease()
     hand.simulation.run(0.2)
     assert max(abs(position - START) for position in hand.path) < 1e-4
 
@@ -173,7 +173,7 @@ def test_where_it_already_is_it_tells_so_all_the_same(with_hand: Callable[..., H
     hand.simulation.run(0.1)
     hand.open()
     hand.simulation.run(0.1)
-    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
+    assert [event.value for event in hand.reports_of(GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
 
 
 def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
@@ -185,9 +185,9 @@ def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
     hand.rest()
     assert hand.state is State.HOMING
     assert hand.position == pytest.approx(CLOSED, abs=2e-3)
-    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(CLOSED)]
+    assert [event.value for event in hand.reports_of(GripperAtRest)] == [pytest.approx(CLOSED)]
     hand.until(State.HOLDING)
-    assert hand.told_of(Homed)
+    assert hand.reports_of(Homed)
     assert kept_to_its_limits(hand.path)
 
 
@@ -197,9 +197,9 @@ def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
     hand.rest()
     hand.simulation.run(2.0)
     assert hand.state is State.HOLDING
-    (rest,) = hand.told_of(GripperAtRest)
+    (rest,) = hand.reports_of(GripperAtRest)
     assert (rest.value, rest.limit) == (pytest.approx(0.5, abs=0.05), 1.0)
-    assert hand.sentence(GripperAtRest) == f"finger rests at {rest.value:.6g} rad, it holds something"
+    assert hand.message(GripperAtRest) == f"finger rests at {rest.value:.6g} rad, it holds something"
     assert 0.5 * FINGER.torque < abs(hand.gripper.drive.torque) < 1.2 * FINGER.torque
     assert kept_to_its_limits(hand.path[: hand.path.index(rest.value)])
     hand.open()
@@ -213,7 +213,7 @@ def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
 
 def stopped_on_its_way(hand: Hand) -> None:
     """It has come to rest under its limits, between where it was and where it should be, has said so, and stays."""
-    (rest,) = hand.told_of(GripperAtRest)
+    (rest,) = hand.reports_of(GripperAtRest)
     assert CLOSED + 0.1 < rest.value < START - 0.05
     assert rest.limit == 0.0
     assert kept_to_its_limits(hand.path)
@@ -247,7 +247,7 @@ def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_a
     hand.simulation.acquire()
     hand.until(State.FAULT)
     hand.simulation.run(0.2)
-    assert len(hand.told_of(LeaseExpired)) == 1
+    assert len(hand.reports_of(LeaseExpired)) == 1
     assert not hand.moving
     assert abs(hand.model.mechanics.velocity) < 0.01
     assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
@@ -293,7 +293,7 @@ def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
     assert hand.simulation.send(Halt()).refusal is None
     hand.simulation.run(0.5)
     assert max(abs(position - START) for position in hand.path) < 1e-4
-    assert [event.value for event in hand.told_of(GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
+    assert [event.value for event in hand.reports_of(GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
 
 
 @pytest.fixture
@@ -339,7 +339,7 @@ def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command:
     off = next(at for at, told in enumerate(hand.told) if told[:2] != ENABLED)
     assert off > 10
     assert hand.told[off - 1][2:6] == hand.told[off - 2][2:6]
-    (rest,) = hand.told_of(GripperAtRest)
+    (rest,) = hand.reports_of(GripperAtRest)
     assert CLOSED + 0.1 < rest.value < START - 0.05
     assert not hand.model.powered
     assert kept_to_its_limits(hand.path[:off])
@@ -351,7 +351,7 @@ def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command:
 def goes_nowhere_by_itself(hand: Hand) -> None:
     """Reset and enabled again it stays where it is; of what became of its way nobody was told that it had an end."""
     assert not hand.moving
-    assert hand.told_of(GripperAtRest) == []
+    assert hand.reports_of(GripperAtRest) == []
     assert hand.simulation.send(Reset()).refusal is None
     hand.until(State.READY)
     here = hand.position
@@ -375,7 +375,7 @@ def test_a_fault_of_its_own_drive_stops_the_arm_and_names_its_joint(hand: Hand) 
     hand.on_its_way()
     hand.model.inject_fault(0x7305)
     hand.until(State.FAULT)
-    assert hand.sentence(DriveFault).startswith("finger: the drive is in fault")
+    assert hand.message(DriveFault).startswith("finger: the drive is in fault")
     hand.simulation.run(1.0)
     goes_nowhere_by_itself(hand)
 
@@ -400,7 +400,7 @@ def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Han
         beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
     assert beyond == CONFIG.watch.cycles
     assert hand.state is State.EMERGENCY_STOP
-    assert hand.sentence(OverSpeed).startswith("finger")
+    assert hand.message(OverSpeed).startswith("finger")
 
 
 def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
@@ -412,14 +412,14 @@ def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_i
         beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.watch.following_error
     assert beyond == CONFIG.watch.cycles
     assert hand.state is State.EMERGENCY_STOP
-    assert hand.sentence(FollowingError).startswith("finger")
+    assert hand.message(FollowingError).startswith("finger")
 
 
 def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
     hand.on_its_way()
     hand.simulation.send(Shutdown())
     hand.model.mechanics.external_torque = -60.0
-    assert hand.simulation.until(lambda: bool(hand.told_of(OverSpeed)), 1.0)
+    assert hand.simulation.until(lambda: bool(hand.reports_of(OverSpeed)), 1.0)
     hand.simulation.run(0.01)
     assert {drive.controlword for drive in hand.simulation.parts.arm.all_drives} == {0x0002}
 
@@ -457,7 +457,7 @@ def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_
     assert hand.simulation.send(Enable()).refusal is None
     hand.model.mechanics.position += 0.1
     hand.until(State.FAULT)
-    assert hand.sentence(PositionJumped).startswith("finger was followed to 1 rad while being enabled")
+    assert hand.message(PositionJumped).startswith("finger was followed to 1 rad while being enabled")
 
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:

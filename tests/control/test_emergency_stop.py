@@ -10,7 +10,7 @@ import pytest
 
 from rtcp.config.operation import InputConfig
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
 from rtcp.ipc.events import (
     EmergencyStopActivated,
     FollowingError,

@@ -219,7 +219,9 @@ def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not
     falsify(rig, axis=1, word=SWITCHED_ON, position=1.98)
     rig.until(State.FAULT, 2 * CONFIG.watch.cycles * PERIOD_S)
     assert rig.kinds[-1] is PositionJumped
-    assert rig.messages[-1].startswith("joint2 was followed to 2.015 rad while being enabled and is suddenly at 1.98 rad")
+    assert rig.messages[-1].startswith(
+        "joint2 was followed to 2.015 rad while being enabled and is suddenly at 1.98 rad"
+    )
 
 
 def test_one_garbled_statusword_stops_a_holding_joint_with_its_torque(rig: LoopRig) -> None:

@@ -11,6 +11,8 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.ipc.commands import Enable, Halt, MoveJoints, Reset
 from rtcp.ipc.events import MovedSinceFault
+from rtcp.ipc.names import Names
+from rtcp.ipc.states import State
 from rtcp.launch.inprocess_slave import InProcessSlave
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create

@@ -13,11 +13,13 @@ from rtcp.control.arm import Arm
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Disable, SetLimits
 from rtcp.ipc.events import LimitsChanged
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Answer, Observer
 from rtcp.ipc.refusals import (
     LimitsExcludeJoint,
     LimitWidened,
     PositionOutOfRange,
+    Refusal,
     SpeedOutOfRange,
     TorqueLimitTooLow,
     WrongRowCount,

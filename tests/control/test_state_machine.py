@@ -12,7 +12,7 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Disable, Enable, Halt, Reset, SetDriveMode, Shutdown
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Reset, SetDriveMode, Shutdown
 from rtcp.ipc.events import (
     Arrived,
     ClockLocked,
@@ -24,6 +24,7 @@ from rtcp.ipc.events import (
     DriveLeftEnabled,
     DriveModeTimeout,
     EnableTimeout,
+    Event,
     GeneratorFailed,
     HomingStillMoving,
     LeaseExpired,
@@ -40,6 +41,7 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.stop_reactions import StopReaction, bounds
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.motion.state import ArmState, Setpoint
 
@@ -52,7 +54,6 @@ from .rig import (
     CST,
     CSV,
     DEBOUNCE_S,
-    EMERGENCIES,
     EMERGENCY_STOP_INPUT,
     ENABLE_OPERATION,
     ENABLE_TIMEOUT_S,
@@ -75,7 +76,7 @@ class Fault:
     """A fault from its cause to its end."""
 
     name: str
-    code: Code
+    kind: type[Event]
     axis: int
     says: tuple[str, ...]
     """What its sentence has to name; {word} is the statusword of the joint when it happened."""
@@ -346,15 +347,15 @@ def story(request: pytest.FixtureRequest, rig_board: tuple[Blackboard, Observer]
 
 
 def test_every_code_of_a_fault_has_its_story() -> None:
-    assert {fault.code for fault in FAULT_STORIES} == FAULTS - EMERGENCIES
+    assert {fault.kind for fault in FAULT_STORIES} == {
+        kind for kind in Event.kinds if kind.is_fault and not kind.is_emergency
+    }
 
 
 def test_a_fault_has_its_code_and_its_joint_or_slave(story: Story) -> None:
-    assert (Code(story.type(event.event)), story.event.axis, story.kept) == (
-        story.fault.code,
-        story.fault.axis,
-        story.type(event.event),
-    )
+    assert isinstance(story.event, story.fault.kind)
+    place = getattr(story.event, "axis", getattr(story.event, "slave", -1))
+    assert (place, story.kept) == (story.fault.axis, story.fault.kind.number)
 
 
 def test_a_fault_is_one_line_that_names_what_is_wrong_where_and_the_key(story: Story) -> None:
@@ -598,7 +599,7 @@ def test_drives_that_still_hear_are_told_to_stop_for_as_long_as_no_frame_comes_b
 
 # -- whatever is lost, in whatever state ----------------------------------------------------------------------------
 
-CAUSES: dict[Code, Callable[[LoopRig], object]] = {
+CAUSES: dict[type[Event], Callable[[LoopRig], object]] = {
     ProcessDataLost: lambda rig: setattr(rig.data, "carries", False),
     SlaveLost: lambda rig: setattr(rig.service, "lost_slave", 2),
     ClockLost: lambda rig: setattr(rig.discipline, "locked", False),
@@ -613,13 +614,13 @@ LOST = [
 
 
 @pytest.mark.parametrize(("code", "state"), LOST, ids=lambda value: value.name.lower())
-def test_what_is_lost_is_that_fault_in_every_state(rig: LoopRig, code: Code, state: State) -> None:
+def test_what_is_lost_is_that_fault_in_every_state(rig: LoopRig, code: type[Event], state: State) -> None:
     # A drive that is kept from enabling keeps the machine in that state.
     rig.data.deaf[0, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
     rig.bring_to(state)
     CAUSES[code](rig)
     rig.until(State.FAULT, 1.1)
-    assert (rig.kinds[-1], rig.machine.fault) == (code, code)
+    assert (rig.kinds[-1], rig.machine.fault) == (code, code.number)
 
 
 def test_a_drive_fault_while_enabling_ends_in_a_fault_that_names_the_joint(rig: LoopRig) -> None:
@@ -629,7 +630,7 @@ def test_a_drive_fault_while_enabling_ends_in_a_fault_that_names_the_joint(rig: 
 
 
 @pytest.mark.parametrize("code", [DriveFault, SlaveLost])
-def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, code: Code) -> None:
+def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, code: type[Event]) -> None:
     rig.set_in_motion()
     rig.models[0].mechanics.external_torque = -100.0
     rig.run(0.04)

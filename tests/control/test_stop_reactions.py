@@ -10,9 +10,12 @@ import pytest
 
 from rtcp.config.operation import InputConfig
 from rtcp.config.stops import StopsConfig
+from rtcp.control.machine import STATES
+from rtcp.control.states import Signal
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Disable, Halt, Reset, Shutdown
-from rtcp.ipc.events import ClockLost, LeaseExpired, MovedSinceFault, PermissionWithdrawn
+from rtcp.ipc.events import ClockLost, Event, LeaseExpired, MovedSinceFault, PermissionWithdrawn
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.states import State
 
@@ -119,15 +122,15 @@ def made(rig_board: tuple[Blackboard, Observer]) -> Iterator[Callable[..., LoopR
     rig_board[1].release(rigs[-1].lease)
 
 
-def codes_of(key: str) -> set[Code]:
-    return {code for code, named in KEYS.items() if named == key}
+def kinds_of(key: str) -> set[type[Event]]:
+    return {kind for kind in Event.kinds if kind.stop_key == key}
 
 
 def stop_for(rig: LoopRig, key: str, seconds: float = FROM_THE_CAUSE_S) -> int:
     """Bring an event about; return the place in the log of the cycle that found it."""
     before = len(rig.events)
     CAUSES[key][0](rig)
-    rig.wait(lambda: any(type(event.event) in codes_of(key) for event in rig.events[before:]), seconds)
+    rig.wait(lambda: any(type(event.event) in kinds_of(key) for event in rig.events[before:]), seconds)
     return len(rig.log) - 1
 
 
@@ -135,7 +138,9 @@ def stop_for(rig: LoopRig, key: str, seconds: float = FROM_THE_CAUSE_S) -> int:
 
 
 def test_every_key_has_an_event_and_every_event_a_key() -> None:
-    assert {entry.name for entry in fields(StopsConfig)} == set(KEYS.values()) == set(CAUSES)
+    assert (
+        {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in Event.kinds} - {""} == set(CAUSES)
+    )
 
 
 class Lived:
@@ -145,7 +150,9 @@ class Lived:
         self.rig, self.key, self.rung = rig.set_in_motion(), key, rung
         self.at = stop_for(rig, key)
         self.said = next(
-            sentence for event, sentence in zip(rig.events, rig.messages, strict=True) if type(event.event) in codes_of(key)
+            sentence
+            for event, sentence in zip(rig.events, rig.messages, strict=True)
+            if type(event.event) in kinds_of(key)
         )
         rig.run(0.6)
         self.ended_in = rig.state
@@ -251,12 +258,12 @@ def test_a_homing_whose_commander_falls_silent_takes_the_rung_too(made: Callable
 
 
 @pytest.mark.parametrize("code", [LeaseExpired, PermissionWithdrawn], ids=lambda code: code.name.lower())
-def test_a_harder_end_is_a_fault_in_the_status_and_a_controlled_one_is_none(code: Code) -> None:
+def test_a_harder_reaction_makes_it_a_fault(code: type[LeaseExpired] | type[PermissionWithdrawn]) -> None:
     soft = Names(CONFIG)
-    hard = Names(replace(CONFIG, stops=with_stops(**{KEYS[code]: "quick_stop"})))
+    hard = Names(replace(CONFIG, stops=with_stops(**{code.stop_key: "quick_stop"})))
     assert hard.faults - soft.faults == {code}
-    assert hard.event(code, -1, 0.0, 0.0).endswith("`rtcp reset` goes on")
-    assert "reset" not in soft.event(code, -1, 0.0, 0.0)
+    assert hard.message(code()).endswith("then `rtcp reset`")
+    assert "reset" not in soft.message(code())
 
 
 # -- a controlled stop that ends in a fault -------------------------------------------------------------------------
@@ -329,13 +336,13 @@ def test_what_is_worse_ends_the_controlled_stop_for_a_lost_clock(made: Callable[
     stop_for(rig, "clock_lost")
     stop_for(rig, key)
     assert rig.state is (State.EMERGENCY_STOP if key == "emergency_stop" else State.FAULT)
-    assert rig.machine.fault in codes_of(key)
+    assert rig.machine.fault in {kind.number for kind in kinds_of(key)}
     rig.run(0.5)
-    assert rig.machine.fault in codes_of(key)
+    assert rig.machine.fault in {kind.number for kind in kinds_of(key)}
 
 
 def test_where_a_lost_clock_may_end_in_a_controlled_stop_set_points_move_the_arm() -> None:
-    assert {state for state, row in TABLE.items() if Event.WAVERS in row.left_by} == {
+    assert {one.state for one in STATES if Signal.STOP_FOR_CLOCK in one.leads_to} == {
         State.HOLDING,
         State.MOVING,
         State.STOPPING,

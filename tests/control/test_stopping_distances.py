@@ -15,8 +15,9 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.commands import Enable, Jog, MoveJoints, SetDriveMode
+from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, SetDriveMode
 from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
 from rtcp.launch.simulation import NAME, Frame, Simulation
 from rtcp.telemetry.stops_page import section
 
@@ -213,9 +214,13 @@ def test_drives_that_hear_nothing_are_stopped_by_their_watchdog(arm: Callable[..
 
 
 @pytest.mark.parametrize("situation", ["moving", "jogging"])
-@pytest.mark.parametrize("rung", [StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF], ids=lambda rung: rung.words)
+@pytest.mark.parametrize(
+    "rung",
+    [StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF],
+    ids=lambda rung: rung.words,
+)
 def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
-    arm: Callable[..., Simulation], situation: str, rung: Rung
+    arm: Callable[..., Simulation], situation: str, rung: StopReaction
 ) -> None:
     simulation = arm(situation, lease_ended=rung.name.lower())
     measured = Measured(simulation)
@@ -235,7 +240,7 @@ def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
 
 
 @pytest.mark.parametrize("rung", [StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF], ids=lambda rung: rung.words)
-def test_an_arm_that_holds_stays_where_it_is_on_every_rung(arm: Callable[..., Simulation], rung: Rung) -> None:
+def test_an_arm_that_holds_stays_where_it_is_on_every_rung(arm: Callable[..., Simulation], rung: StopReaction) -> None:
     simulation = arm("holding", slave_lost=rung.name.lower())
     measured = Measured(simulation)
     lose_the_box(simulation)
