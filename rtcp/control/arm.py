@@ -11,13 +11,14 @@ from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command, Jog, MoveJoints
 from rtcp.ipc.events import Emergency
 from rtcp.ipc.states import ControlMode, DriveMode
-from rtcp.motion.controllers.controller import Controller, ControllerSetup, Phase, load_controllers
+from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
+from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import ArmState
+from rtcp.motion.state import ArmState, Phase
 
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
@@ -63,8 +64,9 @@ class Arm:
         )
         """By the commands that they accept."""
         self._holder = self.controllers[MoveJoints]
-        self.jog = self.controllers.get(Jog)
-        """None where the geometry is unknown."""
+        jog = self.controllers.get(Jog)
+        self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
+        """The controller that the joystick commands; None where the geometry is unknown."""
         self.active = self._holder
         self.control_mode = ControlMode[config.motion.upper()]
         self.configured_mode = DriveMode[config.mode.upper()]
@@ -117,6 +119,10 @@ class Arm:
         for drive in self.all_drives:
             drive.advance(target)
 
+    def limits_changed(self) -> None:
+        """Limit the outputs by the limits in force."""
+        self.output_limiter.take(self.limits)
+
     def stop(self) -> None:
         """Bring all that moves to rest, the gripper too."""
         if self.active.phase is Phase.MOVE:
@@ -157,7 +163,7 @@ class Arm:
         state, drives, controller = self.state, self.drives, self.active
         setpoint = controller.update(state)
         result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
-        if controller.direct:
+        if setpoint.direct:
             self._cst.pass_on(state.commanded, setpoint.torque, drives)
         else:
             self._writer.update(state.commanded, state.commanded_velocity, drives)
@@ -218,7 +224,7 @@ class Arm:
         return len(self.drives) if self.gripper is not None and self.gripper.outside else -1
 
     def first_off_target(self) -> int:
-        """Return the first joint that `track_actual` would move further than it can have turned since the last, or -1."""
+        """Return the first joint that `track_actual` would move further than it can have turned, or -1."""
         tracked = self.output_limiter.sent
         for axis, drive in enumerate(self.drives):
             if drive.state not in _HOLDING and not abs(drive.position - tracked[axis]) <= TRACKED_RAD:

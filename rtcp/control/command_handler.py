@@ -252,7 +252,7 @@ class CommandHandler:
         return None
 
     def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:
-        box, output = self._box, command.number
+        box, output = self._box, command.output
         if box is None:
             return NoOutputs()
         if not 1 <= output <= box.output_count:

@@ -1,4 +1,4 @@
-"""What the states of the machine share: the parts of the loop, facts that outlive a state, and the checks of a cycle."""
+"""What the states of the machine share: the parts of the loop, facts that outlive a state, checks of a cycle."""
 
 from __future__ import annotations
 
@@ -269,5 +269,3 @@ class Context:
         if ended is not None:
             self.limited = limited and ended.by_limit
         return ended
-
-

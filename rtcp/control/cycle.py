@@ -79,6 +79,7 @@ class Cycle:
         self._service = service
         self._discipline = discipline
         self._now = now
+        self._expected = data.expected_wkc
         self._period_ns = round(config.cycle.period_us * 1000)
         self._half_ns = self._period_ns // 2
         self._spin_ns = round(config.cycle.spin_us * 1000)
@@ -111,7 +112,7 @@ class Cycle:
         data.send()
         wkc = data.receive()
         received = self._now()
-        good = wkc == data.expected_wkc
+        good = wkc == self._expected
         context = self._context
         context.now_ns = arm.state.now_ns = woken
         if good:
@@ -190,7 +191,7 @@ class Cycle:
             operator.joystick_mode,
             flags,
             min(wkc, _LARGEST_COUNTER),
-            self._data.expected_wkc,
+            self._expected,
             self.missed,
             context.lost,
             min(woken - planned, _LONGEST_NS),

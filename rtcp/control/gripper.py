@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.config.operation import WatchConfig
-from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
+from rtcp.devices.cia402 import Cia402Drive, DriveState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed
 from rtcp.motion.controllers.gripper import GripperMotion

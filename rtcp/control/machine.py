@@ -1,4 +1,4 @@
-"""The state machine: it alone changes the state. What each state does, and where it leads, is in `rtcp.control.states`."""
+"""The state machine: it alone changes the state. What each state does and leads to: `rtcp.control.states`."""
 
 from __future__ import annotations
 
@@ -224,4 +224,3 @@ class StateMachine:
             self.enables += 1
         elif target is State.MOVING:
             self.motions += 1
-

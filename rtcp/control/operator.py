@@ -16,7 +16,7 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.joystick import Joystick
-from rtcp.motion.controllers.controller import Phase
+from rtcp.motion.state import Phase
 
 
 class Operator:
@@ -132,10 +132,10 @@ class Operator:
             self._code_reported = True
         if joystick.grip is not None:
             self._grip_by_joystick(arm, blackboard, opens=joystick.grip)
-        jog.command(joystick.twist, joystick.frame)
+        jog.command(joystick.twist, in_tool_frame=joystick.frame == "tool")
         if jog.phase is Phase.HOLD and joystick.moves:
-            jog.start(arm.state)
-            jog.command(joystick.twist, joystick.frame)
+            jog.start()
+            jog.command(joystick.twist, in_tool_frame=joystick.frame == "tool")
             arm.active = jog
             return True
         return False

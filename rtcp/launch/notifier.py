@@ -12,8 +12,8 @@ import socket
 import time
 from pathlib import Path
 
-from rtcp.ipc.states import State
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.states import State
 
 PINGS_A_WATCHDOG = 3
 """How often the cycle is looked at within systemd's patience; sd_watchdog_enabled(3) advises at least twice."""

@@ -10,7 +10,7 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.ipc.commands import Enable, MoveJoints, Reset
-from rtcp.ipc.events import ClockLost, ResetTimeout
+from rtcp.ipc.events import ClockLost, ResetWithoutFrames
 from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.realtime.discipline import UNHEARD_CYCLES
@@ -18,7 +18,7 @@ from rtcp.realtime.discipline import UNHEARD_CYCLES
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))
 PERIOD_S = 0.001
-ONE_TURN = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.05]
+ONE_TURN = MoveJoints((1.0, 0.0, 0.0, 0.0, 0.0, 0.0), 0.05, True)
 """Joint 1 to 1 rad at 0.05 rad/s: longer than any of these tests."""
 UNTIL_LOST_S = UNHEARD_CYCLES * PERIOD_S + 1.0
 ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
@@ -51,7 +51,7 @@ def moving(request: pytest.FixtureRequest) -> Iterator[Simulation]:
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
         assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-        assert simulation.send(MoveJoints, ONE_TURN).refusal is None
+        assert simulation.send(ONE_TURN).refusal is None
         simulation.run(1.0)
         yield simulation
 
@@ -78,11 +78,11 @@ def test_a_reference_clock_that_stands_stops_the_arm_by_its_rung_and_a_reset_wai
     assert words[-1] == QUICK_STOP
     assert [type(event.event) for event in moving.events].count(ClockLost) == 1
     assert moving.data.wkc == moving.data.expected_wkc
-    assert moving.order(Reset()).refusal is None
+    assert moving.send(Reset()).refusal is None
     assert moving.until(lambda: moving.state is State.FAULT, 4.0)
     # No drive was told to reset: that they are stopped by quick stop is not why it did not succeed.
-    assert (moving.events[-1].code, moving.events[-1].event.axis) == (ResetTimeout, -1)
-    assert moving.order(Reset()).refusal is None
+    assert moving.events[-1].event == ResetWithoutFrames()
+    assert moving.send(Reset()).refusal is None
     moving.run(2.0)
     assert moving.state is State.RESETTING
     reference.stands = False

@@ -9,9 +9,9 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
-from rtcp.control.gripper import DrivenGripper, gripper_of
+from rtcp.control.gripper import DrivenGripper, make_gripper
 from rtcp.devices.cia402 import DriveState, TargetState
-from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED
+from rtcp.ipc.events import FollowingError, OverSpeed
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
@@ -29,7 +29,7 @@ class LoopRig:
     """The gripper and its drive; between its fingers may lie something hard."""
 
     def __init__(self, config: ArmConfig = DRIVEN, position: float = 1.0) -> None:
-        gripper = gripper_of(config)
+        gripper = make_gripper(config)
         assert gripper is not None
         self.gripper: DrivenGripper = gripper
         self.model = CubemarsDrive("orh40", load_inertia=0.02, initial_position=position)
@@ -63,11 +63,11 @@ class LoopRig:
             mechanics.external_torque = 2000.0 * inside - (5.0 * mechanics.velocity if inside else 0.0)
             self.model.step(DT)
             gripper.decode(self)
-            gripper.lead(self.goal)
+            gripper.drive.advance(self.goal)
             if gripper.enabled:
                 gripper.command()
             else:
-                gripper.follow()
+                gripper.track_actual()
             gripper.encode(self)
             path.append(mechanics.position)
         return path
@@ -80,8 +80,8 @@ class LoopRig:
 
 
 def test_a_gripper_on_an_output_has_no_drive() -> None:
-    assert gripper_of(ARM) is None
-    assert gripper_of(replace(ARM, gripper=None)) is None
+    assert make_gripper(ARM) is None
+    assert make_gripper(replace(ARM, gripper=None)) is None
 
 
 def test_enabling_moves_nothing() -> None:
@@ -170,7 +170,7 @@ def test_a_joint_that_is_enabled_while_others_are_not_rests() -> None:
     rig = LoopRig().enabled()
     rig.gripper.grip(True)
     rig.run(0.5)
-    rig.gripper.follow()
+    rig.gripper.track_actual()
     assert not rig.gripper.motion.moving
 
 
@@ -185,31 +185,31 @@ def test_outside_its_range_it_is_not_to_be_enabled(position: float, outside: boo
 
 @pytest.mark.parametrize("wrong", [0.16, -0.16, nan])
 def test_how_far_it_is_from_its_set_point_counts_but_for_what_it_holds(wrong: float) -> None:
-    gripper = gripper_of(DRIVEN)
+    gripper = make_gripper(DRIVEN)
     assert gripper is not None
     gripper.motion.latch(0.5)
     gripper.drive.position = 0.5 + wrong
     gripper.motion.gripped = True
-    assert [gripper.look() for _ in range(100)] == [None] * 100
+    assert [gripper.beyond_limits() for _ in range(100)] == [None] * 100
     gripper.motion.gripped = False
-    *before, found = [gripper.look() for _ in range(DRIVEN.watch.cycles)]
+    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.watch.cycles)]
     assert before == [None] * (DRIVEN.watch.cycles - 1)
     assert found is not None
-    assert (found.kind, found.axis, found.limit) == (FOLLOWING_ERROR, 6, DRIVEN.watch.following_error)
+    assert (type(found), found.axis, found.limit) == (FollowingError, 6, DRIVEN.watch.following_error)
 
 
 @pytest.mark.parametrize("wrong", [1.51, -1.51, nan])
 def test_a_speed_beyond_its_limit_counts_whatever_it_holds(wrong: float) -> None:
-    gripper = gripper_of(DRIVEN)
+    gripper = make_gripper(DRIVEN)
     assert gripper is not None
     gripper.motion.gripped = True
     gripper.drive.velocity = wrong
-    *before, found = [gripper.look() for _ in range(DRIVEN.watch.cycles)]
+    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.watch.cycles)]
     assert before == [None] * (DRIVEN.watch.cycles - 1)
     assert found is not None
-    assert (found.kind, found.axis, found.limit) == (SPEED, 6, 1.5 * FINGER.velocity)
+    assert (type(found), found.axis, found.limit) == (OverSpeed, 6, 1.5 * FINGER.velocity)
     gripper.drive.velocity = 1.49
-    assert gripper.look() is None
+    assert gripper.beyond_limits() is None
 
 
 def test_disabled_on_its_way_it_stands_and_stays_when_enabled_again() -> None:

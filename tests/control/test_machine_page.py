@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from rtcp.gateway.robot_status import robot_status
+from rtcp.control.machine import STATES
+from rtcp.control.states import ReadyState, StoppedByLimitState
 from rtcp.ipc.commands import Enable, Reset
-from rtcp.ipc.layout import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.layout import FLAG_ENABLED, FLAG_MOTION_ALLOWED
+from rtcp.ipc.states import State
 from rtcp.telemetry.machine_drawing import diagram, page
 
 ROOT = Path(__file__).parents[2]
@@ -61,47 +60,3 @@ def test_the_page_in_the_docs_is_drawn_from_the_table() -> None:
 
 def test_the_picture_shows_every_state() -> None:
     assert all(f"{state.name} :" in diagram() for state in State)
-
-
-# -- RobotStatus ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("state", State)
-def test_motion_is_possible_only_while_the_arm_holds_or_moves(state: State) -> None:
-    found = robot_status(state, ControlMode.JOINT, ALLOWED_TO_MOVE, 0, 0)
-    assert found["motion_possible"] is (state in (State.HOLDING, State.MOVING))
-
-
-@pytest.mark.parametrize("flag", [FLAG_EMERGENCY_STOP, FLAG_SWITCHING])
-def test_motion_is_not_possible_with_the_emergency_stop_pressed_or_while_the_drives_change_their_mode(
-    flag: int,
-) -> None:
-    assert not robot_status(State.HOLDING, ControlMode.JOINT, ALLOWED_TO_MOVE | flag, 0, 0)["motion_possible"]
-
-
-def test_motion_is_not_possible_without_the_enabling_switch() -> None:
-    assert not robot_status(State.HOLDING, ControlMode.JOINT, FLAG_ENABLED, 0, 0)["motion_possible"]
-
-
-def test_the_stick_makes_the_mode_manual() -> None:
-    assert robot_status(State.HOLDING, ControlMode.JOYSTICK, 0, 0, 0)["mode"] == "manual"
-    for mode in set(ControlMode) - {ControlMode.JOYSTICK}:
-        assert robot_status(State.HOLDING, mode, 0, 0, 0)["mode"] == "auto"
-
-
-def test_an_error_has_the_code_of_the_fault_or_of_the_limit() -> None:
-    assert robot_status(State.FAULT, 1, 0, 5, 0)["error_code"] == 5
-    assert robot_status(State.STOPPED_BY_LIMIT, 1, FLAG_ENABLED, 0, 4)["error_code"] == 104
-    assert robot_status(State.HOLDING, 1, FLAG_ENABLED, 0, 0)["error_code"] == 0
-
-
-def test_the_drives_are_powered_also_in_a_stop_by_a_limit() -> None:
-    found = robot_status(State.STOPPED_BY_LIMIT, 1, FLAG_ENABLED, 0, 4)
-    assert found["drives_powered"]
-    assert found["in_error"]
-
-
-@pytest.mark.parametrize("state", State)
-def test_e_stopped_is_the_state_or_the_button(state: State) -> None:
-    assert robot_status(state, 1, 0, 0, 0)["e_stopped"] is (state is State.EMERGENCY_STOP)
-    assert robot_status(state, 1, FLAG_EMERGENCY_STOP, 0, 0)["e_stopped"]

@@ -8,9 +8,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from rtcp.control.assembly import drives_of
 
 from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.control.cycle import make_drives
 from rtcp.control.process import stop_blindly
 from rtcp.devices.cia402 import Cia402Drive
 from rtcp.fieldbus.pdo import layout
@@ -129,7 +129,7 @@ def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_o
     slaves = (*CONFIG.slaves[:2], turned_round(CONFIG.slaves[2]))
     config = replace(CONFIG, slaves=slaves)
     data = Sent(config)
-    arm = SimpleNamespace(pairs=drives_of(config), gripper=None)
+    arm = SimpleNamespace(pairs=make_drives(config), gripper=None)
     stop_blindly(data, config, arm)  # type: ignore[arg-type]
     rest = layout(slaves[1].device.rpdo).bytes - 2
     ramp = [frame for frame in data.frames if struct.unpack_from("<H", frame[1])[0] == QUICK_STOP]
@@ -142,7 +142,7 @@ def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_o
 
 def test_the_grippers_drive_is_told_as_the_joints_are() -> None:
     data = Sent(CONFIG)
-    joint, (slot, drive) = drives_of(CONFIG)
+    joint, (slot, drive) = make_drives(CONFIG)
     arm = SimpleNamespace(pairs=[joint], gripper=SimpleNamespace(slot=slot, drive=drive))
     stop_blindly(data, CONFIG, arm)  # type: ignore[arg-type]
     assert all(frame[slot] == frame[joint[0]] for frame in data.frames)

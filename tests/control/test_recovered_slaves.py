@@ -34,7 +34,7 @@ ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
 ENABLED = (0x27, 0x6F)
 """Operation Enabled and its mask (CiA 402-2, object 0x6041)."""
 SYNC_MANAGER_WATCHDOG = 0x001B
-FULL_SPEED = [1.0, -0.3, 1.2, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
+FULL_SPEED = MoveJoints((1.0, -0.3, 1.2, 0.0, 0.9, 0.0), 0.5, True)
 
 
 class Seen:
@@ -60,7 +60,7 @@ def arm(request: pytest.FixtureRequest) -> Iterator[Simulation]:
         assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
         if request.param == "moving":
-            assert simulation.send(MoveJoints, FULL_SPEED).refusal is None
+            assert simulation.send(FULL_SPEED).refusal is None
         simulation.run(0.5)
         yield simulation
 
@@ -135,11 +135,11 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
     without_supply(arm)
     arm.run(0.2)
     seen = Seen(arm)
-    assert arm.order(Reset()).refusal is None
+    assert arm.send(Reset()).refusal is None
     assert arm.until(lambda: arm.state is State.READY, 4.0)
     arm.run(0.1)
     assert ENABLE_OPERATION not in {sent[0] for _, sent, _, _ in seen.cycles}
-    assert arm.order(Enable()).refusal is None
+    assert arm.send(Enable()).refusal is None
     assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
     arm.run(0.2)
     told = {sent[1] for _, sent, _, _ in seen.cycles if sent[0] == ENABLE_OPERATION}
@@ -151,13 +151,9 @@ def test_after_reset_and_enable_it_is_enabled_where_it_stands(arm: Simulation) -
 
 
 def told(simulation: Simulation) -> list[str]:
-    """The sentences about joints that stand elsewhere than at the fault."""
-    sentences = Names(CONFIG)
-    return [
-        sentences.event(type(event.event), event.axis, event.value, event.limit)
-        for event in simulation.events
-        if type(event.event) == MovedSinceFault
-    ]
+    """The messages about joints that stand elsewhere than at the fault."""
+    names = Names(CONFIG)
+    return [names.message(one.event) for one in simulation.events if isinstance(one.event, MovedSinceFault)]
 
 
 def reset(simulation: Simulation) -> None:
@@ -191,7 +187,7 @@ def test_a_joint_that_comes_back_at_another_position_is_told_with_both_when_the_
     # It is what was said last: `rtcp status` shows it.
     assert arm.events[-1].code == MovedSinceFault
     # It is told once, and no refusal: it may have been turned by hand.
-    assert arm.order(Enable()).refusal is None
+    assert arm.send(Enable()).refusal is None
     assert arm.until(lambda: arm.state is State.HOLDING, 4.0)
     out_of_op(arm)
     reset(arm)
@@ -209,13 +205,12 @@ def test_a_joint_that_comes_back_where_it_stood_is_not_told(
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
 def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_have_run_on_to(arm: Simulation) -> None:
-    arm.order(Halt())
+    arm.send(Halt())
     assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
-    fast = [0.0, -0.3, 2.4, 0.0, 0.9, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5]
-    assert arm.order(MoveJoints, fast).refusal is None
+    assert arm.send(MoveJoints((0.0, -0.3, 2.4, 0.0, 0.9, 0.0), 0.5, True)).refusal is None
     arm.run(1.6)
-    assert arm.parts.arm.state.actual_velocity[AXIS] > 0.4
-    stood = arm.parts.arm.state.actual[AXIS]
+    assert arm.loop.arm.state.actual_velocity[AXIS] > 0.4
+    stood = arm.loop.arm.state.actual[AXIS]
     without_supply(arm)
     reset(arm)
     (said,) = told(arm)

@@ -16,7 +16,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, SetDriveMode
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.states import DriveMode, JogFrame, State
 from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
 from rtcp.launch.simulation import NAME, Frame, Simulation
 from rtcp.telemetry.stops_page import section
@@ -114,19 +114,19 @@ def arm() -> Iterator[Callable[..., Simulation]]:
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
         if mode != 8:
             do(simulation, SetDriveMode(DriveMode(mode)))
-        do(simulation, Enable)
+        do(simulation, Enable())
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-        assert simulation.until(lambda: not simulation.parts.machine.changing_mode, 1.0)
+        assert simulation.until(lambda: not simulation.loop.machine.changing_mode, 1.0)
         simulation.run(0.1)
         if situation == "moving":
-            do(simulation, MoveJoints, [*([0.3] * 6), 0.0, 0.0, 0.0, 0.0, 1.0, 0.5])
+            do(simulation, MoveJoints((0.3,) * 6, 0.5, synchronized=False))
             simulation.run(0.55)
-            assert min(simulation.parts.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
+            assert min(simulation.loop.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
         elif situation == "jogging":
             for _ in range(2):
-                do(simulation, Jog, [0.0, 0.0, -JOG_SPEED, *([0.0] * 8), 0.5])
+                do(simulation, Jog((0.0, 0.0, -JOG_SPEED, 0.0, 0.0, 0.0), JogFrame.BASE, 0.5))
                 simulation.run(0.4)
-            assert max(map(abs, simulation.parts.arm.state.commanded_velocity)) > 0.15
+            assert max(map(abs, simulation.loop.arm.state.commanded_velocity)) > 0.15
         return simulation
 
     yield bring
@@ -134,14 +134,14 @@ def arm() -> Iterator[Callable[..., Simulation]]:
         simulation.close()
 
 
-def do(simulation: Simulation, command: Command, numbers: Sequence[float] = ()) -> None:
-    assert simulation.send(command, numbers).refusal is None
+def do(simulation: Simulation, command: Command) -> None:
+    assert simulation.send(command).refusal is None
 
 
 def lose_the_box(simulation: Simulation) -> None:
     simulation.bus.drop(1, SAFE_OP, AL_WATCHDOG)
     # The service thread sees it some time later; the bound counts from the cycle that is told.
-    simulation.parts.machine._service.lost_slave = 1
+    simulation.service.lost_slave = 1
 
 
 def brakes(simulation: Simulation) -> list[float]:
