@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 from rtcp.config.find import find_config
-from rtcp.config.schema import load
+from rtcp.config.loader import load
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer

@@ -23,14 +23,14 @@ EXCEPTIONS: dict[tuple[str, str], str] = {
     ("rtcp/ipc/motion_messages.py", "rtcp.motion.state"): "messages name the reason for which a motion ended"
 }
 """(file, module) -> why it may import what stands below it or beside it. """
-NEVER_IN_THE_LOOP = {"pydantic", "pydantic_core", "typer", "rich", "pyroute2", "yaml", "mcap", "matplotlib"}
+NEVER_IN_THE_LOOP = {"pydantic", "pydantic_core", "typer", "rich", "pyroute2", "yaml", "ruamel", "mcap", "matplotlib"}
 IN_THE_LOOP = {"annotated_types", "pysoem", "ruckig"}
 """Third-party modules of the loop's process. numpy may be among them by the design, but its threads would keep the
 process from joining the virtual segment's user namespace, so it is not."""
 LET_IN_BY_OTHERS = {"typing_extensions"}
 """annotated_types imports it where it is installed."""
 
-PACKAGES = {"yaml": "pyyaml", "mpl_toolkits": "matplotlib"}
+PACKAGES = {"yaml": "pyyaml", "pydantic_core": "pydantic", "ruamel": "ruamel.yaml", "mpl_toolkits": "matplotlib"}
 """Modules whose package has another name."""
 
 
@@ -180,7 +180,7 @@ def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
     listed = re.search(r"^dependencies = (\[.*?^\])", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
     assert listed is not None
     declared = {
-        re.split(r"[^\w-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
+        re.split(r"[^\w.-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
     }
     names = {found.module.partition(".")[0] for found in IMPORTS if not is_ours(found)} - sys.stdlib_module_names
     assert {PACKAGES.get(name, name) for name in names} - declared == set()

@@ -1,4 +1,4 @@
-"""The command line put together, and the one place where an exception becomes a sentence and an exit code."""
+"""The command `rtcp`, also `python -m rtcp.cli`: all groups, and the one place where an error becomes an exit code."""
 
 from __future__ import annotations
 
@@ -11,25 +11,10 @@ from typing import Annotated
 import typer
 
 import rtcp
-from rtcp.cli import (
-    arm,
-    bus,
-    demo,
-    doctor,
-    faults,
-    jog,
-    joystick,
-    limits,
-    machine,
-    motion,
-    platform,
-    service,
-    soak,
-    status,
-)
+from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, motion, platform, segment, service, soak, status
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 from rtcp.ipc.errors import RtcpError
 
 app = typer.Typer(
@@ -56,73 +41,65 @@ def _root(
     ] = False,
 ) -> None:
     if context.invoked_subcommand is None:
-        _print_help(context)
+        text = context.get_help()  # with rich this call prints, and returns nothing
+        if text.strip():
+            emit(text.rstrip())
 
 
-def _print_help(context: typer.Context) -> None:
-    text = context.get_help()  # with rich it is printed by this call, and nothing is left to print
-    if text.strip():
-        emit(text.rstrip())
-
-
-for _group in (platform, status, machine, motion, jog, limits, joystick, arm, bus, demo, service, doctor, soak, faults):
+for _group in (platform, status, motion, jog, limits, arm, bus, segment, demo, service, doctor, soak, faults):
     _group.register(app)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; a user's mistake ends in a sentence, never in a traceback.
+    """Run one command and return its exit code; a user's mistake ends in a message, never in a traceback.
 
     Args:
         arguments: the command line without the program's name; that of the process when None.
     """
-    _open_what_is_closed()
+    _replace_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a terminal without UTF-8 loses a letter, not the answer
+            stream.reconfigure(errors="replace")  # a terminal without UTF-8 loses a letter, not the output
+    code: int = ExitCode.DONE
     try:
         app(args=None if arguments is None else list(arguments), prog_name="rtcp")
     except SystemExit as ending:
-        return _flushed(ending.code if isinstance(ending.code, int) else ExitCode.DONE)
+        code = ending.code if isinstance(ending.code, int) else ExitCode.DONE
     except RtcpError as error:
         complain(error.message)
-        return _flushed(code_of(error.kind))
+        code = code_of(error.kind)
     except ConfigError as error:
         complain(str(error))
-        return _flushed(ExitCode.USAGE)
+        code = ExitCode.USAGE
     except CommandError as error:
         complain(error.message)
-        return _flushed(error.code)
+        code = error.code
     except KeyboardInterrupt as error:
-        return _flushed(interruption_code(error))
+        code = interruption_code(error)
     except OSError as error:
         where = f": {error.filename}" if error.filename else " (standard output)" if error.errno == errno.ENOSPC else ""
         complain(f"{error.strerror or error}{where}")
-        return _flushed(ExitCode.INTERNAL)
+        code = ExitCode.INTERNAL
     except Exception as error:
         if os.environ.get("RTCP_TRACEBACK"):
             import traceback
 
             traceback.print_exc()
         complain(f"internal error: {type(error).__name__}: {error} (RTCP_TRACEBACK=1 shows where)")
-        return _flushed(ExitCode.INTERNAL)
-    return _flushed(ExitCode.DONE)
+        code = ExitCode.INTERNAL
+    try:
+        sys.stdout.flush()  # here, so that a closed pipe causes no message at exit
+    except BrokenPipeError:
+        mute()
+    return int(code)
 
 
-def _open_what_is_closed() -> None:
-    """Give a command that was started without standard output, as by `>&-`, one that leads nowhere."""
+def _replace_closed_streams() -> None:
+    """Open /dev/null for a standard stream that the shell has closed, as by `>&-`."""
     if sys.stdout is None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     if sys.stderr is None:
         sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-
-
-def _flushed(code: int) -> int:
-    """Flush standard output here, where a reader that has gone is no reason for a message at exit."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        mute()
-    return int(code)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Numbers on the command line: negative ones among options, joint positions, poses."""
+"""What several commands take: shared options, and numbers among options, also negative ones."""
 
 from __future__ import annotations
 
@@ -6,21 +6,41 @@ import difflib
 import math
 import re
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from rtcp.cli.errors import CommandError
-from rtcp.config.plain_number import plain_number
+from rtcp.config.numbers import plain_number
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--config", metavar="FILE", help="File of the arm. Default: $RTCP_CONFIG, /etc/rtcp, the packaged one."
+    ),
+]
+BusName = Annotated[
+    str | None,
+    typer.Option(
+        "--bus",
+        metavar="virtual|NAME",
+        help="virtual or a network interface, as eth0. Default: the running platform's, else the configured one.",
+    ),
+]
+Poll = Annotated[
+    bool, typer.Option("--poll", help="The virtual segment polls: it answers faster and keeps one CPU busy.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, SI units.")]
 
 NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
-"""Lets `-0.5` through to the arguments; `refuse_options` then finds the misspelt options among them."""
-
+"""Passes `-0.5` through to the arguments; `refuse_options` then finds misspelt options among them."""
+JOINTS = 6
 POSE = ("x", "y", "z", "rx", "ry", "rz")
-
+PICTURES = (".png", ".svg", ".pdf")
 RENAMED_OPTIONS = {"--each": "--unsynchronized"}
 """Options of version 0.1 -> their successors."""
-
-_LOOKS_LIKE_A_NUMBER = re.compile(r"-(\d|\.\d|inf|nan)", re.IGNORECASE)
+_NUMBER = re.compile(r"-(\d|\.\d|inf|nan|pi(/|$))", re.IGNORECASE)
 
 
 def refuse_old_name(app: typer.Typer, old: str, new: str) -> None:
@@ -33,76 +53,90 @@ def refuse_old_name(app: typer.Typer, old: str, new: str) -> None:
 
 
 def refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse what stands among numbers and was meant as an option.
+    """Refuse an option that was passed among numbers.
 
     Raises:
-        CommandError: naming the option and the known one that is nearest.
+        CommandError: names the option and the known one that is nearest.
     """
+    known = (*known, "--help", "-h")
     for value in values:
-        if value.startswith("-") and not _LOOKS_LIKE_A_NUMBER.match(value):
-            option = value.split("=", 1)[0]
-            if option in known:
-                raise CommandError(f"{option} stands behind --, which ends the options: write it before")
-            if option in RENAMED_OPTIONS:
-                raise CommandError(f"{option} is now {RENAMED_OPTIONS[option]}")
-            near = difflib.get_close_matches(option, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
-            raise CommandError(f"no such option: {option} ({hint})")
+        if not value.startswith("-") or _NUMBER.match(value):
+            continue
+        option = value.split("=", 1)[0]
+        if option in known:
+            raise CommandError(f"{option} is after --, which ends the options: put it before --")
+        if option in RENAMED_OPTIONS:
+            raise CommandError(f"{option} is now {RENAMED_OPTIONS[option]}")
+        near = difflib.get_close_matches(option, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
+        raise CommandError(f"no such option: {option} ({hint})")
 
 
-def joint_values(values: Sequence[str]) -> list[float]:
-    """Return joint positions, rad, as numbers.
+def joint_values(values: Sequence[str], option: str = "") -> list[float]:
+    """Return joint positions, rad; fractions of pi are accepted.
 
     Raises:
-        CommandError: naming each joint whose value is not a finite number.
+        CommandError: names each joint whose value is not a finite number.
     """
-    numbers, wrong = [], []
-    for joint, value in enumerate(values, 1):
-        try:
-            number = plain_number(value)
-        except ValueError:
-            wrong.append(f"joint {joint}: {value!r} is not a number (rad)")
-            continue
-        if not math.isfinite(number):
-            wrong.append(f"joint {joint}: {value} is not finite; a position is a finite number of rad")
-        numbers.append(number)
-    if wrong:
-        raise CommandError("\n".join(wrong))
-    return numbers
+    return _numbers(values, [(f"{option}joint {joint}", "rad") for joint in range(1, len(values) + 1)])
 
 
 def pose_values(values: Sequence[str]) -> list[float]:
-    """Return a tool pose: x, y, z in m and rx, ry, rz in rad, or as -pi/2.
+    """Return a tool pose: x, y, z in m and rx, ry, rz in rad; fractions of pi are accepted for angles.
 
     Raises:
-        CommandError: naming each number that is none, or how many were given.
+        CommandError: names each value that is not a finite number, or the number of values.
     """
-    from rtcp.config.geometry import angle
-
     if len(values) != len(POSE):
         raise CommandError(f"{len(values)} numbers for a pose of {len(POSE)}: give {' '.join(map(str.upper, POSE))}")
+    return _numbers(values, [(name, "rad" if name.startswith("r") else "m") for name in POSE])
+
+
+def number(value: str, name: str, unit: str = "") -> float:
+    """Return a finite number.
+
+    Raises:
+        CommandError: names what the number is for and its unit.
+    """
+    return _numbers([value], [(name, unit)])[0]
+
+
+def _numbers(values: Sequence[str], names: Sequence[tuple[str, str]]) -> list[float]:
     numbers, wrong = [], []
-    for name, value in zip(POSE, values, strict=True):
-        unit = "rad" if name.startswith("r") else "m"
+    for value, (name, unit) in zip(values, names, strict=True):
         try:
-            number = plain_number(angle(value) if unit == "rad" else value)
+            found = plain_number(_angle(value) if unit == "rad" else value)
         except ValueError:
-            wrong.append(f"{name}: {value!r} is not a number ({unit})")
+            wrong.append(f"{name}: {value!r} is not a number" + (f" ({unit})" if unit else ""))
             continue
-        if not math.isfinite(number):
-            wrong.append(f"{name}: {value} is not finite; a finite number of {unit} is needed")
-        numbers.append(number)
+        if not math.isfinite(found):
+            wrong.append(f"{name}: {value} is not finite; a finite number{f' of {unit}' if unit else ''} is needed")
+        numbers.append(found)
     if wrong:
         raise CommandError("\n".join(wrong))
     return numbers
 
 
+def _angle(value: str) -> object:
+    if "pi" not in value:
+        return value
+    from rtcp.config.numbers import angle  # imports the validator, which loads slowly
+
+    return angle(value)
+
+
 def positive(option: str, value: float | None, unit: str, most: float = math.inf) -> None:
-    """Refuse a value of an option that is not above 0, not finite, or above `most`; None is none.
+    """Refuse a value that is not above 0, not finite, or above `most`; None is allowed.
 
     Raises:
-        CommandError: naming the option, the value and what is allowed.
+        CommandError: names the option, the value and the allowed range.
     """
     if value is not None and not (math.isfinite(value) and 0 < value <= most):
         bound = "" if most == math.inf else f", at most {most:g}"
         raise CommandError(f"{option} {value:g} is not allowed: a finite number of {unit} above 0{bound}")
+
+
+def check_picture(option: str, file: Path) -> None:
+    """Refuse a picture file whose ending names no known format; raises CommandError."""
+    if file.suffix.lower() not in PICTURES:
+        raise CommandError(f"{option} {file}: the ending must be one of {', '.join(PICTURES)}")

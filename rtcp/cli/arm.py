@@ -1,39 +1,41 @@
-"""`rtcp arm`: where the tool is, which joints bring it somewhere, a picture, a URDF file. No platform is needed."""
+"""`rtcp arm`: forward and inverse kinematics, a picture, a URDF file. No platform is needed."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.arguments import (
+    JOINTS,
+    NUMBERS_AS_WRITTEN,
+    PICTURES,
+    AsJson,
+    check_picture,
+    joint_values,
+    pose_values,
+    refuse_options,
+)
 from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit, emit_json, report, show
-from rtcp.config.plain_number import plain_number
+from rtcp.cli.output import emit, emit_json, report, show, table
 
 if TYPE_CHECKING:
-    from kinematics.model import ArmModel
+    from rich.console import RenderableType
 
-JOINTS = 6
-POSE = ("x", "y", "z", "rx", "ry", "rz")
-PICTURES = (".png", ".svg", ".pdf")
+    from kinematics.model import ArmModel
+    from kinematics.solution import Solution
+
+SINGULAR = 1e-9
+"""m or rad; a configuration nearer than this is on the singularity."""
 
 ArmFile = Annotated[
     str | None,
-    typer.Option(
-        "--arm", metavar="FILE", help="An arm's file, or the name of one that comes along; else the platform's."
-    ),
+    typer.Option("--arm", metavar="FILE", help="File of an arm, or name of a packaged one. Default: the platform's."),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
 Positions = Annotated[
     list[str], typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool.")
-]
-Near = Annotated[
-    tuple[str, str, str, str, str, str] | None,
-    typer.Option("--near", metavar="Q1..Q6", help="Joint positions, rad, that free joints keep on a singularity."),
 ]
 
 
@@ -48,19 +50,17 @@ def register(app: typer.Typer) -> None:
 
 
 def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> None:
-    """Show where joint positions bring the tool, and every frame."""
+    """Show the pose of the tool and of every frame at joint positions."""
     q = _joints(positions, ("--arm", "--json"))
     model = _model(arm)
     from kinematics.forward import forward
 
     if as_json:
         pose = forward(model, q)
-        # The sums take the sign from a zero, which only round-off gave it.
+        # Adding 0.0 removes the sign of a zero, which comes from round-off.
         emit_json({"position": [value + 0.0 for value in pose.position], "rpy": [value + 0.0 for value in pose.rpy]})
         return
-    from rtcp.cli.arm_view import forward_picture
-
-    show(*forward_picture(model, q))
+    show(*_forward_tables(model, q))
 
 
 def _ik(
@@ -70,16 +70,17 @@ def _ik(
             metavar="X Y Z RX RY RZ", help="Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."
         ),
     ],
-    near: Near = None,
+    near: Annotated[
+        tuple[str, str, str, str, str, str] | None,
+        typer.Option("--near", metavar="Q1..Q6", help="Joint positions, rad, for joints that a singularity frees."),
+    ] = None,
     arm: ArmFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show all joint positions that bring the tool to a pose; exit code 3 when there are none."""
-    _refuse_options(pose, ("--near", "--arm", "--json", "--help", "-h"))
-    if len(pose) != len(POSE):
-        raise CommandError(f"{len(pose)} numbers for a pose of {len(POSE)}: give {' '.join(map(str.upper, POSE))}")
-    wanted = _numbers(pose, POSE)
-    q_near = None if near is None else _numbers(near, [f"--near, joint {joint}" for joint in range(1, JOINTS + 1)])
+    """Show all joint positions that reach a pose; exit code 3 where there are none."""
+    refuse_options(pose, ("--near", "--arm", "--json"))
+    wanted = pose_values(pose)
+    q_near = None if near is None else joint_values(near, "--near, ")
     model = _model(arm)
     from kinematics.inverse import InverseKinematics
     from kinematics.pose import Pose
@@ -87,33 +88,26 @@ def _ik(
     found = InverseKinematics(model).solve(Pose.from_xyzrpy(*wanted), q_near)
     if as_json:
         solutions = [
-            {
-                "q": list(one.q),
-                "branch": None if one.branch is None else str(one.branch),
-                "within_limits": one.within_limits,
-            }
+            {"q": list(one.q), "branch": one.branch and str(one.branch), "within_limits": one.within_limits}
             for one in found.solutions
         ]
         emit_json({"solutions": solutions, "reason": found.reason})
     if not found.solutions:
         raise CommandError(found.reason or "there is no solution", ExitCode.REFUSED)
     if not as_json:
-        from rtcp.cli.arm_view import inverse_picture
-
-        show(*inverse_picture(model, found.solutions))
+        show(*_inverse_tables(model, found.solutions))
 
 
 def _plot(
     positions: Positions,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help=f"Where the picture goes: {', '.join(PICTURES)}.")
-    ] = Path("arm.png"),
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help=f"Picture: {', '.join(PICTURES)}.")] = (
+        Path("arm.png")
+    ),
     arm: ArmFile = None,
 ) -> None:
     """Draw the arm and its frames."""
     q = _joints(positions, ("--out", "--arm"))
-    if out.suffix.lower() not in PICTURES:
-        raise CommandError(f"--out {out}: the ending must be one of {', '.join(PICTURES)}")
+    check_picture("--out", out)
     model = _model(arm)
     from rtcp.cli.arm_plot import draw
 
@@ -122,21 +116,21 @@ def _plot(
 
 def _urdf(
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="Where it goes; else to standard output.")
+        Path | None, typer.Option("--out", metavar="FILE", help="File to write. Default: standard output.")
     ] = None,
     arm: ArmFile = None,
 ) -> None:
-    """Give the arm as URDF, for viewers, simulators and planners."""
+    """Export the arm as URDF, for viewers, simulators and planners."""
     from kinematics.urdf import to_urdf
     from rtcp.config import find_arm, load_kinematics
-    from rtcp.config.kinematics import torque_limits
+    from rtcp.config.loader import torque_limits
 
     file = find_arm(arm)
     text = to_urdf(load_kinematics(file), torque_limits(file))
     if out is None:
         emit(text.rstrip("\n"))
-        return
-    _write(out, lambda: out.write_text(text, encoding="utf-8"))
+    else:
+        _write(out, lambda: out.write_text(text, encoding="utf-8"))
 
 
 def _model(arm: str | None) -> ArmModel:
@@ -146,43 +140,89 @@ def _model(arm: str | None) -> ArmModel:
 
 
 def _joints(positions: Sequence[str], options: Sequence[str]) -> list[float]:
-    _refuse_options(positions, (*options, "--help", "-h"))
+    refuse_options(positions, options)
     if len(positions) != JOINTS:
         raise CommandError(f"{len(positions)} positions for an arm of {JOINTS} joints: give {JOINTS} numbers, rad")
-    return _numbers(positions, [f"joint {joint}" for joint in range(1, JOINTS + 1)])
-
-
-def _refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse what was meant as an option; the minus sign of a fraction of pi is none of an option."""
-    from rtcp.config.geometry import angle
-
-    refuse_options([value for value in values if angle(value) == value], known)
-
-
-def _numbers(values: Sequence[str], names: Sequence[str]) -> list[float]:
-    """Return finite numbers; every value that is none is named in one error."""
-    from rtcp.config.geometry import angle
-
-    numbers, wrong = [], []
-    for value, name in zip(values, names, strict=True):
-        unit = "m" if name in POSE[:3] else "rad"
-        written = value if unit == "m" else angle(value)
-        try:
-            number = plain_number(written)
-        except ValueError:
-            wrong.append(f"{name}: {value!r} is not a number ({unit})")
-            continue
-        if not math.isfinite(number):
-            wrong.append(f"{name}: {value} is not finite; a finite number of {unit} is needed")
-        numbers.append(number)
-    if wrong:
-        raise CommandError("\n".join(wrong))
-    return numbers
+    return joint_values(positions)
 
 
 def _write(out: Path, write: Callable[[], object]) -> None:
     try:
         write()
     except OSError as error:
-        raise CommandError(f"--out {out}: it cannot be written: {error.strerror or error}") from error
-    report(f"{out} is written")
+        raise CommandError(f"--out {out} cannot be written: {error.strerror or error}") from error
+    report(f"wrote {out}")
+
+
+def _forward_tables(model: ArmModel, q: Sequence[float]) -> list[RenderableType]:
+    """Return the frames at joint positions `q`, rad, and what limits and singularities mean for them."""
+    from rich.text import Text
+
+    from kinematics.forward import frames
+    from kinematics.jacobian import manipulability, singularity_distances
+
+    rows = table(
+        ("frame", "x", "y", "z", "rx", "ry", "rz"), ("frame",), title=f"{model.name}: frames in the base frame, m, rad"
+    )
+    for name, pose in zip([*map(str, range(1, 7)), "tool"], frames(model, q), strict=True):
+        numbers = (f"{value:.6f}" for value in (*pose.position, *pose.rpy))
+        rows.add_row(name, *map(_zero, numbers), style="bold" if name == "tool" else "")
+    distances = singularity_distances(model, q)
+    named = zip(("shoulder", "elbow", "wrist"), distances, ("m", "rad", "rad"), strict=False)
+    known = [f"{name} {_small(value)} {unit}" for name, value, unit in named if value is not None]
+    lines = [
+        f"from the singularities: {', '.join([*known, f'smallest singular value {_small(distances.smallest)}'])}",
+        f"manipulability {_small(manipulability(model, q))} m^3",
+    ]
+    lines += [
+        f"{name} at {value:g} rad is outside its limits, {limit.lower:g} to {limit.upper:g}"
+        for name, value, limit in zip(model.joint_names, q, model.limits, strict=True)
+        if not limit.lower <= value <= limit.upper
+    ]
+    return [rows, *(Text(f" {line}") for line in lines)]
+
+
+def _inverse_tables(model: ArmModel, solutions: Sequence[Solution]) -> list[RenderableType]:
+    """Return the solutions: joint positions, then limits and distances to the singularities."""
+    from rich.text import Text
+
+    from kinematics.jacobian import singularity_distances
+    from kinematics.solution import Singularity
+
+    counted = "1 solution" if len(solutions) == 1 else f"{len(solutions)} solutions"
+    headings = ("#", "branch", *(f"q{joint}" for joint in range(1, 7)), "limits")
+    joints = table(headings, ("branch", "limits"), title=f"{model.name}: {counted}, rad", padding=0)
+    distances = table(
+        ("#", "outside", "shoulder m", "elbow rad", "wrist rad", "smallest", "singular"),
+        ("outside", "singular"),
+        title="limits and distances to the singularities",
+    )
+    for column in (1, 6):
+        distances.columns[column].no_wrap = False
+    for number, one in enumerate(solutions, 1):
+        joints.add_row(
+            str(number),
+            str(one.branch or "-"),
+            *(Text(_zero(f"{q:.4f}"), "red" if joint in one.outside else "") for joint, q in enumerate(one.q)),
+            "inside" if one.within_limits else "outside",
+            style="" if one.within_limits else "dim",
+        )
+        distances.add_row(
+            str(number),
+            ", ".join(f"q{joint + 1}" for joint in one.outside) or "-",
+            *("-" if value is None else _small(value) for value in singularity_distances(model, one.q)),
+            ", ".join(flag.name.lower() for flag in Singularity if flag in one.singularity and flag.name) or "-",
+        )
+    parts: list[RenderableType] = [joints, Text(""), distances]
+    if not any(one.within_limits for one in solutions):
+        parts.append(Text(" no solution is inside the joints' limits"))
+    return parts
+
+
+def _small(value: float) -> str:
+    return "0" if value < SINGULAR else f"{value:.3g}"
+
+
+def _zero(number: str) -> str:
+    """Remove the sign of a zero, which comes from round-off."""
+    return number.removeprefix("-") if not number.strip("-0.") else number

@@ -1,79 +1,403 @@
-"""`rtcp scan`, `rtcp sdo` and `rtcp segment`: the slaves themselves, with a platform running or without."""
+"""`rtcp scan` and `rtcp sdo`: the slaves, through the running platform or over the bus opened for one request."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import math
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol
 
 import typer
 
-from rtcp.cli import sdo_value, segment
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
-from rtcp.cli.bus_access import bus_access, position_of
-from rtcp.cli.errors import CommandError
-from rtcp.cli.options import BusName, ConfigFile, ObjectIndex, SlaveName
-from rtcp.cli.output import emit, emit_json, report, show
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, refuse_options
+from rtcp.cli.connection import connect
+from rtcp.cli.errors import CommandError, code_of, interruption_code, signals_raise
+from rtcp.cli.output import emit, emit_json, facts, report, show, table
+from rtcp.cli.platform import refuse_second_platform
+from rtcp.config.model import VIRTUAL
+from rtcp.config.numbers import plain_number
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
+from rtcp.launch import offline
 
-SDO_WRITE_OPTIONS = ("--type", "--bus", "--config", "--help", "-h")
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+
+INTEGER_TYPES = {f"{sign}int{bits}": (bits // 8, sign == "") for bits in (8, 16, 32, 64) for sign in ("u", "")}
+"""Name -> bytes, signed."""
+FLOAT_TYPES = {"float32": struct.Struct("<f"), "float64": struct.Struct("<d")}
+TYPES = ("bool", *INTEGER_TYPES, *FLOAT_TYPES, "string", "bytes")
+_OBJECT = re.compile(r"(?:0x(?P<prefixed>[0-9a-f]+)|(?P<suffixed>[0-9][0-9a-f]*)h)(?::(?P<sub>\w+))?", re.IGNORECASE)
+
+SlaveName = Annotated[
+    str, typer.Argument(metavar="SLAVE", help="Position on the cable, from 1, or the configured name.")
+]
+ObjectIndex = Annotated[
+    str, typer.Argument(metavar="INDEX[:SUB]", help="Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")
+]
 
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
     app.command("scan")(_scan)
-    segment.register(app)
     sdo = typer.Typer(help="Read and write objects of a slave.", no_args_is_help=True)
     sdo.command("read")(_sdo_read)
     sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)(_sdo_write)
     app.add_typer(sdo, name="sdo")
 
 
-def _scan(
-    bus: BusName = None,
-    config: ConfigFile = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON array.")] = False,
-) -> None:
+def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
     """Show the slaves: identity, state, PDO map, clocks and delays."""
-    with bus_access("scan", bus, config) as access:
+    with _bus("scan", bus, config) as access:
         slaves = access.scan()
     if as_json:
         emit_json(slaves)
-        return
-    from rtcp.cli.scan_view import picture
-
-    show(*picture(access.name, slaves))
+    else:
+        show(*_scan_tables(access.name, slaves))
 
 
 def _sdo_read(
     slave: SlaveName,
     where: ObjectIndex,
-    type_name: Annotated[
-        str | None, typer.Option("--type", metavar="TYPE", help=f"{', '.join(sdo_value.TYPES)}.")
-    ] = None,
+    type_name: Annotated[str | None, typer.Option("--type", metavar="TYPE", help=f"{', '.join(TYPES)}.")] = None,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
-    """Read an object; without --type its bytes in hex and what they may mean."""
-    index, subindex = sdo_value.parse_object(where)
-    known = None if type_name is None else sdo_value.check_type(type_name)
-    with bus_access("sdo read", bus, config) as access:
-        data = access.sdo_read(position_of(slave, access), index, subindex)
-    emit(sdo_value.guesses(data) if known is None else sdo_value.decode(data, known))
+    """Read an object; without --type its bytes in hex and as each type of that size."""
+    index, subindex = parse_object(where)
+    known = None if type_name is None else _checked_type(type_name)
+    with _bus("sdo read", bus, config) as access:
+        data = access.sdo_read(_position(slave, access), index, subindex)
+    emit(interpretations(data) if known is None else decode(data, known))
 
 
 def _sdo_write(
     slave: SlaveName,
     where: ObjectIndex,
     value: Annotated[list[str], typer.Argument(metavar="VALUE")],
-    type_name: Annotated[str, typer.Option("--type", metavar="TYPE", help=f"{', '.join(sdo_value.TYPES)}.")],
+    type_name: Annotated[str, typer.Option("--type", metavar="TYPE", help=f"{', '.join(TYPES)}.")],
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Write an object."""
-    refuse_options([slave, where, *value], SDO_WRITE_OPTIONS)
+    refuse_options([slave, where, *value], ("--type", "--bus", "--config"))
     if len(value) != 1:
-        raise CommandError(f"one value is written at a time, found {len(value)}: {' '.join(value)} (quote a string)")
-    index, subindex = sdo_value.parse_object(where)
-    data = sdo_value.encode(value[0], sdo_value.check_type(type_name))
-    with bus_access("sdo write", bus, config) as access:
-        position = position_of(slave, access)
+        raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
+    index, subindex = parse_object(where)
+    data = encode(value[0], _checked_type(type_name))
+    with _bus("sdo write", bus, config) as access:
+        position = _position(slave, access)
         access.sdo_write(position, index, subindex, data)
     report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
+
+
+# -- access ---------------------------------------------------------------------------------------------------------
+
+
+class BusAccess(Protocol):
+    """What `scan` and `sdo` need of a bus; every method may raise `RtcpError` or `OfflineError`."""
+
+    name: str
+    """`virtual` or the network interface."""
+
+    def positions(self) -> dict[str, int]:
+        """Return the position of each slave by its configured name."""
+
+    def scan(self) -> list[dict[str, Any]]:
+        """Return what each slave reports, as `rtcp.fieldbus.bus.SlaveInfo`, bytes as hex."""
+
+    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
+        """Return the bytes of an object."""
+
+    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
+        """Write the bytes of an object."""
+
+
+class RunningBus:
+    """The bus of the running platform, over its control socket."""
+
+    def __init__(self, client: ControlClient, status: Mapping[str, Any]) -> None:
+        self._client = client
+        self._status = status
+        self.name = str(status.get("bus", "-"))
+
+    def positions(self) -> dict[str, int]:
+        """See `BusAccess`."""
+        return {str(slave["name"]): int(slave["position"]) for slave in self._status.get("slaves", [])}
+
+    def scan(self) -> list[dict[str, Any]]:
+        """Return what the slaves reported when they were scanned."""
+        return list(self._client.call("scan").get("slaves", []))
+
+    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
+        """See `BusAccess`."""
+        answer = self._client.call("sdo_read", {"slave": position, "index": index, "subindex": subindex})
+        return bytes.fromhex(str(answer.get("hex", "")))
+
+    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
+        """See `BusAccess`."""
+        arguments = {"slave": position, "index": index, "subindex": subindex, "hex": data.hex()}
+        self._client.call("sdo_write", arguments)
+
+
+class OfflineBus:
+    """A bus that is opened for each request and closed again."""
+
+    def __init__(self, bus: str | None, config: Path | None) -> None:
+        self._config = config
+        self.name = offline.configuration(config).bus.interface if bus is None else bus
+        if self.name == VIRTUAL:
+            from rtcp.config.loader import segment_path
+            from rtcp.virtual.segment import check_segment
+
+            check_segment(segment_path(offline.configuration(config)))
+
+    def positions(self) -> dict[str, int]:
+        """See `BusAccess`."""
+        return {slave.name: place for place, slave in enumerate(offline.configuration(self._config).slaves, 1)}
+
+    def scan(self) -> list[dict[str, Any]]:
+        """See `BusAccess`."""
+        return offline.scan(self.name, self._config)
+
+    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
+        """See `BusAccess`."""
+        return offline.sdo_read(self.name, self._config, position, index, subindex)
+
+    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
+        """See `BusAccess`."""
+        offline.sdo_write(self.name, self._config, position, index, subindex, data)
+
+
+@contextmanager
+def _bus(command: str, bus: str | None, config: Path | None) -> Iterator[BusAccess]:
+    """Yield the running platform's bus where it is the requested one, else open the requested or configured one.
+
+    Raises:
+        CommandError: the offline bus failed, or a signal ended the command; a started segment has ended.
+        RtcpError: as the platform answers.
+        ConfigError: the configuration is wrong.
+    """
+    try:
+        with signals_raise():
+            try:
+                client = connect(command)
+            except RtcpError as error:
+                if error.kind != "not running":
+                    raise
+                refuse_second_platform()
+                yield OfflineBus(bus, config)
+                return
+            with client:
+                status = client.call("status")
+                yield RunningBus(client, status) if bus in (None, status.get("bus")) else OfflineBus(bus, config)
+    except offline.OfflineError as error:
+        raise CommandError(str(error), code_of(error.kind)) from error
+    except KeyboardInterrupt as interruption:
+        raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
+
+
+def _position(slave: str, access: BusAccess) -> int:
+    """Return the position of a slave given by position or configured name; raises CommandError with the names."""
+    if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
+        return int(slave)
+    named = access.positions()
+    if slave not in named:
+        raise CommandError(f"no slave is called {slave!r}: a position from 1, or one of {', '.join(named) or 'none'}")
+    return named[slave]
+
+
+# -- objects as text (little endian on the wire) --------------------------------------------------------------------
+
+
+def parse_object(text: str) -> tuple[int, int]:
+    """Return index and subindex of `0x6041`, `6041h`, `0x1018:1` or `0x1018:0x01`; raises CommandError."""
+    found = _OBJECT.fullmatch(text)
+    if not found:
+        raise CommandError(
+            f"{text!r} is not an object: write the index in hex, as 0x6041 or 6041h, and 0x1018:1 for a subindex"
+        )
+    index = int(found["prefixed"] or found["suffixed"], 16)
+    if index > 0xFFFF:
+        raise CommandError(f"index 0x{index:X} is too large: at most 0xFFFF")
+    subindex = _integer(found["sub"] or "0", "subindex")
+    if not 0 <= subindex <= 0xFF:
+        raise CommandError(f"subindex {subindex} is not allowed: 0 to 255")
+    return index, subindex
+
+
+def _checked_type(name: str) -> str:
+    if name.lower() not in TYPES:
+        raise CommandError(f"type {name!r} is not known: {', '.join(TYPES)}")
+    return name.lower()
+
+
+def encode(text: str, type_name: str) -> bytes:
+    """Return the bytes of a value; raises CommandError where it does not fit the type."""
+    if type_name == "string":
+        return text.encode()
+    if type_name == "bytes":
+        try:
+            return bytes.fromhex(text.removeprefix("0x"))
+        except ValueError as error:
+            raise CommandError(f"{text!r} is not bytes in hex, as 01ff") from error
+    if type_name in FLOAT_TYPES:
+        return _encode_float(text, type_name)
+    if type_name == "bool":
+        if text.lower() not in ("0", "1", "true", "false"):
+            raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
+        return b"\x01" if text.lower() in ("1", "true") else b"\x00"
+    size, signed = INTEGER_TYPES[type_name]
+    number = _integer(text, type_name)
+    lowest, highest = (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1) if signed else (0, (1 << 8 * size) - 1)
+    if not lowest <= number <= highest:
+        raise CommandError(f"{text} does not fit {type_name}: {lowest} to {highest}")
+    return number.to_bytes(size, "little", signed=signed)
+
+
+def decode(data: bytes, type_name: str) -> str:
+    """Return the value of the bytes as text; raises CommandError where their number is not the type's."""
+    if type_name == "string":
+        return data.rstrip(b"\0").decode(errors="replace")
+    if type_name == "bytes":
+        return data.hex()
+    size = FLOAT_TYPES[type_name].size if type_name in FLOAT_TYPES else INTEGER_TYPES.get(type_name, (1, False))[0]
+    if len(data) != size:
+        raise CommandError(
+            f"the object has {len(data)} bytes ({data.hex() or 'none'}), {type_name} has {size}: choose another --type"
+        )
+    if type_name in FLOAT_TYPES:
+        return repr(float(FLOAT_TYPES[type_name].unpack(data)[0]))
+    if type_name == "bool":
+        return "true" if data[0] else "false"
+    return str(int.from_bytes(data, "little", signed=INTEGER_TYPES[type_name][1]))
+
+
+def interpretations(data: bytes) -> str:
+    """Return the bytes in hex, as integers of that size, and as text where all of it is printable."""
+    parts = [data.hex(" ") or "(empty)"]
+    for name, (size, signed) in INTEGER_TYPES.items():
+        if size == len(data):
+            number = int.from_bytes(data, "little", signed=signed)
+            if not signed:
+                parts.append(f"{name} {number} (0x{number:0{2 * size}X})")
+            elif number < 0:
+                parts.append(f"{name} {number}")
+    text = data.rstrip(b"\0")
+    if len(text) > 1 and all(0x20 <= byte < 0x7F for byte in text):
+        parts.append(f"string {text.decode()!r}")
+    return "   ".join(parts)
+
+
+def _encode_float(text: str, type_name: str) -> bytes:
+    try:
+        number = plain_number(text)
+        packed = FLOAT_TYPES[type_name].pack(number)
+    except ValueError as error:
+        raise CommandError(f"{text!r} is not a number ({type_name})") from error
+    except OverflowError as error:
+        raise CommandError(f"{text} does not fit {type_name}") from error
+    if not math.isfinite(number):
+        raise CommandError(f"{text} is not finite; a finite {type_name} is needed")
+    return packed
+
+
+def _integer(text: str, what: str) -> int:
+    """Return a whole number written in decimal or, after 0x, in hex."""
+    try:
+        if "_" in text or not text.isascii():
+            raise ValueError
+        return int(text, 16) if text.lower().lstrip("+-").startswith("0x") else int(text)
+    except ValueError as error:
+        raise CommandError(f"{text!r} is not a whole number ({what})") from error
+
+
+# -- tables of a scan -----------------------------------------------------------------------------------------------
+
+
+def _scan_tables(bus: str, slaves: Sequence[Mapping[str, Any]]) -> list[RenderableType]:
+    """Return the overview, and for each slave its facts and its PDO map."""
+    from rich.padding import Padding
+    from rich.text import Text
+
+    if not slaves:
+        return [Text(f"{bus}: no slave answers")]
+    counted = "1 slave" if len(slaves) == 1 else f"{len(slaves)} slaves"
+    headings = ("#", "station", "name", "state", "out bits", "in bits", "delay ns")
+    overview = table(headings, ("name", "state"), title=f"{bus}: {counted}")
+    parts: list[RenderableType] = [overview]
+    for slave in slaves:
+        overview.add_row(
+            str(slave["position"]),
+            _hex(slave["station"], 4),
+            Text(str(slave["name"])),
+            str(slave["state"]),
+            str(slave["output_bits"]),
+            str(slave["input_bits"]),
+            str(slave["delay_ns"]) if slave["dc"] else "no DC",
+        )
+        parts += [Text(""), Text(f"{slave['position']}  {slave['name']}", "bold")]
+        parts += [Padding(one, (0, 0, 0, 3)) for one in (_slave_facts(slave), _pdo_map(slave)) if one.row_count]
+    return parts
+
+
+def _slave_facts(slave: Mapping[str, Any]) -> Table:
+    rows = facts()
+    vendor, product, revision = (_hex(slave[key]) for key in ("vendor_id", "product_code", "revision"))
+    identity = f"vendor {vendor}, product {product}, revision {revision}"
+    rows.add_row("identity", f"{identity}\nserial {slave['serial']}, alias {slave['alias']}")
+    code = slave["al_status_code"]
+    rows.add_row("state", f"{slave['state']}" + (f", {_hex(code, 4)}: {slave['al_status']}" if code else ""))
+    rows.add_row("mailbox", _mailbox(slave["mailbox"], bool(slave["has_coe"])))
+    managers = [
+        f"SM{manager['number']} {_hex(manager['start'], 4)} {manager['length']} bytes, "
+        f"control {_hex(manager['control'], 2)}{'' if manager['enabled'] else ', off'}"
+        for manager in slave["sync_managers"]
+    ]
+    if managers:
+        rows.add_row("sync", "\n".join(managers))
+    rows.add_row("FMMUs", str(slave["fmmus"]))
+    rows.add_row("clock", f"yes, {slave['delay_ns']} ns from the reference" if slave["dc"] else "none")
+    ports = ", ".join(f"{port} {found}" for port, found in enumerate(slave["ports"]))
+    behind = f"slave {slave['parent']}" if slave["parent"] else "the master"
+    rows.add_row("ports", f"{ports or '-'}; behind {behind}")
+    return rows
+
+
+def _mailbox(mailbox: Mapping[str, Any] | None, has_coe: bool) -> str:
+    if mailbox is None:
+        return "none"
+    protocols = ", ".join(mailbox["protocols"]) or ("CoE" if has_coe else "no protocol")
+    return (
+        f"{protocols}; to the slave {_hex(mailbox['receive_start'], 4)} {mailbox['receive_size']} bytes, "
+        f"from it {_hex(mailbox['send_start'], 4)} {mailbox['send_size']} bytes"
+    )
+
+
+def _pdo_map(slave: Mapping[str, Any]) -> Table:
+    from rich.text import Text
+
+    rows = table(("PDO", "at", "object", "bits", "name"), ("PDO", "object", "name"))
+    for direction, title in (("outputs", "RxPDO"), ("inputs", "TxPDO")):
+        offset = 0
+        for pdo in slave[direction]:
+            label = f"{title} {_hex(pdo['index'], 4)}"
+            for entry in pdo["entries"]:
+                rows.add_row(
+                    label,
+                    f"{offset // 8}.{offset % 8}",
+                    f"{_hex(entry['index'], 4)}:{entry['sub_index']}",
+                    str(entry["bits"]),
+                    Text(str(entry["name"]) if entry["index"] else "(padding)"),
+                )
+                label = ""
+                offset += int(entry["bits"])
+    return rows
+
+
+def _hex(value: int, digits: int = 8) -> str:
+    return f"0x{value:0{digits}X}"

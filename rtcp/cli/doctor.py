@@ -1,33 +1,34 @@
-"""`rtcp doctor`: what of this host stands in the way of real time, and what mends it."""
+"""`rtcp doctor`: what on this host prevents real time, and how to fix it."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import AsJson, ConfigFile
 from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.options import ConfigFile
-from rtcp.cli.output import emit_json
-from rtcp.config.virtual import VIRTUAL
+from rtcp.cli.output import emit, emit_json, show, table
+from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
 from rtcp.realtime.host import Host
 from rtcp.realtime.scheduling import choose_cpu
 
-CODES = {
-    Severity.OK: ExitCode.DONE,
-    Severity.NOTE: ExitCode.DONE,
-    Severity.WARNING: ExitCode.REFUSED,
-    Severity.BAD: ExitCode.FAULT,
+RESULTS = {
+    Severity.OK: (ExitCode.DONE, "green", "no obstacle to real time was found"),
+    Severity.NOTE: (ExitCode.DONE, "", "no obstacle to real time was found"),
+    Severity.WARNING: (ExitCode.REFUSED, "yellow", "cycles will be late at times"),
+    Severity.BAD: (ExitCode.FAULT, "bold red", "the loop cannot keep its cycle here"),
 }
-"""The exit code of the worst finding: what is merely in the way is told from what keeps the loop from its cycle."""
+"""Worst finding -> exit code, style and summary."""
 
 Bus = Annotated[
     str | None,
-    typer.Option("--bus", metavar="virtual|NAME", help="virtual, or a network interface; else the configuration's."),
+    typer.Option("--bus", metavar="virtual|NAME", help="virtual, or a network interface. Default: the configured one."),
 ]
 
 
@@ -36,52 +37,43 @@ def register(app: typer.Typer) -> None:
     app.command("doctor")(_doctor)
 
 
-def _doctor(
-    bus: Bus = None,
-    config: ConfigFile = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, the worst finding first.")] = False,
-) -> None:
-    """Show what of this host stands in the way of real time, why, and what mends it; changes nothing.
+def _doctor(bus: Bus = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
+    """Show what on this host prevents real time, why, and how to fix it; changes nothing.
 
-    Exit codes: 0 nothing stands in the way, 3 cycles will be late at times, 5 the loop cannot keep its cycle.
+    Exit codes: 0 no obstacle, 3 cycles will be late at times, 5 the loop cannot keep its cycle.
     """
     case = _case(bus, config)
-    findings = sorted(examine(case), key=lambda finding: -finding.severity)  # stable: the order of the checks stays
-    worst = max(finding.severity for finding in findings)
+    findings = sorted(examine(case), key=lambda finding: -finding.severity)  # stable: keeps the order of the checks
     if as_json:
-        emit_json(_as_json(case, worst, findings))
+        emit_json(_as_json(case, findings))
     else:
-        from rtcp.cli.doctor_view import show_findings
-
-        show_findings(case, findings)
-    raise typer.Exit(CODES[worst])
-
-
-def _checked(name: str) -> str:
-    """Return what may be an interface's name: the kernel's rule, `dev_valid_name` of net/core/dev.c."""
-    if not re.fullmatch(r"[^\s/:]{1,15}", name) or name in (".", ".."):
-        raise CommandError(f"{name!r} is no name of a network interface: 1 to 15 letters without / : and white space")
-    return name
+        _show(case, findings)
+    raise typer.Exit(RESULTS[findings[0].severity][0])
 
 
 def _case(bus: str | None, config: Path | None) -> Case:
-    from rtcp.config import find_config, load  # here: the validator starts slowly, and `rtcp status` must not wait
+    from rtcp.config import find_config, load  # the validator loads slowly
 
     arm = load(find_config(config))
     name = arm.bus.interface if bus is None else bus
+    # dev_valid_name of the kernel's net/core/dev.c
+    if name != VIRTUAL and (not re.fullmatch(r"[^\s/:]{1,15}", name) or name in (".", "..")):
+        raise CommandError(
+            f"{name!r} is not the name of a network interface: 1 to 15 characters other than /, : and blanks"
+        )
     return Case(
         host=Host(),
         cpu=choose_cpu(arm.cycle.cpu),
         priority=arm.cycle.priority,
-        interface=None if name == VIRTUAL else _checked(name),
-        wait_us=arm.bus.receive_fraction * arm.cycle.period_us,
+        interface=None if name == VIRTUAL else name,
         blackboard=blackboard_file(runtime_directory()),
+        wait_us=arm.bus.receive_fraction * arm.cycle.period_us,
     )
 
 
-def _as_json(case: Case, worst: Severity, findings: list[Finding]) -> dict[str, Any]:
+def _as_json(case: Case, findings: Sequence[Finding]) -> dict[str, Any]:
     return {
-        "severity": worst.name.lower(),
+        "severity": findings[0].severity.name.lower(),
         "cpu": case.cpu,
         "bus": case.interface or VIRTUAL,
         "findings": [
@@ -95,3 +87,32 @@ def _as_json(case: Case, worst: Severity, findings: list[Finding]) -> dict[str, 
             for finding in findings
         ],
     }
+
+
+def _show(case: Case, findings: Sequence[Finding]) -> None:
+    """Print the findings as a table, then the commands that fix them, then a summary."""
+    from rich.text import Text
+
+    rows = table(("", "check", "found"), ("", "check"), expand=True, fill="found")
+    for finding in findings:
+        rows.add_row(_severity(finding), finding.key, Text(finding.found))
+    show(rows)
+    fixable = [finding for finding in findings if finding.remedy]
+    if fixable:
+        emit("\nTo fix, as root:")
+    for finding in fixable:
+        emit("")
+        show(_severity(finding).append(f"  {finding.key}: {finding.why}", "not bold default"))
+        for line in finding.remedy:
+            emit(f"    {line}")  # on one line however long, so that it can be copied
+    emit("")
+    counts = {severity: sum(finding.severity is severity for finding in findings) for severity in reversed(Severity)}
+    counted = ", ".join(f"{count} {severity.name.lower()}" for severity, count in counts.items() if count)
+    _, style, summary = RESULTS[findings[0].severity]
+    show(Text(f"Cycle on CPU {case.cpu}, bus {case.interface or VIRTUAL}: {summary} ({counted}).", style))
+
+
+def _severity(finding: Finding) -> Any:
+    from rich.text import Text
+
+    return Text(finding.severity.name.lower(), RESULTS[finding.severity][1])

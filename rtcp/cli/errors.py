@@ -1,4 +1,4 @@
-"""How a command ends: its exit codes, and what each kind of error means to a shell."""
+"""How a command ends: exit codes, errors, and the signals that interrupt it."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from types import FrameType
 
 
 class ExitCode(IntEnum):
-    """Exit codes of `rtcp`; scripts tell them apart."""
+    """Exit codes of `rtcp`, for scripts."""
 
     DONE = 0
     INTERNAL = 1
     USAGE = 2
     """The command line or the configuration is wrong; nothing was started or moved."""
     REFUSED = 3
-    """The platform runs and will not do this now."""
+    """The platform runs and refuses the command in its present state."""
     NOT_RUNNING = 4
     FAULT = 5
-    """It was begun and went wrong, or took too long."""
+    """The command started and failed, or timed out."""
     INTERRUPTED = 130
 
 
@@ -30,15 +30,14 @@ _CODES = {
     "config": ExitCode.USAGE,
     "refused": ExitCode.REFUSED,
     "not running": ExitCode.NOT_RUNNING,
-    "fault": ExitCode.FAULT,
-    "timeout": ExitCode.FAULT,
-    "lost": ExitCode.FAULT,
     "internal": ExitCode.INTERNAL,
 }
+SUSPENDING = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+"""Signals that suspend a command: Ctrl-Z, and terminal access from the background."""
 
 
 class CommandError(Exception):
-    """A command's end that is not success: a sentence (or several, a line each) and the exit code."""
+    """A failed command: the message (one line for each problem) and the exit code."""
 
     def __init__(self, message: str, code: int = ExitCode.USAGE) -> None:
         super().__init__(message)
@@ -46,12 +45,8 @@ class CommandError(Exception):
         self.code = int(code)
 
 
-SUSPENDING = (signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
-"""What suspends a command: Ctrl-Z, and a terminal that one in the background reads or, by its setting, writes."""
-
-
 class Interrupted(KeyboardInterrupt):
-    """A signal came that ends a command: everything winds up as after Ctrl-C."""
+    """A signal that ends the command with the same clean-up as Ctrl-C."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"ended by {signal.Signals(number).name}")
@@ -59,25 +54,25 @@ class Interrupted(KeyboardInterrupt):
 
 
 def code_of(kind: str) -> ExitCode:
-    """Return the exit code of an error's kind; a kind that nobody foresaw is a fault."""
+    """Return the exit code of an error kind; kinds that are not listed (fault, timeout, lost) give FAULT."""
     return _CODES.get(kind, ExitCode.FAULT)
 
 
 def interruption_code(error: KeyboardInterrupt) -> int:
-    """Return 130 for Ctrl-C and 128 + number for another signal, as shells have it."""
+    """Return 130 for Ctrl-C and 128 + number for another signal, as shells do."""
     return error.code if isinstance(error, Interrupted) else ExitCode.INTERRUPTED
 
 
 @contextmanager
-def orderly_signals(*more: signal.Signals) -> Iterator[None]:
-    """While inside, SIGTERM, SIGHUP and `more` raise `Interrupted`, so that `finally` ends what was started."""
+def signals_raise(*more: signal.Signals) -> Iterator[None]:
+    """Raise `Interrupted` on SIGTERM, SIGHUP and `more` while inside, so that `finally` blocks run."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         raise Interrupted(number)
 
-    kept = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP, *more)}
+    handlers = {number: signal.signal(number, interrupt) for number in (signal.SIGTERM, signal.SIGHUP, *more)}
     try:
         yield
     finally:
-        for number, handler in kept.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)

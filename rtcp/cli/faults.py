@@ -1,30 +1,33 @@
-"""`rtcp faults`: what the black box has recorded. No platform is needed."""
+"""`rtcp faults`: the recordings of the black box. No platform is needed."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rtcp.cli.arguments import AsJson, check_picture
 from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit_json, report, show
+from rtcp.cli.output import emit_json, facts, report, show, table
 
 if TYPE_CHECKING:
+    from rich.console import RenderableType
+    from rich.table import Table
+
     from rtcp.gateway.blackbox_file import Listed
 
 SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
-"""Of the service and of root; `systemd/` has it as StateDirectory=."""
-
-PICTURES = (".png", ".svg", ".pdf")
-
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
+"""Recordings of the service and of root; StateDirectory= of the unit."""
+JOINT_COLUMNS = (("position", "rad"), ("target", "rad"), ("velocity", "rad/s"), ("torque", "Nm"))
 
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
-    faults = typer.Typer(help="List what the black box has recorded, show one fault.", invoke_without_command=True)
+    faults = typer.Typer(help="List the recorded faults, show one.", invoke_without_command=True)
     faults.callback()(_list)
     faults.command("show")(_show)
     app.add_typer(faults, name="faults")
@@ -34,91 +37,77 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
     """List the recorded faults, the newest last."""
     if context.invoked_subcommand is not None:
         return
-    found = _listed()
+    from rtcp.gateway.blackbox_file import faults_directory, listed
+
+    with _readable():
+        found = listed(faults_directory())
     if as_json:
-        from rtcp.cli.faults_summary import as_row
-
-        emit_json({"faults": [as_row(one) for one in found]})
+        emit_json({"faults": [_row(one) for one in found]})
     elif found:
-        from rtcp.cli.faults_view import table
-
-        show(table(found))
+        show(*_list_table(found))
     else:
-        from rtcp.gateway.blackbox_file import faults_directory
-
-        report(f"no fault has been recorded ({faults_directory()}){_elsewhere()}")
+        report(f"no fault has been recorded in {faults_directory()}{_service_hint()}")
 
 
 def _show(
     number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
     plot: Annotated[
         Path | None,
-        typer.Option("--plot", metavar="FILE", help="The picture: .png, .svg or .pdf; else beside the recording."),
+        typer.Option(
+            "--plot", metavar="FILE", help="Picture: .png, .svg or .pdf. Default: a .png beside the recording."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Show one fault: what happened when, where the joints were, and a picture of it."""
-    if plot is not None and plot.suffix.lower() not in PICTURES:
-        raise CommandError(f"--plot {plot}: the ending {plot.suffix!r} is none of {', '.join(PICTURES)}")
-    path = _path(number)
-    from rtcp.gateway.blackbox_file import RecordingError, read
+    if plot is not None:
+        check_picture("--plot", plot)
+    path = _recording(number)
+    from rtcp.gateway.blackbox_file import read
+    from rtcp.telemetry.fault_report import draw, summary
 
-    try:
+    with _readable():
         recording = read(path)
-    except RecordingError as error:
-        raise CommandError(str(error), ExitCode.FAULT) from error
-    from rtcp.cli.faults_summary import summary
-
-    told = {**summary(recording), "file": str(path)}
+    fault = {**summary(recording), "file": str(path)}
     if not as_json or plot is not None:
-        from rtcp.cli.faults_plot import draw
-
-        told["picture"] = str(out := _place(plot, path))
+        out = _picture_file(path) if plot is None else plot
+        fault["picture"] = str(out)
         try:
             draw(recording, out)
         except OSError as error:
             option, code = ("", ExitCode.FAULT) if plot is None else ("--plot ", ExitCode.USAGE)
-            why = f"{option}{out}: the picture cannot be written there: {error.strerror or error}"
-            raise CommandError(why, code) from error
+            raise CommandError(f"{option}{out} cannot be written: {error.strerror or error}", code) from error
     if as_json:
-        emit_json(told)
+        emit_json(fault)
         return
-    from rtcp.cli.faults_view import picture
-
-    show(picture(told))
-    report(f"\nrecording: {told['file']}\npicture: {told['picture']}")
+    show(*_fault_tables(fault))
+    report(f"\nrecording: {fault['file']}\npicture: {fault['picture']}")
 
 
-def _listed() -> list[Listed]:
-    from rtcp.gateway.blackbox_file import RecordingError, faults_directory, listed
+@contextmanager
+def _readable() -> Iterator[None]:
+    from rtcp.gateway.blackbox_file import RecordingError
 
     try:
-        return listed(faults_directory())
+        yield
     except RecordingError as error:
         raise CommandError(str(error), ExitCode.FAULT) from error
 
 
-def _path(number: int) -> Path:
-    """Return the recording of this number.
+def _recording(number: int) -> Path:
+    """Return the recording of this number; raises CommandError with the numbers that exist."""
+    from rtcp.gateway.blackbox_file import faults_directory, files
 
-    Raises:
-        CommandError: there is none; it says which there are.
-    """
-    from rtcp.gateway.blackbox_file import RecordingError, faults_directory, files
-
-    directory = faults_directory()
-    try:
-        there = dict(files(directory))
-    except RecordingError as error:
-        raise CommandError(str(error), ExitCode.FAULT) from error
-    if number in there:
-        return there[number]
-    which = f"recorded: {_spans(sorted(there))}" if there else f"none has been recorded{_elsewhere()}"
-    raise CommandError(f"there is no fault {number} in {directory}: {which}")
+    with _readable():
+        recorded = dict(files(faults_directory()))
+    if number in recorded:
+        return recorded[number]
+    which = f"recorded: {_spans(sorted(recorded))}" if recorded else f"none has been recorded{_service_hint()}"
+    raise CommandError(f"there is no fault {number} in {faults_directory()}: {which}")
 
 
-def _elsewhere() -> str:
-    """Return where the service records, of which another user has an empty list of their own."""
+def _service_hint() -> str:
+    """Return where the service records, for a user whose own list is empty."""
     from rtcp.gateway.blackbox_file import faults_directory
 
     if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
@@ -137,9 +126,79 @@ def _spans(numbers: list[int]) -> str:
     return ", ".join("-".join(map(str, span)) for span in spans)
 
 
-def _place(plot: Path | None, recording: Path) -> Path:
-    """Return where the picture goes: where it was asked for, beside the recording, or here where that may not be."""
-    if plot is not None:
-        return plot
+def _picture_file(recording: Path) -> Path:
+    """Return a file beside the recording, or in the working directory where that cannot be written to."""
     beside = recording.with_suffix(".png")
     return beside if os.access(beside.parent, os.W_OK) else Path(beside.name)
+
+
+def _row(one: Listed) -> dict[str, Any]:
+    if one.about is None:
+        return {"number": one.number, "file": str(one.path), "error": one.trouble}
+    return {
+        "number": one.number,
+        "time": one.about.when.isoformat(timespec="milliseconds"),
+        "what": one.about.what,
+        "before": one.about.before,
+        "seconds": round(one.seconds, 4),
+        "notes": list(one.about.notes),
+        "file": str(one.path),
+    }
+
+
+def _list_table(found: Sequence[Listed]) -> list[RenderableType]:
+    """Return the list; what a recording lacks follows below it."""
+    from rich.text import Text
+
+    rows = table(("#", "time", "what", "before", "recorded"), ("time", "before"), expand=True, fill="what")
+    notes: list[RenderableType] = []
+    for one in found:
+        if one.about is None:
+            rows.add_row(str(one.number), "-", Text("unreadable", "red"), "-", "-")
+            notes.append(Text(f"{one.number}: {one.trouble}", "red"))
+            continue
+        what = Text(one.about.what.partition(";")[0])
+        rows.add_row(
+            str(one.number), f"{one.about.when:%Y-%m-%d %H:%M:%S}", what, one.about.before, f"{one.seconds:.1f} s"
+        )
+        notes += [Text(f"{one.number}: {note}") for note in one.about.notes]
+    return [rows, *([Text()] if notes else []), *notes]
+
+
+def _fault_tables(fault: dict[str, Any]) -> list[RenderableType]:
+    """Return everything about one fault, from its summary."""
+    from rich import box
+    from rich.panel import Panel
+    from rich.text import Text
+
+    head = Text.assemble((f"FAULT {fault['number']}", "bold red"), f"   {fault['time'].replace('T', ' ')}   ")
+    head.append(f"{fault['arm']} on {fault['bus']}, every {fault['cycle_ns'] / 1000:g} us\n")
+    head.append(fault["what"], "red")
+    versions = ", ".join(f"{name} {version}" for name, version in fault["versions"].items())
+    head.append(f"\nbefore: {fault['before']}; {versions}")
+    timeline = table(("s", "what happened"), expand=True, fill="what happened")
+    for entry in fault["timeline"]:
+        timeline.add_row(f"{entry['t_s']:+.3f}", Text(entry["sentence"]))
+    parts: list[RenderableType] = [Panel(head, box=box.ROUNDED, title="rtcp", title_align="left"), timeline]
+    if "joints" in fault:
+        joints = table(
+            ("at the fault", *(f"{name} {unit}" for name, unit in JOINT_COLUMNS)), ("at the fault",), expand=True
+        )
+        for at, name in enumerate(fault["joint_names"]):
+            joints.add_row(name, *(f"{fault['joints'][column][at]:+.4f}" for column, _ in JOINT_COLUMNS))
+        parts += [Text(), joints, Text(), _facts(fault)]
+    return [*parts, *(Text(note, "yellow") for note in fault["notes"])]
+
+
+def _facts(fault: dict[str, Any]) -> Table:
+    rows = facts()
+    rows.columns[0].style = "bold"
+    rows.add_row("recorded", f"{fault['cycles']} cycles, {fault['begins_s']:+.1f} s to {fault['ends_s']:+.1f} s")
+    if step := fault["largest_step"]:
+        where = f"{step['joint']}, {step['rad_per_s']:.4g} rad/s, at {step['t_s']:+.3f} s"
+        rows.add_row("largest step", f"{step['rad']:.3g} rad of a target in one cycle ({where})")
+    rows.add_row("missed", f"{fault['missed']} cycles of the grid")
+    wkc = fault["wkc"]
+    counted = f"working counter {wkc['actual']} of {wkc['expected']} at the fault"
+    rows.add_row("frames", f"{counted}; {wkc['wrong_cycles']} wrong, {wkc['without_answer']} without an answer")
+    return rows

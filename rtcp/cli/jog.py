@@ -1,160 +1,269 @@
-"""`rtcp jog`: the tool or a joint moves while a key is held, or for a time."""
+"""`rtcp jog` and `rtcp joystick`: motion while a key is held, or for a time; both renew a command that expires."""
 
 from __future__ import annotations
 
-import math
 import re
 import sys
 import time
-from collections.abc import Callable
-from typing import Annotated
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, positive, refuse_options
-from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.keys import ESCAPE, HeldKey, Keys
-from rtcp.cli.output import report
-from rtcp.cli.progress import stopping
-from rtcp.cli.renewal import Renewal
-from rtcp.config.plain_number import plain_number
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, number, positive, refuse_old_name, refuse_options
+from rtcp.cli.connection import connect, stopping
+from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, signals_raise
+from rtcp.cli.keyboard import QUIT, HeldKey, Keyboard, RenewalCheck
+from rtcp.cli.output import emit, report
 from rtcp.ipc.client import ControlClient
 
-AXES = ("x", "y", "z", "rx", "ry", "rz")
-TURN_S = 0.05
-"""So often a jog is said again."""
-HOLD_S = 0.25
-"""So long it counts: a client that is stopped or cut off moves the arm no longer than that, and never again."""
-LONGEST_S = 60.0
-BACKWARDS = ("down", "left", "-")
-QUITS = ("q", ESCAPE, "\x04")
+JOG_INTERVAL_S, JOG_HOLD_S = 0.05, 0.25
+"""Interval of jog commands, and how long one is valid: a client that stalls moves the arm no longer than that."""
+JOYSTICK_INTERVAL_S, JOYSTICK_HOLD_S = 0.08, 0.4
+"""The same of forced joystick inputs."""
+PADDLE_S = 0.15
+"""Length of a tap on a paddle: longer than its debounce time."""
+LONGEST_JOG_S, LONGEST_JOYSTICK_S = 60.0, 3600.0
+SHOW_INTERVAL_S = 0.25
+BACKWARD = ("down", "left", "-")
 _JOINT = re.compile(r"joint([1-9]\d?)")
-Say = Callable[[float, float], None]
-"""Says the jog: its direction, and when that was wanted, s of CLOCK_MONOTONIC."""
+Jog = Callable[[float, float], None]
+"""Sends a jog: its direction, and the instant at which it was wanted, s of CLOCK_MONOTONIC."""
+
+INPUTS = {
+    "forward": "forward",
+    "backward": "backward",
+    "left": "left",
+    "right": "right",
+    "up": "mode_up",
+    "down": "mode_down",
+    "chair": "chair",
+    "estop": "emergency_stop",
+    "enable": "enabling_switch",
+}
+"""Words of the command line -> inputs of the IO box."""
+ARROWS = {"up": "forward", "down": "backward", "left": "left", "right": "right"}
+PADDLES = {"+": "mode_up", "-": "mode_down"}
+SWITCHES = {"t": "chair", "e": "emergency_stop"}
 
 
 def register(app: typer.Typer) -> None:
     """Add this group's commands."""
     app.command("jog", context_settings=NUMBERS_AS_WRITTEN)(_jog)
+    app.command("joystick")(_joystick)
+    refuse_old_name(app, "stick", "rtcp joystick")
+
+
+# -- jog ------------------------------------------------------------------------------------------------------------
 
 
 def _jog(
     axis: Annotated[str, typer.Argument(metavar="AXIS", help="x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
-    speed: Annotated[
-        str, typer.Argument(metavar="SPEED", help="m/s; rad/s of a turn or a joint; negative: the other way.")
-    ],
-    frame: Annotated[str, typer.Option("--frame", metavar="base|tool", help="Whose x, y, z they are.")] = "base",
+    speed: Annotated[str, typer.Argument(metavar="SPEED", help="m/s; rad/s of rotations and joints; may be negative.")],
+    frame: Annotated[str, typer.Option("--frame", metavar="base|tool", help="Frame of x, y, z.")] = "base",
     seconds: Annotated[
-        float | None, typer.Option("--seconds", metavar="N", help="Move for so long, s, without keys.")
+        float | None, typer.Option("--seconds", metavar="N", help="Move for N seconds, without keys.")
     ] = None,
 ) -> None:
-    """Move while a key is held (down, left or - : the other way; q ends); Ctrl-C stops the arm."""  # fmt: skip
-    refuse_options([axis, speed], ("--frame", "--seconds", "--help", "-h"))
-    at, joints = _axis(axis)
-    wanted = _speed(speed, joints or at >= 3)
+    """Move while a key is held (down, left and - move backward, q ends); Ctrl-C stops the arm."""
+    refuse_options([axis, speed], ("--frame", "--seconds"))
+    at, of_joint = _axis(axis)
+    wanted = number(speed, "SPEED", "rad/s" if of_joint or at >= 3 else "m/s")
+    if wanted == 0:
+        raise CommandError(f"SPEED {speed} is not allowed: a number other than 0")
     if frame not in ("base", "tool"):
         raise CommandError(f"--frame {frame} is not known: base or tool")
-    positive("--seconds", seconds, "s", LONGEST_S)
+    positive("--seconds", seconds, "s", LONGEST_JOG_S)
     if seconds is None and not sys.stdin.isatty():
-        raise CommandError("there is no terminal whose keys could be held: give --seconds N")
+        raise CommandError("standard input is not a terminal, so no key can be held: give --seconds N")
     with stopping(client := connect("jog")):
-        count = len(client.call("status").get("joint_names") or AXES) if joints else len(AXES)
+        count = len(client.call("status").get("joint_names") or POSE) if of_joint else len(POSE)
         if at >= count:
             raise CommandError(f"{axis} does not exist: joint1 to joint{count}")
 
-        def say(direction: float, now: float) -> None:
+        def jog(direction: float, now: float) -> None:
             speeds = [0.0] * count
             speeds[at] = direction * wanted
-            arguments = {"v": speeds, "frame": "joints" if joints else frame, "hold_s": HOLD_S, "t": now}
+            arguments = {"v": speeds, "frame": "joints" if of_joint else frame, "hold_s": JOG_HOLD_S, "t": now}
             client.call("jog", arguments)
 
         if seconds is not None:
-            _for_a_time(client, say, seconds)
+            _jog_for(client, jog, seconds)
         else:
-            report(f"hold a key to move {axis} at {wanted:g} (down, left or -: the other way), q ends")
-            _while_held(client, say)
-        _show_end(client)
+            report(f"hold a key to move {axis} at {wanted:g} (down, left or -: backward), q ends")
+            _jog_by_keys(client, jog)
+        joints = client.call("status").get("joints") or {}
+    report(f"stopped at {' '.join(f'{value:.4f}' for value in joints.get('position') or ())} rad")
 
 
-def _for_a_time(client: ControlClient, say: Say, seconds: float) -> None:
+def _axis(axis: str) -> tuple[int, bool]:
+    """Return the index of an axis, from 0, and whether it is a joint."""
+    name = axis.lower()
+    if name in POSE:
+        return POSE.index(name), False
+    found = _JOINT.fullmatch(name)
+    if found is None:
+        raise CommandError(f"{axis!r} is not an axis: {', '.join(POSE)}, or joint1 to joint6")
+    return int(found[1]) - 1, True
+
+
+def _jog_for(client: ControlClient, jog: Jog, seconds: float) -> None:
     until = time.monotonic() + seconds
-    renewal = Renewal(HOLD_S)
+    renewal = RenewalCheck(JOG_HOLD_S)
     while True:
         now = time.monotonic()
-        if missed := renewal.missed(now):
+        if late_s := renewal.overdue(now):
             client.call("halt")
             raise CommandError(
-                f"the jog was not said again for {missed:.1f} s: the arm had stopped, and stays so", ExitCode.FAULT
+                f"the jog was not renewed for {late_s:.1f} s: the arm had stopped and stays stopped", ExitCode.FAULT
             )
         if now >= until:
             break
-        say(1.0, now)
-        time.sleep(max(0.0, min(TURN_S, until - now)))
+        jog(1.0, now)
+        time.sleep(max(0.0, min(JOG_INTERVAL_S, until - now)))
     client.call("halt")
 
 
-def _while_held(client: ControlClient, say: Say) -> None:
-    key = HeldKey()
-    renewal = Renewal(HOLD_S)
-    moves = False
+def _jog_by_keys(client: ControlClient, jog: Jog) -> None:
+    key, renewal = HeldKey(), RenewalCheck(JOG_HOLD_S)
+    moving = False
     due = time.monotonic()
-    with Keys() as keys:
+    with Keyboard() as keyboard:
         while True:
-            pressed = keys.read(due - time.monotonic())
+            pressed = keyboard.read(due - time.monotonic())
             now = time.monotonic()
-            if pressed in QUITS:
+            if pressed in QUIT:
                 break
-            missed = renewal.missed(now)
-            if missed:
-                report(f"the keys were not looked at for {missed:.1f} s: what was pressed meanwhile does not count")
+            late_s = renewal.overdue(now)
+            if late_s:
+                report(f"the keyboard was not read for {late_s:.1f} s: keys pressed meanwhile are ignored")
                 key.release()
             elif pressed:
                 key.press(pressed, now)
             if now < due:
                 continue
-            due = now + TURN_S
-            held = key.held(now)
-            if held:
-                say(-1.0 if held in BACKWARDS else 1.0, now)
-                moves = True
+            due = now + JOG_INTERVAL_S
+            if held := key.held(now):
+                jog(-1.0 if held in BACKWARD else 1.0, now)
+                moving = True
                 continue
-            if moves:
+            if moving:
                 client.call("halt")
-                moves = False
-                renewal.missed(time.monotonic())  # the halt's wait is no silence
-            elif not missed:
+                moving = False
+                renewal.overdue(time.monotonic())  # the halt's wait is not a stall
+            elif not late_s:
                 continue
-            # A key that was pressed while nobody looked, be it during the halt, must not move the arm now.
-            if not keys.drain().isdisjoint(QUITS):
+            # A key that was pressed during the stall or the halt must not move the arm now.
+            if not keyboard.drain().isdisjoint(QUIT):
                 break
-    if moves:
+    if moving:
         client.call("halt")
 
 
-def _show_end(client: ControlClient) -> None:
-    joints = client.call("status").get("joints") or {}
-    shown = " ".join(f"{value:.4f}" for value in joints.get("position") or ())
-    report(f"stopped at {shown} rad")
+# -- joystick -------------------------------------------------------------------------------------------------------
 
 
-def _axis(axis: str) -> tuple[int, bool]:
-    """Return the place of an axis, from 0, and whether it is a joint's."""
-    name = axis.lower()
-    if name in AXES:
-        return AXES.index(name), False
-    found = _JOINT.fullmatch(name)
-    if found is None:
-        raise CommandError(f"{axis!r} is no axis: {', '.join(AXES)}, or joint1 to joint6")
-    return int(found[1]) - 1, True
-
-
-def _speed(speed: str, turns: bool) -> float:
-    unit = "rad/s" if turns else "m/s"
+def _joystick(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[POSITION..]",
+            help=f"{', '.join(INPUTS)} (one or more), byte N, or release. Default: by keys.",
+        ),
+    ] = None,
+    seconds: Annotated[float, typer.Option("--seconds", metavar="N", help="Release after N seconds.")] = 1.0,
+) -> None:
+    """Operate the joystick of the virtual arm: arrows, + - (paddles), t (toggle), e (emergency stop), q (quit)."""
+    positive("--seconds", seconds, "s", LONGEST_JOYSTICK_S)
+    if not words:
+        if not sys.stdin.isatty():
+            raise CommandError(
+                f"standard input is not a terminal: give a position, as {', '.join(INPUTS)}, byte N or release"
+            )
+        with connect("joystick") as client:
+            _force_by_keys(client)
+        return
+    pressed, byte = _position(words)
     try:
-        found = plain_number(speed)
-    except ValueError:
-        raise CommandError(f"{speed!r} is not a number ({unit})") from None
-    if not math.isfinite(found) or found == 0:
-        raise CommandError(f"speed {speed} is not allowed: a finite number of {unit}, not 0")
-    return found
+        with signals_raise(*SUSPENDING), connect("joystick") as client:
+            if words == ["release"]:
+                _force(client, [], None, time.monotonic())
+            else:
+                _force_for(client, pressed, byte, seconds)
+    except KeyboardInterrupt as interruption:
+        raise CommandError("interrupted: the joystick is released", interruption_code(interruption)) from None
+    report("the joystick is released")
+
+
+def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
+    """Return the inputs that are pressed, or the whole input byte."""
+    if words[0] == "byte":
+        if len(words) != 2 or not (words[1].isascii() and words[1].isdecimal()) or int(words[1]) > 255:
+            raise CommandError(f"{' '.join(words)} is not allowed: one number from 0 to 255")
+        return [], int(words[1])
+    if list(words) == ["release"]:
+        return [], None
+    if unknown := [word for word in words if word not in INPUTS]:
+        raise CommandError(f"{unknown[0]!r} is not a joystick position: {', '.join(INPUTS)}, byte N or release")
+    return [INPUTS[word] for word in words], None
+
+
+def _force(client: ControlClient, pressed: Sequence[str], byte: int | None, now: float) -> None:
+    client.call("stick", {"pressed": list(pressed), "byte": byte, "hold_s": JOYSTICK_HOLD_S, "t": now})
+
+
+def _force_for(client: ControlClient, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
+    until = time.monotonic() + seconds
+    renewal = RenewalCheck(JOYSTICK_HOLD_S)
+    while (now := time.monotonic()) < until:
+        if late_s := renewal.overdue(now):
+            raise CommandError(
+                f"the joystick was not renewed for {late_s:.1f} s: it was released and stays released", ExitCode.FAULT
+            )
+        _force(client, pressed, byte, now)
+        time.sleep(max(0.0, min(JOYSTICK_INTERVAL_S, until - now)))
+
+
+def _force_by_keys(client: ControlClient) -> None:
+    report("arrows: the joystick, while held; +, -: mode paddles; t: arm or wheelchair; e: emergency stop; q: quit")
+    key, renewal = HeldKey(), RenewalCheck(JOYSTICK_HOLD_S)
+    switched: set[str] = set()
+    paddle, paddle_until, shown_at = "", 0.0, 0.0
+    due = time.monotonic()
+    with Keyboard() as keyboard:
+        while True:
+            pressed = keyboard.read(due - time.monotonic())
+            now = time.monotonic()
+            if pressed in QUIT:
+                break
+            if renewal.overdue(now):
+                # Keys pressed during the stall must not move the arm now.
+                key.release()
+                pressed, paddle_until = "", now
+                if not keyboard.drain().isdisjoint(QUIT):
+                    break
+            if pressed in ARROWS:
+                key.press(pressed, now)
+            elif pressed:
+                key.release()
+            if pressed in PADDLES:
+                paddle, paddle_until = PADDLES[pressed], now + PADDLE_S
+            elif pressed in SWITCHES:
+                switched ^= {SWITCHES[pressed]}
+            if now < due:
+                continue
+            due = now + JOYSTICK_INTERVAL_S
+            held = key.held(now)
+            inputs = [*([paddle] if now < paddle_until else [ARROWS[held]] if held else []), *sorted(switched)]
+            _force(client, inputs, None, now)
+            if now - shown_at > SHOW_INTERVAL_S:
+                shown_at = now
+                _show(client.call("status"), inputs)
+    emit("")
+
+
+def _show(status: dict[str, Any], inputs: Sequence[str]) -> None:
+    mode = (status.get("stick") or {}).get("mode", "-")
+    line = f"{status.get('state', '-')}, {status.get('motion', '-')}, {mode}: {' '.join(inputs) or 'neutral'}"
+    sys.stdout.write(f"\r{line[:79]:79}")
+    sys.stdout.flush()

@@ -1,20 +1,17 @@
-"""`rtcp limits show` and `set`: what no motion goes beyond, changed as one transaction."""
+"""`rtcp limits show` and `set`: limits of joints, tool and boxes, changed as one transaction."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, refuse_options
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, number, refuse_options
 from rtcp.cli.connection import ask
 from rtcp.cli.errors import CommandError
-from rtcp.cli.output import emit_json, report, show
-from rtcp.config.plain_number import plain_number
+from rtcp.cli.output import emit_json, report, show, table
 
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object, SI units.")]
 COLUMNS = (
     ("min", "rad"), ("max", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s^2"), ("jerk", "rad/s^3"),
     ("torque", "Nm"),
@@ -32,12 +29,12 @@ def register(app: typer.Typer) -> None:
 
 
 def _show(as_json: AsJson = False) -> None:
-    """Show the limits of the joints and the tool, and the boxes; what was changed is marked."""
+    """Show the limits of joints, tool and boxes; a star marks a changed value."""
     found = ask("limits show", "limits")
     if as_json:
         emit_json(found)
-        return
-    show(*_picture(found))
+    else:
+        show(*_tables(found))
 
 
 def _set(
@@ -45,19 +42,19 @@ def _set(
         list[str],
         typer.Argument(
             metavar="KEY VALUE..",
-            help="joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all are taken, or none.",
+            help="joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all apply, or none.",
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
-    """Change limits, within what is configured; refused as a whole if the arm would be outside."""
-    refuse_options(pairs, ("--json", "--help", "-h"))
+    """Change limits within the configured ones; refused as a whole where the arm would be outside."""
+    refuse_options(pairs, ("--json",))
     changes = _changes(pairs)
     found = ask("limits set", "limits", {"set": changes})
     if as_json:
         emit_json(found)
-        return
-    report(f"{len(changes)} {'limit is' if len(changes) == 1 else 'limits are'} changed until `rtcp stop`")
+    else:
+        report(f"{len(changes)} {'limit is' if len(changes) == 1 else 'limits are'} changed until `rtcp stop`")
 
 
 def _changes(pairs: Sequence[str]) -> dict[str, float]:
@@ -66,38 +63,32 @@ def _changes(pairs: Sequence[str]) -> dict[str, float]:
     changes: dict[str, float] = {}
     wrong = []
     for key, value in zip(pairs[::2], pairs[1::2], strict=True):
-        try:
-            number = plain_number(value)
-        except ValueError:
-            wrong.append(f"{key}: {value!r} is not a number")
-            continue
-        if not math.isfinite(number):
-            wrong.append(f"{key}: {value} is not finite; a limit is a finite number")
-        elif key in changes:
+        if key in changes:
             wrong.append(f"{key} is given twice")
-        changes[key] = number
+        try:
+            changes[key] = number(value, key)
+        except CommandError as error:
+            wrong.append(error.message)
     if wrong:
         raise CommandError("\n".join(wrong))
     return changes
 
 
-def _picture(found: Mapping[str, Any]) -> list[Any]:
-    from rich import box
+def _tables(found: Mapping[str, Any]) -> list[Any]:
     from rich.table import Table
 
     now, configured = found["limits"], found["configured"]
-    joints = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1))
-    joints.add_column("joint")
-    for name, unit in COLUMNS:
-        joints.add_column(f"{name}\n{unit}", justify="right")
+    joints = table(("joint", *(f"{name}\n{unit}" for name, unit in COLUMNS)), ("joint",))
     for at, joint in enumerate(found["joint_names"]):
-        joints.add_row(joint, *(_changed(now[name][at], configured[name][at]) for name, _ in COLUMNS))
-    boxes = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1))
-    for heading in ("box", "x m", "y m", "z m"):
-        boxes.add_column(heading, justify="left" if heading == "box" else "right")
-    _row(boxes, "tool inside", now["box"], configured["box"])
-    for name, corners in now["keep_out"].items():
-        _row(boxes, f"keep out: {name}", corners, configured["keep_out"].get(name))
+        joints.add_row(joint, *(_marked(now[name][at], configured[name][at]) for name, _ in COLUMNS))
+    boxes = table(("box", "x m", "y m", "z m"), ("box",))
+    rows = [("tool inside", now["box"], configured["box"])]
+    rows += [(f"keep out: {name}", box, configured["keep_out"].get(name)) for name, box in now["keep_out"].items()]
+    for name, box, before in rows:
+        if box is not None:
+            before = before or box  # noqa: PLW2901
+            spans = zip(box["min"], box["max"], before["min"], before["max"], strict=True)
+            boxes.add_row(name, *(f"{_marked(low, was)} to {_marked(high, had)}" for low, high, was, had in spans))
     tool = Table.grid(padding=(0, 2))
     for name, unit in UNITS.items():
         tool.add_row(f"tool: {name.replace('_', ' ')}", f"{found['cartesian'][name]:g} {unit}")
@@ -106,18 +97,5 @@ def _picture(found: Mapping[str, Any]) -> list[Any]:
     return [joints, "", boxes, "", tool]
 
 
-def _row(table: Any, name: str, corners: Mapping[str, Any] | None, configured: Mapping[str, Any] | None) -> None:
-    if corners is None:
-        return
-    before = configured or corners
-    table.add_row(
-        name,
-        *(
-            f"{_changed(low, was)} to {_changed(high, had)}"
-            for low, high, was, had in zip(corners["min"], corners["max"], before["min"], before["max"], strict=True)
-        ),
-    )
-
-
-def _changed(value: float, configured: float) -> str:
+def _marked(value: float, configured: float) -> str:
     return f"{value:g}" if value == configured else f"{value:g} *"

@@ -1,23 +1,29 @@
-"""What the commands print: answers on standard output, sentences about trouble on standard error."""
+"""What commands print: results on standard output, errors on standard error, tables, progress of a motion."""
 
 from __future__ import annotations
 
 import json
 import os
 import sys
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
+    from rich.table import Table
 
 PIPED_WIDTH = 80
-"""Columns of tables that go to a file or a pipe."""
+"""Columns of a table that goes to a file or a pipe."""
+ABSENT = "-"
+
+Progress = Callable[[Mapping[str, Any]], None]
 
 
 def emit(text: str) -> None:
-    """Print an answer at once; end the command quietly when its reader has gone (`rtcp status | head -1`)."""
+    """Print a result; end the command quietly when the reader has closed the pipe (`rtcp status | head -1`)."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -31,7 +37,7 @@ def emit_json(value: Any) -> None:
 
 
 def report(text: str) -> None:
-    """Print one line of progress; go on silently when its reader has gone."""
+    """Print one line of progress; continue silently when the reader has closed the pipe."""
     try:
         print(text, flush=True)
     except BrokenPipeError:
@@ -39,21 +45,19 @@ def report(text: str) -> None:
 
 
 def complain(text: str) -> None:
-    """Print a sentence about trouble on standard error, each line marked as ours."""
+    """Print an error on standard error, `rtcp: ` before each line."""
     try:
         for line in text.splitlines() or [""]:
             print(f"rtcp: {line}", file=sys.stderr, flush=True)
     except OSError:
-        pass  # nobody is left to tell; the exit code still says it
+        pass  # standard error is closed; the exit code still tells
 
 
-def show(*renderables: RenderableType) -> None:
-    """Print rich's tables and panels: coloured and as wide as the terminal, or plain at 80 columns in a pipe."""
-    canvas = console()
-    with canvas.capture() as captured:
-        for renderable in renderables:
-            canvas.print(renderable)
-    emit("\n".join(line.rstrip() for line in captured.get().rstrip().splitlines()))
+def mute() -> None:
+    """Redirect standard output to /dev/null, so that neither a later line nor the flush at exit fails."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.close(null)
 
 
 def console() -> Console:
@@ -63,8 +67,94 @@ def console() -> Console:
     return Console(highlight=False, width=None if sys.stdout.isatty() else PIPED_WIDTH)
 
 
-def mute() -> None:
-    """Point standard output at nothing, so that neither a later line nor the interpreter's last flush fails."""
-    nothing = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nothing, sys.stdout.fileno())
-    os.close(nothing)
+def show(*renderables: RenderableType) -> None:
+    """Print tables and panels: coloured and as wide as the terminal, or plain at 80 columns in a pipe."""
+    canvas = console()
+    with canvas.capture() as captured:
+        for renderable in renderables:
+            canvas.print(renderable)
+    emit("\n".join(line.rstrip() for line in captured.get().rstrip().splitlines()))
+
+
+def table(
+    headings: Sequence[str],
+    left: Collection[str] = (),
+    *,
+    title: str | None = None,
+    expand: bool = False,
+    fill: str = "",
+    padding: int = 1,
+) -> Table:
+    """Return an empty table; columns are right-aligned and do not wrap.
+
+    Args:
+        headings: one for each column.
+        left: headings of the columns that are left-aligned.
+        title: line above the table.
+        expand: use the full width.
+        fill: heading of the column that takes the remaining width and wraps.
+        padding: blanks on each side of a cell.
+    """
+    from rich import box
+    from rich.table import Table
+
+    made = Table(
+        box=box.SIMPLE_HEAD, title=title, title_justify="left", show_edge=False, expand=expand, padding=(0, padding)
+    )
+    for heading in headings:
+        wraps = heading == fill and heading != ""
+        made.add_column(
+            heading,
+            justify="left" if heading in left or wraps else "right",
+            no_wrap=not wraps and "\n" not in heading,
+            ratio=1 if wraps else None,
+        )
+    return made
+
+
+def facts() -> Table:
+    """Return an empty grid of two columns: a label and its value, which wraps."""
+    from rich.table import Table
+
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column()
+    return grid
+
+
+@contextmanager
+def progress() -> Iterator[Progress]:
+    """Yield a function that shows the progress of a motion: a bar on a terminal, else a line every 10 %."""
+    if not sys.stdout.isatty():
+        yield _line_reporter()
+        return
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+
+    columns = (TextColumn("moving"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
+    with Progress(*columns, console=console()) as bar:
+        task = bar.add_task("move", total=1.0, left="")
+        yield lambda update: bar.update(task, completed=_fraction(update), left=_remaining(update))
+        bar.update(task, completed=1.0, left="")
+
+
+def _line_reporter() -> Progress:
+    shown = -1
+
+    def line(update: Mapping[str, Any]) -> None:
+        nonlocal shown
+        tenth = int(_fraction(update) * 10)
+        if tenth > shown:
+            shown = tenth
+            report(f"moving: {_fraction(update):4.0%} {_remaining(update)}".rstrip())
+
+    return line
+
+
+def _fraction(update: Mapping[str, Any]) -> float:
+    value = update.get("fraction")
+    return min(1.0, max(0.0, float(value))) if isinstance(value, int | float) else 0.0
+
+
+def _remaining(update: Mapping[str, Any]) -> str:
+    value = update.get("remaining_s")
+    return f"{value:.1f} s left" if isinstance(value, int | float) else ""

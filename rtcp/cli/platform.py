@@ -1,24 +1,26 @@
-"""`rtcp start` and `rtcp stop`: the platform's processes, in the foreground or on their own."""
+"""`rtcp start` and `rtcp stop`: the platform's processes, in the foreground or detached."""
 
 from __future__ import annotations
 
-import math
 import time
-from typing import Annotated
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, ExitCode, code_of
-from rtcp.cli.launch import launch, serve
-from rtcp.cli.options import BusName, ConfigFile, Poll
+from rtcp.cli.arguments import BusName, ConfigFile, Poll, positive
+from rtcp.cli.connection import connect, loop_process
+from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code, signals_raise
 from rtcp.cli.output import report
 from rtcp.ipc.errors import RtcpError
 
-PATIENCE_S = 5.0
-"""For a machine that is still starting: its frames have to come back first, or to be missed for long enough."""
-_ASK_S = 0.02
-_NOT_WELL = frozenset({"starting", "fault", "emergency_stop"})
+if TYPE_CHECKING:
+    from rtcp.launch.launcher import StartOptions
+    from rtcp.launch.platform import Platform
+
+READY_TIMEOUT_S = 5.0
+"""Time for the machine to leave `starting`: its frames must return first, or be missing for long enough."""
+_NOT_READY = frozenset({"starting", "fault", "emergency_stop"})
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
 
 
@@ -31,56 +33,53 @@ def register(app: typer.Typer) -> None:
 def _start(
     config: ConfigFile = None,
     bus: BusName = None,
-    mode: Annotated[
-        str | None, typer.Option("--mode", metavar="NAME", help=f"At the start: {', '.join(MODES)}.")
-    ] = None,
+    mode: Annotated[str | None, typer.Option("--mode", metavar="NAME", help=f"Initial mode: {', '.join(MODES)}.")] = (
+        None
+    ),
     cycle_us: Annotated[
-        float | None, typer.Option("--cycle-us", metavar="N", help="Cycle, us; else the configuration's.")
+        float | None, typer.Option("--cycle-us", metavar="N", help="Cycle, us. Default: the configured one.")
     ] = None,
     poll: Poll = False,
-    detach: Annotated[bool, typer.Option("--detach", help="Return once it runs; `rtcp stop` ends it.")] = False,
+    detach: Annotated[bool, typer.Option("--detach", help="Return when it runs; `rtcp stop` ends it.")] = False,
 ) -> None:
     """Start the platform: bring the slaves to OP and wait for commands."""
     mode = None if mode is None else mode.lower()
     if mode is not None and mode not in MODES:
         raise CommandError(f"--mode {mode} is not known: {', '.join(MODES)}")
-    if cycle_us is not None and not (math.isfinite(cycle_us) and cycle_us > 0):
-        raise CommandError(f"--cycle-us {cycle_us:g} is not allowed: a number of us above 0")
+    positive("--cycle-us", cycle_us, "us")
     from rtcp.launch.launcher import StartOptions
 
-    request = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
+    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
     if detach:
-        # The processes have sessions of their own: nothing needs to stay behind for them.
-        launch(request, report)
-        said, well = _outcome("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop` ends it")
-        if not well:
-            raise CommandError(said, ExitCode.FAULT)
-        report(said)
+        launch(options)  # the processes have sessions of their own and outlive this command
+        message, ready = _wait_ready("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop`")
+        if not ready:
+            raise CommandError(message, ExitCode.FAULT)
+        report(message)
         return
-    ready = "`rtcp enable` and `rtcp move` in another terminal; Ctrl-C or `rtcp stop` ends it"
-    ending = serve(request, report, lambda: report(_outcome(ready)[0]))
-    report("stopped" if ending == 0 else "the platform has ended")
-    raise typer.Exit(ending)
+    code = serve(options, lambda: report(_wait_ready("`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`")[0]))
+    report("stopped" if code == 0 else "the platform has ended")
+    raise typer.Exit(code)
 
 
-def _outcome(ready: str) -> tuple[str, bool]:
-    """Wait until the machine has left its start; return in a sentence what came of it, and whether that is well.
+def _wait_ready(hint: str) -> tuple[str, bool]:
+    """Wait until the machine leaves `starting`; return a message and whether the start succeeded.
 
-    A loop that was only given its gateway back may be doing anything: that is no failed start, unless it is in a fault.
+    A loop that only got its gateway back may be in any state: the start failed only if that is a fault.
     """
-    until = time.monotonic() + PATIENCE_S
+    until = time.monotonic() + READY_TIMEOUT_S
     try:
         with connect("start") as client:
             while (status := client.call("status"))["state"] == "starting" and time.monotonic() < until:
-                time.sleep(_ASK_S)
+                time.sleep(0.02)
     except RtcpError as error:
         return f"started, but: {error.message}", False
     state, message = str(status["state"]), str(status["message"])
     if state == "ready":
-        return f"ready: {ready}", True
+        return f"ready: {hint} ends it", True
     if state == "starting":
-        message = f"not ready within {PATIENCE_S:g} s (`rtcp status`): {message}"
-    if state in _NOT_WELL:
+        message = f"not ready within {READY_TIMEOUT_S:g} s (`rtcp status`): {message}"
+    if state in _NOT_READY:
         return f"started, but: {message}", False
     return f"{state.replace('_', ' ')}: {message}", True
 
@@ -91,9 +90,53 @@ def _stop() -> None:
     from rtcp.launch.platform import StartError
 
     try:
-        left = launcher.stop(report)
+        problems = launcher.stop(report)
     except StartError as error:
         raise CommandError(str(error), code_of(error.kind)) from error
-    if left:
-        raise CommandError("\n".join(f"stopped, but: {sentence}" for sentence in left), ExitCode.FAULT)
+    if problems:
+        raise CommandError("\n".join(f"stopped, but: {problem}" for problem in problems), ExitCode.FAULT)
     report("stopped")
+
+
+def refuse_second_platform() -> None:
+    """Raise CommandError while a platform runs, with or without a gateway."""
+    if loop := loop_process():
+        raise CommandError(
+            f"a platform runs already (loop process {loop}): `rtcp status` shows it, `rtcp stop` ends it",
+            ExitCode.REFUSED,
+        )
+
+
+def launch(options: StartOptions, log: Callable[[str], None] = report) -> Platform:
+    """Start the platform and return it in the state ready; `log` receives a line for each step.
+
+    Raises:
+        CommandError: the launcher refused, or a signal ended the start; nothing is left running.
+        ConfigError: names every mistake of the configuration.
+    """
+    from rtcp.launch import launcher
+    from rtcp.launch.platform import StartError
+    from rtcp.virtual.segment import check_segment
+
+    try:
+        with signals_raise():
+            return launcher.start(options, log, check_segment)
+    except StartError as error:
+        raise CommandError(str(error), code_of(error.kind)) from error
+    except KeyboardInterrupt as interruption:
+        raise CommandError(
+            "interrupted while starting: nothing is left running", interruption_code(interruption)
+        ) from None
+
+
+def serve(options: StartOptions, announce: Callable[[], None]) -> int:
+    """Start the platform, call `announce` when it is up, supervise it to its end and return the exit code."""
+    from rtcp.launch.supervisor import supervise
+
+    with signals_raise():
+        running = launch(options)
+        try:
+            announce()
+            return supervise(running, report)
+        except KeyboardInterrupt:  # a signal before `supervise` has installed its handlers
+            return ExitCode.FAULT if running.stop(report) else ExitCode.DONE

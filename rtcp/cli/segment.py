@@ -1,29 +1,38 @@
-"""`rtcp segment`: run software slaves for any EtherCAT master, and make faults on those that run."""
+"""`rtcp segment`: run software slaves for any EtherCAT master, and inject faults into a running segment."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+import signal
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from rtcp.cli.arguments import refuse_old_name
+from rtcp.cli.arguments import AsJson, Poll, refuse_old_name
 from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.options import Poll
 from rtcp.cli.output import emit, emit_json, report
-from rtcp.ipc.runtime_directory import is_listening, runtime_directory, segment_control
+from rtcp.ipc.runtime_directory import (
+    RuntimeDirectoryError,
+    free_segment_control,
+    is_listening,
+    make_runtime_directory,
+    runtime_directory,
+    segment_control,
+)
 
 if TYPE_CHECKING:
     from rtcp.virtual.faults.client import SegmentClient
 
 ControlPath = Annotated[
     Path | None,
-    typer.Option(
-        "--segment", metavar="PATH", help="Control socket of the segment; else the one in the runtime directory."
-    ),
+    typer.Option("--segment", metavar="PATH", help="Control socket of the segment. Default: in the runtime directory."),
 ]
+_IN_HEX = ("code", "index")
 
 
 def register(app: typer.Typer) -> None:
@@ -32,10 +41,13 @@ def register(app: typer.Typer) -> None:
     segment.callback()(_segment)
     segment.command("fault")(_fault)
     segment.command("clear")(_clear)
-    refuse_old_name(segment, "mend", "rtcp segment clear")
     segment.command("faults")(_faults)
     segment.command("kinds")(_kinds)
+    refuse_old_name(segment, "mend", "rtcp segment clear")
     app.add_typer(segment, name="segment")
+
+
+# -- a segment in this process --------------------------------------------------------------------------------------
 
 
 def _segment(
@@ -46,16 +58,16 @@ def _segment(
     interface: Annotated[
         str | None,
         typer.Option(
-            "--interface", metavar="NAME", help="Leave the master's end here under this name; else in a namespace."
+            "--interface", metavar="NAME", help="Name of the master's interface, here. Default: in a network namespace."
         ),
     ] = None,
     poll: Poll = False,
     cpu: Annotated[int | None, typer.Option("--cpu", metavar="N", help="CPU of the segment.")] = None,
     script: Annotated[
-        Path | None, typer.Option("--faults", metavar="SCRIPT", help="Faults with their times, s from the start.")
+        Path | None, typer.Option("--faults", metavar="SCRIPT", help="Faults with their times, s after the start.")
     ] = None,
 ) -> None:
-    """Run a segment of software slaves for any EtherCAT master, until stopped; or make faults on one that runs."""
+    """Run a segment of software slaves until stopped, or inject faults into a running one."""
     given = {"--config": config, "--interface": interface, "--poll": poll or None, "--cpu": cpu, "--faults": script}
     if context.invoked_subcommand is not None:
         if wrong := [option for option, value in given.items() if value is not None]:
@@ -63,45 +75,87 @@ def _segment(
         return
     if config is None:
         raise CommandError("--config FILE is missing: the slaves in the order of the cable (or: fault, clear, faults)")
-    from rtcp.cli.segment_run import run_segment
+    _run(config, interface, poll, cpu, script)
 
-    run_segment(config, interface, poll, cpu, script)
+
+def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, script: Path | None) -> None:
+    from rtcp.virtual.network import NetworkError
+    from rtcp.virtual.server import run
+
+    users_before = _user_namespace()
+    control = _control()
+
+    def ready(started: dict[str, int | str | bool]) -> None:
+        # The segment has its own handler of SIGTERM by now; a terminal that closes ends it in the same way.
+        signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))
+        count, name, pid = started["slaves"], started["interface"], started["pid"]
+        report(f"segment of {count} {'slave' if count == 1 else 'slaves'} (process {pid})")
+        if not started["namespace"]:
+            report(f"the master's interface is {name}: `rtcp start --bus {name}`, or any EtherCAT master on {name}")
+        else:
+            users = "" if _user_namespace() == users_before else " -U --preserve-credentials"
+            report(f"the master's interface is {name} in the network namespace of process {pid}; start a master with")
+            report(f"  nsenter -t {pid}{users} -n COMMAND {name}")
+        where = "" if control == segment_control(runtime_directory()) else f" --segment {control}"
+        report(f"inject faults with `rtcp segment fault NAME{where}`; control socket {control}")
+        report("Ctrl-C ends it")
+
+    try:
+        run(config, interface, poll, cpu, ready, control, script)
+    except (NetworkError, ValueError) as error:
+        raise CommandError(str(error)) from error
+    report("ended")
+
+
+def _control() -> Path:
+    """Return a free path for the control socket, in the runtime directory where that is possible."""
+    directory = runtime_directory()
+    try:
+        make_runtime_directory(directory)
+    except RuntimeDirectoryError:
+        return Path(tempfile.gettempdir()) / f"rtcp-segment-{os.getpid()}.sock"
+    return free_segment_control(directory)
+
+
+def _user_namespace() -> str:
+    return os.readlink("/proc/self/ns/user")
+
+
+# -- faults of a running segment ------------------------------------------------------------------------------------
 
 
 def _fault(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Kind of the fault: `rtcp segment kinds` lists them.")],
     pairs: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE..", help="As after=3, code=0x1A.")] = None,
     lasts: Annotated[
-        float | None, typer.Option("--lasts", metavar="S", help="How long, s; else until it is cleared.")
+        float | None, typer.Option("--lasts", metavar="S", help="Duration, s. Default: until it is cleared.")
     ] = None,
     segment: ControlPath = None,
 ) -> None:
-    """Make a fault on the segment that runs."""
-    from rtcp.cli.segment_view import named
+    """Inject a fault into the running segment."""
     from rtcp.config.faults import ONCE, parse, sentence_of
 
-    mapping = _mapping(name, pairs or [], lasts)
-    planned, findings = parse(mapping)
+    planned, findings = parse(_mapping(name, pairs or [], lasts))
     if planned is None:
         raise CommandError("\n".join(map(sentence_of, findings)))
     if planned.at:
-        raise CommandError("at: a fault that is asked for begins at once; only a script has times")
+        raise CommandError("at: a fault of the command line begins at once; only a script has times")
     with _client(segment) as client:
         number = client.fault(planned.as_mapping())
         active = any(each["id"] == number for each in client.faults())
-    said = f"fault {number}: {named(planned.as_mapping())}"
+    fault = f"fault {number}: {_named(planned.as_mapping())}"
     if isinstance(planned.fault, ONCE) or not active:
-        report(f"{said}: it has happened")
+        report(f"{fault}: done")
         return
     until = "until it is cleared" if planned.lasts is None else f"for {planned.lasts:g} s"
     if getattr(planned.fault, "burst", None) is not None:
-        until = "until its burst has passed"
+        until = "until its burst is over"
     where = "" if segment is None else f" --segment {segment}"
-    report(f"{said}, {until}; to clear it: rtcp segment clear {number}{where}")
+    report(f"{fault}, {until}; to clear it: rtcp segment clear {number}{where}")
 
 
 def _clear(
-    number: Annotated[int | None, typer.Argument(metavar="ID", help="The fault's number; else all faults.")] = None,
+    number: Annotated[int | None, typer.Argument(metavar="ID", help="Number of a fault. Default: all.")] = None,
     segment: ControlPath = None,
 ) -> None:
     """Clear a fault, or all of them."""
@@ -110,44 +164,83 @@ def _clear(
     report(f"cleared: {', '.join(f'fault {each}' for each in cleared)}" if cleared else "no fault is active")
 
 
-def _faults(
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON array.")] = False, segment: ControlPath = None
-) -> None:
-    """Show the faults that are active, since when, and what they have done to frames."""
+def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
+    """Show the active faults, since when, and how many frames they have changed."""
     with _client(segment) as client:
         active = client.faults()
     if as_json:
         emit_json(active)
         return
-    from rtcp.cli.segment_view import line_of
-
-    emit("\n".join(map(line_of, active)) or "no fault is active")
+    for fault in active:
+        left = "until it is cleared" if fault["left_s"] is None else f"{fault['left_s']:.1f} s left"
+        counts = "".join(f", {count} {what.replace('_', ' ')}" for what, count in fault["counts"].items())
+        emit(f"fault {fault['id']}: {_named(fault['fault'])}, for {fault['since_s']:.1f} s, {left}{counts}")
+    if not active:
+        emit("no fault is active")
 
 
 def _kinds() -> None:
-    """List the kinds of faults, their keys and what is allowed for them."""
-    from rtcp.cli.segment_view import kinds
-
+    """List the kinds of faults, their keys and the allowed values."""
     for kind in kinds():
         emit(f"{kind.name}: {kind.says}")
         for key, allowed in kind.keys.items():
             emit(f"    {key:9} {allowed}")
-    emit("Each but those that happen once takes --lasts S. In a script: a list `faults:` with fault, at, lasts, keys.")
+    emit("Each that has a duration takes --lasts S. In a script: a list `faults:` with fault, at, lasts, keys.")
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of fault: what it is, and the allowed values of each key."""
+
+    name: str
+    says: str
+    keys: dict[str, str]
+
+
+def kinds() -> list[Kind]:
+    """Return every kind of fault."""
+    from rtcp.config.faults import FAULTS
+
+    return [
+        Kind(name, str(kind.__doc__).partition("\n")[0], {field.name: _allowed(kind, field) for field in fields(kind)})
+        for name, kind in FAULTS.items()
+    ]
+
+
+def _allowed(kind: Any, field: Any) -> str:
+    from rtcp.config.validation import allowed
+
+    text = allowed(get_type_hints(kind, include_extras=True)[field.name])
+    if field.default is MISSING:
+        return text
+    if field.default is None:
+        return f"{text} (rate or burst)"
+    return f"{text} ({_shown(field.name, field.default)} if left out)"
+
+
+def _shown(key: str, value: Any) -> str:
+    return f"0x{value:04X}" if key in _IN_HEX else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _named(fault: Mapping[str, Any]) -> str:
+    """Return a fault as it is written on the command line."""
+    own = [f"{key}={_shown(key, value)}" for key, value in fault.items() if key not in ("fault", "at", "lasts")]
+    return " ".join([fault["fault"], *own])
 
 
 def _mapping(name: str, pairs: Sequence[str], lasts: float | None) -> dict[str, Any]:
-    """Return the mapping that a command line names."""
+    """Return the fault of a command line as a script has it; raises CommandError."""
     mapping: dict[str, Any] = {"fault": name}
     for pair in pairs:
-        key, separator, value = pair.partition("=")
-        if not separator or not key or not value:
-            raise CommandError(f"{pair!r} is no KEY=VALUE, as after=3 or code=0x1A")
+        key, _, value = pair.partition("=")
+        if not key or not value:
+            raise CommandError(f"{pair!r} is not KEY=VALUE, as after=3 or code=0x1A")
         if key in mapping:
-            raise CommandError(f"{key} stands twice")
+            raise CommandError(f"{key} is given twice")
         mapping[key] = _value(value)
     if lasts is not None:
         if "lasts" in mapping:
-            raise CommandError("lasts stands twice")
+            raise CommandError("lasts is given twice")
         mapping["lasts"] = lasts
     return mapping
 
@@ -166,10 +259,10 @@ def _value(written: str) -> int | float | str:
 
 @contextmanager
 def _client(path: Path | None) -> Iterator[SegmentClient]:
-    """Speak to the segment at `path`, or to the one that runs.
+    """Connect to the segment at `path`, or to the running one.
 
     Raises:
-        CommandError: there is none, or several, or it refuses.
+        CommandError: no segment runs, several run, or the segment refuses.
     """
     from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
 

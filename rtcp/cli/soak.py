@@ -1,22 +1,23 @@
-"""`rtcp soak`: the platform on its virtual segment, broken again and again at random, for as long as one likes."""
+"""`rtcp soak`: the platform on its virtual segment, with random faults, for a long time."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.errors import CommandError, ExitCode, interruption_code, orderly_signals
-from rtcp.cli.launch import launch, refuse_a_second_platform
-from rtcp.cli.options import ConfigFile
-from rtcp.cli.output import emit, report, show
-from rtcp.config.virtual import VIRTUAL
+from rtcp.cli.arguments import AsJson, ConfigFile, positive
+from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
+from rtcp.cli.output import emit, report, show, table
+from rtcp.cli.platform import launch, refuse_second_platform
+from rtcp.config.model import VIRTUAL
 
 if TYPE_CHECKING:
-    from rtcp.telemetry.trials.soak import Summary
+    from rich.table import Table
+
+    from rtcp.telemetry.soak import Summary
 
 LONGEST_MIN = 10_080.0
 
@@ -27,59 +28,80 @@ def register(app: typer.Typer) -> None:
 
 
 def _soak(
-    minutes: Annotated[float, typer.Option("--minutes", metavar="N", help="How long.")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="What all that is chosen follows from.")] = 1,
+    minutes: Annotated[float, typer.Option("--minutes", metavar="N", help="Duration.")] = 60.0,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of all random choices.")] = 1,
     config: ConfigFile = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the account as JSON.")] = False,
+    as_json: AsJson = False,
 ) -> None:
-    """Let the arm work on its virtual segment while faults come at random; say what became of them, and what was lost.
+    """Run the arm on its virtual segment with random faults; show the result of each kind of fault.
 
-    Ends with 5 where something must not have been: a target beyond its limits, an arm that could not be brought back, a
-    torn record, a process that grew.
+    Exit code 5 for any violation: a target outside its limits, an arm that does not recover, a torn record, a process
+    that grows.
     """
-    if not (math.isfinite(minutes) and 0 < minutes <= LONGEST_MIN):
-        raise CommandError(f"--minutes {minutes:g} is not allowed: above 0, at most {LONGEST_MIN:g}")
+    positive("--minutes", minutes, "min", LONGEST_MIN)
     if seed < 0:
         raise CommandError(f"--seed {seed} is not allowed: 0 or more")
-    refuse_a_second_platform()
+    refuse_second_platform()
     from rtcp.ipc.runtime_directory import runtime_directory
     from rtcp.ipc.session import read_processes, read_session
     from rtcp.launch.launcher import StartOptions
-    from rtcp.telemetry.trials.bench import Bench
-    from rtcp.telemetry.trials.soak import Soak
+    from rtcp.telemetry.harness import Harness
+    from rtcp.telemetry.soak import Soak
 
-    say = (lambda line: None) if as_json else report
+    log = (lambda line: None) if as_json else report
     interrupted: KeyboardInterrupt | None = None
-    with orderly_signals():
-        running = launch(StartOptions(config=config, bus=VIRTUAL, mode="joint"), say)
+    with signals_raise():
+        running = launch(StartOptions(config=config, bus=VIRTUAL, mode="joint"), log)
         try:
             directory = runtime_directory()
             found = read_processes(directory)
             pids = {"loop": found.loop, "gateway": found.gateway, "segment": found.segment}
-            with Bench(directory, read_session(directory).config) as bench:
-                soak = Soak(bench, pids, seed, say)
+            with Harness(directory, read_session(directory).config) as harness:
+                soak = Soak(harness, pids, seed, log)
                 try:
                     soak.run(minutes)
                 except KeyboardInterrupt as interruption:
                     interrupted = interruption
         finally:
-            left = running.stop()
-    soak.summary.failures.extend(left)
+            problems = running.stop()
     summary = soak.summary
+    summary.failures.extend(problems)
     if as_json:
-        emit(json.dumps(_as_json(summary), indent=2))
+        emit(json.dumps(dataclasses.asdict(summary), indent=2))
     else:
-        from rtcp.cli.soak_view import tables
-
-        for table in tables(summary):
-            show(table)
-        until_then = "" if interrupted is None else " until then"
-        report("\n".join(summary.failures) or f"nothing was lost{until_then}")
+        show(_fault_table(summary))
+        show(_process_table(summary))
+        report("\n".join(summary.failures) or f"no failure{'' if interrupted is None else ' until the interruption'}")
     if interrupted is not None:
-        raise CommandError("interrupted; the trial under way was cut off", interruption_code(interrupted))
+        raise CommandError("interrupted; the current trial was aborted", interruption_code(interrupted))
     if summary.failures:
         raise typer.Exit(ExitCode.FAULT)
 
 
-def _as_json(summary: Summary) -> dict[str, Any]:
-    return dataclasses.asdict(summary)
+def _fault_table(summary: Summary) -> Table:
+    counts = ("injected", "noticed", "continued", "stopped", "recovered")
+    rows = table(("fault", *counts), ("fault",), title=f"{summary.minutes:.1f} min, seed {summary.seed}")
+    for kind, found in sorted(summary.counts.items()):
+        rows.add_row(kind, *(str(getattr(found, count)) for count in counts))
+    rows.add_section()
+    found_all = summary.counts.values()
+    rows.add_row("all", *(str(sum(getattr(found, count) for found in found_all)) for count in counts))
+    return rows
+
+
+def _process_table(summary: Summary) -> Table:
+    rows = table(
+        ("process", "RSS, MiB", "threads", "open files"),
+        ("process",),
+        title=f"{summary.records} cycles, {summary.torn} records torn or lost, "
+        f"largest step of a target {summary.largest_step:.3f} of the limit",
+    )
+    for name, last in summary.last.items():
+        first = summary.first.get(name, last)
+        rows.add_row(
+            name,
+            f"{first.rss / 2**20:.1f} -> {last.rss / 2**20:.1f}",
+            f"{first.threads} -> {last.threads}",
+            f"{first.files} -> {last.files}",
+        )
+    return rows

@@ -8,12 +8,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from rtcp.config.errors import ConfigError
 from rtcp.config.find import default_config, find_arm, find_config
+from rtcp.config.model import ConfigError
 
 if TYPE_CHECKING:
-    from rtcp.config.kinematics import load_kinematics
-    from rtcp.config.schema import load, load_device, segment_path, with_period
+    from rtcp.config.loader import load, load_device, load_kinematics, segment_path, with_period
     from rtcp.config.segment import SegmentConfig, SegmentSlave, load_segment
 
 __all__ = [
@@ -31,14 +30,10 @@ __all__ = [
     "with_period",
 ]
 
-_ON_FIRST_USE = {
-    "load_kinematics": "rtcp.config.kinematics",
-    **dict.fromkeys(("load", "load_device", "segment_path", "with_period"), "rtcp.config.schema"),
-    **dict.fromkeys(("SegmentConfig", "SegmentSlave", "load_segment"), "rtcp.config.segment"),
-}
+_SEGMENT = ("SegmentConfig", "SegmentSlave", "load_segment")
 
 
 def __getattr__(name: str) -> object:
-    if name not in _ON_FIRST_USE:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_ON_FIRST_USE[name]), name)
+    return getattr(importlib.import_module(f"rtcp.config.{'segment' if name in _SEGMENT else 'loader'}"), name)

@@ -1,67 +1,104 @@
 """A YAML file as plain values, with the line of every key.
 
-Scalars are read as YAML 1.2's core schema says and not as 1.1, whose `on`, `1:30` and `010` turn into a boolean, 90
-and 8, and whose `1e-3` stays a text. Repeated keys, which YAML forbids and most readers pass over, are mistakes.
+Scalars follow YAML 1.2's core schema and not 1.1, whose `on`, `1:30` and `010` become a boolean, 90 and 8, and whose
+`1e-3` stays a text. Repeated keys, which YAML forbids and most readers accept, are mistakes.
 """
 
 from __future__ import annotations
 
 import re
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+from ruamel.yaml.events import (
+    AliasEvent,
+    DocumentStartEvent,
+    MappingEndEvent,
+    MappingStartEvent,
+    ScalarEvent,
+    SequenceEndEvent,
+    SequenceStartEvent,
+    StreamEndEvent,
+)
+from ruamel.yaml.reader import ReaderError
 
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 
 KeyPath = tuple[str | int, ...]
 """Keys and list positions from the top of a file to a value."""
-
 Finding = tuple[KeyPath, str]
 """A mistake: where it is and the rest of its sentence."""
 
 _LARGEST, _MOST_VALUES, _DEEPEST = 1 << 20, 20_000, 50
-"""What a file may hold, in bytes or characters, values and levels: aliases count as all that they stand for."""
+"""Limits of a file, in bytes or characters, values and levels: an alias counts as everything that it stands for."""
+_LONGEST_NUMBER = 100
+"""Characters of an integer; Python refuses to convert some thousand."""
 _KINDS = {
-    stat.S_IFDIR: "a directory",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
+    stat.S_IFDIR: "a directory", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
-}
+}  # fmt: skip
+_CONSTANTS = {"": None, "~": None, "null": None, "Null": None, "NULL": None, "true": True, "True": True, "TRUE": True,
+              "false": False, "False": False, "FALSE": False}  # fmt: skip
+_OPEN = object()
+"""Value of an anchor whose end is not read yet."""
+_INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
+_FLOAT = re.compile(
+    r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
+)
 
 
 @dataclass
 class Document:
-    """What one file says: `data` holds dict, list, str, int, float, bool and None only."""
+    """The content of one file: `data` holds dict, list, str, int, float, bool and None only."""
 
     path: Path
-    data: object = None
+    data: Any = None
     lines: dict[KeyPath, int] = field(default_factory=dict)
     """Line (from 1) of each key or list entry."""
 
     def line(self, where: KeyPath) -> int:
-        """Return the line of a key, or of the nearest one above it that is there."""
+        """Return the line of a key, or of the nearest one above it that exists."""
         while where and where not in self.lines:
             where = where[:-1]
         return self.lines.get(where, 1)
 
     def sentences(self, findings: Iterable[Finding]) -> list[str]:
-        """Return one sentence a finding, `file:line: key: text`, in the order of the lines."""
+        """Return one sentence per finding, `file:line: key: text`, in the order of the lines."""
         return [
-            f"{self.path}:{self.line(where)}: {dotted(where)}{': ' if where else ''}{text}"
-            for where, text in sorted(findings, key=lambda finding: self.line(finding[0]))
+            f"{self.path}:{self.line(finding[0])}: {sentence(finding)}"
+            for finding in sorted(findings, key=lambda finding: self.line(finding[0]))
         ]
 
 
 def dotted(where: KeyPath) -> str:
     """Return a key path as people write it: `joints[2].velocity`."""
-    text = ""
-    for key in where:
-        text += f"[{key}]" if isinstance(key, int) else f".{key}" if text else key
-    return text
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in where).removeprefix(".")
+
+
+def sentence(finding: Finding) -> str:
+    """Return a finding as text, its key first."""
+    where, text = finding
+    return f"{dotted(where)}: {text}" if where else text
+
+
+def shown(found: object) -> str:
+    """Return a value as a sentence names it."""
+    if isinstance(found, bool):
+        return "true" if found else "false"
+    if found is None:
+        return "nothing"
+    if isinstance(found, str):
+        return f'the text "{found if len(found) <= 60 else found[:57] + "..."}"'
+    if isinstance(found, dict):
+        return "a mapping"
+    if isinstance(found, list):
+        return "an empty list" if not found else "a list"
+    return str(found)
 
 
 def read(path: Path) -> Document:
@@ -73,28 +110,25 @@ def read(path: Path) -> Document:
     """
     text = text_of(path)
     document = Document(path)
-    builder = _Builder(document.lines)
+    builder = _Builder(text, document.lines)
     try:
-        root = _Loader(text).get_single_node()
-        document.data = None if root is None else builder.value(root, ())
-    except yaml.MarkedYAMLError as error:
+        document.data = builder.document()
+    except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f"{mark.line + 1}:{mark.column + 1}: " if mark else " "
         raise ConfigError([f"{path}:{place}this is not valid YAML: {_reason(error)}"]) from error
-    except yaml.reader.ReaderError as error:
+    except ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         found = f"{ord(text[error.position]):#04x}"
         raise ConfigError(
             [f"{path}:{line}: this is not a text file: it holds the control character {found}"]
         ) from error
-    except RecursionError as error:
-        raise ConfigError([f"{path}: the lists and mappings are nested too deeply"]) from error
     except _TooMuch as error:
         raise ConfigError([f"{path}: {error}"]) from error
-    if root is None:
+    if document.data is None and not builder.findings:
         raise ConfigError([f"{path}: the file is empty; a mapping of keys to values is expected"])
-    if not isinstance(root, yaml.MappingNode):
-        kind = "a list" if isinstance(root, yaml.SequenceNode) else "a single value"
+    if not isinstance(document.data, dict):
+        kind = "a list" if isinstance(document.data, list) else "a single value"
         raise ConfigError([f"{path}:1: the file holds {kind}; a mapping of keys to values (`key: value`) is expected"])
     if builder.findings:
         raise ConfigError(document.sentences(builder.findings))
@@ -102,20 +136,20 @@ def read(path: Path) -> Document:
 
 
 def text_of(path: Path) -> str:
-    """Return what a file says.
+    """Return the content of a text file.
 
     Raises:
         ConfigError: the file is missing, unreadable, no regular file, no text, or larger than any configuration.
     """
     try:
         kind = stat.S_IFMT(path.stat().st_mode)
-        # Looked at before it is opened, which would wait for the other end of a pipe.
+        # Checked before the file is opened: opening a pipe waits for its other end.
         if kind != stat.S_IFREG:
             raise ConfigError([f"{path}: this is {_KINDS.get(kind, 'something else')}; a regular file is expected"])
         with path.open("rb") as file:
             content = file.read(_LARGEST + 1)
         if len(content) > _LARGEST:
-            raise ConfigError([f"{path}: {_holds_more_than(_LARGEST, 'bytes')}"])
+            raise ConfigError([f"{path}: the file holds more than {_LARGEST} bytes, the limit of a configuration"])
         return content.decode("utf-8-sig")
     except FileNotFoundError as error:
         raise ConfigError([f"{path}: there is no such file"]) from error
@@ -123,131 +157,137 @@ def text_of(path: Path) -> str:
         raise ConfigError([f"{path}: the file cannot be read: {error.strerror}"]) from error
     except UnicodeDecodeError as error:
         byte = error.object[error.start]
-        raise ConfigError(
-            [f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"]
-        ) from error
+        told = f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"
+        raise ConfigError([told]) from error
 
 
-def _holds_more_than(limit: int, what: str) -> str:
-    return f"the file holds more than {limit} {what}; a configuration has at most so many"
+def _reason(error: MarkedYAMLError) -> str:
+    problem = error.problem or "unknown"
+    if "'\\t'" in problem or "tab" in problem:
+        return "a tab cannot indent; use spaces"
+    return f"{problem} {error.context}" if error.context else problem
 
 
 class _TooMuch(Exception):
     """The file is larger than any configuration, or unfolds to more: the rest of a sentence."""
 
 
-class _Count:
-    """Adds up, and ends the reading where it becomes more than a configuration has."""
-
-    def __init__(self, limit: int, what: str) -> None:
-        self._left, self._limit, self._what = limit, limit, what
-
-    def add(self, number: int) -> None:
-        self._left -= number
-        if self._left < 0:
-            what = f"{self._what}, an alias counted as all that it stands for"
-            raise _TooMuch(_holds_more_than(self._limit, what))
-
-
-def _reason(error: yaml.MarkedYAMLError) -> str:
-    problem = error.problem or "unknown"
-    if "'\\t'" in problem:
-        return "a tab cannot indent; use spaces"
-    return f"{problem} {error.context}" if error.context else problem
-
-
-class _Loader(yaml.SafeLoader):
-    """PyYAML's reader with the scalars of YAML 1.2."""
-
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}
-
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._values = _Count(_MOST_VALUES, "values")
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        self._values.add(1)
-        return super().compose_node(parent, index)
-
-
-_LONGEST_NUMBER = 100
-"""Characters of an integer; Python refuses to convert some thousand."""
-_INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
-_FLOAT = re.compile(
-    r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
-)
-for _tag, _pattern, _first in (
-    ("null", re.compile(r"~|null|Null|NULL|"), ["~", "n", "N", ""]),
-    ("bool", re.compile(r"true|True|TRUE|false|False|FALSE"), list("tTfF")),
-    ("int", _INTEGER, list("-+0123456789")),
-    ("float", _FLOAT, list("-+.0123456789")),
-):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_pattern.pattern})\Z"), _first)
-
-
 class _Builder:
-    """Turns YAML nodes into values, noting lines and what is not allowed."""
+    """Turns YAML's events into values, noting lines and what is not allowed."""
 
-    def __init__(self, lines: dict[KeyPath, int]) -> None:
-        self.lines = lines
+    def __init__(self, text: str, lines: dict[KeyPath, int]) -> None:
         self.findings: list[Finding] = []
-        self._open: list[yaml.Node] = []
-        self._values = _Count(_MOST_VALUES, "values")
-        self._characters = _Count(_LARGEST, "characters")
+        self._events: Iterator[Any] = YAML(typ="safe", pure=True).parse(text)
+        self._lines = lines
+        self._values = self._characters = self._depth = 0
+        self._anchors: dict[str, object] = {}
 
-    def value(self, node: yaml.Node, where: KeyPath) -> object:
-        self._values.add(1)
-        if len(self._open) >= _DEEPEST:
-            raise RecursionError
-        self.lines.setdefault(where, node.start_mark.line + 1)
-        if any(node is outer for outer in self._open):
+    def document(self) -> object:
+        """Return the value of the only document; None where there is none."""
+        for event in self._events:
+            if isinstance(event, StreamEndEvent):
+                return None
+            if isinstance(event, DocumentStartEvent):
+                break
+        value = self._value(next(self._events), ())
+        next(self._events)
+        if not isinstance(after := next(self._events), StreamEndEvent):
+            raise MarkedYAMLError(problem="found a second document", problem_mark=after.start_mark)
+        return value
+
+    def _count(self, text: str = "") -> None:
+        """Add a value, or the text of one, to what the file holds."""
+        self._values += not text
+        self._characters += len(text)
+        for found, limit, what in (
+            (self._values, _MOST_VALUES, "values"),
+            (self._characters, _LARGEST, "characters"),
+        ):
+            if found > limit:
+                told = f"the file holds more than {limit} {what}, the limit of a configuration"
+                raise _TooMuch(f"{told}; an alias counts as everything that it stands for")
+        if self._depth >= _DEEPEST:
+            raise _TooMuch("the lists and mappings are nested too deeply")
+
+    def _value(self, event: Any, where: KeyPath) -> object:
+        self._lines.setdefault(where, event.start_mark.line + 1)
+        if isinstance(event, AliasEvent):
+            return self._alias(event, where)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = _OPEN
+        self._count()
+        if event.tag is not None:
+            self.findings.append((where, f"the tag {event.tag} is not allowed; write a plain value"))
+        self._depth += 1
+        value: object
+        if isinstance(event, MappingStartEvent):
+            value = self._mapping(where)
+        elif isinstance(event, SequenceStartEvent):
+            value = self._sequence(where)
+        else:
+            value = self._scalar(event, where)
+        self._depth -= 1
+        if event.anchor is not None:
+            self._anchors[event.anchor] = value
+        return value
+
+    def _alias(self, event: AliasEvent, where: KeyPath) -> object:
+        if event.anchor not in self._anchors:
+            raise MarkedYAMLError(problem=f"found undefined alias {event.anchor!r}", problem_mark=event.start_mark)
+        value = self._anchors[event.anchor]
+        if value is _OPEN:
             self.findings.append((where, "this alias contains itself"))
             return None
-        self._open.append(node)
-        try:
-            if isinstance(node, yaml.MappingNode):
-                return self._mapping(node, where)
-            if isinstance(node, yaml.SequenceNode):
-                return [self.value(entry, (*where, i)) for i, entry in enumerate(node.value)]
-            return self._scalar(node, where)
-        finally:
-            self._open.pop()
+        self._count_again(value)
+        return value
 
-    def _mapping(self, node: yaml.MappingNode, where: KeyPath) -> dict[str, object]:
-        values: dict[str, object] = {}
-        for key_node, value_node in node.value:
-            line = key_node.start_mark.line + 1
-            if not (isinstance(key_node, yaml.ScalarNode) and key_node.tag == "tag:yaml.org,2002:str"):
-                found = key_node.value if isinstance(key_node, yaml.ScalarNode) else "a list or mapping"
-                self.findings.append((where, f"found the key {found} in line {line}; a key must be a text"))
-                continue
-            key = key_node.value
-            self._characters.add(len(key))
-            inner = (*where, key)
-            if key in values:
-                first = self.lines[inner]
-                self.findings.append((inner, f"this key stands twice, in lines {first} and {line}; keep one of them"))
-                continue
-            self.lines[inner] = line
-            values[key] = self.value(value_node, inner)
+    def _count_again(self, value: object) -> None:
+        self._count()
+        self._depth += 1
+        if isinstance(value, str):
+            self._count(value)
+        elif isinstance(value, list | dict):
+            for inner in value if isinstance(value, list) else (*value, *value.values()):
+                self._count_again(inner)
+        self._depth -= 1
+
+    def _sequence(self, where: KeyPath) -> list[object]:
+        values: list[object] = []
+        while not isinstance(event := next(self._events), SequenceEndEvent):
+            values.append(self._value(event, (*where, len(values))))
         return values
 
-    def _scalar(self, node: yaml.Node, where: KeyPath) -> object:
-        text = str(node.value)
-        self._characters.add(len(text))
-        match node.tag.removeprefix("tag:yaml.org,2002:"):
-            case "str":
-                return text
-            case "null":
+    def _mapping(self, where: KeyPath) -> dict[str, object]:
+        values: dict[str, object] = {}
+        while not isinstance(event := next(self._events), MappingEndEvent):
+            line = event.start_mark.line + 1
+            key = self._value(event, (*where, "?"))
+            self._lines.pop((*where, "?"))
+            if not isinstance(key, str):
+                found = event.value if isinstance(event, ScalarEvent) else "a list or mapping"
+                self.findings.append((where, f"found the key {found} in line {line}; a key must be a text"))
+                self._value(next(self._events), where)
+                continue
+            inner = (*where, key)
+            if key in values:
+                told = f"this key occurs twice, in lines {self._lines[inner]} and {line}; keep one of them"
+                self.findings.append((inner, told))
+                self._value(next(self._events), inner)
+                continue
+            self._lines[inner] = line
+            values[key] = self._value(next(self._events), inner)
+        return values
+
+    def _scalar(self, event: ScalarEvent, where: KeyPath) -> object:
+        text = str(event.value)
+        self._count(text)
+        if event.tag is not None or not event.implicit[0]:
+            return text
+        if text in _CONSTANTS:
+            return _CONSTANTS[text]
+        if _INTEGER.fullmatch(text):
+            if len(text) > _LONGEST_NUMBER:
+                self.findings.append((where, f"this number has {len(text)} digits; the limit is {_LONGEST_NUMBER}"))
                 return None
-            case "bool" if text.lower() in ("true", "false"):
-                return text.lower() == "true"
-            case "int" if len(text) > _LONGEST_NUMBER:
-                self.findings.append((where, f"this number has {len(text)} digits; allowed are {_LONGEST_NUMBER}"))
-                return None
-            case "int" if _INTEGER.fullmatch(text):
-                return int(text) if text.lstrip("+-").isdigit() else int(text, 0)
-            case "float" if _FLOAT.fullmatch(text):
-                return float(text.lower().replace(".inf", "inf").replace(".nan", "nan"))
-        self.findings.append((where, f"the tag {node.tag} is not allowed; write a plain value"))
-        return None
+            return int(text) if text.lstrip("+-").isdigit() else int(text, 0)
+        return float(text.lower().replace(".inf", "inf").replace(".nan", "nan")) if _FLOAT.fullmatch(text) else text

@@ -14,9 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.checking import Checker, shown, unknown_key
-from rtcp.config.document import Finding, dotted, read
-from rtcp.config.errors import ConfigError
+from rtcp.config.document import Finding, dotted, read, shown
 from rtcp.config.fault_kinds import (
     FAULTS,
     ONCE,
@@ -44,6 +42,8 @@ from rtcp.config.fault_kinds import (
     TerminalFault,
     WorkingCounter,
 )
+from rtcp.config.model import ConfigError
+from rtcp.config.validation import Checker, unknown_key
 
 __all__ = [
     "FAULTS", "ONCE", "AlFall", "AlHang", "AlRefuse", "CableFault", "ClockDrift", "ClockJump", "Corrupt", "Delay",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 
 SYSTEM = Path("/etc/rtcp/assistive_arm.yaml")
 """The configuration of this machine."""

@@ -1,69 +1,115 @@
-"""The configuration as the platform uses it: frozen, checked whole by `rtcp.config.schema`, SI units throughout.
+"""The model of every configuration file: frozen dataclasses with their ranges, SI units throughout.
 
-This module imports nothing heavy: the loop's process holds these objects and no validator.
+This module imports nothing heavy: the loop's process holds these objects and no validator. `rtcp.config.validation`
+checks the ranges, `rtcp.config.rules` what concerns more than one value. The tables in docs/configuration.md are made
+of the attribute docstrings here.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
+from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
 from kinematics.model import ArmModel
-from rtcp.config.operation import (
-    CartesianConfig,
-    InputsConfig,
-    JogConfig,
-    MotionName,
-    OutputsConfig,
-    WatchConfig,
+from rtcp.config.numbers import (
+    U8,
+    U16,
+    U32,
+    Angle,
+    Fraction,
+    Length,
+    Milliseconds,
+    Name,
+    NotNegative,
+    Positive,
+    Rate,
+    Speed,
+    Terminal,
+    Turn,
+    Vector,
 )
-from rtcp.config.stops import StopsConfig
 
-U8 = Annotated[int, Ge(0), Le(0xFF)]
-U16 = Annotated[int, Ge(0), Le(0xFFFF)]
-U32 = Annotated[int, Ge(0), Le(0xFFFFFFFF)]
-Positive = Annotated[float, Gt(0)]
-NotNegative = Annotated[float, Ge(0)]
-Fraction = Annotated[float, Gt(0), Lt(1)]
-Name = Annotated[str, MinLen(1), MaxLen(64)]
+VIRTUAL = "virtual"
+"""Name of the bus that is a segment in software."""
+JOINTS = 6
+"""Joints of an arm that has `kinematics`."""
+MOST_AXES = 10
+"""Joints, a gripper's among them, that a command has room for."""
+MOST_POINTS = 4096
+"""Points or poses of a motion file."""
 
 DataTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
                        "float32", "float64"]  # fmt: skip
+BITS: dict[str, int] = {
+    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "float32": 32, "float64": 64,
+}  # fmt: skip
 DriveModeName = Literal["csp", "csv", "cst"]
+ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
+FrameName = Literal["base", "tool"]
+Level = Literal["high", "low"]
+HardStop = Literal["quick_stop", "torque_off"]
+"""Reactions where set-points cannot be executed or trusted: the drives stop by themselves."""
+AnyStop = Literal["controlled_stop", "quick_stop", "torque_off"]
+
+
+class ConfigError(Exception):
+    """A configuration that cannot be used; `problems` holds one sentence per mistake, all of them at once."""
+
+    def __init__(self, problems: Iterable[str]) -> None:
+        self.problems = list(problems)
+        super().__init__("\n".join(self.problems))
+
+
+# -- devices: config/devices/*.yaml ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class PdoEntry:
-    """One mapped object: `value in SI = counts * factor`. Index 0 is padding and has no name of use."""
+    """One mapped object: `value in SI = counts * factor`. Index 0 is padding and needs no name."""
 
     index: U16
+    """Object index; 0: padding."""
     sub_index: U8
+    """Object subindex."""
     type: DataTypeName
-    name: Name
+    """Data type on the wire."""
+    name: Name = "padding"
+    """Channel name; the kind of device determines which names are needed."""
     factor: float = 1.0
+    """SI units per count; not 0."""
 
 
 @dataclass(frozen=True)
 class Pdo:
-    """A process data object (0x16xx from the master, 0x1Axx to it) and the entries mapped into it, in order."""
+    """A process data object and the entries mapped into it, in order."""
 
     index: U16
+    """PDO mapping object: 0x1600 to 0x17ff from the master, 0x1a00 to 0x1bff to it (ETG.1000.6)."""
     channels: Annotated[tuple[PdoEntry, ...], MinLen(1)]
 
 
 @dataclass(frozen=True)
 class StartupSdo:
-    """An SDO written in PRE-OP and read back; `optional` ones may be absent from the device."""
+    """An SDO written in PRE-OP and read back."""
 
     index: U16
+    """Object index."""
     sub_index: U8
+    """Object subindex."""
     type: DataTypeName
+    """Data type of the object."""
     value: float
+    """Value to write, in the range of `type`."""
     name: str = ""
+    """Text for messages."""
     optional: bool = False
+    """True: the device may lack the object."""
 
 
 @dataclass(frozen=True)
@@ -71,23 +117,55 @@ class DeviceDescription:
     """A kind of slave, from `config/devices/<key>.yaml`."""
 
     name: Name
+    """Device name, for messages."""
     kind: Literal["cia402", "io"]
+    """Driver: `cia402` moves a joint, `io` is a box of inputs and outputs."""
     vendor_id: U32
+    """Vendor id (0x1018:01); another one on the bus is refused."""
     product_id: U32
+    """Product code (0x1018:02); another one on the bus is refused."""
     rpdo: tuple[Pdo, ...]
     """Outputs of the master, assigned through 0x1C12."""
     tpdo: tuple[Pdo, ...]
     """Inputs of the master, assigned through 0x1C13."""
     configurable_pdos: bool = True
-    """False where the device's mapping is fixed: it is then read and compared, never written."""
+    """False: the mapping is fixed in the device; it is compared and never written."""
     complete_access: bool = True
-    """False where the device answers SDO complete access of its PDO assignment wrongly though its EEPROM offers it."""
+    """False: the device answers SDO complete access of its PDO assignment wrongly although its EEPROM offers it."""
     sdo: tuple[StartupSdo, ...] = ()
     assign_activate: U16 = 0
-    """DC AssignActivate word of the ESI (0x0300: SYNC0; 0x0700: SYNC0 and SYNC1); 0: no distributed clocks."""
+    """DC AssignActivate word of the ESI: 0x0300 for SYNC0, 0x0700 for SYNC0 and SYNC1, 0 for no distributed clock."""
     sync0_shift_us: float = 0.0
+    """SYNC0 shift, us; less than one cycle in either direction."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
-    """Process-data (sync manager) watchdog: the drive stops when no output arrives for so long."""
+    """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
+
+    def wire_range(self, channel: str) -> tuple[float, float]:
+        """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
+        for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
+            if entry.name == channel and not entry.type.startswith("float"):
+                low, high = sorted(end * entry.factor for end in integer_range(entry.type))
+                return low, high
+        return -math.inf, math.inf
+
+
+def integer_range(kind: str) -> tuple[int, int]:
+    """Return the smallest and the largest number of an integer type."""
+    bits = BITS[kind]
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
+
+
+# -- the arm: config/assistive_arm.yaml --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class SlaveEntry:
+    """A slave as the arm's file lists it."""
+
+    name: Name
+    """Slave name; unique."""
+    device: Name
+    """Device file: `devices/NAME.yaml` beside the arm's file, or a path that ends in .yaml."""
 
 
 @dataclass(frozen=True)
@@ -103,98 +181,361 @@ class Range:
     """A closed interval; `min < max`."""
 
     min: float
+    """Lower position limit, rad."""
     max: float
+    """Upper position limit, rad; greater than `min`."""
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint, the drive that moves it and its limits (rad, rad/s, rad/s^2, rad/s^3, Nm)."""
+    """A joint, the drive that moves it and its limits. No target beyond them reaches the drive."""
 
     name: Name
+    """Joint name; unique, and not `joints`."""
     slave: Name
+    """Drive that moves the joint: a name under `slaves` of kind `cia402`; unique."""
     position: Range
-    velocity: Annotated[float, Ge(0.001)]
-    acceleration: Annotated[float, Ge(0.001)]
-    jerk: Annotated[float, Ge(0.001)]
+    velocity: Rate
+    """Speed limit, rad/s; in CSP also the drive's own limit."""
+    acceleration: Rate
+    """Acceleration limit, rad/s²; also determines stopping distances."""
+    jerk: Rate
+    """Jerk limit, rad/s³."""
     torque: Positive
+    """Torque limit, Nm."""
     csv_gain: NotNegative = 10.0
-    """Position gain of the loop closed in CSV, 1/s."""
+    """Position gain in CSV, 1/s."""
     cst_stiffness: NotNegative = 600.0
     """Joint stiffness in CST, Nm/rad."""
     cst_damping: NotNegative = 60.0
-    """Joint damping in CST, Nm s/rad."""
+    """Joint damping in CST, Nm s/rad; follows the inertia at the drive."""
     cst_integral: NotNegative = 1200.0
     """Integral gain in CST, Nm/(rad s)."""
 
 
 @dataclass(frozen=True)
 class GripperConfig:
-    """A gripper on a digital output, or one that a drive of its own moves: either `output` or `joint` is given."""
+    """A gripper on a digital output, or one with a drive of its own: either `output` or `joint` is given."""
 
-    output: Annotated[int, Ge(1), Le(16)] | None = None
-    closed: Literal["on", "off"] = "on"
-    """The output's state that closes it."""
+    output: Terminal | None = None
+    """Output that moves the gripper."""
+    closed: Literal["on", "off"] | None = None
+    """Output state that closes the gripper; none: on. Only with `output`."""
     joint: Joint | None = None
-    """The axis after the arm's joints; its limits are the gripper's, at the drive's shaft."""
+    """Axis after the arm's joints, with the keys of one of `joints`; its limits are at the drive's shaft."""
     open_position: float | None = None
+    """Position of `joint` where the gripper is open, rad; needed with `joint`."""
     closed_position: float | None = None
-    """rad, of `joint`: where the gripper is open and where it is closed."""
+    """Position of `joint` where the gripper is closed, rad; needed with `joint`."""
 
 
 @dataclass(frozen=True)
 class CycleConfig:
-    """The cycle: its period, its priority and its place."""
+    """The cycle: its period, its priority and its CPU."""
 
     period_us: Annotated[float, Ge(100), Le(100_000)] = 500.0
+    """Cycle period, us."""
     priority: Annotated[int, Ge(1), Le(98)] = 80
+    """SCHED_FIFO priority; below that of the network card's interrupt."""
     cpu: Annotated[int, Ge(0)] | None = None
-    """CPU of the cycle; None: the last one that the process may use."""
+    """CPU of the cycle; none: the last one that the process may use."""
     spin_us: Annotated[float, Ge(0), Le(50)] = 40.0
-    """The timer wakes so long before the tick; the rest is waited for awake, which takes the timer's jitter out."""
+    """Busy wait before the tick, us; removes the timer's jitter."""
 
 
 @dataclass(frozen=True)
 class BusConfig:
-    """The bus: an interface or `virtual`, and how long what may be missing."""
+    """The bus and its tolerances."""
 
-    interface: Name = "virtual"
+    interface: Name = VIRTUAL
+    """`virtual`, or a network interface of at most 15 characters."""
     segment: str = "segment.yaml"
-    """Slaves of the virtual segment; a path relative to the arm's file."""
+    """File of the virtual segment, relative to the arm's file."""
     receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
-    """How long a frame is waited for, as a fraction of the period."""
+    """Receive timeout, fraction of the period."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
-    """So many cycles in a row without a right working counter, or so many more than with one, are a fault."""
-    virtual_patience: Annotated[float, Ge(1), Le(100)] = 25.0
-    """So many times wider are limits on lost process data on the virtual bus alone; see `rtcp.config.virtual`."""
+    """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
+    timeout_scale: Annotated[float, Ge(1), Le(100)] = 25.0
+    """Factor on `lost_cycles` and `watchdog_ms` on the virtual bus only; above 1 its sync error check is off."""
     send_phase: Fraction = 0.5
-    """Where between two SYNC0 the frame passes the reference slave, as a fraction of the period."""
+    """Instant between two SYNC0 at which the frame passes the reference clock, fraction of the period."""
     op_timeout_s: Positive = 5.0
+    """Timeout for all slaves from INIT to OP, s."""
     watch_ms: Annotated[float, Ge(2), Le(1000)] = 10.0
-    """So often the slave watcher, on the thread beside the cycle, asks for the slaves' states."""
+    """Interval at which the slave watcher reads the slaves' states, ms."""
 
 
 @dataclass(frozen=True)
-class ArmConfig:
-    """The whole configuration of an arm: what `config/assistive_arm.yaml` and the files it names say."""
+class Box:
+    """A box along the base's axes: the tool stays inside it. `min < max` in each coordinate."""
+
+    min: Vector
+    """Corner x, y, z of the box that the tool stays in, m; left out: no box."""
+    max: Vector
+    """Opposite corner, m; greater in each coordinate."""
+
+
+@dataclass(frozen=True)
+class KeepOut:
+    """A box that neither tool nor wrist nor elbow may enter: the user, the chair."""
 
     name: Name
-    slaves: Annotated[tuple[SlaveConfig, ...], MinLen(1)]
-    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(10)]
-    cycle: CycleConfig
-    bus: BusConfig
-    mode: DriveModeName = "csp"
+    """Name for messages and `rtcp limits set NAME.min.x`; unique, no dot, not `box`, `joints` or a joint's name."""
+    min: Vector
+    """Corner x, y, z, m; tool, wrist and elbow stay outside."""
+    max: Vector
+    """Opposite corner, m; greater in each coordinate."""
+
+
+@dataclass(frozen=True)
+class SingularityLimits:
+    """Minimum distances that Cartesian motion keeps from singularities; 0 disables a limit."""
+
+    shoulder: NotNegative = 0.03
+    """Distance of the wrist center from axis 1, m."""
+    elbow: NotNegative = 0.08
+    """Angle of the elbow from stretched or folded, rad."""
+    wrist: NotNegative = 0.08
+    """Angle of joint 5 from where axes 4 and 6 are in line, rad."""
+
+
+@dataclass(frozen=True)
+class CartesianConfig:
+    """Limits of the tool: boxes hold in every mode, speeds and singularities in Cartesian motion."""
+
+    speed: Annotated[float, Gt(0), Le(0.25)] = 0.25
+    """Tool speed limit, m/s; at most 0.25 under manual control (ISO 10218-1)."""
+    acceleration: Positive = 0.5
+    """Tool acceleration limit, m/s²."""
+    jerk: Positive = 5.0
+    """Tool jerk limit, m/s³."""
+    angular_speed: Annotated[float, Gt(0), Le(2)] = 0.5
+    """Tool rotation speed limit, rad/s."""
+    angular_acceleration: Positive = 1.0
+    """Tool rotation acceleration limit, rad/s²."""
+    angular_jerk: Positive = 10.0
+    """Tool rotation jerk limit, rad/s³."""
+    box: Box | None = None
+    keep_out: tuple[KeepOut, ...] = ()
+    singularity: SingularityLimits = field(default_factory=SingularityLimits)
+
+
+@dataclass(frozen=True)
+class JogConfig:
+    """Speeds and frame of the joystick."""
+
+    speed: Annotated[float, Gt(0), Le(0.25)] = 0.1
+    """Joystick speed, m/s; at most `cartesian.speed`."""
+    angular_speed: Annotated[float, Gt(0), Le(2)] = 0.3
+    """Joystick rotation speed, rad/s; at most `cartesian.angular_speed`."""
+    frame: FrameName = "base"
+    """Frame of the joystick's directions."""
+
+
+@dataclass(frozen=True)
+class SupervisionConfig:
+    """Limits on measured values; the emergency stop follows when one is exceeded for `cycles` in a row."""
+
+    cycles: Annotated[int, Ge(1), Le(1000)] = 5
+    """Cycles in a row beyond a limit that cause the emergency stop."""
+    speed: Annotated[float, Ge(1), Le(10)] = 1.5
+    """Measured speed limit, multiple of the joint's `velocity`."""
+    torque: Annotated[float, Ge(1), Le(10)] = 1.5
+    """Measured torque limit, multiple of the joint's `torque`."""
+    following_error: Annotated[float, Gt(0), Le(1)] = 0.15
+    """Following error limit, rad: commanded minus actual position."""
+
+
+@dataclass(frozen=True)
+class StopsConfig:
+    """The stop reaction to each event. Stop categories are those of IEC 60204-1."""
+
+    lost_frames: HardStop = "quick_stop"
+    """`bus.lost_cycles` lost cycles in a row, or as many more than good ones."""
+    slave_lost: HardStop = "quick_stop"
+    """A slave has left OP or does not answer."""
+    drive_fault: HardStop = "quick_stop"
+    """A drive is in fault or has left Operation Enabled by itself: the reaction of all others."""
+    clock_lost: AnyStop = "quick_stop"
+    """The cycle has not followed the reference clock for 1 s."""
+    emergency_stop: HardStop = "quick_stop"
+    """The emergency stop input is active: torque goes off at standstill (category 1), or at once (category 0)."""
+    supervision: HardStop = "quick_stop"
+    """A measured value exceeds a limit of `supervision`; categories as for the emergency stop."""
+    lease_ended: AnyStop = "controlled_stop"
+    """The commander of a motion was silent for `lease_s`, or its connection closed."""
+    enabling_switch: AnyStop = "controlled_stop"
+    """The enabling switch was released during a motion."""
+
+
+@dataclass(frozen=True)
+class InputConfig:
+    """An input terminal of the IO box with a meaning."""
+
+    number: Terminal
+    """Input terminal; no terminal is used twice."""
+    active: Level = "high"
+    """Active level."""
+    debounce_ms: Milliseconds = 5.0
+    """Debounce time, ms."""
+
+
+@dataclass(frozen=True)
+class EmergencyStopConfig(InputConfig):
+    """The emergency stop's input. Its level has no default: a wrong one would show only in an emergency."""
+
+    active: Level = field()
+    """Level that means pressed; low for a normally closed contact, where a cut wire stops the arm too."""
+
+
+@dataclass(frozen=True)
+class JoystickConfig:
+    """The terminals of the joystick, all active low through pull-ups, or all active high."""
+
+    forward: Terminal = 1
+    """Input terminal of this direction."""
+    backward: Terminal = 2
+    """Input terminal of this direction."""
+    left: Terminal = 3
+    """Input terminal of this direction."""
+    right: Terminal = 4
+    """Input terminal of this direction."""
+    mode_up: Terminal = 5
+    """Input terminal of the paddle: next joystick mode, on release."""
+    mode_down: Terminal = 6
+    """Input terminal of the paddle: previous joystick mode, on release."""
+    active: Level = "low"
+    """Level that means pressed, for all six."""
+    debounce_ms: Milliseconds = 5.0
+    """Debounce time, ms."""
+
+
+@dataclass(frozen=True)
+class InputsConfig:
+    """Inputs with a meaning; one that is left out does not exist."""
+
+    joystick: JoystickConfig | None = None
+    arm_toggle: InputConfig | None = None
+    """Active: the joystick moves the arm; inactive: the wheelchair, and the arm holds still."""
+    enabling_switch: InputConfig | None = None
+    """Active: motion is allowed. Release stops; pressing again moves nothing until a new command."""
+    emergency_stop: EmergencyStopConfig | None = None
+    """Active: pressed."""
+
+
+@dataclass(frozen=True)
+class OutputsConfig:
+    """Outputs with a meaning; one that is left out does not exist."""
+
+    state_lamp: Terminal | None = None
+    """Output terminal: on while drives have torque; no terminal is used twice."""
+    motion_lamp: Terminal | None = None
+    """Output terminal: on while the arm moves."""
+    heartbeat: Terminal | None = None
+    """Output terminal: toggled each cycle, for an oscilloscope."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of modified (Craig) parameters: T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
+
+    alpha: Turn
+    """Twist, rad; one of six rows, base to flange, see [kinematics](kinematics.md)."""
+    a: Length
+    """Link length, m."""
+    d: Length
+    """Link offset, m."""
+    offset: Turn = 0.0
+    """Joint offset, rad: theta = q + offset."""
+
+
+@dataclass(frozen=True)
+class MechanicalLimit:
+    """Mechanical range and speed of a joint."""
+
+    min: Angle
+    """Lower mechanical end, rad; `limits` left out: those of `joints`."""
+    max: Angle
+    """Upper mechanical end, rad; greater than `min`."""
+    velocity: Speed | None = None
+    """Largest speed, rad/s; none: not known."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """Mass and center of mass of the link that moves with a joint."""
+
+    mass: NotNegative
+    """Link mass, kg; `links` left out: gravity is not compensated."""
+    centre: Vector
+    """Center of mass x, y, z in the joint's frame, m."""
+
+
+@dataclass(frozen=True)
+class Tool:
+    """The transform from the flange (frame 6) to the tool."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    """Tool position x, y, z from the flange, m."""
+    rpy: Annotated[tuple[Turn, ...], MinLen(3), MaxLen(3)] = (0.0, 0.0, 0.0)
+    """Tool rotation rx, ry, rz, rad: R = Rx(rx) Ry(ry) Rz(rz)."""
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """The arm's geometry; `limits` may be left out beside `joints`, `links` where masses are not known."""
+
+    dh: Annotated[tuple[Row, ...], MinLen(JOINTS), MaxLen(JOINTS)]
+    limits: Annotated[tuple[MechanicalLimit, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
+    links: Annotated[tuple[Link, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
+    tool: Tool = field(default_factory=Tool)
+
+
+@dataclass(frozen=True)
+class ArmSettings:
+    """What the arm's file and the configuration made of it have in common."""
+
+    name: Name
+    """Name of the arm, also of its file of zero offsets."""
+    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(MOST_AXES)]
+    cycle: CycleConfig = field(default_factory=CycleConfig)
+    bus: BusConfig = field(default_factory=BusConfig)
+    drive_mode: DriveModeName = "csp"
+    """Drive mode at the start: cyclic synchronous position, velocity or torque; `rtcp mode` changes it."""
+    control_mode: ControlModeName = "joint"
+    """Commands that the arm takes at the start; see [control modes](configuration.md#control-modes)."""
     enable_timeout_s: Positive = 3.0
+    """Timeout until all drives are enabled, or without torque, s."""
     lease_s: Positive = 0.5
-    """A commander that is silent for so long has lost its lease: the arm stops in a controlled way."""
-    motion: MotionName = "joint"
-    """What the arm takes commands for at the start."""
+    """Silence of the commander that ends its lease, s; see [whose silence](motion.md#whose-silence-stops-the-arm)."""
     cartesian: CartesianConfig = field(default_factory=CartesianConfig)
     jog: JogConfig = field(default_factory=JogConfig)
-    watch: WatchConfig = field(default_factory=WatchConfig)
+    supervision: SupervisionConfig = field(default_factory=SupervisionConfig)
     stops: StopsConfig = field(default_factory=StopsConfig)
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
+
+    @property
+    def axes(self) -> tuple[Joint, ...]:
+        """Everything that drives move: the joints, from base to tool, then the gripper's where it has a drive."""
+        driven = self.gripper.joint if self.gripper else None
+        return self.joints if driven is None else (*self.joints, driven)
+
+
+@dataclass(frozen=True)
+class ArmFile(ArmSettings):
+    """The arm's file as it is written: its slaves only name their device."""
+
+    slaves: Annotated[tuple[SlaveEntry, ...], MinLen(1)] = field(kw_only=True)
+    kinematics: Kinematics | None = None
+
+
+@dataclass(frozen=True)
+class ArmConfig(ArmSettings):
+    """The whole configuration of an arm: what `config/assistive_arm.yaml` and the files it names say."""
+
+    slaves: tuple[SlaveConfig, ...] = field(kw_only=True)
     arm: ArmModel | None = None
     """The geometry; None: only joint motion is possible, and no Cartesian guard."""
     zero_offsets: tuple[float, ...] = ()
@@ -202,8 +543,39 @@ class ArmConfig:
     source: Path = Path()
     """The file it was read from."""
 
-    @property
-    def axes(self) -> tuple[Joint, ...]:
-        """All that drives move: the joints, from base to tool, and after them the gripper's where it has a drive."""
-        driven = self.gripper.joint if self.gripper else None
-        return self.joints if driven is None else (*self.joints, driven)
+
+# -- motion files ------------------------------------------------------------------------------------------------------
+
+_Numbers = Annotated[tuple[Angle, ...], MinLen(1), MaxLen(6)]
+_Coordinates = Annotated[tuple[Angle, ...], MinLen(6), MaxLen(6)]
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point of a trajectory: time, s, and position, rad; velocity, rad/s, and acceleration, rad/s², if given."""
+
+    t: NotNegative
+    q: _Numbers
+    v: _Numbers | None = None
+    a: _Numbers | None = None
+
+
+@dataclass(frozen=True)
+class Stop:
+    """The end of a straight line: a pose (x, y, z, rx, ry, rz; m and rad) or the joints that have it; speed, m/s.
+
+    `speed` None: that of the whole path.
+    """
+
+    pose: _Coordinates | None = None
+    q: _Coordinates | None = None
+    speed: Positive | None = None
+
+
+@dataclass(frozen=True)
+class MotionFile:
+    """A motion: either `trajectory` or `path` has entries. speed: m/s, of a path; None: the configuration's."""
+
+    trajectory: Annotated[tuple[Point, ...], MaxLen(MOST_POINTS)] = ()
+    path: Annotated[tuple[Stop, ...], MaxLen(MOST_POINTS)] = ()
+    speed: Positive | None = None

@@ -1,167 +1,474 @@
-"""What no single type can say: rules between the values of a file and between files.
+"""Rules between the values of a file and between files: what no single type can state.
 
-They work on plain values, as many of them as have the right form, so that a mistake elsewhere hides none of theirs.
+A rule yields findings: the key path below its object and the rest of the sentence. See `validation.rule` for when it
+runs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from rtcp.config.document import Finding, KeyPath, dotted
-from rtcp.config.model import CycleConfig, DeviceDescription, PdoEntry
+from rtcp.config.model import (
+    BITS,
+    MOST_AXES,
+    VIRTUAL,
+    ArmConfig,
+    ArmFile,
+    Box,
+    DeviceDescription,
+    GripperConfig,
+    Joint,
+    KeepOut,
+    Kinematics,
+    MechanicalLimit,
+    MotionFile,
+    Pdo,
+    PdoEntry,
+    Point,
+    Range,
+    StartupSdo,
+    Stop,
+    integer_range,
+)
+from rtcp.config.validation import EVERY_KEY, rule
 
-BITS = {
-    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
-    "float32": 32, "float64": 64,
-}  # fmt: skip
+_NUMERIC = tuple(name for name in BITS if name != "bool")
+_INTEGERS = tuple(name for name in _NUMERIC if "int" in name)
 
-MOST_AXES = 10
-"""Joints, a gripper's among them, that a command has room for."""
-
+# The channels that a driver of each kind reads and writes, and their types. CiA 402-2 fixes 0x6040 and 0x6041 as
+# UINT16, 0x6060 and 0x6061 as INT8; the other widths are the device's own choice.
+CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
+    "cia402": {
+        "rpdo": {
+            "controlword": ("uint16",),
+            "target_position": _INTEGERS,
+            "target_velocity": _INTEGERS,
+            "target_torque": _INTEGERS,
+            "modes_of_operation": ("int8",),
+        },
+        "tpdo": {
+            "statusword": ("uint16",),
+            "position": _NUMERIC,
+            "velocity": _NUMERIC,
+            "torque": _NUMERIC,
+            "modes_of_operation_display": ("int8",),
+        },
+    },
+    "io": {"rpdo": {"outputs": ("uint16",)}, "tpdo": {"inputs": ("uint16",), "counter": ("int32",)}},
+}
+PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
+"""Objects of receive and transmit PDO mappings (ETG.1000.6)."""
+JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
 LONGEST_INTERFACE = 15
 """Characters of a network interface's name (IFNAMSIZ less the closing zero)."""
 
+_ALL_JOINTS = "joints"
+_BASE = (0.0, 0.0, 0.0)
 
-def entries(data: object, *keys: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the mappings in a list of mappings, with their place in it; nothing where the form is another."""
-    for key in keys:
-        data = data.get(key) if isinstance(data, dict) else None
-    if isinstance(data, list | tuple):
-        yield from ((i, entry) for i, entry in enumerate(data) if isinstance(entry, dict))
-
-
-def axes(data: object) -> list[tuple[KeyPath, dict[str, Any]]]:
-    """Return all that drives move, each with its place: the joints, and the gripper's joint where it has one."""
-    found: list[tuple[KeyPath, dict[str, Any]]] = [(("joints", i), joint) for i, joint in entries(data, "joints")]
-    gripper = data.get("gripper") if isinstance(data, dict) else None
-    driven = gripper.get("joint") if isinstance(gripper, dict) else None
-    return [*found, (("gripper", "joint"), driven)] if isinstance(driven, dict) else found
+Position = tuple[float, float, float]
+Place = tuple[KeyPath, object]
+"""Where a value is, and the value."""
 
 
-def number(data: object, key: str) -> float | None:
-    """Return the number under a key; None where there is none."""
-    value = data.get(key) if isinstance(data, dict) else None
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
+def _repeated(places: Iterable[Place], what: str) -> Iterator[Finding]:
+    first: dict[object, KeyPath] = {}
+    for where, value in places:
+        if (before := first.setdefault(value, where)) != where:
+            found = f'the text "{value}"' if isinstance(value, str) else f"{value}"
+            yield where, f"found {found}, the {what} of {dotted(before)}; each needs its own"
 
 
-def text(data: object, key: str) -> str | None:
-    """Return the text under a key; None where there is none."""
-    value = data.get(key) if isinstance(data, dict) else None
-    return value if isinstance(value, str) else None
+def _min_below_max(low: float, high: float) -> str:
+    return "" if low < high else f"found min {low:g} and max {high:g}; min must be less than max"
 
 
-def period_us(data: object) -> float | None:
-    """Return the cycle period of an arm's file, us; None where it is not a number."""
-    cycle = data.get("cycle", {}) if isinstance(data, dict) else {}
-    return number(cycle, "period_us") if isinstance(cycle, dict) and "period_us" in cycle else CycleConfig.period_us
+# -- devices -----------------------------------------------------------------------------------------------------------
 
 
-def devices_named(data: object) -> dict[str, KeyPath]:
-    """Return the devices that an arm's file names, each with the first place."""
-    named: dict[str, KeyPath] = {}
-    for i, slave in entries(data, "slaves"):
-        if device := text(slave, "device"):
-            named.setdefault(device, ("slaves", i, "device"))
-    return named
+@rule(PdoEntry)
+def _entry(entry: PdoEntry) -> Iterator[Finding]:
+    if entry.index and entry.factor == 0:
+        yield ("factor",), "found 0, allowed is any number but 0"
+    if entry.index and entry.name == PdoEntry.name:
+        yield (), f"the key name is missing; it must be a text of 1 to 64 characters other than {PdoEntry.name}"
 
 
-def arm_findings(data: object) -> list[Finding]:
-    """Return the mistakes of an arm's file that concern more than one value."""
-    slaves: list[tuple[KeyPath, dict[str, Any]]] = [(("slaves", i), slave) for i, slave in entries(data, "slaves")]
-    findings = _repeated(slaves, "name") + _repeated(axes(data), "name") + _repeated(axes(data), "slave")
-    if len(axes(data)) > MOST_AXES and axes(data)[-1][0] == ("gripper", "joint"):
-        told = f"found beside {len(axes(data)) - 1} joints, allowed are {MOST_AXES} in all"
-        findings.append((("gripper", "joint"), told))
-    for where, joint in axes(data):
-        position = joint.get("position")
-        low, high = number(position, "min"), number(position, "max")
-        if low is not None and high is not None and not low < high:
-            findings.append(((*where, "position"), f"found min {low} and max {high}; min must be less than max"))
-    bus = data.get("bus") if isinstance(data, dict) else None
-    interface = text(bus, "interface")
-    if interface and (len(interface) > LONGEST_INTERFACE or "/" in interface or any(map(str.isspace, interface))):
-        wanted = f"virtual, or a network interface of at most {LONGEST_INTERFACE} characters without spaces and /"
-        findings.append((("bus", "interface"), f'found the text "{interface}", allowed is {wanted}'))
-    return findings
+@rule(StartupSdo)
+def _startup_value(sdo: StartupSdo) -> Iterator[Finding]:
+    if sdo.type.startswith("float"):
+        return
+    low, high = integer_range(sdo.type)
+    if not low <= sdo.value <= high or sdo.value != int(sdo.value):
+        yield ("value",), f"found {sdo.value:g}, allowed is an integer from {low} to {high}, the range of {sdo.type}"
 
 
-def joint_findings(data: object, devices: Mapping[str, DeviceDescription]) -> list[Finding]:
-    """Return the mistakes between the joints and the slaves that move them."""
-    slaves = {name: slave for _, slave in entries(data, "slaves") if (name := text(slave, "name"))}
-    findings: list[Finding] = []
-    for axis, joint in axes(data):
-        name = text(joint, "slave")
-        if name is None:
-            continue
-        where = (*axis, "slave")
-        if name not in slaves:
-            known = f"allowed are the names under slaves: {', '.join(slaves)}" if slaves else "no slave has a name"
-            findings.append((where, f'found the text "{name}", which is no slave; {known}'))
-            continue
-        device = devices.get(text(slaves[name], "device") or "")
-        if device is None:
-            continue
-        if device.kind != "cia402":
-            kind = f"its device {slaves[name]['device']} is of kind {device.kind}"
-            findings.append((where, f'found the text "{name}", which moves no joint: {kind}; allowed is kind cia402'))
-            continue
-        findings += _beyond_the_wire(axis, joint, device)
-    return findings
+@rule(DeviceDescription, "rpdo", "kind")
+def _rpdo(device: DeviceDescription) -> Iterator[Finding]:
+    return _pdos("rpdo", device.rpdo, device.kind)
 
 
-def _repeated(found: list[tuple[KeyPath, dict[str, Any]]], key: str) -> list[Finding]:
-    findings: list[Finding] = []
-    first: dict[str, KeyPath] = {}
-    for where, entry in found:
-        value = text(entry, key)
-        if value is not None and (place := first.setdefault(value, where)) != where:
-            told = f'found the text "{value}", the {key} that {dotted(place)} has; each needs its own'
-            findings.append(((*where, key), told))
-    return findings
+@rule(DeviceDescription, "tpdo", "kind")
+def _tpdo(device: DeviceDescription) -> Iterator[Finding]:
+    return _pdos("tpdo", device.tpdo, device.kind)
 
 
-def _beyond_the_wire(axis: KeyPath, joint: dict[str, Any], device: DeviceDescription) -> list[Finding]:
+@rule(DeviceDescription, "assign_activate")
+def _dc_word(device: DeviceDescription) -> Iterator[Finding]:
+    word = device.assign_activate
+    if word and word & 0x0300 != 0x0300:
+        wanted = "0 for no distributed clocks, or a word that activates SYNC0, as 0x0300 or 0x0700"
+        yield ("assign_activate",), f"found {word:#06x}, allowed is {wanted}"
+
+
+def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
+    low, high = PDO_RANGE[direction]
+    first: dict[int, int] = {}
+    names: dict[str, tuple[KeyPath, PdoEntry]] = {}
+    for i, pdo in enumerate(pdos):
+        if not low <= pdo.index <= high:
+            wanted = f"{low:#x} to {high:#x}, the objects of a {direction}"
+            yield (direction, i, "index"), f"found {pdo.index:#06x}, allowed is {wanted}"
+        elif first.setdefault(pdo.index, i) != i:
+            told = f"found {pdo.index:#06x}, the index of {direction}[{first[pdo.index]}]; each needs its own"
+            yield (direction, i, "index"), told
+        for j, entry in enumerate(pdo.channels):
+            where = (direction, i, "channels", j)
+            if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
+                told = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
+                yield (*where, "name"), told
+    bits = sum(BITS[entry.type] for pdo in pdos for entry in pdo.channels)
+    if bits % 8:
+        wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
+        yield (direction,), f"found {bits} bits in all, allowed are {wanted}"
+    needed = CHANNELS[kind][direction]
+    if missing := [name for name in needed if name not in names]:
+        there = f"its channels are {', '.join(names)}" if names else "it has no channels"
+        those = f"{'a channel' if len(missing) == 1 else 'channels'} named {', '.join(missing)}"
+        yield (direction,), f"kind {kind} needs {those}; {there}"
+    for name in needed.keys() & names.keys():
+        place, entry = names[name]
+        if entry.type not in needed[name]:
+            wanted = "any type but bool" if needed[name] is _NUMERIC else " or ".join(needed[name])
+            yield (*place, "type"), f"found {entry.type} for {name}, allowed is {wanted}"
+
+
+def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Finding]:
+    """Yield the mistakes of a device under a cycle period, us."""
+    cycles = f"the cycle period is {period_us:g} us"
+    shortest, watchdog = 2 * period_us / 1000, device.watchdog_ms
+    # A drive keeps its last target until the watchdog expires: 100 ms is the ESC's default, 10 cycles for slower buses.
+    longest = max(100.0, 10 * period_us / 1000) if device.kind == "cia402" else math.inf
+    if watchdog <= shortest:
+        wanted = f"more than 2 cycles, {shortest:g} ms ({cycles}): one late frame must not trip it"
+        yield ("watchdog_ms",), f"found {watchdog:g} ms, allowed is {wanted}"
+    elif watchdog > longest:
+        wanted = f"at most {longest:g} ms ({cycles}): until it expires the drive keeps its last target"
+        yield ("watchdog_ms",), f"found {watchdog:g} ms, allowed is {wanted}"
+    if abs(device.sync0_shift_us) >= period_us:
+        wanted = f"less than one cycle in either direction ({cycles})"
+        yield ("sync0_shift_us",), f"found {device.sync0_shift_us:g} us, allowed is {wanted}"
+
+
+# -- the arm -----------------------------------------------------------------------------------------------------------
+
+
+@rule(Range)
+@rule(MechanicalLimit)
+def _range(limits: Range | MechanicalLimit) -> Iterator[Finding]:
+    if told := _min_below_max(limits.min, limits.max):
+        yield (), told
+
+
+@rule(Box)
+@rule(KeepOut)
+def _corners(box: Box | KeepOut) -> Iterator[Finding]:
+    for axis, low, high in zip("xyz", box.min, box.max, strict=True):
+        if told := _min_below_max(low, high):
+            yield (), told.replace(";", f" in {axis};")
+
+
+@rule(GripperConfig)
+def _gripper(gripper: GripperConfig) -> Iterator[Finding]:
+    joint = gripper.joint
+    ends = (("open_position", gripper.open_position), ("closed_position", gripper.closed_position))
+    if (gripper.output is None) == (joint is None):
+        found = "neither output nor joint" if joint is None else "both output and joint"
+        yield (), f"found {found}, allowed is one of them: a digital output, or a drive of its own"
+        return
+    if joint is None:
+        for key, end in ends:
+            if end is not None:
+                yield (key,), "this key belongs to a gripper with a joint, not to one on an output"
+        return
+    if gripper.closed is not None:
+        yield ("closed",), "this key belongs to a gripper on an output, not to one with a joint"
+    low, high = joint.position.min, joint.position.max
+    for key, end in ends:
+        if end is None:
+            yield (), f"the key {key} is missing; it must be a number inside gripper.joint.position"
+        elif not low <= end <= high:
+            yield (key,), f"found {end:g}, allowed is {low:g} to {high:g}, gripper.joint.position"
+    if gripper.closed_position is not None and gripper.closed_position == gripper.open_position:
+        yield ("closed_position",), f"found {gripper.closed_position:g}, the open_position; the two must differ"
+
+
+def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
+    """Yield everything that drives move with its place: the joints, then the gripper's joint where it has one."""
+    yield from ((("joints", i), joint) for i, joint in enumerate(arm.joints))
+    if arm.gripper and arm.gripper.joint:
+        yield ("gripper", "joint"), arm.gripper.joint
+
+
+@rule(ArmFile, "slaves")
+def _slave_names(arm: ArmFile) -> Iterator[Finding]:
+    return _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+
+
+@rule(ArmFile, "joints", "gripper")
+def _axis_names(arm: ArmFile) -> Iterator[Finding]:
+    axes = list(axes_of(arm))
+    yield from _repeated((((*where, "name"), joint.name) for where, joint in axes), "name")
+    yield from _repeated((((*where, "slave"), joint.slave) for where, joint in axes), "slave")
+    if len(axes) > MOST_AXES:
+        yield ("gripper", "joint"), f"found beside {len(axes) - 1} joints, allowed are {MOST_AXES} in all"
+    for where, joint in axes:
+        if joint.name == _ALL_JOINTS:
+            yield (*where, "name"), f'found the text "{_ALL_JOINTS}", which in the key of a limit means all joints'
+
+
+@rule(ArmFile, "bus")
+def _interface(arm: ArmFile) -> Iterator[Finding]:
+    name = arm.bus.interface
+    if len(name) > LONGEST_INTERFACE or "/" in name or any(map(str.isspace, name)):
+        wanted = f"{VIRTUAL}, or a network interface of at most {LONGEST_INTERFACE} characters without spaces and /"
+        yield ("bus", "interface"), f'found the text "{name}", allowed is {wanted}'
+
+
+@rule(ArmFile, "control_mode", "inputs")
+def _control_mode(arm: ArmFile) -> Iterator[Finding]:
+    stick = arm.inputs.joystick is not None
+    if told := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=stick):
+        yield ("control_mode",), told
+
+
+def missing_for(control_mode: str, *, geometry: bool, joystick: bool) -> str:
+    """Return the sentence for a control mode whose needs the arm does not meet; empty where it does."""
+    if control_mode in ("cartesian", "joystick") and not geometry:
+        return f'found the text "{control_mode}", which needs the arm\'s geometry: the key kinematics is missing'
+    if control_mode == "joystick" and not joystick:
+        return f'found the text "{control_mode}", which needs a joystick: the key inputs.joystick is missing'
+    return ""
+
+
+@rule(ArmFile, "jog", "cartesian")
+def _jog_speeds(arm: ArmFile) -> Iterator[Finding]:
+    for key in ("speed", "angular_speed"):
+        speed, most = getattr(arm.jog, key), getattr(arm.cartesian, key)
+        if speed > most:
+            yield ("jog", key), f"this is {speed:g}, allowed is at most {most:g}, cartesian.{key}"
+
+
+@rule(ArmFile, "inputs")
+def _input_terminals(arm: ArmFile) -> Iterator[Finding]:
+    return _repeated(_inputs(arm), "input")
+
+
+@rule(ArmFile, "outputs", "gripper")
+def _output_terminals(arm: ArmFile) -> Iterator[Finding]:
+    return _repeated(_outputs(arm), "output")
+
+
+def _inputs(arm: ArmFile) -> Iterator[Place]:
+    if stick := arm.inputs.joystick:
+        yield from ((("inputs", "joystick", key), getattr(stick, key)) for key in JOYSTICK_TERMINALS)
+    for key in ("arm_toggle", "enabling_switch", "emergency_stop"):
+        if terminal := getattr(arm.inputs, key):
+            yield ("inputs", key, "number"), terminal.number
+
+
+def _outputs(arm: ArmFile) -> Iterator[Place]:
+    outputs = {("outputs", key): getattr(arm.outputs, key) for key in ("state_lamp", "motion_lamp", "heartbeat")}
+    if arm.gripper:
+        outputs["gripper", "output"] = arm.gripper.output
+    return ((where, number) for where, number in outputs.items() if number is not None)
+
+
+def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
+    """Yield the mistakes between joints and the slaves that move them; `devices`: the valid ones by name."""
+    slaves = {slave.name: slave for slave in arm.slaves}
+    for where, joint in axes_of(arm):
+        slave = slaves.get(joint.slave)
+        device = devices.get(slave.device) if slave else None
+        if slave is None:
+            told = f'found the text "{joint.slave}", which is no slave; allowed are the names under slaves: '
+            yield (*where, "slave"), told + ", ".join(slaves)
+        elif device is not None and device.kind != "cia402":
+            told = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
+            yield (*where, "slave"), f"{told}{device.kind}; allowed is kind cia402"
+        elif device is not None:
+            yield from _beyond_the_wire(where, joint, device)
+
+
+def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
+    """Yield the terminals of an arm that has no IO box; `devices`: the valid ones by name."""
+    found = [devices.get(slave.device) for slave in arm.slaves]
+    if any(device is None or device.kind == "io" for device in found):
+        return
+    for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
+        for where, number in terminals:
+            yield where, f"found {kind} {number}, but no slave is of kind io; leave it out for such an arm"
+
+
+def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> Iterator[Finding]:
     """Limits that the drive's process data cannot express: a target near them would wrap around."""
-    channels = {channel.name: channel for pdo in device.rpdo for channel in pdo.channels}
-    position = joint.get("position")
-    limits: tuple[tuple[KeyPath, float | None, str], ...] = (
-        (("position", "min"), number(position, "min"), "target_position"),
-        (("position", "max"), number(position, "max"), "target_position"),
-        (("velocity",), number(joint, "velocity"), "target_velocity"),
-        (("torque",), number(joint, "torque"), "target_torque"),
+    position = joint.position
+    limits: tuple[tuple[KeyPath, tuple[float, ...], str], ...] = (
+        (("position", "min"), (position.min,), "target_position"),
+        (("position", "max"), (position.max,), "target_position"),
+        (("velocity",), (-joint.velocity, joint.velocity), "target_velocity"),
+        (("torque",), (-joint.torque, joint.torque), "target_torque"),
     )
-    findings: list[Finding] = []
-    for where, limit, name in limits:
-        channel = channels.get(name)
-        if limit is None or channel is None or channel.type.startswith("float"):
-            continue
-        low, high = _reach(channel)
-        # A speed or torque limit holds both ways.
-        ends = (limit,) if where[0] == "position" else (-limit, limit)
+    for where, ends, name in limits:
+        low, high = device.wire_range(name)
         if not all(low <= end <= high for end in ends):
-            why = f"{name} of {device.name} is {channel.type} with factor {channel.factor:g}"
-            found = f"{limit:g}" if len(ends) == 1 else f"+-{limit:g}"
-            findings.append(((*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"))
-    return findings
+            entry = next(entry for pdo in device.rpdo for entry in pdo.channels if entry.name == name)
+            why = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"
+            found = f"{'+-' if len(ends) == 2 else ''}{ends[-1]:g}"
+            yield (*axis, *where), f"found {found}, allowed is {low:g} to {high:g}: {why}"
 
 
-def wire_range(device: DeviceDescription, name: str) -> tuple[float, float]:
-    """Return what a channel to a device can say, SI; without bounds where the channel is a float or not there."""
-    found = [channel for pdo in device.rpdo for channel in pdo.channels if channel.name == name]
-    if not found or found[0].type.startswith("float"):
-        return -math.inf, math.inf
-    return _reach(found[0])
+# -- geometry and boxes ------------------------------------------------------------------------------------------------
 
 
-def _reach(channel: PdoEntry) -> tuple[float, float]:
-    low, high = integer_range(channel.type)
-    ends = (low * channel.factor, high * channel.factor)
-    return min(ends), max(ends)
+@rule(ArmFile, "kinematics", "joints")
+def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
+    part = arm.kinematics
+    if part is None:
+        return
+    if len(arm.joints) != len(part.dh):
+        told = f"found beside {len(arm.joints)} joints, allowed are {len(part.dh)}; leave it out for such an arm"
+        yield ("kinematics",), told
+    for i, (joint, limit) in enumerate(zip(arm.joints, part.limits or ())):  # noqa: B905 the count is checked above
+        place = f"kinematics.limits[{i}]"
+        low, high = joint.position.min, joint.position.max
+        if low < limit.min:
+            told = f"found {low:g}, allowed is at least {limit.min:g}, the joint's mechanical end in {place}"
+            yield ("joints", i, "position", "min"), told
+        if high > limit.max:
+            told = f"found {high:g}, allowed is at most {limit.max:g}, the joint's mechanical end in {place}"
+            yield ("joints", i, "position", "max"), told
+        if limit.velocity is not None and joint.velocity > limit.velocity:
+            told = f"found {joint.velocity:g}, allowed is at most {limit.velocity:g}, the velocity in {place}"
+            yield ("joints", i, "velocity"), told
 
 
-def integer_range(kind: str) -> tuple[int, int]:
-    """Return the smallest and the largest number of an integer type."""
-    bits = BITS[kind]
-    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
+@rule(ArmFile, "cartesian", "kinematics")
+def _boxes(arm: ArmFile) -> Iterator[Finding]:
+    tool, part = arm.cartesian.box, arm.kinematics
+    boxes: list[tuple[KeyPath, Box | KeepOut]] = [(("cartesian", "box"), tool)] if tool else []
+    boxes += [(("cartesian", "keep_out", i), box) for i, box in enumerate(arm.cartesian.keep_out)]
+    for where, box in boxes:
+        if part is None:
+            yield where, "found a box, which needs the arm's geometry: the key kinematics is missing"
+        elif told := _misplaced(box, part):
+            yield where, told
+        elif tool and isinstance(box, KeepOut) and _holds(box, tool):
+            yield where, "found a box around all of cartesian.box: the tool has no place left"
+
+
+@rule(ArmFile, "cartesian", "joints", "gripper")
+def _box_names(arm: ArmFile) -> Iterator[Finding]:
+    """Names with which the key of a limit, as joint2.max or user.max.z, has two meanings."""
+    boxes = arm.cartesian.keep_out
+    yield from _repeated(((("cartesian", "keep_out", i, "name"), box.name) for i, box in enumerate(boxes)), "name")
+    taken = {"box": "cartesian.box", _ALL_JOINTS: "all joints"}
+    taken |= {joint.name: dotted(where) for where, joint in axes_of(arm) if joint.name not in taken}
+    for i, box in enumerate(boxes):
+        if box.name in taken:
+            told = f'found the text "{box.name}", which in the key of a limit means {taken[box.name]}'
+            yield ("cartesian", "keep_out", i, "name"), told
+        elif "." in box.name:
+            told = f'found the text "{box.name}", allowed is one without a dot: dots separate the parts of a key'
+            yield ("cartesian", "keep_out", i, "name"), told
+
+
+def shoulder_and_reach(part: Kinematics) -> tuple[Position, float]:
+    """Return a point that no joint moves, the origin of frame 1 (m), and how far from it the tool can be at most, m."""
+    row = part.dh[0]
+    shoulder = (row.a, 0.0 - math.sin(row.alpha) * row.d, math.cos(row.alpha) * row.d)
+    return shoulder, sum(math.hypot(row.a, row.d) for row in part.dh[1:]) + math.hypot(*part.tool.position)
+
+
+def _misplaced(box: Box | KeepOut, part: Kinematics) -> str:
+    shoulder, reach = shoulder_and_reach(part)
+    nearest = [min(max(c, low), high) for c, low, high in zip(shoulder, box.min, box.max, strict=True)]
+    away = math.dist(shoulder, nearest)
+    if away > reach:
+        what = "the arm never meets it" if isinstance(box, KeepOut) else "the tool is never inside"
+        told = f"found a box that begins {away:.3f} m from the shoulder, allowed is at most {reach:.3f} m"
+        return f"{told}, the arm's reach: {what}"
+    if isinstance(box, KeepOut) and _meets(_BASE, shoulder, box):
+        at = ", ".join(f"{coordinate:g}" for coordinate in shoulder)
+        told = "found a box around the arm's base, allowed is one beside it"
+        return f"{told}: the base is at (0, 0, 0), the shoulder at ({at})"
+    return ""
+
+
+def _meets(start: Position, end: Position, box: KeepOut) -> bool:
+    """Return whether the straight line between two points meets a box (the method of slabs)."""
+    enter, leave = 0.0, 1.0
+    for begin, finish, low, high in zip(start, end, box.min, box.max, strict=True):
+        if begin == finish:
+            if not low <= begin <= high:
+                return False
+            continue
+        first, last = sorted(((low - begin) / (finish - begin), (high - begin) / (finish - begin)))
+        enter, leave = max(enter, first), min(leave, last)
+    return enter <= leave
+
+
+def _holds(outer: KeepOut, inner: Box) -> bool:
+    return all(a <= b for a, b in zip((*outer.min, *inner.max), (*inner.min, *outer.max), strict=True))
+
+
+# -- motion files ------------------------------------------------------------------------------------------------------
+
+
+@rule(Point)
+def _point(point: Point) -> Iterator[Finding]:
+    if point.a is not None and point.v is None:
+        yield ("a",), "a needs v beside it"
+
+
+@rule(Stop)
+def _stop(stop: Stop) -> Iterator[Finding]:
+    if (stop.pose is None) == (stop.q is None):
+        yield (), f"found {'neither' if stop.pose is None else 'both'} of pose and q; one of them is needed"
+
+
+@rule(MotionFile, EVERY_KEY)
+def _one_form(motion: MotionFile) -> Iterator[Finding]:
+    if not motion.trajectory and not motion.path:
+        yield (), "neither trajectory nor path has entries; one of them is needed"
+    if motion.trajectory and motion.path:
+        yield ("path",), "a file holds a trajectory or a path, found both; write two files"
+    if motion.trajectory and motion.speed is not None:
+        yield ("speed",), "a speed is for a path; a trajectory's follows from its times"
+
+
+@rule(MotionFile, "trajectory")
+def _points(motion: MotionFile) -> Iterator[Finding]:
+    points = motion.trajectory
+    for i, point in enumerate(points):
+        where, first, before = ("trajectory", i), points[0], points[max(i - 1, 0)]
+        if i and not point.t > before.t:
+            yield (*where, "t"), f"found {point.t:g} after {before.t:g}; times must rise"
+        for key in ("q", "v", "a"):
+            numbers, as_first = getattr(point, key), getattr(first, key)
+            if numbers is not None and len(numbers) != len(first.q):
+                told = f"found {len(numbers)} numbers, allowed are {len(first.q)}, as the first point has"
+                yield (*where, key), told
+            if (numbers is None) != (as_first is None):
+                yield (*where, key), f"{key} must be given for all points or for none"

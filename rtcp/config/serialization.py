@@ -76,9 +76,11 @@ def _typed(kind: Any, data: object, where: str) -> Any:
     elif origin is Literal:
         if data in choices:
             return data
-    elif isinstance(kind, type) and issubclass(kind, Path | Enum):
-        if isinstance(data, str | int):
+    elif isinstance(kind, type) and issubclass(kind, Path):
+        if isinstance(data, str):
             return kind(data)
+    elif isinstance(kind, type) and issubclass(kind, Enum):
+        return kind(data)
     elif kind is float:
         # JSON of other writers has no difference between 1 and 1.0.
         if isinstance(data, float | int) and not isinstance(data, bool):

@@ -68,8 +68,8 @@ class Arm:
         self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
         """The controller that the joystick commands; None where the geometry is unknown."""
         self.active = self._holder
-        self.control_mode = ControlMode[config.motion.upper()]
-        self.configured_mode = DriveMode[config.mode.upper()]
+        self.control_mode = ControlMode[config.control_mode.upper()]
+        self.configured_mode = DriveMode[config.drive_mode.upper()]
         """Drive mode of moves, lines, streams and jogs."""
         self._cst = CstWriter(joints, self.period_s)
         self._writers: dict[DriveMode, DriveWriter] = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtcp.config.model import ArmConfig, Joint
-from rtcp.config.operation import WatchConfig
+from rtcp.config.model import SupervisionConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed
@@ -114,7 +114,7 @@ class GripperSupervision:
         axis: its number.
     """
 
-    def __init__(self, config: WatchConfig, joint: Joint, axis: int) -> None:
+    def __init__(self, config: SupervisionConfig, joint: Joint, axis: int) -> None:
         self._axis = axis
         self._cycles = config.cycles
         self._speed = config.speed * joint.velocity
@@ -154,4 +154,4 @@ def make_gripper(config: ArmConfig) -> DrivenGripper | None:
     period_s = config.cycle.period_us * 1e-6
     motion = GripperMotion(joint, gripper.open_position, gripper.closed_position, period_s)
     axis = len(config.joints)
-    return DrivenGripper(slot, drive, motion, GripperSupervision(config.watch, joint, axis), axis)
+    return DrivenGripper(slot, drive, motion, GripperSupervision(config.supervision, joint, axis), axis)

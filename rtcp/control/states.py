@@ -234,7 +234,7 @@ class Enabling(MachineState):
         arm = ctx.arm
         axis = arm.first_off_target()
         self._false_cycles = 0 if axis < 0 else self._false_cycles + 1
-        if self._false_cycles < ctx.config.watch.cycles:
+        if self._false_cycles < ctx.config.supervision.cycles:
             return None
         return PositionJumped(axis, arm.all_drives[axis].position, arm.tracked_to(axis))
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from rtcp.config.model import DeviceDescription, GripperConfig, SlaveConfig
-from rtcp.config.operation import InputConfig, InputsConfig, OutputsConfig
+from rtcp.config.model import DeviceDescription, GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
 from rtcp.devices.driver import DeviceError, slots
 from rtcp.fieldbus.pdo import TYPES, ImageLayout, layout
 
@@ -171,7 +170,7 @@ class Outputs:
         self._moving = _mask(config.motion_lamp)
         self._heartbeat = _mask(config.heartbeat)
         self._gripper = 0 if gripper is None else _mask(gripper.output)
-        self._closed = gripper is not None and gripper.closed == "on"
+        self._closed = gripper is not None and gripper.closed != "off"
         numbers = (config.state_lamp, config.motion_lamp, config.heartbeat, None if gripper is None else gripper.output)
         self.meant = frozenset(number for number in numbers if number is not None)
         """Numbers of the outputs that nobody switches by hand."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rtcp.config.model import ArmConfig
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL, ArmConfig
 from rtcp.ipc.machine import ALLOWED, TABLE, Code, Command, Refusal, State
 from rtcp.ipc.motion_messages import motion_events, motion_refusals
 from rtcp.ipc.naming import Matter, Naming, number
@@ -140,10 +139,8 @@ class Sentences:
 
     def _lost_cycles(self) -> str:
         bus = self._config.bus
-        widened = bus.interface == VIRTUAL and bus.virtual_patience != 1
-        return (
-            f"bus.lost_cycles times bus.virtual_patience, {bus.virtual_patience:g}," if widened else "bus.lost_cycles"
-        )
+        widened = bus.interface == VIRTUAL and bus.timeout_scale != 1
+        return f"bus.lost_cycles times bus.timeout_scale, {bus.timeout_scale:g}," if widened else "bus.lost_cycles"
 
     def _not_in_this_state(self, matter: Matter) -> str:
         command, state = Command(int(matter.value)), State(matter.axis)
@@ -184,9 +181,10 @@ class Sentences:
     def _position_jumped(self, matter: Matter) -> str:
         return (
             f"{self._joint(matter)} was followed to {number(matter.limit)} rad while being enabled and is suddenly at "
-            f"{number(matter.value)} rad, for {self._config.watch.cycles} cycles (watch.cycles in {self._file}): it "
-            f"was turned, or its drive shows a false position; {self._names.stop(Code.POSITION_JUMPED)}, let it stand, "
-            "compare it with `rtcp status`; `rtcp reset` goes on"
+            f"{number(matter.value)} rad, for {self._config.supervision.cycles} cycles (supervision.cycles in "
+            f"{self._file}): it was turned, or its drive shows a false position; "
+            f"{self._names.stop(Code.POSITION_JUMPED)}, let it stand, compare it with `rtcp status`; "
+            "`rtcp reset` goes on"
         )
 
     def _reset_stuck(self, matter: Matter) -> str:

@@ -139,7 +139,7 @@ def motion_events(names: Naming) -> dict[int, Say]:
     def ended(reason: Reason) -> int:
         return Code.ENDED + reason
 
-    watch = f"watch in {file}"
+    watch = f"supervision in {file}"
 
     def emergency(code: Code) -> str:
         return names.stop(code, " at once" if names.rungs[code] is Rung.TORQUE_OFF else ", then torque off")
@@ -153,11 +153,11 @@ def motion_events(names: Naming) -> dict[int, Say]:
         ),
         Code.OVER_SPEED: lambda m: (
             f"{names.joint(m.axis)}: measured speed {number(m.value)} rad/s was beyond {number(m.limit)} rad/s for "
-            f"{names.config.watch.cycles} cycles ({watch}): {watched(Code.OVER_SPEED)}"
+            f"{names.config.supervision.cycles} cycles ({watch}): {watched(Code.OVER_SPEED)}"
         ),
         Code.OVER_TORQUE: lambda m: (
             f"{names.joint(m.axis)}: measured torque {number(m.value)} Nm was beyond {number(m.limit)} Nm for "
-            f"{names.config.watch.cycles} cycles ({watch}): {watched(Code.OVER_TORQUE)}"
+            f"{names.config.supervision.cycles} cycles ({watch}): {watched(Code.OVER_TORQUE)}"
         ),
         Code.FOLLOWING_ERROR: lambda m: (
             f"{names.joint(m.axis)}: it was {number(m.value)} rad away from where it was commanded, at most "

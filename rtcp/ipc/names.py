@@ -8,8 +8,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
-from rtcp.config.model import ArmConfig
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL, ArmConfig
 from rtcp.ipc.commands import COMMANDS, Reset
 from rtcp.ipc.events import JOYSTICK_MODES, Emergency
 from rtcp.ipc.message import Message
@@ -67,8 +66,8 @@ class Names:
     def lost_cycles(self) -> str:
         """Return the keys that set how many cycles may be lost."""
         bus = self.config.bus
-        if bus.interface == VIRTUAL and bus.virtual_patience != 1:
-            return f"bus.lost_cycles times bus.virtual_patience, {bus.virtual_patience:g},"
+        if bus.interface == VIRTUAL and bus.timeout_scale != 1:
+            return f"bus.lost_cycles times bus.timeout_scale, {bus.timeout_scale:g},"
         return "bus.lost_cycles"
 
     def reaction(self, event: Any) -> str:
@@ -100,7 +99,7 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "reaction": Names.reaction,
     "lost_cycles": lambda names, about: names.lost_cycles(),
     "enable_timeout": lambda names, about: names.config.enable_timeout_s,
-    "supervision": lambda names, about: f"{names.config.watch.cycles} cycles (watch in {names.file})",
+    "supervision": lambda names, about: f"{names.config.supervision.cycles} cycles (supervision in {names.file})",
     "joystick_mode": lambda names, about: JOYSTICK_MODES[about.mode % len(JOYSTICK_MODES)],
     "direction_name": lambda names, about: _DIRECTIONS[about.direction % len(_DIRECTIONS)],
     "singularity": lambda names, about: _SINGULARITIES[about.which % 3][0],

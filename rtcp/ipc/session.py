@@ -39,14 +39,14 @@ class SessionError(Exception):
 
 
 class Pid(int):
-    """A process id with the start of its process, s since boot; a later process with the same id differs."""
+    """A process id with psutil's identity of its process, which no later process with the same id has."""
 
-    started: float
+    identity: int
 
-    def __new__(cls, number: int, started: float = 0.0) -> Pid:
-        """Combine both; `identify` looks up the start."""
+    def __new__(cls, number: int, identity: int = 0) -> Pid:
+        """Combine both; `identify` looks the identity up."""
         made = super().__new__(cls, number)
-        made.started = started
+        made.identity = identity
         return made
 
 
@@ -58,7 +58,9 @@ def identify(number: int) -> Pid:
     import psutil  # here and below: the loop's process must not load it
 
     try:
-        return Pid(number, _started(number))
+        # The hash of (id, start since boot), numbers alone: the same in every process, and no step of the wall clock
+        # changes it. `create_time()` needs /proc/stat, which the service does not see.
+        return Pid(number, hash(psutil.Process(number)))
     except psutil.Error:
         return Pid(number)
 
@@ -103,20 +105,9 @@ def _find(pid: int) -> psutil.Process | None:
     try:
         process = psutil.Process(pid)
         ended = process.status() in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
-        return None if ended or _started(pid) != pid.started else process
+        return None if ended or hash(process) != pid.identity else process
     except psutil.Error:
         return None
-
-
-def _started(number: int) -> float:
-    """Return when a process started, s since boot: unlike psutil's own time, a step of the wall clock leaves it."""
-    import psutil
-
-    while True:  # psutil keeps the first answer of each `Process`
-        boot = psutil.boot_time()
-        started = psutil.Process(number).create_time() - boot
-        if psutil.boot_time() == boot:
-            return round(started, 2)
 
 
 @dataclass
@@ -129,12 +120,12 @@ class Processes:
 
     def write(self, directory: Path) -> None:
         """Replace `processes.json`, whole or not at all."""
-        started = {name: pid.started for name, pid in vars(self).items()}
-        _replace(processes_file(directory), {**vars(self), "started": started})
+        identities = {name: pid.identity for name, pid in vars(self).items()}
+        _replace(processes_file(directory), {**vars(self), "identities": identities})
 
 
 def processes_file(directory: Path) -> Path:
-    """Return the path of the file that names the processes: `{"loop": 12, ..., "started": {"loop": 3.45, ...}}`."""
+    """Return the path of the file that names the processes: `{"loop": 12, ..., "identities": {"loop": 3, ...}}`."""
     return directory / "processes.json"
 
 
@@ -142,7 +133,7 @@ def read_processes(directory: Path) -> Processes:
     """Return the processes that `processes.json` names; none where it is missing or damaged."""
     try:
         found = json.loads(processes_file(directory).read_text())
-        return Processes(*(Pid(int(found[one.name]), float(found["started"][one.name])) for one in fields(Processes)))
+        return Processes(*(Pid(int(found[one.name]), int(found["identities"][one.name])) for one in fields(Processes)))
     except (OSError, ValueError, LookupError, TypeError, OverflowError, RecursionError):
         return Processes()
 

@@ -12,8 +12,7 @@ from enum import IntEnum
 from math import sqrt
 from typing import NamedTuple
 
-from rtcp.config.model import ArmConfig, Joint
-from rtcp.config.stops import StopsConfig
+from rtcp.config.model import ArmConfig, Joint, StopsConfig
 from rtcp.ipc.events import EVENTS, Event
 
 _LATENCY_CYCLES = 3

@@ -14,8 +14,7 @@ from math import sqrt
 from types import MappingProxyType
 from typing import NamedTuple
 
-from rtcp.config.model import ArmConfig, Joint
-from rtcp.config.stops import StopsConfig
+from rtcp.config.model import ArmConfig, Joint, StopsConfig
 from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.codes import Code
 

@@ -12,11 +12,9 @@ from pathlib import Path
 from typing import get_args
 
 from rtcp.config.find import find_config
-from rtcp.config.model import ArmConfig, DriveModeName
-from rtcp.config.operation import MotionName
-from rtcp.config.schema import load, segment_path, with_motion, with_period
+from rtcp.config.loader import load, segment_path, widen, with_control_mode, with_period
+from rtcp.config.model import VIRTUAL, ArmConfig, ControlModeName, DriveModeName
 from rtcp.config.segment import load_segment
-from rtcp.config.virtual import VIRTUAL, widen
 from rtcp.config.zero import read_zeros, state_directory
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import check_name
@@ -201,12 +199,12 @@ def _configured(options: StartOptions) -> ArmConfig:
 
 def _with_mode(config: ArmConfig, mode: str) -> ArmConfig:
     drive_modes: dict[str, DriveModeName] = {name: name for name in get_args(DriveModeName)}
-    motions: dict[str, MotionName] = {name: name for name in get_args(MotionName)}
+    motions: dict[str, ControlModeName] = {name: name for name in get_args(ControlModeName)}
     if mode in motions:
-        return with_motion(config, motions[mode])
+        return with_control_mode(config, motions[mode])
     if mode not in drive_modes:
         raise StartError(f"mode {mode!r} is unknown: {', '.join([*motions, *drive_modes])}", "usage")
-    return dataclasses.replace(config, mode=drive_modes[mode])
+    return dataclasses.replace(config, drive_mode=drive_modes[mode])
 
 
 def _check_bus(config: ArmConfig, check_segment: CheckSegment) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from rtcp.config.virtual import VIRTUAL
+from rtcp.config.model import VIRTUAL
 
 if TYPE_CHECKING:
     from rtcp.config.model import ArmConfig
@@ -49,7 +49,7 @@ def configuration(config: Path | None) -> ArmConfig:
         ConfigError: with every mistake in it.
     """
     from rtcp.config.find import find_config
-    from rtcp.config.schema import load
+    from rtcp.config.loader import load
 
     return load(find_config(config))
 
@@ -99,7 +99,7 @@ def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str
         except BusError as error:
             raise OfflineError("usage", str(error)) from error
         return _question({**question, "interface": bus, "namespace_pid": None})
-    from rtcp.config.schema import segment_path
+    from rtcp.config.loader import segment_path
 
     with _segment(segment_path(configuration(config))) as ready:
         return _question({**question, "interface": ready["interface"], "namespace_pid": ready["pid"]})

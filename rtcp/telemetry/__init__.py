@@ -1,1 +1,1 @@
-"""What is made of cycle records after the cycle: recordings, experiments, pictures."""
+"""Analysis of cycle records and fault injection: recordings, the square, fault reports, trials and the soak."""

@@ -16,8 +16,7 @@ from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.config.model import ArmConfig
-from rtcp.config.motion_points import Stop
+from rtcp.config.model import ArmConfig, Stop
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines

@@ -8,7 +8,7 @@ import os
 import sys
 from pathlib import Path
 
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError
 from rtcp.virtual.network import NetworkError
 from rtcp.virtual.server import run
 

@@ -236,15 +236,15 @@ WRONG = {
     "a misspelt option": (("fk", *HOME, "--jsn"), "no such option: --jsn (did you mean --json?)"),
     "a misspelt option of ik": (("ik", "0", "-1", "0", "0", "0", "0", "--nera"), "did you mean --near?"),
     "a misspelt option of plot": (("plot", *HOME, "--outt", "a.png"), "did you mean --out?"),
-    "an option behind the end of options": (("fk", "--", *HOME, "--json"), "--json stands behind --, which ends the"),
+    "an option behind the end of options": (("fk", "--", *HOME, "--json"), "--json is after --, which ends the"),
     "an unknown arm": (("fk", *HOME, "--arm", "abb_irb140"), "known are abb_irb120, assistive_arm"),
     "a file that is not there": (("urdf", "--arm", "none.yaml"), "none.yaml, named by --arm, does not exist"),
     "a file of something else": (("fk", *HOME, "--arm", "segment"), "segment.yaml:"),
     "a picture of no kind": (("plot", *HOME, "--out", "arm.jpg"), "the ending must be one of .png, .svg, .pdf"),
     "a picture without ending": (("plot", *HOME, "--out", "arm"), "the ending must be one of .png, .svg, .pdf"),
-    "a place that is not there": (("plot", *HOME, "--out", "none/arm.png"), "--out none/arm.png: it cannot be written"),
-    "a URDF nowhere": (("urdf", "--out", "none/arm.urdf"), "--out none/arm.urdf: it cannot be written: No such file"),
-    "a URDF over a directory": (("urdf", "--out", "."), "--out .: it cannot be written: Is a directory"),
+    "a place that is not there": (("plot", *HOME, "--out", "none/arm.png"), "--out none/arm.png cannot be written"),
+    "a URDF nowhere": (("urdf", "--out", "none/arm.urdf"), "--out none/arm.urdf cannot be written: No such file"),
+    "a URDF over a directory": (("urdf", "--out", "."), "--out . cannot be written: Is a directory"),
     "a number for urdf": (("urdf", "1"), "extra argument"),
 }
 
@@ -302,7 +302,7 @@ def test_a_picture_has_the_format_of_its_ending(rtcp: Rtcp, tmp_path: Path, endi
     out = tmp_path / f"arm.{ending}"
     ended = rtcp("arm", "plot", "0", "-0.5", "pi/3", "0", "0.5", "0", "--out", str(out))
     assert (ended.code, ended.err) == (0, "")
-    assert ended.out == f"{out} is written\n"
+    assert ended.out == f"wrote {out}\n"
     assert out.read_bytes().startswith(beginning)
 
 
@@ -350,7 +350,7 @@ def test_a_picture_is_drawn_without_a_display_and_without_warnings(
         str(file),
     ]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stdout, done.stderr) == (0, "arm.png is written\n", "")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "wrote arm.png\n", "")
     assert (tmp_path / "arm.png").stat().st_size > 10_000
 
 
@@ -379,7 +379,7 @@ def test_only_a_picture_loads_what_draws_it() -> None:
 def test_the_urdf_goes_to_standard_output_or_into_a_file(rtcp: Rtcp, tmp_path: Path) -> None:
     out = tmp_path / "arm.urdf"
     ended = rtcp("arm", "urdf", "--out", str(out))
-    assert (ended.code, ended.out) == (0, f"{out} is written\n")
+    assert (ended.code, ended.out) == (0, f"wrote {out}\n")
     assert rtcp("arm", "urdf").out == out.read_text()
     assert ET.parse(out).getroot().get("name") == "assistive-arm"
 

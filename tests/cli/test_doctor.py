@@ -49,8 +49,8 @@ def severities(answer: dict[str, Any]) -> list[str]:
 @pytest.mark.parametrize(
     ("runtime_us", "code", "sentence"),
     [
-        ("-1", 0, "nothing that was found stands in the way"),
-        ("950000", 0, "nothing that was found stands in the way"),
+        ("-1", 0, "no obstacle to real time was found"),
+        ("950000", 0, "no obstacle to real time was found"),
         ("500000", 3, "cycles will be late at times"),
         ("0", 5, "the loop cannot keep its cycle here"),
     ],
@@ -108,12 +108,12 @@ def test_the_bus_of_the_command_line_goes_before_the_configurations(
 def test_what_can_be_no_interface_is_a_mistake_on_the_command_line(rtcp: Callable[..., Any], name: str) -> None:
     ended = rtcp("doctor", "--bus", name)
     assert (ended.code, ended.out) == (2, "")
-    assert f"{name!r} is no name of a network interface" in ended.trouble
+    assert f"{name!r} is not the name of a network interface" in ended.trouble
 
 
 def test_in_a_pipe_the_table_fits_80_columns(rtcp: Callable[..., Any], host: Callable[..., None]) -> None:
     host({f"{CPUS}/online": "0-1", f"{CPUS}/isolated": ""})
-    table = rtcp("doctor").out.split("What mends it")[0]
+    table = rtcp("doctor").out.split("To fix, as root")[0]
     assert max(map(len, table.splitlines())) == 80
 
 

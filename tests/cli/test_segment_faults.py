@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.cli.segment_view import kinds
+from rtcp.cli.segment import kinds
 from rtcp.config.faults import FAULTS, load_script
 
 pytestmark = pytest.mark.alone
@@ -47,7 +47,7 @@ def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
     rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
 ) -> None:
     process, said = begin()
-    assert f"faults are made by `rtcp segment fault NAME`: control socket {directory / 'segment.sock'}\n" in said
+    assert f"inject faults with `rtcp segment fault NAME`; control socket {directory / 'segment.sock'}\n" in said
 
     made = rtcp("segment", "fault", "cable", "after=1")
     assert (made.code, made.err) == (0, "")
@@ -55,16 +55,16 @@ def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
     assert rtcp("segment", "fault", "sdo_abort", "slave=2", "code=0x06090030", "--lasts", "60").out == (
         "fault 2: sdo_abort slave=2 code=0x6090030 index=0x0000, for 60 s; to clear it: rtcp segment clear 2\n"
     )
-    assert "until its burst has passed" in rtcp("segment", "fault", "loss", "burst=5").out
+    assert "until its burst is over" in rtcp("segment", "fault", "loss", "burst=5").out
     assert rtcp("segment", "fault", "clock_jump", "slave=2", "us=-50.5").out == (
-        "fault 4: clock_jump slave=2 us=-50.5: it has happened\n"
+        "fault 4: clock_jump slave=2 us=-50.5: done\n"
     )
 
     listed = json.loads(rtcp("segment", "faults", "--json").out)
     assert [(each["id"], each["fault"]["fault"]) for each in listed] == [(1, "cable"), (2, "sdo_abort"), (3, "loss")]
     lines = rtcp("segment", "faults").out.splitlines()
     assert re.fullmatch(r"fault 1: cable after=1, for \d+\.\d s, until it is cleared", lines[0])
-    assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s to come", lines[1])
+    assert re.fullmatch(r"fault 2: .*, for \d+\.\d s, \d\d\.\d s left", lines[1])
     assert lines[2].endswith("0 lost before, 0 lost behind")
 
     assert rtcp("segment", "clear", "1").out == "cleared: fault 1\n"
@@ -88,7 +88,7 @@ def test_a_second_segment_has_a_socket_of_its_own_and_has_to_be_chosen(
     begin()
     second, said = begin()
     own = directory / f"segment-{second.pid}.sock"
-    assert f"faults are made by `rtcp segment fault NAME --segment {own}`: control socket {own}\n" in said
+    assert f"inject faults with `rtcp segment fault NAME --segment {own}`; control socket {own}\n" in said
 
     unclear = rtcp("segment", "faults")
     assert unclear.code == 2
@@ -123,19 +123,19 @@ def test_without_a_segment_that_runs_the_exit_code_is_4(rtcp: Rtcp, directory: P
 @pytest.mark.parametrize(
     ("command", "sentence"),
     [
-        (("fault", "cabel", "after=1"), "fault: this fault is not known here; did you mean cable?"),
+        (("fault", "cabel", "after=1"), "fault: this fault does not exist; did you mean cable?"),
         (("fault", "cable"), "the key after is missing; it must be an integer from 0 to 254"),
-        (("fault", "cable", "after"), "'after' is no KEY=VALUE, as after=3 or code=0x1A"),
-        (("fault", "cable", "=3"), "'=3' is no KEY=VALUE"),
+        (("fault", "cable", "after"), "'after' is not KEY=VALUE, as after=3 or code=0x1A"),
+        (("fault", "cable", "=3"), "'=3' is not KEY=VALUE"),
         (("fault", "cable", "after=1.5"), "after: found 1.5, allowed is an integer from 0 to 254"),
         (("fault", "cable", "after=1_0"), 'after: found the text "1_0", allowed is an integer'),
         (("fault", "cable", "after=0xFFFF"), "after: found 65535, allowed is an integer"),
-        (("fault", "cable", "after=1", "after=2"), "after stands twice"),
-        (("fault", "cable", "after=1", "lasts=2", "--lasts", "2"), "lasts stands twice"),
+        (("fault", "cable", "after=1", "after=2"), "after is given twice"),
+        (("fault", "cable", "after=1", "lasts=2", "--lasts", "2"), "lasts is given twice"),
         (("fault", "cable", "after=1", "--lasts", "-1"), "lasts: found -1.0, allowed is a number from 0.001"),
         (("fault", "cable", "after=1", "--lasts", "nan"), "lasts: found nan"),
-        (("fault", "cable", "after=1", "at=3"), "at: a fault that is asked for begins at once"),
-        (("fault", "cable", "after=1", "fault=power"), "fault stands twice"),
+        (("fault", "cable", "after=1", "at=3"), "at: a fault of the command line begins at once"),
+        (("fault", "cable", "after=1", "fault=power"), "fault is given twice"),
         (("fault", "loss"), "give either rate"),
         (("fault", "loss", "rate=nan"), "rate: "),
         (("fault", "loss", "rate=inf"), "rate: "),

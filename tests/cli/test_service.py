@@ -59,7 +59,7 @@ def test_a_second_install_changes_nothing(install: Callable[..., Any], tmp_path:
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in PLACES}
     done = install()
     assert done.code == 0
-    assert done.out.count("as it is to be") == len(PLACES)
+    assert done.out.count("up to date") == len(PLACES)
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in PLACES} == before
 
 
@@ -102,7 +102,7 @@ def test_uninstall_removes_what_install_wrote(
     assert files(tmp_path) == set()
     again = uninstall()
     assert again.code == 0
-    assert "nothing of `rtcp service install` is here" in again.out
+    assert "no file of `rtcp service install` exists" in again.out
 
 
 def test_uninstall_names_what_it_leaves(
@@ -133,8 +133,8 @@ def test_uninstall_names_what_it_leaves(
 @pytest.mark.parametrize(
     ("program", "sentence"),
     [
-        ("rtcp", "an absolute path is needed"),
-        ("/home/someone/.venv/bin/rtcp", "lies in /home, which the service does not see"),
+        ("rtcp", "systemd needs an absolute path"),
+        ("/home/someone/.venv/bin/rtcp", "is in /home, which the service cannot see"),
     ],
 )
 def test_a_program_that_the_service_could_not_start_is_refused(
@@ -153,7 +153,7 @@ def test_a_program_whose_interpreter_the_service_does_not_see_is_refused(rtcp: C
         script.flush()
         done = rtcp("service", "install", "--root", "/nowhere", "--program", script.name)
     assert done.code == 3
-    assert "or its interpreter lies in /home" in done.trouble
+    assert "or its interpreter is in /home" in done.trouble
 
 
 def test_where_not_even_root_may_write_install_says_so(rtcp: Callable[..., Any]) -> None:
@@ -172,7 +172,7 @@ def test_where_it_may_not_write_uninstall_says_so_and_removes_nothing(
     done = uninstall()
     closed.chmod(0o755)
     assert done.code == 3
-    assert f"{closed} may not be written to" in done.trouble
+    assert f"{closed} cannot be written to" in done.trouble
     assert files(tmp_path) == PLACES
 
 

@@ -87,7 +87,7 @@ def test_a_runtime_directory_that_cannot_be_made_is_named(
 @pytest.fixture
 def launched(platform: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     """A platform that `rtcp start` has brought up, as far as its processes are concerned."""
-    monkeypatch.setattr(start, "launch", lambda request, say: None)
+    monkeypatch.setattr(start, "launch", lambda options: None)
     platform.status |= {"state": "ready", "message": "all slaves are in OP"}
     return platform
 
@@ -117,7 +117,7 @@ def test_a_start_that_ends_in_a_fault_says_why_and_leaves_the_platform_running(
 def test_a_start_does_not_wait_for_ever(
     rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(start, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(start, "READY_TIMEOUT_S", 0.2)
     launched.status |= {"state": "starting", "message": "slave 3 is back"}
     ended = rtcp("start", "--detach")
     assert ended.code == 5
@@ -135,9 +135,9 @@ def test_a_loop_that_is_given_its_gateway_back_while_it_holds_is_no_failed_start
 def test_a_start_in_the_foreground_tells_what_came_of_it_and_runs_on(
     rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def serve(request: object, say: Callable[[str], None], announce: Callable[[], None]) -> int:
+    def serve(options: object, announce: Callable[[], None]) -> int:
         announce()
-        say("it runs on")
+        start.report("it runs on")
         return 0
 
     monkeypatch.setattr(start, "serve", serve)
@@ -169,7 +169,7 @@ def test_a_later_bearer_of_the_loops_pid_is_neither_taken_for_it_nor_signalled(
     rtcp: Callable[..., Any], loop: subprocess.Popen[bytes], directory: Path
 ) -> None:
     # As if the loop had ended and its id gone round: what bears it now started at another instant.
-    Processes(loop=Pid(loop.pid, identify(loop.pid).started - 1)).write(directory)
+    Processes(loop=Pid(loop.pid, identify(loop.pid).identity - 1)).write(directory)
     assert rtcp("stop").code == 4
     assert "no platform is running" in rtcp("status").trouble
     assert loop.poll() is None
@@ -187,4 +187,4 @@ def test_the_pids_stand_in_their_file_as_plain_numbers_by_name(
     loop: subprocess.Popen[bytes], directory: Path
 ) -> None:  # fmt: skip
     found = json.loads((directory / "processes.json").read_text())
-    assert found == {"loop": loop.pid, "gateway": 0, "segment": 0, "started": found["started"]}
+    assert found == {"loop": loop.pid, "gateway": 0, "segment": 0, "identities": found["identities"]}

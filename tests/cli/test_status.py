@@ -102,11 +102,11 @@ def test_the_robot_status_and_the_states_are_told_in_words(platform: Any, rtcp: 
     shown = " ".join(rtcp("status").out.split())
     assert "STOPPED BY LIMIT joystick, csp on virtual" in shown
     assert "robot manual, drives powered, no motion possible, not in motion, emergency stop, error 107" in shown
-    assert "stick Z-yaw, it is the wheelchair's" in shown
+    assert "joystick Z-yaw, controls the wheelchair" in shown
 
 
 def test_a_status_without_a_robot_has_no_line_for_it(platform: Any, rtcp: Callable[..., Any]) -> None:
-    assert not any(line.startswith(("robot", "stick")) for line in rtcp("status").out.splitlines())
+    assert not any(line.startswith(("robot", "joystick")) for line in rtcp("status").out.splitlines())
 
 
 def test_the_last_messages_are_shown_with_their_local_time(
@@ -161,7 +161,7 @@ def test_without_an_answer_the_clocks_are_not_followed_and_no_counter_is_made_up
     shown = rtcp("status").out
     assert "no answer, 21 expected" in shown
     assert "working counter" not in shown
-    assert "not followed: no answer" in shown
+    assert "not tracked: no answer" in shown
     assert "offset" not in shown
 
 
@@ -169,6 +169,6 @@ def test_what_the_joints_last_said_is_said_to_be_old_where_they_are_not_heard(
     platform: Any, rtcp: Callable[..., Any]
 ) -> None:
     platform.status["unheard_s"] = 1.5
-    assert "as last heard, 1.5 s ago" in rtcp("status").out
+    assert "last received 1.5 s ago" in rtcp("status").out
     platform.status["unheard_s"] = 0.0
-    assert "as last heard" not in rtcp("status").out
+    assert "last received" not in rtcp("status").out

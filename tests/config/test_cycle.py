@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from rtcp.config import ConfigError, default_config, load, with_period
-from rtcp.config.checking import allowed, annotation
 from rtcp.config.model import CycleConfig
+from rtcp.config.validation import allowed, annotation
 
 
 def test_the_configuration_accepts_cycles_of_100_us_to_100_ms() -> None:

@@ -48,36 +48,36 @@ UNREADABLE = {
     ),
     "a key twice": (
         b"a: 1\nb:\n  c: 1\n  d: 2\n  c: 3\n",
-        "a.yaml:3: b.c: this key stands twice, in lines 3 and 5; keep one of them",
+        "a.yaml:3: b.c: this key occurs twice, in lines 3 and 5; keep one of them",
     ),
     "a number as key": (b"1: 2\n", "a.yaml:1: found the key 1 in line 1; a key must be a text"),
     "an object of Python": (
         b"a: !!python/name:os.system\n",
         "a.yaml:1: a: the tag tag:yaml.org,2002:python/name:os.system is not allowed; write a plain value",
     ),
-    "an endless number": (b"a: " + b"1" * 5000, "a.yaml:1: a: this number has 5000 digits; allowed are 100"),
+    "an endless number": (b"a: " + b"1" * 5000, "a.yaml:1: a: this number has 5000 digits; the limit is 100"),
     "an alias of itself": (b"a: &x [*x]\n", "a.yaml:1: a[0]: this alias contains itself"),
     "an unknown alias": (b"a: *x\n", "a.yaml:1:4: this is not valid YAML: found undefined alias 'x'"),
     "nesting without end": (b"a: " + b"[" * 5000, "a.yaml: the lists and mappings are nested too deeply"),
     "more than a megabyte": (
         b"a: 1\n" * 300_000,
-        "a.yaml: the file holds more than 1048576 bytes; a configuration has at most so many",
+        "a.yaml: the file holds more than 1048576 bytes, the limit of a configuration",
     ),
     "more values than any arm has": (
         b"a: [" + b"1," * 30_000 + b"1]",
-        "a.yaml: the file holds more than 20000 values, an alias counted as all that it stands for; a configuration "
-        "has at most so many",
+        "a.yaml: the file holds more than 20000 values, the limit of a configuration; an alias counts as everything "
+        "that it stands for",
     ),
     "a billion laughs": (
         b"a: &a [ha, ha, ha, ha, ha, ha, ha, ha, ha]\n"
         + b"".join(f"{new}: &{new} [{','.join(['*' + old] * 9)}]\n".encode() for old, new in pairwise("abcdefghi")),
-        "a.yaml: the file holds more than 20000 values, an alias counted as all that it stands for; a configuration "
-        "has at most so many",
+        "a.yaml: the file holds more than 20000 values, the limit of a configuration; an alias counts as everything "
+        "that it stands for",
     ),
     "one long text a thousand times": (
         b"a: &a " + b"x" * 500_000 + b"\nb: [" + b"*a," * 1000 + b"]",
-        "a.yaml: the file holds more than 1048576 characters, an alias counted as all that it stands for; a "
-        "configuration has at most so many",
+        "a.yaml: the file holds more than 1048576 characters, the limit of a configuration; an alias counts as "
+        "everything that it stands for",
     ),
     "aliases that nest more deeply than the file": (
         b"".join(

@@ -39,11 +39,11 @@ MISTAKES = {
     ),
     "a position on an output": (
         ((ON_AN_OUTPUT, "gripper: {output: 4, open_position: 1.0}"),),
-        "gripper.open_position: this key belongs to a gripper with a joint; here is one on an output",
+        "gripper.open_position: this key belongs to a gripper with a joint, not to one on an output",
     ),
     "a level of a drive": (
         driven("open_position", 'closed: "on", open_position'),
-        "gripper.closed: this key belongs to a gripper on an output; here is one with a joint",
+        "gripper.closed: this key belongs to a gripper on an output, not to one with a joint",
     ),
     "no place where it is open": (
         driven("open_position: 1.4, ", ""),
@@ -59,15 +59,15 @@ MISTAKES = {
     ),
     "closed where it is open": (
         driven("closed_position: 0.0", "closed_position: 1.4"),
-        "gripper.closed_position: found 1.4, the open_position too; the gripper must have somewhere to go",
+        "gripper.closed_position: found 1.4, the open_position; the two must differ",
     ),
     "the drive of a joint": (
         driven("drive7", "drive6"),
-        'gripper.joint.slave: found the text "drive6", the slave that joints[5] has; each needs its own',
+        'gripper.joint.slave: found the text "drive6", the slave of joints[5].slave; each needs its own',
     ),
     "the name of a joint": (
         driven("finger", "joint6"),
-        'gripper.joint.name: found the text "joint6", the name that joints[5] has; each needs its own',
+        'gripper.joint.name: found the text "joint6", the name of joints[5].name; each needs its own',
     ),
     "a slave that is none": (
         driven("drive7", "drive8"),

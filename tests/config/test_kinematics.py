@@ -18,8 +18,8 @@ from kinematics.forward import forward, frames
 from kinematics.model import DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
 from rtcp.config import ConfigError, default_config, find, find_arm, load, load_kinematics
-from rtcp.config.geometry import angle
-from rtcp.config.operation import CartesianConfig
+from rtcp.config.model import CartesianConfig
+from rtcp.config.numbers import angle
 
 ARM, IRB = Path("assistive_arm.yaml"), Path("abb_irb120.yaml")
 ROW1 = "{alpha: 0, a: 0, d: 0.290}"
@@ -218,34 +218,35 @@ def test_the_tool_is_a_position_and_three_angles(directory: Path, written: str, 
 
 # -- mistakes ----------------------------------------------------------------------------------------------------------
 
-NUMBER_OR_PI = "a number, or a fraction of pi, as -pi/2 or 11*pi/12"
+TURN = "a number from -6.28319 to 6.28319, or a fraction of pi, as -pi/2 or 11*pi/12"
+DEGREES = "; angles are in rad: write 90 degrees as pi/2"
 
 MISTAKES = {
     "an expression for an angle": (
         IRB,
         ("alpha: -pi/2", "alpha: pi*2"),
-        f'kinematics.dh[1].alpha: found the text "pi*2", allowed is {NUMBER_OR_PI}',
+        f'kinematics.dh[1].alpha: found the text "pi*2", allowed is {TURN}',
     ),
     "an angle with its unit": (
         IRB,
         ("alpha: -pi/2", "alpha: -90 deg"),
-        f'kinematics.dh[1].alpha: found the text "-90 deg", allowed is {NUMBER_OR_PI}; '
+        f'kinematics.dh[1].alpha: found the text "-90 deg", allowed is {TURN}; '
         "write the number alone, the key names its unit",
     ),
     "an angle in degrees": (
         IRB,
         ("alpha: -pi/2", "alpha: -90"),
-        "kinematics.dh[1].alpha: found -90, allowed is -2*pi to 2*pi: an angle is in rad; 90 degrees are written pi/2",
+        f"kinematics.dh[1].alpha: found -90, allowed is {TURN}{DEGREES}",
     ),
     "a tool turned by degrees": (
         IRB,
         ("kinematics:\n", "kinematics:\n  tool: {rpy: [0, 180, 0]}\n"),
-        "kinematics.tool.rpy[1]: found 180, allowed is -2*pi to 2*pi: an angle is in rad; 90 degrees are written pi/2",
+        f"kinematics.tool.rpy[1]: found 180, allowed is {TURN}{DEGREES}",
     ),
     "no number for an angle": (
         IRB,
         ("alpha: -pi/2", "alpha: .nan"),
-        f"kinematics.dh[1].alpha: found nan, allowed is {NUMBER_OR_PI}",
+        f"kinematics.dh[1].alpha: found nan, allowed is {TURN}{DEGREES}",
     ),
     "an infinite length": (
         IRB,
@@ -270,27 +271,27 @@ MISTAKES = {
     "a row with a key of another convention": (
         IRB,
         (ROW1, "{alpha: 0, a: 0, d: 0.290, theta: 0}"),
-        "kinematics.dh[0].theta: this key is not known here; allowed are alpha, a, d, offset",
+        "kinematics.dh[0].theta: this key does not exist; allowed are alpha, a, d, offset",
     ),
     "five rows": (
         IRB,
         (f"    - {ROW1}\n", ""),
-        "kinematics.dh: found 5 rows, allowed are 6, one for each joint",
+        "kinematics.dh: found a list of 5, allowed is a list of 6 entries",
     ),
     "seven rows": (
         ARM,
         ("    - {alpha: pi/2, a: 0, d: 0.140}\n", "    - {alpha: pi/2, a: 0, d: 0.140}\n" * 2),
-        "kinematics.dh: found 7 rows, allowed are 6, one for each joint",
+        "kinematics.dh: found a list of 7, allowed is a list of 6 entries",
     ),
     "five limits": (
         IRB,
         (f"    - {LIMIT1}", "    #"),
-        "kinematics.limits: found 5 entries, allowed are 6, one for each joint",
+        "kinematics.limits: found a list of 5, allowed is a list of 6 entries",
     ),
     "five masses": (
         IRB,
         (f"    - {LINK1}", "    #"),
-        "kinematics.links: found 5 entries, allowed are 6, one for each joint",
+        "kinematics.links: found a list of 5, allowed is a list of 6 entries",
     ),
     "min above max": (
         IRB,
@@ -311,12 +312,12 @@ MISTAKES = {
     "a centre in a plane": (
         IRB,
         ("[0.0000977, -0.00012, -0.05159]", "[0.0000977, -0.00012]"),
-        "kinematics.links[0].centre: found 2 numbers, allowed are three: x, y, z",
+        "kinematics.links[0].centre: found a list of 2, allowed is a list of 3 numbers",
     ),
     "a tool with a quaternion": (
         IRB,
         ("kinematics:\n", "kinematics:\n  tool: {rpy: [0, 0, 0, 1]}\n"),
-        "kinematics.tool.rpy: found 4 numbers, allowed are three: rx, ry, rz",
+        "kinematics.tool.rpy: found a list of 4, allowed is a list of 3 numbers",
     ),
     "a list for the kinematics": (
         IRB,
@@ -326,7 +327,7 @@ MISTAKES = {
     "an unknown key beside it": (
         IRB,
         ("name: abb-irb120", "name: abb-irb120\npayload: 3"),
-        "payload: this key is not known here; allowed are name, kinematics",
+        "payload: this key does not exist; allowed are name, kinematics",
     ),
     "a joint beyond its mechanics": (
         ARM,
@@ -372,7 +373,7 @@ def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_kinematics(rewritten(IRB, lambda data: data["kinematics"].pop("limits")))  # type: ignore[attr-defined]
     (problem,) = caught.value.problems
-    wanted = "it must be a list of 6 mappings with the keys min, max, velocity in a file without joints"
+    wanted = "in a file without joints it must be a list of 6 mappings with the keys min, max, velocity"
     assert problem.endswith(f"kinematics: the key limits is missing; {wanted}")
 
 
@@ -384,8 +385,8 @@ def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: 
 
 
 def test_a_mistake_elsewhere_in_a_whole_arm_is_named_too(problems_of: Callable[..., list[str]]) -> None:
-    (problem,) = problems_of(ARM, ("mode: csp", "mode: cps"))
-    assert problem == 'mode: found the text "cps", allowed is one of csp, csv, cst'
+    (problem,) = problems_of(ARM, ("drive_mode: csp", "drive_mode: cps"))
+    assert problem == 'drive_mode: found the text "cps", allowed is one of csp, csv, cst'
 
 
 def problems_of_reading() -> list[str]:

@@ -10,25 +10,28 @@ import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from kinematics.forward import frames
 from rtcp.config import ConfigError, default_config, load, load_segment, segment_path
-from rtcp.config.arm_model import kinematics_part
-from rtcp.config.model import ArmConfig
-from rtcp.config.operation import (
+from rtcp.config.document import read
+from rtcp.config.loader import with_control_mode
+from rtcp.config.model import (
+    ArmConfig,
     Box,
     CartesianConfig,
     EmergencyStopConfig,
     InputConfig,
     JogConfig,
     KeepOut,
-    WatchConfig,
+    Kinematics,
+    SupervisionConfig,
 )
-from rtcp.config.operation_rules import shoulder_and_reach
-from rtcp.config.schema import with_motion
+from rtcp.config.rules import shoulder_and_reach
+from rtcp.config.validation import Checker
 from rtcp.virtual.models import create
 
 ARM = "assistive_arm.yaml"
@@ -45,23 +48,23 @@ def around(corners: str) -> tuple[str, str]:
 
 MISTAKES = {
     "a motion that there is not": (
-        ("motion: joint", "motion: joints"),
-        'motion: found the text "joints", allowed is one of joint, cartesian, joystick, velocity, torque',
+        ("control_mode: joint", "control_mode: joints"),
+        'control_mode: found the text "joints", allowed is one of joint, cartesian, joystick, velocity, torque',
     ),
     "a joystick motion without a stick": (
-        ("motion: joint", "motion: joystick"),
+        ("control_mode: joint", "control_mode: joystick"),
         ("  " + STICK, ""),
-        'motion: found the text "joystick", which needs the stick\'s terminals: the key inputs.joystick is missing',
+        'control_mode: found the text "joystick", which needs a joystick: the key inputs.joystick is missing',
     ),
     "a cartesian motion without geometry": (
-        ("motion: joint", "motion: cartesian"),
+        ("control_mode: joint", "control_mode: cartesian"),
         WITHOUT_GEOMETRY,
-        'motion: found the text "cartesian", which needs the arm\'s geometry: the key kinematics is missing',
+        'control_mode: found the text "cartesian", which needs the arm\'s geometry: the key kinematics is missing',
     ),
     "a joystick motion without geometry": (
-        ("motion: joint", "motion: joystick"),
+        ("control_mode: joint", "control_mode: joystick"),
         WITHOUT_GEOMETRY,
-        'motion: found the text "joystick", which needs the arm\'s geometry: the key kinematics is missing',
+        'control_mode: found the text "joystick", which needs the arm\'s geometry: the key kinematics is missing',
     ),
     "a box without geometry": (
         WITHOUT_GEOMETRY,
@@ -98,12 +101,12 @@ MISTAKES = {
     "a box around the base": (
         around("min: [-0.1, -0.1, -0.1], max: [0.1, 0.1, 0.05]"),
         "cartesian.keep_out[0]: found a box around the arm's base, allowed is one beside it: "
-        "the arm stands there, its base at (0, 0, 0) and its shoulder at (0, 0, 0.17)",
+        "the base is at (0, 0, 0), the shoulder at (0, 0, 0.17)",
     ),
     "a box around all that the arm reaches": (
         around("min: [-2, -2, -2], max: [2, 2, 2]"),
         "cartesian.keep_out[0]: found a box around the arm's base, allowed is one beside it: "
-        "the arm stands there, its base at (0, 0, 0) and its shoulder at (0, 0, 0.17)",
+        "the base is at (0, 0, 0), the shoulder at (0, 0, 0.17)",
     ),
     "a box that the arm never meets": (
         around("min: [2, -0.35, 0], max: [3, 0.35, 0.85]"),
@@ -117,12 +120,11 @@ MISTAKES = {
     ),
     "a keep-out box around the tool's": (
         (TOOL_BOX, "{min: [0.5, -0.3, 0.1], max: [0.8, 0.3, 0.3]}"),
-        "cartesian.keep_out[0]: found a box around all of cartesian.box: it leaves the tool no place to be",
+        "cartesian.keep_out[0]: found a box around all of cartesian.box: the tool has no place left",
     ),
     "two boxes of one name": (
         ("name: chair", "name: user"),
-        'cartesian.keep_out[1].name: found the text "user", the name that cartesian.keep_out[0] has; '
-        "each needs its own",
+        'cartesian.keep_out[1].name: found the text "user", the name of cartesian.keep_out[0].name; each needs its own',
     ),
     "a negative distance to a singularity": (
         ("shoulder: 0.03", "shoulder: -0.03"),
@@ -130,12 +132,12 @@ MISTAKES = {
     ),
     "a stick that is faster than the tool may be": (
         ("  angular_speed: 0.3", "  angular_speed: 0.6"),
-        "jog.angular_speed: found 0.6, allowed is at most 0.5, cartesian.angular_speed",
+        "jog.angular_speed: this is 0.6, allowed is at most 0.5, cartesian.angular_speed",
     ),
     "a stick whose usual speed is faster": (
         ("  speed: 0.25 ", "  speed: 0.05 "),
         ("  speed: 0.1 ", "  # "),
-        "jog.speed: found 0.1, its default, allowed is at most 0.05, cartesian.speed",
+        "jog.speed: this is 0.1, allowed is at most 0.05, cartesian.speed",
     ),
     "an unknown frame": (
         ("frame: base", "frame: flange"),
@@ -143,7 +145,7 @@ MISTAKES = {
     ),
     "a watch that trips at the limit's half": (
         ("  torque: 1.5 ", "  torque: 0.5 "),
-        "watch.torque: found 0.5, allowed is a number from 1 to 10",
+        "supervision.torque: found 0.5, allowed is a number from 1 to 10",
     ),
     "a keep-out box with the name of the box that the tool stays in": (
         ("name: user", "name: box"),
@@ -159,8 +161,8 @@ MISTAKES = {
     ),
     "a keep-out box with a dot in its name": (
         ("name: user", "name: user.min"),
-        'cartesian.keep_out[0].name: found the text "user.min", allowed is one without a dot: in the key of a limit '
-        "dots part its words",
+        'cartesian.keep_out[0].name: found the text "user.min", allowed is one without a dot: dots separate '
+        "the parts of a key",
     ),
     "a joint with the name of all of them": (
         ("name: joint3", "name: joints"),
@@ -196,7 +198,7 @@ MISTAKES = {
     ),
     "a meaning that there is not": (
         (TOGGLE, TOGGLE.replace("arm_toggle", "toggle")),
-        "inputs.toggle: this key is not known here; did you mean arm_toggle? allowed are joystick, arm_toggle, "
+        "inputs.toggle: this key does not exist; did you mean arm_toggle? allowed are joystick, arm_toggle, "
         "enabling_switch, emergency_stop",
     ),
     "a gripper on a lamp": (
@@ -237,9 +239,12 @@ def test_one_mistake_gives_one_sentence_with_its_line(
 
 def test_a_mistake_elsewhere_hides_none_of_these(problems_after: Callable[..., list[str]]) -> None:
     problems = problems_after(
-        ARM, ("mode: csp", "mode: cps"), around("min: [2, 0, 0], max: [3, 1, 1]"), ("{output: 4", "{output: 1")
+        ARM,
+        ("drive_mode: csp", "drive_mode: cps"),
+        around("min: [2, 0, 0], max: [3, 1, 1]"),
+        ("{output: 4", "{output: 1"),
     )
-    assert [problem.split(": ")[1] for problem in problems] == ["mode", "cartesian.keep_out[0]", "gripper.output"]
+    assert [problem.split(": ")[1] for problem in problems] == ["drive_mode", "cartesian.keep_out[0]", "gripper.output"]
 
 
 @pytest.mark.parametrize(
@@ -258,7 +263,7 @@ def test_a_box_may_stand_close_to_the_base(directory: Path, corners: str) -> Non
     assert len(load(Path(ARM)).cartesian.keep_out) == 2
 
 
-@pytest.mark.parametrize("key", ["motion", "cartesian", "jog", "watch", "inputs", "outputs", "gripper"])
+@pytest.mark.parametrize("key", ["control_mode", "cartesian", "jog", "supervision", "inputs", "outputs", "gripper"])
 def test_each_part_may_be_left_out(directory: Path, key: str) -> None:
     data = yaml.safe_load(Path(ARM).read_text())
     del data[key]
@@ -282,7 +287,7 @@ def test_whatever_stands_in_these_parts_is_accepted_or_named(directory: Path, va
     for key, inner in (
         ("cartesian", None), ("cartesian", "box"), ("cartesian", "keep_out"), ("cartesian", "singularity"),
         ("jog", None), ("inputs", None), ("inputs", "joystick"), ("inputs", "arm_toggle"), ("outputs", None),
-        ("gripper", None), ("gripper", "output"), ("gripper", "joint"), ("motion", None), ("watch", None),
+        ("gripper", None), ("gripper", "output"), ("gripper", "joint"), ("control_mode", None), ("supervision", None),
         ("kinematics", None), ("slaves", None),
     ):  # fmt: skip
         data = yaml.safe_load(shipped)
@@ -298,10 +303,15 @@ def test_whatever_stands_in_these_parts_is_accepted_or_named(directory: Path, va
 
 
 def test_the_parts_are_read_into_their_dataclasses(directory: Path) -> None:
-    text = Path(ARM).read_text().replace("motion: joint ", "motion: joystick ").replace("frame: base", "frame: tool")
+    text = (
+        Path(ARM)
+        .read_text()
+        .replace("control_mode: joint ", "control_mode: joystick ")
+        .replace("frame: base", "frame: tool")
+    )
     Path(ARM).write_text(text.replace("# enabling_switch:", "enabling_switch:").replace("  cycles: 5", "  cycles: 7"))
     arm = load(Path(ARM))
-    assert arm.motion == "joystick"
+    assert arm.control_mode == "joystick"
     assert arm.cartesian == CartesianConfig(
         box=Box((-1.2, -1.0, -0.42), (0.8, 1.0, 1.4)),
         keep_out=(
@@ -310,7 +320,7 @@ def test_the_parts_are_read_into_their_dataclasses(directory: Path) -> None:
         ),
     )
     assert arm.jog == JogConfig(frame="tool")
-    assert arm.watch == WatchConfig(cycles=7)
+    assert arm.supervision == SupervisionConfig(cycles=7)
     assert arm.inputs.enabling_switch == InputConfig(11)
     assert arm.inputs.emergency_stop == EmergencyStopConfig(10, "low")
 
@@ -324,6 +334,10 @@ def test_the_geometry_is_the_one_of_the_kinematics_part() -> None:
 def test_the_configuration_is_read_without_numpy() -> None:
     code = "import sys, rtcp.config as c; c.load(c.default_config()); print('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"
+
+
+def geometry_of(data: Any) -> Kinematics | None:
+    return Checker(Kinematics).check(data["kinematics"])[0]
 
 
 def inside(point: Sequence[float], box: Box | KeepOut) -> bool:
@@ -355,7 +369,7 @@ def test_a_pick_is_free_and_the_user_is_not() -> None:
 
 
 def test_no_pose_of_the_arm_is_beyond_its_reach() -> None:
-    part = kinematics_part(yaml.safe_load(default_config().read_text()))
+    part = geometry_of(read(default_config()).data)
     model = load(default_config()).arm
     assert part is not None
     assert model is not None
@@ -374,7 +388,7 @@ def test_the_shoulder_is_found_also_where_the_base_is_tilted(directory: Path) ->
     data["kinematics"]["tool"] = {"position": [0.0, 0.0, 0.1]}
     del data["cartesian"]
     Path(ARM).write_text(yaml.safe_dump(data))
-    part, model = kinematics_part(data), load(Path(ARM)).arm
+    part, model = geometry_of(data), load(Path(ARM)).arm
     assert part is not None
     assert model is not None
     shoulder, reach = shoulder_and_reach(part)
@@ -387,14 +401,14 @@ def test_the_shoulder_is_found_also_where_the_base_is_tilted(directory: Path) ->
 
 def test_another_motion_is_checked_like_the_file(directory: Path) -> None:
     arm = load(Path(ARM))
-    assert with_motion(arm, "joystick").motion == "joystick"
+    assert with_control_mode(arm, "joystick").control_mode == "joystick"
     data = yaml.safe_load(Path(ARM).read_text())
     del data["kinematics"], data["cartesian"], data["inputs"]["joystick"]
     Path(ARM).write_text(yaml.safe_dump(data))
     bare = load(Path(ARM))
-    assert with_motion(bare, "velocity").motion == "velocity"
-    with pytest.raises(ConfigError, match=r"^motion: .* needs the arm's geometry"):
-        with_motion(bare, "cartesian")
+    assert with_control_mode(bare, "velocity").control_mode == "velocity"
+    with pytest.raises(ConfigError, match=r"^control_mode: .* needs the arm's geometry"):
+        with_control_mode(bare, "cartesian")
 
 
 # -- the virtual box ---------------------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.plain_number import plain_number
+from rtcp.config.numbers import plain_number
 
 
 @pytest.mark.parametrize(

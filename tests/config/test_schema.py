@@ -21,6 +21,10 @@ BOX = "devices/diewu-io.yaml"
 JOINT1 = "name: joint1\n    slave: drive1\n    position: {min: -3.1, max: 3.1}\n    velocity: 0.5"
 TORQUE = "{index: 0x6071, sub_index: 0, type: int32, name: target_torque, factor: 0.0001}"
 
+KEYS = (
+    "name, joints, cycle, bus, drive_mode, control_mode, enable_timeout_s, lease_s, cartesian, jog, "
+    "supervision, stops, inputs, outputs, gripper, slaves, kinematics"
+)
 Spoil = Callable[..., list[str]]
 
 
@@ -111,22 +115,20 @@ IN_THE_ARM = {
         "cycle.cpu: found -1, allowed is an integer of at least 0",
     ),
     "an unknown choice": (
-        ("mode: csp", "mode: cps"),
-        'mode: found the text "cps", allowed is one of csp, csv, cst',
+        ("drive_mode: csp", "drive_mode: cps"),
+        'drive_mode: found the text "cps", allowed is one of csp, csv, cst',
     ),
     "an unknown key at the top": (
         ("lease_s:", "leese_s:"),
-        "leese_s: this key is not known here; did you mean lease_s? allowed are name, slaves, joints, cycle, bus, "
-        "mode, enable_timeout_s, lease_s, motion, cartesian, jog, watch, stops, inputs, outputs, gripper, kinematics",
+        "leese_s: this key does not exist; did you mean lease_s? allowed are " + KEYS,
     ),
     "an unknown key that resembles none": (
         ("priority: 80", "zzz: 1"),
-        "cycle.zzz: this key is not known here; allowed are period_us, priority, cpu, spin_us",
+        "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us",
     ),
     "the program's own key": (
         ("lease_s: 0.5", "source: here"),
-        "source: this key is not known here; allowed are name, slaves, joints, cycle, bus, mode, "
-        "enable_timeout_s, lease_s, motion, cartesian, jog, watch, stops, inputs, outputs, gripper, kinematics",
+        "source: this key does not exist; allowed are " + KEYS,
     ),
     "a missing key": (
         ("    jerk: 20.0\n", ""),
@@ -161,15 +163,15 @@ IN_THE_ARM = {
     ),
     "two joints on one slave": (
         ("slave: drive2", "slave: drive1"),
-        'joints[1].slave: found the text "drive1", the slave that joints[0] has; each needs its own',
+        'joints[1].slave: found the text "drive1", the slave of joints[0].slave; each needs its own',
     ),
     "two joints of one name": (
         ("name: joint2", "name: joint1"),
-        'joints[1].name: found the text "joint1", the name that joints[0] has; each needs its own',
+        'joints[1].name: found the text "joint1", the name of joints[0].name; each needs its own',
     ),
     "two slaves of one name": (
         ("{name: drive6,", "{name: io,"),
-        'slaves[6].name: found the text "io", the name that slaves[0] has; each needs its own',
+        'slaves[6].name: found the text "io", the name of slaves[0].name; each needs its own',
     ),
     "a device that is not described": (
         ("device: diewu-io", "device: diewu"),
@@ -273,7 +275,7 @@ IN_A_DEVICE = {
     "a DC word without SYNC0": (
         DRIVE,
         ("assign_activate: 0x0300", "assign_activate: 0x0100"),
-        "assign_activate: found 0x0100, allowed is 0 for no distributed clocks, or a word that switches SYNC0 on, "
+        "assign_activate: found 0x0100, allowed is 0 for no distributed clocks, or a word that activates SYNC0, "
         "as 0x0300 or 0x0700",
     ),
     "a watchdog that a late frame trips": (
@@ -291,7 +293,8 @@ IN_A_DEVICE = {
     "a SYNC0 shift of more than a cycle": (
         DRIVE,
         ("sync0_shift_us: 0", "sync0_shift_us: -500"),
-        "sync0_shift_us: found -500 us, allowed is less than one cycle either way (the cycle period is 500 us)",
+        "sync0_shift_us: found -500 us, allowed is less than one cycle in either direction "
+        "(the cycle period is 500 us)",
     ),
 }
 
@@ -325,8 +328,13 @@ def test_the_mistakes_of_all_files_come_at_once(directory: Path, problems_after:
     box.write_text(box.read_text().replace("kind: io", "kind: oi"))
     drive = directory / DRIVE
     drive.write_text(drive.read_text().replace("watchdog_ms: 20", "watchdog_ms: 0"))
-    problems = problems_after(ARM, ("mode: csp", "mode: off"), (JOINT1, JOINT1.replace("0.5", "fast")))
-    assert [problem.split(": ")[1] for problem in problems] == ["mode", "joints[0].velocity", "kind", "watchdog_ms"]
+    problems = problems_after(ARM, ("drive_mode: csp", "drive_mode: off"), (JOINT1, JOINT1.replace("0.5", "fast")))
+    assert [problem.split(": ")[1] for problem in problems] == [
+        "drive_mode",
+        "joints[0].velocity",
+        "kind",
+        "watchdog_ms",
+    ]
 
 
 def test_a_device_used_by_six_slaves_is_complained_of_once(problems_after: Spoil) -> None:
@@ -334,7 +342,7 @@ def test_a_device_used_by_six_slaves_is_complained_of_once(problems_after: Spoil
 
 
 def test_the_error_reads_as_its_sentences_line_by_line(directory: Path) -> None:
-    Path(ARM).write_text("mode: csp\n")
+    Path(ARM).write_text("drive_mode: csp\n")
     with pytest.raises(ConfigError) as caught:
         load(Path(ARM))
     assert str(caught.value).splitlines() == caught.value.problems

@@ -46,7 +46,7 @@ MISTAKES = {
     ),
     "an unknown key": (
         "slaves: [{model: m, drift: 3}]",
-        "slaves[0].drift: this key is not known here; did you mean drift_ppm? allowed are model, drift_ppm, delay_ns, "
+        "slaves[0].drift: this key does not exist; did you mean drift_ppm? allowed are model, drift_ppm, delay_ns, "
         "alias, options",
     ),
     "a wild drift": (

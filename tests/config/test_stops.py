@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import default_config, load
-from rtcp.config.stops import StopsConfig
+from rtcp.config.model import StopsConfig
 
 FILE = "assistive_arm.yaml"
 MISTAKES = {
@@ -29,12 +29,12 @@ MISTAKES = {
         'stops.clock_lost: found the text "fast", allowed is one of controlled_stop, quick_stop, torque_off',
     ),
     "off is a text of its own, and no rung": (
-        ("supervision: quick_stop", "watch: off"),
+        ("supervision: quick_stop", "supervision: off"),
         'stops.supervision: found the text "off", allowed is one of quick_stop, torque_off',
     ),
     "an event that there is not": (
         ("slave_lost: quick_stop", "slaves_lost: quick_stop"),
-        "stops.slaves_lost: this key is not known here; did you mean slave_lost? allowed are lost_frames, slave_lost, "
+        "stops.slaves_lost: this key does not exist; did you mean slave_lost? allowed are lost_frames, slave_lost, "
         "drive_fault, clock_lost, emergency_stop, supervision, lease_ended, enabling_switch",
     ),
 }

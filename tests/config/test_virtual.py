@@ -7,9 +7,8 @@ import dataclasses
 import pytest
 
 from rtcp.config.find import default_config
+from rtcp.config.loader import load, widen
 from rtcp.config.model import ArmConfig
-from rtcp.config.schema import load
-from rtcp.config.virtual import widen
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +17,7 @@ def shipped() -> ArmConfig:
 
 
 def with_bus(config: ArmConfig, interface: str, patience: float) -> ArmConfig:
-    return dataclasses.replace(
-        config, bus=dataclasses.replace(config.bus, interface=interface, virtual_patience=patience)
-    )
+    return dataclasses.replace(config, bus=dataclasses.replace(config.bus, interface=interface, timeout_scale=patience))
 
 
 def sync_error_limits(config: ArmConfig) -> list[float]:

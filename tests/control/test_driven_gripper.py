@@ -398,7 +398,7 @@ def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Han
     while hand.state is State.HOLDING:
         hand.simulation.cycle()
         beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
-    assert beyond == CONFIG.watch.cycles
+    assert beyond == CONFIG.supervision.cycles
     assert hand.state is State.EMERGENCY_STOP
     assert hand.message(OverSpeed).startswith("finger")
 
@@ -409,8 +409,8 @@ def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_i
     beyond = 0
     while hand.state is State.HOLDING:
         hand.simulation.cycle()
-        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.watch.following_error
-    assert beyond == CONFIG.watch.cycles
+        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.supervision.following_error
+    assert beyond == CONFIG.supervision.cycles
     assert hand.state is State.EMERGENCY_STOP
     assert hand.message(FollowingError).startswith("finger")
 
@@ -462,7 +462,7 @@ def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:
     supervision = hand.gripper.supervision
-    supervision._fast = supervision._off = CONFIG.watch.cycles - 1
+    supervision._fast = supervision._off = CONFIG.supervision.cycles - 1
     hand.simulation.send(Disable())
     hand.until(State.READY)
     hand.simulation.send(Enable())

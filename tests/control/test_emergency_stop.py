@@ -171,7 +171,7 @@ def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(rig: LoopRig) -
     rig.do(move_to(0.0, 0.4, speed=SPEED))
     rig.until(State.EMERGENCY_STOP)
     assert (rig.kinds[-1], rig.last.axis) == (FollowingError, 1)
-    assert "watch in assistive_arm.yaml" in rig.messages[-1]
+    assert "supervision in assistive_arm.yaml" in rig.messages[-1]
 
 
 @pytest.mark.parametrize("cycles", [4, 5])

@@ -83,7 +83,7 @@ def test_no_joint_follows_a_false_position_while_its_drive_is_being_enabled(
 
 def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_places(rig: LoopRig) -> None:
     falsify(until_told_to_enable(rig), word=SWITCHED_ON, position=0.1)
-    rig.run((CONFIG.watch.cycles - 1) * PERIOD_S)
+    rig.run((CONFIG.supervision.cycles - 1) * PERIOD_S)
     assert rig.state is State.ENABLING
     rig.cycle()
     assert (rig.state, rig.kinds[-1]) == (State.FAULT, PositionJumped)
@@ -94,7 +94,7 @@ def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_p
 def test_false_positions_that_do_not_follow_each_other_are_not_added_up(rig: LoopRig) -> None:
     rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     until_told_to_enable(rig)
-    for _ in range(2 * CONFIG.watch.cycles):
+    for _ in range(2 * CONFIG.supervision.cycles):
         end = falsify(rig, axis=1, position=0.1)
         rig.cycle()
         end()
@@ -119,7 +119,7 @@ def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(ri
     rig.wait(lambda: rig.log[-1].drives[0].statusword & 0x6F == 0x27)
     turned = rig.models[0].mechanics
     turned.inertia, turned.velocity = 1e5, 0.9
-    rig.until(State.EMERGENCY_STOP, (CONFIG.watch.cycles + 3) * PERIOD_S)
+    rig.until(State.EMERGENCY_STOP, (CONFIG.supervision.cycles + 3) * PERIOD_S)
     assert rig.kinds[-1] is OverSpeed
 
 
@@ -214,7 +214,7 @@ def test_a_false_position_is_judged_by_where_a_joint_beyond_its_range_is_and_not
     end()
     assert {cycle.drives[1].target for cycle in rig.log[before:]} == {20150}
     falsify(rig, axis=1, word=SWITCHED_ON, position=1.98)
-    rig.until(State.FAULT, 2 * CONFIG.watch.cycles * PERIOD_S)
+    rig.until(State.FAULT, 2 * CONFIG.supervision.cycles * PERIOD_S)
     assert rig.kinds[-1] is PositionJumped
     assert rig.last == PositionJumped(1, pytest.approx(1.98), pytest.approx(2.015))
 

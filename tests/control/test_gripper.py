@@ -192,10 +192,10 @@ def test_how_far_it_is_from_its_set_point_counts_but_for_what_it_holds(wrong: fl
     gripper.motion.gripped = True
     assert [gripper.beyond_limits() for _ in range(100)] == [None] * 100
     gripper.motion.gripped = False
-    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.watch.cycles)]
-    assert before == [None] * (DRIVEN.watch.cycles - 1)
+    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.supervision.cycles)]
+    assert before == [None] * (DRIVEN.supervision.cycles - 1)
     assert found is not None
-    assert (type(found), found.axis, found.limit) == (FollowingError, 6, DRIVEN.watch.following_error)
+    assert (type(found), found.axis, found.limit) == (FollowingError, 6, DRIVEN.supervision.following_error)
 
 
 @pytest.mark.parametrize("wrong", [1.51, -1.51, nan])
@@ -204,8 +204,8 @@ def test_a_speed_beyond_its_limit_counts_whatever_it_holds(wrong: float) -> None
     assert gripper is not None
     gripper.motion.gripped = True
     gripper.drive.velocity = wrong
-    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.watch.cycles)]
-    assert before == [None] * (DRIVEN.watch.cycles - 1)
+    *before, found = [gripper.beyond_limits() for _ in range(DRIVEN.supervision.cycles)]
+    assert before == [None] * (DRIVEN.supervision.cycles - 1)
     assert found is not None
     assert (type(found), found.axis, found.limit) == (OverSpeed, 6, 1.5 * FINGER.velocity)
     gripper.drive.velocity = 1.49

@@ -296,7 +296,7 @@ FAULT_STORIES = (
     ),
     Fault(
         "a joint that says it is elsewhere while it is enabled", PositionJumped, 1,
-        ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (watch in assistive_arm.yaml)", "`rtcp reset`"),
+        ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
         joint_says_it_is_elsewhere, joint_says_where_it_is,
     ),
     Fault(

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig
+from rtcp.config.model import EmergencyStopConfig, InputConfig, InputsConfig, JoystickConfig
 from rtcp.devices.io_box import JoystickInput
 
 CYCLE = 0.0005

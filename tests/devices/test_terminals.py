@@ -2,8 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.model import GripperConfig
-from rtcp.config.operation import EmergencyStopConfig, InputConfig, InputsConfig, OutputsConfig
+from rtcp.config.model import EmergencyStopConfig, GripperConfig, InputConfig, InputsConfig, OutputsConfig
 from rtcp.devices.io_box import Inputs, Outputs, Switch
 
 CYCLE = 0.0005

@@ -50,7 +50,7 @@ class Platform:
         file = mine / "assistive_arm.yaml"
         text = file.read_text()
         for old, new in {
-            "virtual_patience: 25 ": f"virtual_patience: {lost_ms / 20:g} ",
+            "timeout_scale: 25 ": f"timeout_scale: {lost_ms / 20:g} ",
             "lease_s: 0.5": "lease_s: 3.0",
         }.items():
             assert old in text

@@ -44,7 +44,7 @@ class Arm:
 
 @pytest.fixture
 def arm() -> Iterator[Arm]:
-    config = replace(CONFIG, motion="joystick", cycle=replace(CONFIG.cycle, period_us=2000.0))
+    config = replace(CONFIG, control_mode="joystick", cycle=replace(CONFIG.cycle, period_us=2000.0))
     with Simulation(config, seed=3, positions=START) as simulation:
         assert simulation.until(lambda: simulation.state is State.READY, 5.0)
         simulation.run(0.1)

@@ -1,4 +1,4 @@
-"""The fault matrix: every fault that the virtual segment can make, and what must come of it."""
+"""The fault matrix: every fault that the virtual segment can inject, and the required reaction."""
 
 from __future__ import annotations
 
@@ -7,30 +7,30 @@ from dataclasses import dataclass
 from typing import Any
 
 Fault = Mapping[str, Any]
-HOLDING, MOVING, JOGGING, STICK = "holding", "moving", "jogging", "stick"
+HOLDING, MOVING, JOGGING, JOYSTICK = "holding", "moving", "jogging", "joystick"
 THREE = (HOLDING, MOVING, JOGGING)
-GOES_ON = "goes on"
+CONTINUES = "continues"
 FAULT = "fault"
 EMERGENCY = "emergency_stop"
 STOPS = "holding"
-"""The motion is ended in a controlled way, without a fault."""
+"""The motion ends in a controlled stop, without a fault."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """Faults made at once, and what must follow."""
+    """Faults injected at once, and the required reaction."""
 
     name: str
     faults: Sequence[Fault]
     ends_in: tuple[str, ...]
-    """Any of these: FAULT, EMERGENCY, GOES_ON, STOPS."""
+    """Allowed reactions: FAULT, EMERGENCY, CONTINUES, STOPS."""
     words: tuple[str, ...] = ()
-    """Each must be in some sentence that is said until the mending."""
-    activities: tuple[str, ...] = THREE
+    """Each must be in a message before the fault is cleared."""
+    workloads: tuple[str, ...] = THREE
     watch_s: float = 3.0
-    """So long a machine that goes on is watched."""
+    """How long a machine that continues is observed."""
     reset_is_refused: bool = False
-    """A reset asked for while the fault lasts must be refused."""
+    """A reset while the fault is active must be refused."""
 
 
 def _fault(name: str, **own: Any) -> Fault:
@@ -44,12 +44,12 @@ CASES: tuple[Case, ...] = (
     Case("cable: slave 1 to 2", [_fault("cable", after=1)], (FAULT,), reset_is_refused=True),
     Case("cable: slave 3 to 4", [_fault("cable", after=3)], (FAULT,), reset_is_refused=True),
     Case("cable: slave 6 to 7", [_fault("cable", after=6)], (FAULT,), reset_is_refused=True),
-    # Shorter than lost cycles are held, longer than the watcher needs: whichever looks first on a shared host.
-    Case("cable for 50 ms", [_fault("cable", after=3, lasts=0.05)], (GOES_ON, FAULT), watch_s=1.5),
+    # Shorter than the holding of lost cycles, longer than the slave watcher needs: either may come first.
+    Case("cable for 50 ms", [_fault("cable", after=3, lasts=0.05)], (CONTINUES, FAULT), watch_s=1.5),
     Case("power: IO box (reference clock)", [_fault("power", slave=BOX)], (FAULT,), reset_is_refused=True),
     Case("power: drive 3", [_fault("power", slave=DRIVE_3)], (FAULT,), reset_is_refused=True),
     Case(
-        "power: drive 3, and the button is pressed",
+        "power: drive 3, and the emergency stop is pressed",
         [_fault("power", slave=DRIVE_3), _fault("input", number=10, how="low")],
         (EMERGENCY,),
         ("emergency stop",),
@@ -71,42 +71,42 @@ CASES: tuple[Case, ...] = (
         (FAULT,),
         reset_is_refused=True,
     ),
-    Case("hangs in OP", [_fault("al_hang", slave=DRIVE_3)], (GOES_ON,), watch_s=0.7),
-    Case("SDOs 500 ms late", [_fault("sdo_late", slave=DRIVE_1, ms=500)], (GOES_ON,), watch_s=0.7),
-    Case("SDOs aborted", [_fault("sdo_abort", slave=DRIVE_1)], (GOES_ON,), watch_s=0.7),
-    Case("frames lost: 1 in 100", [_fault("loss", rate=0.01)], (GOES_ON,), watch_s=1.5),
-    Case("frames lost: 20 in a row", [_fault("loss", burst=20)], (GOES_ON,), watch_s=1.0),
+    Case("hangs in OP", [_fault("al_hang", slave=DRIVE_3)], (CONTINUES,), watch_s=0.7),
+    Case("SDOs 500 ms late", [_fault("sdo_late", slave=DRIVE_1, ms=500)], (CONTINUES,), watch_s=0.7),
+    Case("SDOs aborted", [_fault("sdo_abort", slave=DRIVE_1)], (CONTINUES,), watch_s=0.7),
+    Case("frames lost: 1 in 100", [_fault("loss", rate=0.01)], (CONTINUES,), watch_s=1.5),
+    Case("frames lost: 20 in a row", [_fault("loss", burst=20)], (CONTINUES,), watch_s=1.0),
     Case("frames lost: 4 in 5", [_fault("loss", rate=0.8)], (FAULT,), (LOST,)),
     Case("frames lost: all", [_fault("loss", rate=1.0)], (FAULT,), (LOST,), reset_is_refused=True),
-    Case("answers 3 ms late: 1 in 50", [_fault("delay", ms=3, rate=0.02)], (GOES_ON,), watch_s=1.5),
+    Case("answers 3 ms late: 1 in 50", [_fault("delay", ms=3, rate=0.02)], (CONTINUES,), watch_s=1.5),
     Case("answers 3 ms late: all", [_fault("delay", ms=3, rate=1.0)], (FAULT,), reset_is_refused=True),
-    Case("answers twice: all", [_fault("duplicate", rate=1.0)], (GOES_ON,), watch_s=1.5),
-    Case("answers out of order: 1 in 50", [_fault("reorder", rate=0.02)], (GOES_ON,), watch_s=1.5),
-    # Told at once, and then at most every 10 s: the trials after the first may be too early for it.
+    Case("answers twice: all", [_fault("duplicate", rate=1.0)], (CONTINUES,), watch_s=1.5),
+    Case("answers out of order: 1 in 50", [_fault("reorder", rate=0.02)], (CONTINUES,), watch_s=1.5),
+    # Reported at once, then at most every 10 s: possibly not in the trials after the first.
     Case(
         "damaged on the cable 3 to 4: 1 in 50",
         [_fault("corrupt", after=3, rate=0.02)],
-        (GOES_ON,),
+        (CONTINUES,),
         ("enter between slave 3",),
-        activities=(HOLDING,),
+        workloads=(HOLDING,),
     ),
     Case(
         "damaged on the cable 3 to 4: 1 in 50",
         [_fault("corrupt", after=3, rate=0.02)],
-        (GOES_ON,),
-        activities=(MOVING, JOGGING),
+        (CONTINUES,),
+        workloads=(MOVING, JOGGING),
         watch_s=1.5,
     ),
-    Case("damaged on the cable 3 to 4: 20", [_fault("corrupt", after=3, burst=20)], (GOES_ON,), watch_s=1.0),
+    Case("damaged on the cable 3 to 4: 20", [_fault("corrupt", after=3, burst=20)], (CONTINUES,), watch_s=1.0),
     Case(
         "damaged on the way back, 3 to 4: 1 in 50",
         [_fault("corrupt", after=3, way="back", rate=0.02)],
-        (GOES_ON,),
+        (CONTINUES,),
         watch_s=1.5,
     ),
-    # Whatever the bits make of the answer: a statusword that says disabled stops the arm, a position may go unseen.
-    Case("bits turned, unseen: 1 in 100", [_fault("garble", rate=0.01, bits=2)], (GOES_ON, FAULT, EMERGENCY)),
-    Case("working counter wrong: 10 in a row", [_fault("wkc", slave=DRIVE_3, burst=10)], (GOES_ON,), watch_s=1.0),
+    # It depends on the bits: a statusword that reads as disabled stops the arm, a position may pass undetected.
+    Case("undetected bit errors: 1 in 100", [_fault("garble", rate=0.01, bits=2)], (CONTINUES, FAULT, EMERGENCY)),
+    Case("working counter wrong: 10 in a row", [_fault("wkc", slave=DRIVE_3, burst=10)], (CONTINUES,), watch_s=1.0),
     Case("working counter wrong: always", [_fault("wkc", slave=DRIVE_3, rate=1.0)], (FAULT,), (LOST,)),
     Case("drive: over-current", [_fault("drive", slave=DRIVE_3, error="over-current")], (FAULT,), ("0x2310",)),
     Case(
@@ -119,11 +119,11 @@ CASES: tuple[Case, ...] = (
     Case("drive: following error", [_fault("drive", slave=DRIVE_1, error="following-error")], (FAULT,), ("0x8611",)),
     Case("drive: encoder", [_fault("drive", slave=DRIVE_3, error="encoder")], (FAULT,), ("0x7305",)),
     Case("SYNC0 lost", [_fault("sync0", slave=DRIVE_3)], (FAULT,), reset_is_refused=True),
-    # A jump past the next SYNC0 loses it, as in hardware that compares for equality; where it lies is chance.
-    Case("clock jumps 200 us: drive 3", [_fault("clock_jump", slave=DRIVE_3, us=200)], (GOES_ON, FAULT)),
-    Case("clock jumps 200 us: reference", [_fault("clock_jump", slave=BOX, us=200)], (GOES_ON, FAULT)),
-    Case("clock drifts 200 ppm: drive 3", [_fault("clock_drift", slave=DRIVE_3)], (GOES_ON,)),
-    Case("clock drifts 200 ppm: reference", [_fault("clock_drift", slave=BOX)], (GOES_ON,)),
+    # A jump past the next SYNC0 loses it, as in hardware that compares for equality; its phase is random.
+    Case("clock jumps 200 us: drive 3", [_fault("clock_jump", slave=DRIVE_3, us=200)], (CONTINUES, FAULT)),
+    Case("clock jumps 200 us: reference", [_fault("clock_jump", slave=BOX, us=200)], (CONTINUES, FAULT)),
+    Case("clock drifts 200 ppm: drive 3", [_fault("clock_drift", slave=DRIVE_3)], (CONTINUES,)),
+    Case("clock drifts 200 ppm: reference", [_fault("clock_drift", slave=BOX)], (CONTINUES,)),
     Case(
         "emergency stop's input stuck at pressed",
         [_fault("input", number=10, how="low")],
@@ -136,25 +136,25 @@ CASES: tuple[Case, ...] = (
         [_fault("input", number=10, how="bounce", ms=20)],
         (EMERGENCY,),
     ),
-    Case("stick's input stuck", [_fault("input", number=1, how="low")], (GOES_ON,), activities=THREE, watch_s=1.0),
-    Case("stick out of code", [_fault("stick_code", value=0)], (GOES_ON,), activities=THREE, watch_s=1.0),
-    Case("stick out of code", [_fault("stick_code", value=0)], (STOPS,), activities=(STICK,), watch_s=1.0),
+    Case("joystick input stuck", [_fault("input", number=1, how="low")], (CONTINUES,), workloads=THREE, watch_s=1.0),
+    Case("joystick out of code", [_fault("stick_code", value=0)], (CONTINUES,), workloads=THREE, watch_s=1.0),
+    Case("joystick out of code", [_fault("stick_code", value=0)], (STOPS,), workloads=(JOYSTICK,), watch_s=1.0),
     Case(
-        "toggle bounces", [_fault("input", number=9, how="bounce", ms=20)], (STOPS,), activities=(STICK,), watch_s=1.0
+        "toggle bounces", [_fault("input", number=9, how="bounce", ms=20)], (STOPS,), workloads=(JOYSTICK,), watch_s=1.0
     ),
-    # Nobody notices, and that is the danger: the button and the stick behind such a box are dead.
+    # Undetectable by the master: the button and the joystick behind such a box are dead.
     Case(
         "inputs frozen, then the emergency stop is pressed",
         [_fault("input_frozen", slave=BOX), _fault("input", number=10, how="low")],
-        (GOES_ON,),
+        (CONTINUES,),
         watch_s=1.0,
     ),
     Case(
-        "inputs frozen, then the stick shows neutral",
+        "inputs frozen, then the joystick shows neutral",
         [_fault("input_frozen", slave=BOX), _fault("stick_code", value=63)],
-        (GOES_ON,),
-        activities=(STICK,),
+        (CONTINUES,),
+        workloads=(JOYSTICK,),
         watch_s=1.0,
     ),
-    Case("noise of other protocols", [_fault("noise", rate_hz=500)], (GOES_ON,), watch_s=1.5),
+    Case("noise of other protocols", [_fault("noise", rate_hz=500)], (CONTINUES,), watch_s=1.5),
 )

@@ -1,4 +1,4 @@
-"""A fixed part of the fault matrix; `make faults` carries out the whole."""
+"""A fixed part of the fault matrix; `make faults` runs all of it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from rtcp.telemetry.trials.bench import Bench
+from rtcp.telemetry.harness import Harness
 from tests.e2e.conftest import Platform
-from tests.faults.cases import CASES, HOLDING, JOGGING, MOVING, STICK, Case
-from tests.faults.run import SHIPPED_MS, bench_of, play
+from tests.faults.cases import CASES, HOLDING, JOGGING, JOYSTICK, MOVING, Case
+from tests.faults.run import SHIPPED_MS, harness_of, run_case
 
 pytestmark = pytest.mark.alone
 
@@ -22,38 +22,40 @@ PART = (
     ("working counter wrong: always", JOGGING),
     ("drive: over-current", MOVING),
     ("emergency stop's input stuck at pressed", JOGGING),
-    ("stick out of code", STICK),
+    ("joystick out of code", JOYSTICK),
 )
 
 
-def case_of(name: str, activity: str) -> Case:
-    """Return the case of this name that has the activity."""
-    return next(case for case in CASES if case.name == name and activity in case.activities)
+def case_of(name: str, workload: str) -> Case:
+    """The case of this name that has the workload."""
+    return next(case for case in CASES if case.name == name and workload in case.workloads)
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[Bench]:
-    """A bench for all of them: each must leave the arm usable for the next."""
+def harness() -> Iterator[Harness]:
+    """One platform for all cases: each must leave the arm usable for the next."""
     platform = Platform()
     try:
         platform.be_patient(SHIPPED_MS)
         platform.rtcp("start", "--detach")
-        with bench_of(platform) as made:
+        with harness_of(platform) as made:
             yield made
     finally:
         platform.end()
 
 
-@pytest.mark.parametrize(("name", "activity"), PART)
-def test_a_fault_ends_as_the_matrix_says_and_the_arm_can_be_used_again(bench: Bench, name: str, activity: str) -> None:
-    outcome, wrong = play(bench, case_of(name, activity), activity)
-    assert not wrong, f"{wrong}\n{outcome}"
+@pytest.mark.parametrize(("name", "workload"), PART)
+def test_a_fault_has_the_reaction_of_the_matrix_and_the_arm_recovers(
+    harness: Harness, name: str, workload: str
+) -> None:
+    result, wrong = run_case(harness, case_of(name, workload), workload)
+    assert not wrong, f"{wrong}\n{result}"
 
 
-def test_no_record_of_a_cycle_was_torn_or_lost_meanwhile(bench: Bench) -> None:
-    bench.follow()
-    assert bench.records > 0
-    assert bench.torn == 0
+def test_no_cycle_record_was_torn_or_lost_in_these_trials(harness: Harness) -> None:
+    harness.read_cycles()
+    assert harness.records > 0
+    assert harness.torn == 0
 
 
 def test_every_kind_of_fault_is_in_the_matrix() -> None:

@@ -1,4 +1,4 @@
-"""The soak: what it draws, what it tells, and that it can fail."""
+"""The soak: its random faults, its report, and that it can fail."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from random import Random
 import pytest
 
 from rtcp.config.faults import FAULTS, parse
-from rtcp.telemetry.trials.resources import GROWTH, Resources, grown, resources
-from rtcp.telemetry.trials.soak import draw
+from rtcp.telemetry.soak import GROWTH, Resources, grown, random_fault, resources
 from tests.e2e.conftest import Platform
 from tests.faults.run import SHIPPED_MS
 
@@ -20,23 +19,22 @@ DRIVES = (2, 3, 4, 5, 6, 7)
 HELD = Resources(rss=60 << 20, threads=2, files=10)
 
 
-def test_every_fault_that_is_drawn_is_one_that_the_segment_takes() -> None:
-    random, drawn = Random(1), set()
+def test_every_random_fault_is_one_that_the_segment_accepts() -> None:
+    random, chosen = Random(1), set()
     for _ in range(2000):
-        fault = draw(random, 7, DRIVES)
+        fault = random_fault(random, 7, DRIVES)
         planned, findings = parse(fault)
         assert planned is not None, (fault, findings)
         assert 1 <= fault.get("slave", 1) <= 7
         assert 0 <= fault.get("after", 0) <= 6
-        drawn.add(fault["fault"])
-    # Bits that no checksum sees are turned in the matrix: what a drive then says it is, it may say of any limit.
-    # Frozen inputs nobody notices: there is nothing to count.
-    assert drawn == set(FAULTS) - {"garble", "input_frozen"}
+        chosen.add(fault["fault"])
+    # Left out: undetected bit errors, which may report any state or limit; frozen inputs, which nothing detects.
+    assert chosen == set(FAULTS) - {"garble", "input_frozen"}
 
 
-def test_the_same_seed_draws_the_same_faults() -> None:
+def test_the_same_seed_gives_the_same_faults() -> None:
     one, other = Random(7), Random(7)
-    assert [draw(one, 7, DRIVES) for _ in range(50)] == [draw(other, 7, DRIVES) for _ in range(50)]
+    assert [random_fault(one, 7, DRIVES) for _ in range(50)] == [random_fault(other, 7, DRIVES) for _ in range(50)]
 
 
 @pytest.mark.parametrize(
@@ -48,13 +46,13 @@ def test_the_same_seed_draws_the_same_faults() -> None:
         (None, "has ended"),
     ],
 )
-def test_what_a_process_holds_more_of_is_a_failure(last: Resources | None, words: str) -> None:
+def test_a_resource_that_has_grown_is_a_failure(last: Resources | None, words: str) -> None:
     found = grown({"loop": HELD}, {} if last is None else {"loop": last}, settled=True)
     assert len(found) == 1
     assert words in found[0]
 
 
-def test_a_process_that_holds_what_it_held_is_none() -> None:
+def test_equal_resources_unsettled_memory_and_the_gateways_threads_are_no_failure() -> None:
     assert grown({"loop": HELD}, {"loop": HELD}, settled=True) == []
     assert grown({"loop": HELD}, {"loop": Resources(HELD.rss * 2, 2, 10)}, settled=False) == []
     assert grown({"gateway": HELD}, {"gateway": Resources(HELD.rss, 4, 12)}, settled=True) == []
@@ -74,7 +72,7 @@ def test_resources_are_those_of_the_process() -> None:
     ("arguments", "words"),
     [(("--minutes", "0"), "above 0"), (("--minutes", "nan"), "above 0"), (("--seed", "-1"), "0 or")],
 )
-def test_what_cannot_be_is_a_usage_error(arguments: tuple[str, str], words: str) -> None:
+def test_an_impossible_duration_or_seed_is_a_usage_error(arguments: tuple[str, str], words: str) -> None:
     platform = Platform()
     try:
         done = platform.rtcp("soak", *arguments, check=2)
@@ -83,7 +81,7 @@ def test_what_cannot_be_is_a_usage_error(arguments: tuple[str, str], words: str)
         platform.end()
 
 
-def test_a_soak_tells_what_became_of_its_faults_and_that_nothing_was_lost() -> None:
+def test_a_soak_reports_the_result_of_each_kind_of_fault_and_no_failure() -> None:
     platform = Platform()
     try:
         platform.be_patient(SHIPPED_MS)
@@ -93,9 +91,9 @@ def test_a_soak_tells_what_became_of_its_faults_and_that_nothing_was_lost() -> N
         assert found["records"] > 0
         assert found["torn"] == 0
         assert 0.0 < found["largest_step"] <= 1.0 + 1e-6
-        accounts = found["accounts"].values()
-        assert sum(account["injected"] for account in accounts) >= 1
-        assert all(account["injected"] == account["recovered"] for account in accounts)
+        counts = found["counts"].values()
+        assert sum(count["injected"] for count in counts) >= 1
+        assert all(count["injected"] == count["recovered"] for count in counts)
         assert set(found["last"]) == {"loop", "gateway", "segment"}
         assert not (platform.directory / "processes.json").exists()
     finally:

@@ -20,8 +20,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from rtcp.config.loader import load
 from rtcp.config.model import Pdo, PdoEntry, SlaveConfig, StartupSdo
-from rtcp.config.schema import load
 from rtcp.devices import Cia402Drive, TargetState
 from rtcp.fieldbus import AlState, BusError, SdoAborted
 from rtcp.fieldbus.bus import ProcessData, station_of

@@ -270,7 +270,7 @@ def test_a_loop_of_another_start_does_not_answer_for_this_one(directory: Path, l
     this = identify(os.getpid())
     write_exit_report(directory, this, ["a slave stayed in OP"])
     assert exit_problems(directory, this, lived) == ("a slave stayed in OP",)
-    gone = Pid(this + 1, this.started)
+    gone = Pid(this + 1, this.identity)
     (sentence,) = exit_problems(directory, gone, lived)
     assert ("was killed" in sentence) == lived
     assert "left to their watchdog" in sentence

@@ -149,7 +149,7 @@ def _play(count: int, seed: int, mode: str) -> Found:
     found = Found(mode)
     random = Random(seed)
     config = load(default_config())
-    config = replace(config, mode=mode, cycle=replace(config.cycle, period_us=1000.0))  # type: ignore[arg-type]
+    config = replace(config, drive_mode=mode, cycle=replace(config.cycle, period_us=1000.0))  # type: ignore[arg-type]
     began = time.monotonic()
     memory: Memory | None = None
     with Simulation(config, seed, positions=START) as simulation:

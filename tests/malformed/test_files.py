@@ -16,7 +16,7 @@ import pytest
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.faults import load_script
-from rtcp.config.kinematics import load_kinematics
+from rtcp.config.loader import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, store_zero, zero_file
@@ -36,7 +36,7 @@ from rtcp.ipc.session import (
     read_session,
     session_file,
 )
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.malformed.files import damaged
 
 SHIPPED = default_config().parent

@@ -7,8 +7,7 @@ from dataclasses import replace
 from math import isfinite
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
-from rtcp.config.operation import Box, KeepOut
+from rtcp.config.model import ArmConfig, Box, KeepOut
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint

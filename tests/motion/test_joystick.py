@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from rtcp.config.operation import JogConfig
+from rtcp.config.model import JogConfig
 from rtcp.motion.controllers.joystick import Joystick
 
 SPEED, TURN = 0.1, 0.3

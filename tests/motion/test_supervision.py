@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.config.operation import WatchConfig
+from rtcp.config.model import SupervisionConfig
 from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED, TORQUE, Found, Supervision
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
@@ -18,7 +18,7 @@ from rtcp.motion.state import ArmState
 from .judge import JOINTS_ONLY
 
 CYCLES = 5
-CONFIG = replace(JOINTS_ONLY, watch=WatchConfig(cycles=CYCLES, speed=1.5, torque=2.0, following_error=0.1))
+CONFIG = replace(JOINTS_ONLY, supervision=SupervisionConfig(cycles=CYCLES, speed=1.5, torque=2.0, following_error=0.1))
 BOUNDS = {SPEED: 1.5 * 1.5, TORQUE: 2.0 * CONFIG.joints[1].torque, FOLLOWING_ERROR: 0.1}
 """Of the second joint: its limit is 1.5 rad/s."""
 KINDS = pytest.mark.parametrize("kind", [SPEED, TORQUE, FOLLOWING_ERROR], ids=["speed", "torque", "following error"])

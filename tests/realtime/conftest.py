@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
 from rtcp.realtime.host import Coalescing, Host
 
@@ -220,3 +222,14 @@ def jetson(patient: Callable[[str], Patient]) -> Patient:
 @pytest.fixture
 def laptop(patient: Callable[[str], Patient]) -> Patient:
     return patient("laptop")
+
+
+@pytest.fixture
+def publish() -> Callable[..., None]:
+    """Publish a cycle record with these scalars; the others are 0."""
+    names = [name for name, _ in SCALARS[1:]]
+
+    def publish(board: Blackboard, **scalars: int) -> None:
+        board.publish([*(scalars.get(name, 0) for name in names), *[0] * (len(PER_JOINT) * 6)])
+
+    return publish

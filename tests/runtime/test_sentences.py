@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rtcp.config.find import default_config
-from rtcp.config.schema import load
+from rtcp.config.loader import load
 from rtcp.ipc.machine import ALLOWED, Code, Command, Refusal, State
 from rtcp.ipc.messages import Sentences
 from rtcp.motion.state import Reason

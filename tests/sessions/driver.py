@@ -222,4 +222,4 @@ class Driver:
 def with_start(config: ArmConfig, period_us: float, mode: str, motion: str = "joint") -> ArmConfig:
     """Return the configuration with another cycle, drive mode and motion mode."""
     cycle = replace(config.cycle, period_us=period_us)
-    return replace(config, cycle=cycle, mode=mode, motion=motion)  # type: ignore[arg-type]
+    return replace(config, cycle=cycle, drive_mode=mode, control_mode=motion)  # type: ignore[arg-type]

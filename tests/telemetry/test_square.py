@@ -11,8 +11,7 @@ import pytest
 
 from kinematics import forward
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
-from rtcp.config.operation import Box
+from rtcp.config.model import ArmConfig, Box
 from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
 from rtcp.telemetry.recording import Recording

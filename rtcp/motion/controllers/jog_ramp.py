@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import sqrt
 
-from rtcp.config.operation import CartesianConfig
+from rtcp.config.model import CartesianConfig
 
 
 class JogRamp:

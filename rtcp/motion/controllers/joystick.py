@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from rtcp.config.operation import JogConfig
+from rtcp.config.model import JogConfig
 
 GRIPPER = 3
 MODES = 4

@@ -18,7 +18,7 @@ from rtcp.motion.planning.slerp import quaternion, rotation, turn_between, turne
 from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
 
 if TYPE_CHECKING:
-    from rtcp.config.operation import SingularityLimits
+    from rtcp.config.model import SingularityLimits
     from rtcp.motion.limits import Limits
 
 AT_START_M, AT_START_RAD = 1e-3, 2e-3

@@ -29,10 +29,10 @@ class Supervision:
     """
 
     def __init__(self, config: ArmConfig, limits: Limits) -> None:
-        watch, n = config.watch, len(config.joints)
+        bounds, n = config.supervision, len(config.joints)
         self._limits = limits
-        self._cycles = watch.cycles
-        self._speed, self._torque, self._error = watch.speed, watch.torque, watch.following_error
+        self._cycles = bounds.cycles
+        self._speed, self._torque, self._error = bounds.speed, bounds.torque, bounds.following_error
         self._joints = range(n)
         self._counts = [[0] * n, [0] * n, [0] * n]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from rtcp.config.motion_points import Point, Stop
+from rtcp.config.model import Point, Stop
 
 __all__ = ["Plan", "PlanRefused", "Point", "Stop", "ZoneAt"]
 

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.config.errors import ConfigError
+from rtcp.config.model import ConfigError, Point, Stop
 from rtcp.config.motion_file import MotionFile, read_motion
-from rtcp.config.motion_points import Point, Stop
 
 Write = Callable[..., Path]
 
@@ -115,9 +114,9 @@ CSV = [
     ("t,q1\n0,0\n\n1,0,0\n", "a.csv:4: found 3 columns, the header has 2"),
     ("t,q1\n0,high\n", 'a.csv:2: q1: found the text "high", allowed is a number'),
     ("t,q1\n0,nan\n", "a.csv:2: q1: found nan, allowed is a finite number"),
-    ("t,q1\n-1,0\n", "a.csv:2: t: found -1, allowed is at least 0"),
-    ("t,q1\n1,0\n1,0\n", "a.csv:3: t: found 1 after 1; times must rise"),
-    ("x,y,z,rx,ry,rz,speed\n0,0,0,0,0,0,0\n", "a.csv:2: speed: found 0, allowed is greater than 0"),
+    ("t,q1\n-1,0\n", "a.csv:2: trajectory[0].t: found -1.0, allowed is a number of at least 0"),
+    ("t,q1\n1,0\n1,0\n", "a.csv:3: trajectory[1].t: found 1 after 1; times must rise"),
+    ("x,y,z,rx,ry,rz,speed\n0,0,0,0,0,0,0\n", "a.csv:2: path[0].speed: found 0.0, allowed is a number greater than 0"),
 ]
 
 
@@ -127,16 +126,15 @@ def test_a_mistake_in_csv_is_named_in_one_sentence(write: Write, text: str, sent
 
 
 def test_all_mistakes_of_a_file_are_named(write: Write) -> None:
-    assert said(write("t,q1\n2,0\n1,0\n3,x\n-4,0\n", "a.csv")) == [
-        "a.csv:3: t: found 1 after 2; times must rise",
+    assert said(write("t,q1\n2,0\n1,0\n3,x\n4,0\n3,0\n", "a.csv")) == [
         'a.csv:4: q1: found the text "x", allowed is a number',
-        "a.csv:5: t: found -4, allowed is at least 0",
-        "a.csv:5: t: found -4 after 1; times must rise",
+        "a.csv:3: trajectory[1].t: found 1 after 2; times must rise",
+        "a.csv:6: trajectory[3].t: found 3 after 4; times must rise",
     ]
 
 
 def test_an_ending_that_says_no_form_is_refused(write: Write) -> None:
-    assert said(write("", "a.txt")) == ['a.txt: the ending ".txt" says no form; allowed are .yaml, .yml and .csv']
+    assert said(write("", "a.txt")) == ['a.txt: the ending ".txt" selects no form; allowed are .yaml, .yml and .csv']
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -168,7 +168,7 @@ def test_a_reversal_of_the_whole_torque_keeps_to_the_acceleration_and_the_set_po
             plant.run(0.1, [sign * torque for torque in plant.limits.torque])
             apart = zip(plant.state.commanded, plant.state.actual, strict=True)
             worst = max(worst, *(abs(a - b) for a, b in apart))
-    # An emergency stop comes at 0.15 rad (watch.following_error).
+    # An emergency stop comes at 0.15 rad (supervision.following_error).
     assert worst < 0.05
     for axis in range(6):
         # The set-point has 2 rad/s^2, and the arm is at most 0.2 rad/s beside it.

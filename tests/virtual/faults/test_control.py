@@ -17,8 +17,9 @@ import pytest
 
 from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
 from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS
-from rtcp.virtual.frame import Command, Datagram, build, parse
+from rtcp.virtual.protocol import Command
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
+from tests.virtual.frames import Datagram, build, parse
 
 pytestmark = pytest.mark.alone
 
@@ -155,7 +156,7 @@ def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
         ({}, "do: found nothing, allowed is one of fault, clear, faults, truth, clear_peaks"),
         ({"do": "dance"}, 'do: found the text "dance", allowed is one of fault'),
         ({"do": ["fault"]}, "do: found a list, allowed is one of fault"),
-        ({"do": "truth", "slave": 1}, "slave: this key is not known here; allowed are do"),
+        ({"do": "truth", "slave": 1}, "slave: this key does not exist; allowed are do"),
         ({"do": "clear", "id": True}, "id: found true, allowed is the number of a fault, or none for all"),
         ({"do": "clear", "id": 99999}, "there was no fault 99999; active now: none"),
         ({"do": "fault"}, "found nothing, allowed is a mapping with the key `fault`"),

@@ -1,0 +1,255 @@
+"""Reads the arm's file and the device files that it names into one frozen `ArmConfig`, or names every mistake."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from kinematics.model import ArmModel, DhRow, JointLimit, LinkMass
+from kinematics.pose import Pose
+from rtcp.config import rules
+from rtcp.config.document import Document, Finding, KeyPath, read, sentence
+from rtcp.config.find import exists
+from rtcp.config.model import (
+    JOINTS,
+    VIRTUAL,
+    ArmConfig,
+    ArmFile,
+    ArmSettings,
+    ConfigError,
+    ControlModeName,
+    CycleConfig,
+    DeviceDescription,
+    Joint,
+    Kinematics,
+    MechanicalLimit,
+    SlaveConfig,
+)
+from rtcp.config.numbers import Name
+from rtcp.config.validation import Checker, FileRule, allowed, keys, rule
+
+RENAMED = {
+    "mode": "drive_mode",
+    "motion": "control_mode",
+    "watch": "supervision",
+    "bus.timeout_scale": "bus.timeout_scale",
+    "stops.watch": "stops.supervision",
+}
+"""Keys of the arm's file in version 0.1, and their names now."""
+_SYNC_ERROR_LIMIT = (0x10F1, 2)
+_LONGEST_WATCHDOG_MS = 6000.0
+
+
+@dataclass(frozen=True)
+class KinematicsFile:
+    """An arm that is only computed with: no slaves, no drives."""
+
+    name: Name
+    kinematics: Kinematics
+
+
+@rule(KinematicsFile, "kinematics")
+def _limits(file: KinematicsFile) -> Iterator[Finding]:
+    if file.kinematics.limits is None:
+        wanted = f"a list of {JOINTS} mappings with the keys {', '.join(keys(MechanicalLimit))}"
+        yield ("kinematics",), f"the key limits is missing; in a file without joints it must be {wanted}"
+
+
+_ARM = Checker(ArmFile, RENAMED)
+_KINEMATICS, _DEVICE, _CYCLE = Checker(KinematicsFile), Checker(DeviceDescription), Checker(CycleConfig)
+
+
+def load(path: Path) -> ArmConfig:
+    """Read the arm's file and the device files beside it.
+
+    Raises:
+        ConfigError: with one sentence for every mistake in all of these files: file, line, key, what was found and
+            what is allowed.
+    """
+    document = read(path)
+    cycle, _ = _CYCLE.check(document.data.get("cycle", {}))
+    devices: dict[str, DeviceDescription] = {}
+    missing: list[Finding] = []
+    in_devices: list[str] = []
+    for key, where in _devices_named(document.data):
+        file = device_path(path, key)
+        if not exists(file):
+            missing.append((where, _no_device(key, file)))
+            continue
+        try:
+            devices[key] = load_device(file, cycle.period_us if cycle else None)
+        except ConfigError as error:
+            in_devices += error.problems
+    drives = FileRule(("slaves", "joints", "gripper"), partial(rules.drive_findings, devices=devices))
+    terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
+    arm, findings = _ARM.check(document.data, drives, terminals)
+    findings += missing
+    if findings or in_devices or arm is None:
+        raise ConfigError(document.sentences(findings) + in_devices)
+    return ArmConfig(
+        **{field.name: getattr(arm, field.name) for field in fields(ArmSettings)},
+        slaves=tuple(SlaveConfig(slave.name, devices[slave.device]) for slave in arm.slaves),
+        arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
+        source=path,
+    )
+
+
+def load_device(path: Path, period_us: float | None = None) -> DeviceDescription:
+    """Read a device file; with a cycle period (us) its watchdog is checked against it.
+
+    Raises:
+        ConfigError: with one sentence for every mistake.
+    """
+    document = read(path)
+    timing = partial(rules.period_findings, period_us=period_us or 0.0)
+    more = [FileRule(("kind", "watchdog_ms", "sync0_shift_us"), timing)] if period_us is not None else []
+    device, findings = _DEVICE.check(document.data, *more)
+    if device is None:
+        raise ConfigError(document.sentences(findings))
+    return device
+
+
+def load_kinematics(path: Path) -> ArmModel:
+    """Read an arm's file and return its kinematics.
+
+    A file with any key of a whole arm is checked as one, with its device files; its joints' `position` and `velocity`
+    are then the limits of the model, and `kinematics.limits` are the mechanical ones that they must lie within.
+
+    Raises:
+        ConfigError: with one sentence for every mistake: file, line, key, what was found and what is allowed.
+    """
+    document = read(path)
+    if _is_whole_arm(document):
+        arm = load(path).arm
+        if arm is None:
+            told = f"the key kinematics is missing; it must be {allowed(Kinematics)}"
+            raise ConfigError(document.sentences([((), told)]))
+        return arm
+    file, findings = _KINEMATICS.check(document.data)
+    if file is None:
+        raise ConfigError(document.sentences(findings))
+    return _arm_model(document, file.name, file.kinematics, ())
+
+
+def torque_limits(path: Path) -> tuple[float, ...] | None:
+    """Return the torque limits, Nm, of a whole arm's joints; None where the file has kinematics alone.
+
+    Raises:
+        ConfigError: as `load_kinematics`.
+    """
+    return tuple(joint.torque for joint in load(path).joints) if _is_whole_arm(read(path)) else None
+
+
+def device_path(arm: Path, key: str) -> Path:
+    """Return the file of a device: `devices/<key>.yaml` beside the arm's file, or the path that the key is."""
+    if "/" in key or key.endswith((".yaml", ".yml")):
+        return arm.parent / key
+    return arm.parent / "devices" / f"{key}.yaml"
+
+
+def segment_path(config: ArmConfig) -> Path:
+    """Return the file of the virtual segment's slaves, which the arm's file names."""
+    return config.source.parent / config.bus.segment
+
+
+def with_period(config: ArmConfig, period_us: float) -> ArmConfig:
+    """Return the same arm with another cycle period (us), as a command's `--cycle-us` asks for.
+
+    Raises:
+        ConfigError: the period is out of range or does not suit a device's watchdog.
+    """
+    cycle, findings = _CYCLE.check({**asdict(config.cycle), "period_us": period_us})
+    if cycle is None:
+        raise ConfigError(f"cycle.{sentence(finding)}" for finding in findings)
+    problems = [
+        f"{device.name}: {sentence(finding)}"
+        for device in {slave.device.name: slave.device for slave in config.slaves}.values()
+        for finding in rules.period_findings(device, period_us)
+    ]
+    if problems:
+        raise ConfigError(problems)
+    return replace(config, cycle=cycle)
+
+
+def with_control_mode(config: ArmConfig, control_mode: ControlModeName) -> ArmConfig:
+    """Return the same arm with another control mode at its start, as `rtcp start --mode` asks for.
+
+    Raises:
+        ConfigError: the arm lacks what this mode needs: its geometry, a joystick.
+    """
+    geometry, joystick = config.arm is not None, config.inputs.joystick is not None
+    if told := rules.missing_for(control_mode, geometry=geometry, joystick=joystick):
+        raise ConfigError([f"control_mode: {told}"])
+    return replace(config, control_mode=control_mode)
+
+
+def widen(config: ArmConfig) -> ArmConfig:
+    """Return the configuration with `bus.timeout_scale` applied: only where its bus is `virtual`.
+
+    Master and virtual slaves are processes of one host: where it takes the CPU away for 30 ms, as virtual machines do,
+    both stand still, and a limit that suits a cable would end every second run. Multiplied are `bus.lost_cycles` and
+    `watchdog_ms` of every device. The sync error counter limit among its start-up SDOs (0x10F1:02, ETG.1020) becomes 0,
+    which disables that check: a missed SYNC0 counts 3 and one that is met takes 1 away, so that a host which loses a
+    quarter of its ticks exceeds any limit in the end.
+    """
+    scale = config.bus.timeout_scale
+    if config.bus.interface != VIRTUAL or scale == 1:
+        return config
+
+    def widened(device: DeviceDescription) -> DeviceDescription:
+        unlimited = ((entry.index, entry.sub_index) == _SYNC_ERROR_LIMIT for entry in device.sdo)
+        sdo = tuple(replace(e, value=0.0) if off else e for e, off in zip(device.sdo, unlimited, strict=True))
+        return replace(device, watchdog_ms=min(device.watchdog_ms * scale, _LONGEST_WATCHDOG_MS), sdo=sdo)
+
+    return replace(
+        config,
+        bus=replace(config.bus, lost_cycles=round(config.bus.lost_cycles * scale)),
+        slaves=tuple(replace(slave, device=widened(slave.device)) for slave in config.slaves),
+    )
+
+
+def _is_whole_arm(document: Document) -> bool:
+    own = {field.name for field in fields(KinematicsFile)}
+    return any(field.name in document.data for field in fields(ArmFile) if field.name not in own)
+
+
+def _devices_named(data: Any) -> Iterator[tuple[str, KeyPath]]:
+    """Yield the devices that an arm's file names, each with its first place, whatever else is wrong with the file."""
+    slaves = data.get("slaves")
+    named: set[str] = set()
+    for i, slave in enumerate(slaves if isinstance(slaves, list) else ()):
+        key = slave.get("device") if isinstance(slave, dict) else None
+        if isinstance(key, str) and key and key not in named:
+            named.add(key)
+            yield key, ("slaves", i, "device")
+
+
+def _arm_model(document: Document, name: str, part: Kinematics, joints: Sequence[Joint]) -> ArmModel:
+    """Return the model of an arm; where it has `joints`, their names, ranges and speeds are the model's."""
+    try:
+        limits = [JointLimit(one.position.min, one.position.max, one.velocity) for one in joints] or [
+            JointLimit(one.min, one.max, one.velocity or math.inf) for one in part.limits or ()
+        ]
+        x, y, z, rx, ry, rz = *part.tool.position, *part.tool.rpy
+        return ArmModel(
+            name=name,
+            rows=tuple(DhRow(row.alpha, row.a, row.d, row.offset) for row in part.dh),
+            limits=tuple(limits),
+            links=tuple(
+                LinkMass(link.mass, (link.centre[0], link.centre[1], link.centre[2])) for link in part.links or ()
+            ),
+            tool=Pose.from_xyzrpy(x, y, z, rx, ry, rz),
+            joint_names=tuple(joint.name for joint in joints) or ArmModel.joint_names,
+        )
+    except ValueError as error:
+        raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
+
+
+def _no_device(key: str, file: Path) -> str:
+    there = sorted(other.stem for other in file.parent.glob("*.yaml")) if file.parent.is_dir() else []
+    listed = f"in {file.parent} are {', '.join(there)}" if there else f"{file.parent} holds no device files"
+    return f'found the text "{key}", but there is no file {file}; {listed}'

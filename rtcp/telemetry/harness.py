@@ -1,0 +1,217 @@
+"""A running platform with its segment, for fault injection: commands, faults, and every cycle that follows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from rtcp.config.model import ArmConfig
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.machine import State
+from rtcp.ipc.messages import Sentences
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
+from rtcp.ipc.session import read_session
+from rtcp.telemetry.recording import target_steps
+from rtcp.virtual.faults.client import SegmentClient
+
+CLIENT_NAME = "a trial"
+_POLL_S = 0.02
+_STANDSTILL_S = 0.25
+"""A joint that has not moved for this long is at standstill."""
+_STOP_TIMEOUT_S = 10.0
+_RESETS, _RESET_PAUSE_S = 5, 1.0
+_MOVES, _SPEED = 3, 0.4
+
+
+@dataclass(frozen=True)
+class Moment:
+    """An instant, and the last event and text of the platform before it."""
+
+    event: int
+    text: int
+
+
+class TrialFailed(Exception):
+    """The platform does not do what a trial needs in order to continue; the message says what."""
+
+
+class Harness:
+    """Commands a platform and its segment, and reads every cycle record.
+
+    Args:
+        directory: the platform's runtime directory.
+        config: the arm.
+    """
+
+    def __init__(self, directory: Path, config: ArmConfig) -> None:
+        self.directory = directory
+        self.config = config
+        self.client = ControlClient(CLIENT_NAME, control_socket(directory))
+        # The session knows the socket: another segment may have the usual one.
+        self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
+        self.observer = Observer(blackboard_file(directory))
+        self.segment.clear_peaks()  # from the first request on the segment observes its joints
+        self._sentences = Sentences(config)
+        self._speeds = np.array([joint.velocity for joint in config.joints])
+        self._seen = self.observer.head
+        self._last: Any = None
+        self.injected = 0
+        """Faults injected."""
+        self.records = 0
+        """Cycle records read."""
+        self.torn = 0
+        """Cycle records that were torn, or overwritten before they were read."""
+        self.wrong = 0
+        """Cycles without the expected working counter."""
+        self.largest_step = 0.0
+        """Largest step of a target between cycles with enabled drives, as a fraction of what its speed limit allows."""
+
+    def __enter__(self) -> Harness:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:  # fmt: skip
+        self.client.close()
+        self.segment.close()
+        self.observer.close()
+
+    # -- observation ------------------------------------------------------------------------------------------------
+
+    def read_cycles(self) -> None:
+        """Read the cycles since the last call; must be called every few seconds."""
+        found, torn = self.observer.since(self._seen)
+        self.torn += torn
+        if not len(found):
+            return
+        self._seen = int(found[-1]["number"])
+        self.records += len(found)
+        self.wrong += int((found["wkc"] != found["wkc_expected"]).sum())
+        joined = found if self._last is None else np.concatenate([self._last, found])
+        self._last = found[-1:].copy()
+        _, steps = target_steps(joined)
+        if len(steps):
+            allowed = self._speeds * self.observer.period_ns * 1e-9
+            self.largest_step = max(self.largest_step, float((steps / allowed).max()))
+
+    def state(self) -> str:
+        """Return the machine's state as `rtcp status` names it."""
+        self.read_cycles()
+        latest = self.observer.latest()
+        return "off" if latest is None else State(int(latest[0]["state"])).name.lower()
+
+    def speed(self) -> float:
+        """Return the measured speed of the fastest joint, rad/s."""
+        latest = self.observer.latest()
+        return 0.0 if latest is None else float(np.abs(latest[0]["velocity"]).max())
+
+    def moment(self) -> Moment:
+        """Return this moment, for `messages_since`."""
+        events, texts = self.observer.events_since(0), self.observer.texts_since(0)
+        return Moment(events[-1].number if events else 0, texts[-1].number if texts else 0)
+
+    def messages_since(self, moment: Moment) -> list[str]:
+        """Return the platform's messages since a moment, in their order."""
+        found = [
+            (event.time_ns, self._sentences.event(event.code, event.axis, event.value, event.limit))
+            for event in self.observer.events_since(moment.event)
+        ]
+        found += [(text.time_ns, text.sentence) for text in self.observer.texts_since(moment.text)]
+        return [sentence for _, sentence in sorted(found)]
+
+    def wait_for(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait for a condition while reading cycles; return whether it was met in time."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > end:
+                return False
+            self.read_cycles()
+            time.sleep(_POLL_S)
+        return True
+
+    def wait(self, seconds: float) -> None:
+        """Wait while reading cycles."""
+        self.wait_for(lambda: False, seconds)
+
+    def drives(self) -> list[dict[str, Any]]:
+        """Return the segment's ground truth of each joint's drive, as `position_rad`, `torque_on`."""
+        found = {slave["position"]: slave for slave in self.segment.truth()["slaves"]}
+        positions = {slave.name: at for at, slave in enumerate(self.config.slaves, 1)}
+        return [found[positions[joint.slave]] for joint in self.config.joints]
+
+    def joint_positions(self) -> list[float]:
+        """Return the true joint positions, rad."""
+        return [drive["position_rad"] for drive in self.drives()]
+
+    def wait_standstill(self) -> int:
+        """Wait until every joint is truly at standstill; return when the last one stopped, ns of CLOCK_MONOTONIC.
+
+        Raises:
+            TrialFailed: a joint still moves after 10 s.
+        """
+
+        def moved_ns() -> int:
+            return max((one["moved_ns"] for one in self.segment.truth()["slaves"] if "moved_ns" in one), default=0)
+
+        standstill_ns = round(_STANDSTILL_S * 1e9)
+        if not self.wait_for(lambda: time.monotonic_ns() - moved_ns() > standstill_ns, _STOP_TIMEOUT_S):
+            raise TrialFailed(f"a joint still moves {_STOP_TIMEOUT_S:g} s after the fault")
+        return moved_ns()
+
+    # -- commands ---------------------------------------------------------------------------------------------------
+
+    def inject(self, fault: Mapping[str, Any]) -> None:
+        """Inject a fault; raises SegmentRefused, SegmentAway."""
+        self.segment.fault(fault)
+        self.injected += 1
+
+    def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
+        """Send a command to the platform; raises RtcpError."""
+        return self.client.call(verb, arguments, timeout_s=60.0)
+
+    def enable(self) -> tuple[int, str]:
+        """Reset and enable until the arm holds.
+
+        Returns:
+            The number of attempts, and the last refusal (empty when the arm holds).
+        """
+        refusal = ""
+        for attempt in range(1, _RESETS + 1):
+            try:
+                if self.state() in ("fault", "emergency_stop", "stopped_by_limit"):
+                    self.call("reset")
+                if self.state() != "holding":
+                    self.call("enable")
+            except RtcpError as error:
+                refusal = error.message
+                self.wait(_RESET_PAUSE_S)
+                continue
+            return attempt, ""
+        return _RESETS, refusal
+
+    def move(self, q: Sequence[float]) -> str:
+        """Enable and move to `q`, rad; return why that was not possible, empty where it was.
+
+        It is repeated: a host that delays the gateway for longer than `lease_s` ends a move, as it must.
+        """
+        refusal = ""
+        for _ in range(_MOVES):
+            _, refusal = self.enable()
+            if refusal:
+                break
+            try:
+                self.call("motion", name="joint")
+                self.call("move", q=list(q), speed=_SPEED)
+            except RtcpError as error:
+                refusal = error.message
+                continue
+            return ""
+        return refusal

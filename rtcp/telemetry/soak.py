@@ -1,0 +1,220 @@
+"""The soak: random faults while the arm works, for hours, and the result for each kind of fault."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any
+
+import psutil
+
+from rtcp.ipc.errors import RtcpError
+from rtcp.telemetry.harness import Harness, TrialFailed
+from rtcp.telemetry.trial import WORKLOADS, named, run_trial
+from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
+
+SETTLE_S = 60.0
+"""After this time a process has allocated all that it keeps: its memory must not grow."""
+GROWTH = 2 << 20
+"""Growth of a process after that, bytes, that is the allocator's noise and not a leak."""
+_WATCH_S = 1.0
+_ON_FRAMES = frozenset({"cable", "power", "loss", "delay", "duplicate", "reorder", "corrupt", "wkc", "noise"})
+"""Faults that show in the working counter; for others a wrong counter means nothing."""
+_PROCESSES = ("loop", "gateway", "segment")
+_VARIABLE = frozenset({"gateway"})
+"""Processes whose threads and files vary with their connections, and mean no leak."""
+Log = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Resources:
+    """Resources of a process."""
+
+    rss: int
+    """Resident memory, bytes."""
+    threads: int
+    files: int
+
+
+def resources(pid: int) -> Resources | None:
+    """Return the present resources of a process; None where it has ended or is another user's."""
+    try:
+        process = psutil.Process(pid)
+        return Resources(process.memory_info().rss, process.num_threads(), process.num_fds())
+    except psutil.Error:
+        return None
+
+
+def grown(first: Mapping[str, Resources], last: Mapping[str, Resources], *, settled: bool) -> list[str]:
+    """Return a message for each resource of a process that has grown, and for each process that has ended.
+
+    Args:
+        first: resources at first, by name of the process.
+        last: present resources; a process that is missing has ended.
+        settled: `first` was taken after `SETTLE_S`: memory is compared too.
+    """
+    found = []
+    for name, before in first.items():
+        now = last.get(name)
+        if now is None:
+            found.append(f"the {name} has ended")
+            continue
+        if name not in _VARIABLE:
+            for count, unit in (("threads", "threads"), ("files", "open files")):
+                if getattr(now, count) > getattr(before, count):
+                    found.append(f"the {name} has {getattr(now, count)} {unit}, {getattr(before, count)} before")
+        if settled and now.rss - before.rss > GROWTH:
+            found.append(f"the {name} uses {now.rss / 2**20:.1f} MiB, {before.rss / 2**20:.1f} after the first minute")
+    return found
+
+
+def random_fault(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[str, Any]:
+    """Return a random fault with its parameters.
+
+    Args:
+        random: source of randomness.
+        slaves: number of slaves.
+        drives: positions of the drives.
+    """
+    slave, drive, cable = random.randint(1, slaves), random.choice(drives), random.randrange(slaves)
+    often: dict[str, Any] = random.choice(
+        ({"burst": random.randint(1, 200)}, {"rate": random.choice((0.002, 0.02, 0.2))})
+    )
+    seed = random.randrange(1 << 16)
+    some: tuple[dict[str, Any], ...] = (
+        {"fault": "cable", "after": cable},
+        {"fault": "power", "slave": slave},
+        {"fault": "al_fall", "slave": slave, "state": random.choice(("SAFE-OP", "PRE-OP"))},
+        {"fault": "al_hang", "slave": slave},
+        {"fault": "al_refuse", "slave": slave},
+        {"fault": "sdo_late", "slave": drive, "ms": random.choice((20, 300))},
+        {"fault": "sdo_abort", "slave": drive},
+        {"fault": "loss", **often, "seed": seed},
+        {"fault": "delay", "ms": random.choice((0.5, 3.0)), **often, "seed": seed},
+        {"fault": "duplicate", **often, "seed": seed},
+        {"fault": "reorder", **often, "seed": seed},
+        {"fault": "corrupt", "after": cable, "way": random.choice(("out", "back")), **often, "seed": seed},
+        {"fault": "wkc", "slave": slave, **often, "seed": seed},
+        {
+            "fault": "drive",
+            "slave": drive,
+            "error": random.choice(("over-current", "over-temperature", "following-error", "encoder")),
+        },
+        {"fault": "sync0", "slave": drive},
+        {"fault": "clock_jump", "slave": slave, "us": random.choice((-300, 50, 300))},
+        {"fault": "clock_drift", "slave": slave, "ppm": random.choice((-200, 200))},
+        {"fault": "input", "number": random.choice((1, 9, 10)), "how": random.choice(("low", "bounce")), "ms": 20},
+        {"fault": "stick_code", "value": random.randrange(64)},
+        {"fault": "noise", "rate_hz": random.choice((50, 500))},
+    )
+    fault = random.choice(some)
+    if fault["fault"] not in ("al_fall", "clock_jump"):
+        fault["lasts"] = round(random.choice((0.02, 0.2, 1.0, 3.0)), 3)
+    return fault
+
+
+@dataclass
+class Counts:
+    """Results of the trials with one kind of fault."""
+
+    injected: int = 0
+    noticed: int = 0
+    """Trials with a message, with cycles without the expected working counter, or with a stop."""
+    continued: int = 0
+    stopped: int = 0
+    recovered: int = 0
+
+
+@dataclass
+class Summary:
+    """Result of a soak."""
+
+    seed: int
+    minutes: float = 0.0
+    counts: dict[str, Counts] = field(default_factory=dict)
+    records: int = 0
+    torn: int = 0
+    largest_step: float = 0.0
+    first: dict[str, Resources] = field(default_factory=dict)
+    """Resources of each process after the first minute, or at the beginning of a shorter soak."""
+    last: dict[str, Resources] = field(default_factory=dict)
+    failures: list[str] = field(default_factory=list)
+    """A message for each violation."""
+
+
+class Soak:
+    """Runs random trials for a given time.
+
+    Args:
+        harness: the platform.
+        pids: process ids by name: loop, gateway, segment.
+        seed: seed of all random choices.
+        log: receives a line for each trial.
+    """
+
+    def __init__(self, harness: Harness, pids: Mapping[str, int], seed: int, log: Log) -> None:
+        self._harness = harness
+        self._pids = {name: pids[name] for name in _PROCESSES}
+        self._random = Random(seed)
+        self._log = log
+        slaves = harness.config.slaves
+        driven = {joint.slave for joint in harness.config.joints}
+        self._slaves = len(slaves)
+        self._drives = tuple(at for at, slave in enumerate(slaves, 1) if slave.name in driven)
+        self.summary = Summary(seed)
+
+    def run(self, minutes: float) -> Summary:
+        """Run for this time; the trial that is running then is finished."""
+        begun = time.monotonic()
+        summary = self.summary
+        summary.first = self._resources()
+        settled, number = False, 0
+        try:
+            while (passed := time.monotonic() - begun) <= minutes * 60.0:
+                if not settled and passed > SETTLE_S:
+                    settled, summary.first = True, self._resources()
+                number += 1
+                fault = random_fault(self._random, self._slaves, self._drives)
+                self._trial(number, fault, self._random.choice(tuple(WORKLOADS)))
+                if len(self._resources()) < len(self._pids):
+                    break
+        finally:  # also after an interruption
+            summary.minutes = (time.monotonic() - begun) / 60.0
+            summary.last = self._resources()
+            summary.records, summary.torn = self._harness.records, self._harness.torn
+            if summary.torn:
+                summary.failures.append(f"{summary.torn} cycle records were torn or lost")
+            summary.failures += grown(summary.first, summary.last, settled=settled)
+        return summary
+
+    def _trial(self, number: int, fault: dict[str, Any], workload: str) -> None:
+        harness, summary = self._harness, self.summary
+        counts = summary.counts.setdefault(str(fault["fault"]), Counts())
+        trial = f"trial {number}, {named([fault])}, while {workload}"
+        before = harness.injected
+        try:
+            result = run_trial(harness, [fault], workload, _WATCH_S)
+            harness.read_cycles()
+        except (TrialFailed, RtcpError, SegmentRefused, SegmentAway, OSError) as error:
+            summary.failures.append(f"{trial}: {error}")
+            self._log(f"{trial}: {error}")
+            with contextlib.suppress(SegmentRefused, SegmentAway, OSError):
+                harness.segment.clear()
+            return
+        finally:
+            counts.injected += harness.injected - before
+        counts.continued += result.continued
+        counts.stopped += not result.continued
+        wrong_counter = fault["fault"] in _ON_FRAMES and result.wrong_cycles > 0
+        counts.noticed += bool(result.messages) or wrong_counter or not result.continued
+        counts.recovered += result.recovered
+        summary.largest_step = max(summary.largest_step, result.largest_step)
+        summary.failures += [f"{trial}: {violation}" for violation in result.violations]
+        self._log(f"{trial}: {result.state.replace('_', ' ')}; {result.message or 'no message'}")
+
+    def _resources(self) -> dict[str, Resources]:
+        found = {name: resources(pid) for name, pid in self._pids.items()}
+        return {name: held for name, held in found.items() if held is not None}
