@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.gripper import FOLLOWED_RAD, DrivenGripper
@@ -10,7 +10,9 @@ from rtcp.control.motions import Motions
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.codes import Code
-from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveMode, DriveWriter
+from rtcp.ipc.states import DriveMode
+from rtcp.motion.controllers import ControllerSetup
+from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
@@ -29,6 +31,10 @@ RANGE_MARGIN_RAD = 0.02
 must not leave an arm that no command can move."""
 
 
+def _no_plan(slot: int) -> memoryview[float]:
+    raise LookupError(slot)
+
+
 class Arm:
     """What a cycle does with the joints.
 
@@ -44,6 +50,7 @@ class Arm:
         config: ArmConfig,
         drives: Sequence[tuple[int, Cia402Drive]],
         gripper: DrivenGripper | None = None,
+        plan: Callable[[int], memoryview[float]] = _no_plan,
     ) -> None:
         joints = config.joints
         self.period_s = config.cycle.period_us * 1e-6
@@ -55,7 +62,7 @@ class Arm:
         self.limits = Limits(config)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.output_limiter = OutputLimiter(self.limits, self.period_s)
-        self.motions = Motions(config, self.limits, self.trajectory_guard, self.period_s)
+        self.motions = Motions(ControllerSetup(config, self.limits, self.trajectory_guard, self.period_s, plan))
         self._torque_law = CstWriter(joints, self.period_s)
         self._laws: dict[DriveMode, DriveWriter] = {
             DriveMode.CSP: CspWriter(),
@@ -127,9 +134,9 @@ class Arm:
     def command(self) -> GuardResult:
         """Write the targets of this cycle: the active mode, its guards, the law, the last clamp."""
         state, drives, mode = self.state, self.drives, self.motions.active
-        target = mode.update(state, self.period_s)
+        target = mode.update(state)
         verdict = self.trajectory_guard.apply(state, target, mode.tolerates_saturation)
-        if mode is self.motions.torque and self.motions.torque.direct:
+        if target.direct:
             self._torque_law.pass_on(state.commanded, target.torque, drives)
         else:
             self._law.update(state.commanded, state.commanded_velocity, drives)

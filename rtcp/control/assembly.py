@@ -96,7 +96,7 @@ def assemble(
     Raises:
         DeviceError: a device's description cannot serve.
     """
-    arm = Arm(config, drives_of(config), gripper_of(config))
+    arm = Arm(config, drives_of(config), gripper_of(config), blackboard.plan)
     slotted = box_of(config)
     box = None if slotted is None else slotted[1]
     operator = Operator(config, box)

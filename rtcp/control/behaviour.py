@@ -19,11 +19,11 @@ from rtcp.control.resetting import Resetting
 from rtcp.control.tracking import Tracking
 from rtcp.devices.cia402 import TargetState
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Reason
 from rtcp.ipc.machine import TABLE, WITH_TORQUE, Code, Event, State
+from rtcp.ipc.states import DriveMode
 from rtcp.ipc.stops import Rung
-from rtcp.motion.drive_writers import DriveMode
 from rtcp.motion.guards.supervision import Supervision
-from rtcp.motion.state import Reason
 from rtcp.realtime.discipline import Discipline
 
 _MODE_S = 1.0

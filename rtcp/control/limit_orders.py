@@ -52,6 +52,5 @@ class LimitOrders:
                     return Refusal.LIMITS_WEAK, axis, abs(held), most
         limits.apply(new)
         arm.output_limiter.take(limits)
-        arm.motions.generator.set_limits(limits.velocity, limits.acceleration, limits.jerk)
         self._blackboard.event(Code.LIMITS)
         return DONE

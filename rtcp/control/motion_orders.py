@@ -1,48 +1,64 @@
-"""Commands that set the arm in motion: checked, then handed to their mode."""
+"""Commands that set the arm in motion, handed to their controllers."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from math import isfinite
+from dataclasses import astuple, fields
+from functools import partial
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.behaviour import Behaviour
 from rtcp.control.operator import Operator
 from rtcp.control.verdict import DONE, Verdict
+from rtcp.ipc import commands, refusals, states
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Command, JogFrame, MotionMode, Refusal
-from rtcp.ipc.layout import PLAN_ROWS, PLANS
 from rtcp.ipc.machine import State
-from rtcp.motion.controllers.joint_move import LONGEST_S
-from rtcp.motion.controllers.line import LineController
-from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.drive_writers import DriveMode
-from rtcp.motion.planning.rows import Wrong
-from rtcp.motion.state import Controller, Phase
+from rtcp.ipc.states import DriveMode
 
-MOST_PIECES = 256
-"""Straight pieces of a plan: all are looked at in the cycle in which it begins."""
 AUTOMATIC = (MotionMode.JOINT, MotionMode.CARTESIAN)
 """Modes that take moves, trajectories, lines, streams and jogs alike."""
-LONGEST_HOLD_S = 1.0
-"""A speed, a torque or a jog counts for so long at most; then it has to be said again."""
 
-
-_PLAN_REFUSALS = {
-    Wrong.DAMAGED: Refusal.BAD_PLAN,
-    Wrong.START: Refusal.PLAN_START,
-    Wrong.START_SPEED: Refusal.PLAN_SPEED,
-    Wrong.UNREACHABLE: Refusal.PLAN_LEAD,
-    Wrong.MOVING: Refusal.PLAN_MOVING,
+_REFUSALS: dict[type[refusals.Refusal], Refusal] = {
+    refusals.NotFinite: Refusal.NOT_A_NUMBER,
+    refusals.StampNotFinite: Refusal.NOT_A_NUMBER,
+    refusals.PositionOutOfRange: Refusal.POSITION_LIMIT,
+    refusals.SpeedOutOfRange: Refusal.SPEED,
+    refusals.TargetInBox: Refusal.ZONE,
+    refusals.NoTrajectory: Refusal.NO_PLAN,
+    refusals.WrongRowCount: Refusal.BAD_PLAN,
+    refusals.DamagedRow: Refusal.BAD_PLAN,
+    refusals.PlanStartsElsewhere: Refusal.PLAN_START,
+    refusals.PathStartsElsewhere: Refusal.PLAN_START,
+    refusals.PlanStartsMoving: Refusal.PLAN_SPEED,
+    refusals.ApproachImpossible: Refusal.PLAN_LEAD,
+    refusals.PathNeedsRest: Refusal.PLAN_MOVING,
+    refusals.StreamPointDropped: Refusal.STREAM_DROPPED,
+    refusals.JogSpeedOutOfRange: Refusal.JOG_SPEED,
+    refusals.JointSpeedOutOfRange: Refusal.JOINT_SPEED,
+    refusals.TorqueOutOfRange: Refusal.TORQUE_LIMIT,
+    refusals.FractionOutOfRange: Refusal.IMPEDANCE,
+    refusals.HoldTimeOutOfRange: Refusal.HOLD_TIME,
+    refusals.NoGeometry: Refusal.NO_GEOMETRY,
 }
+
+
+def _in_numbers(refusal: refusals.Refusal) -> Verdict:
+    """Return the code of a refusal, where it is, the value and the limit."""
+    values = astuple(refusal)
+    names = [field.name for field in fields(refusal)]
+    if not names or names[0] not in ("axis", "row", "box", "direction"):
+        values = (-1, *values)
+    at, value, limit = [*values, 0.0, 0.0][:3]
+    return _REFUSALS[type(refusal)], at, value, limit
 
 
 class MotionOrders:
     """What `Orders` hands on.
 
     Args:
-        config: Cartesian speeds.
+        config: the arm.
         arm: the joints.
         operator: knows whether motion is permitted.
         behaviour: the machine's state.
@@ -56,17 +72,24 @@ class MotionOrders:
         self._operator = operator
         self._behaviour = behaviour
         self._blackboard = blackboard
-        self._numbers = [0.0] * len(arm.drives)
-        cartesian = config.cartesian
-        self._jog_bounds = (cartesian.speed,) * 3 + (cartesian.angular_speed,) * 3
+        self._joints = len(arm.drives)
+        n = self._joints
         self.answers: dict[Command, Callable[[int, Sequence[float]], Verdict]] = {
-            Command.MOVE: self._move,
-            Command.TRAJECTORY: self._trajectory,
-            Command.LINE: self._line,
-            Command.STREAM: self._stream,
+            Command.MOVE: partial(
+                self._begin, AUTOMATIC, lambda x: commands.MoveJoints(tuple(x[:n]), x[-1], x[-2] != 1.0)
+            ),
+            Command.TRAJECTORY: partial(self._begin, AUTOMATIC, lambda x: commands.RunTrajectory(*_whole(x))),
+            Command.LINE: partial(self._begin, AUTOMATIC, lambda x: commands.RunLines(*_whole(x))),
+            Command.STREAM: partial(self._begin, AUTOMATIC, lambda x: commands.StreamPosition(tuple(x[:n]), x[-1])),
             Command.JOG: self._jog,
-            Command.VELOCITY: self._velocity,
-            Command.TORQUE: self._torque,
+            Command.VELOCITY: partial(
+                self._begin, (MotionMode.VELOCITY,), lambda x: commands.MoveAtVelocity(tuple(x[:n]), x[-1])
+            ),
+            Command.TORQUE: partial(
+                self._begin,
+                (MotionMode.TORQUE,),
+                lambda x: commands.ApplyTorque(tuple(x[:n]), x[-3], x[-2], x[-1]),
+            ),
             Command.HOME: self._home,
         }
 
@@ -79,148 +102,35 @@ class MotionOrders:
             return (Refusal.NOT_PERMITTED,)
         return None
 
-    def _begin(self, lease: int, mode: Controller) -> Verdict:
-        behaviour = self._behaviour
-        going_on = behaviour.state is State.MOVING and self._arm.motions.active is mode and behaviour.lease == lease
-        self._arm.motions.active = mode
-        if not going_on:
+    def _begin(
+        self,
+        allowed: tuple[MotionMode, ...],
+        typed: Callable[[Sequence[float]], commands.Command],
+        lease: int,
+        numbers: Sequence[float],
+    ) -> Verdict:
+        if hindrance := self._hindered(*allowed):
+            return hindrance
+        command, arm, behaviour = typed(numbers), self._arm, self._behaviour
+        controller = arm.motions.controllers.get(type(command))
+        if controller is None:
+            return (Refusal.NO_GEOMETRY,)
+        continues = behaviour.state is State.MOVING and arm.motions.active is controller and behaviour.lease == lease
+        refusal = controller.accept(command, arm.state, continues)
+        if refusal is not None:
+            return _in_numbers(refusal)
+        if isinstance(command, (commands.RunTrajectory, commands.RunLines)):
+            self._blackboard.use_plan(command.slot)
+        arm.motions.active = controller
+        if not continues:
             behaviour.begin_motion(lease)
         return DONE
 
-    def _in_range(self, numbers: Sequence[float], low: Sequence[float], high: Sequence[float]) -> Verdict | None:
-        """Copy the joints' numbers and return what is wrong with them, or None."""
-        target = self._numbers
-        for axis in range(len(target)):
-            wanted = numbers[axis]
-            if not isfinite(wanted):
-                return Refusal.NOT_A_NUMBER, axis, wanted
-            if not low[axis] <= wanted <= high[axis]:
-                return Refusal.POSITION_LIMIT, axis, wanted, high[axis] if wanted > high[axis] else low[axis]
-            target[axis] = wanted
-        return None
-
-    def _move(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(*AUTOMATIC):
-            return hindrance
-        arm, speed, each = self._arm, numbers[-1], numbers[-2] == 1.0
-        limits = arm.limits
-        fastest = max(limits.velocity)
-        if not isfinite(speed) or not 0.0 < speed <= fastest:
-            return Refusal.SPEED, -1, speed, fastest
-        if wrong := self._in_range(numbers, limits.low, limits.high):
-            return wrong
-        box = arm.trajectory_guard.zone_at(self._numbers)
-        if box is not None:
-            return Refusal.ZONE, box, 0.0
-        generator = arm.motions.generator
-        if not generator.move_to(arm.state, self._numbers, speed, each=each):
-            return Refusal.NO_PLAN, -1, speed, LONGEST_S
-        return self._begin(lease, generator)
-
-    def _rows(self, numbers: Sequence[float], most: int) -> tuple[int, int] | None:
-        slot, count = numbers[0], numbers[1]
-        if slot not in range(PLANS) or count not in range(1, most + 1):
-            return None
-        return int(slot), int(count)
-
-    def _carry_out(
-        self, lease: int, numbers: Sequence[float], mode: TrajectoryController | LineController, most: int
-    ) -> Verdict:
-        if hindrance := self._hindered(*AUTOMATIC):
-            return hindrance
-        rows = self._rows(numbers, most)
-        if rows is None:
-            return Refusal.BAD_PLAN, -1, numbers[1], float(most)
-        slot, count = rows
-        refused = mode.start(self._arm.state, self._blackboard.plan(slot), count)
-        if refused is not None:
-            return _PLAN_REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
-        self._blackboard.use_plan(slot)
-        return self._begin(lease, mode)
-
-    def _trajectory(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        return self._carry_out(lease, numbers, self._arm.motions.trajectory, PLAN_ROWS)
-
-    def _line(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        line = self._arm.motions.line
-        return (Refusal.NO_GEOMETRY,) if line is None else self._carry_out(lease, numbers, line, MOST_PIECES)
-
-    def _goes_on(self, mode: Controller) -> bool:
-        return self._arm.motions.active is mode and mode.phase is Phase.MOVE and self._behaviour.state is State.MOVING
-
-    def _stream(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(*AUTOMATIC):
-            return hindrance
-        limits, arm, stream = self._arm.limits, self._arm, self._arm.motions.stream
-        if wrong := self._in_range(numbers, limits.low, limits.high):
-            return wrong
-        if not isfinite(numbers[-1]):
-            return Refusal.NOT_A_NUMBER, -1, numbers[-1]
-        if not self._goes_on(stream):
-            stream.start(arm.state)
-        if not stream.feed(self._numbers, numbers[-1], self._behaviour.now_ns):
-            return Refusal.STREAM_DROPPED, -1, stream.late_s
-        return self._begin(lease, stream)
-
     def _jog(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(*AUTOMATIC):
-            return hindrance
-        frame = numbers[-2]
-        if frame not in tuple(JogFrame):
-            return Refusal.JOG_FRAME, -1, frame
-        if frame == JogFrame.JOINTS:
-            return self._speeds(lease, numbers)
-        jog, arm = self._arm.motions.jog, self._arm
-        if jog is None:
-            return (Refusal.NO_GEOMETRY,)
-        if wrong := self._within(numbers, self._jog_bounds, Refusal.JOG_SPEED):
-            return wrong
-        if not self._goes_on(jog):
-            jog.start(arm.state)
-        until_ns = self._behaviour.now_ns + round(numbers[-1] * 1e9)
-        jog.command(self._numbers, "tool" if frame == JogFrame.TOOL else "base", until_ns)
-        return self._begin(lease, jog)
-
-    def _velocity(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        return self._hindered(MotionMode.VELOCITY) or self._speeds(lease, numbers)
-
-    def _speeds(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if wrong := self._within(numbers, self._arm.limits.velocity, Refusal.JOINT_SPEED):
-            return wrong
-        velocity = self._arm.motions.velocity
-        if not self._goes_on(velocity):
-            velocity.start(self._arm.state)
-        velocity.command(self._numbers, numbers[-1], self._behaviour.now_ns)
-        return self._begin(lease, velocity)
-
-    def _within(self, numbers: Sequence[float], bounds: Sequence[float], refusal: Refusal) -> Verdict | None:
-        """Copy the joints' numbers and return what is wrong with them, or with how long they are to count, or None."""
-        hold_s = numbers[-1]
-        if not 0.0 < hold_s <= LONGEST_HOLD_S:
-            return Refusal.HOLD_TIME, -1, hold_s, LONGEST_HOLD_S
-        for axis in range(len(self._numbers)):
-            wanted, bound = numbers[axis], bounds[axis]
-            if not isfinite(wanted):
-                return Refusal.NOT_A_NUMBER, axis, wanted
-            if not -bound <= wanted <= bound:
-                return refusal, axis, wanted, bound
-            self._numbers[axis] = wanted
-        return None
-
-    def _torque(self, lease: int, numbers: Sequence[float]) -> Verdict:
-        if hindrance := self._hindered(MotionMode.TORQUE):
-            return hindrance
-        if wrong := self._within(numbers, self._arm.limits.torque, Refusal.TORQUE_LIMIT):
-            return wrong
-        stiffness, damping = numbers[-3], numbers[-2]
-        for share in (stiffness, damping):
-            if not 0.0 <= share <= 1.0:
-                return Refusal.IMPEDANCE, -1, share
-        torque = self._arm.motions.torque
-        if not self._goes_on(torque):
-            torque.start(self._arm.state)
-        torque.command(self._numbers, numbers[-1], self._behaviour.now_ns, stiffness, damping)
-        return self._begin(lease, torque)
+        if numbers[-2] not in tuple(JogFrame):
+            return self._hindered(*AUTOMATIC) or (Refusal.JOG_FRAME, -1, numbers[-2])
+        frame = states.JogFrame(int(numbers[-2]))
+        return self._begin(AUTOMATIC, lambda x: commands.Jog(tuple(x[: self._joints]), frame, x[-1]), lease, numbers)
 
     def _home(self, lease: int, numbers: Sequence[float]) -> Verdict:
         arm, axis = self._arm, numbers[0]
@@ -232,3 +142,9 @@ class MotionOrders:
             return Refusal.HOME_MODE, -1, float(arm.mode)
         self._behaviour.home(int(axis), lease)
         return DONE
+
+
+def _whole(numbers: Sequence[float]) -> tuple[int, int]:
+    """Return slot and rows; -1 for what is no whole number."""
+    slot, rows = (int(x) if x == x // 1 else -1 for x in numbers[:2])
+    return slot, rows

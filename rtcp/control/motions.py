@@ -1,44 +1,25 @@
-"""The modes of motion and which of them is active."""
+"""The motion controllers of an arm and which of them is active."""
 
 from __future__ import annotations
 
-from rtcp.config.model import ArmConfig
 from rtcp.ipc.codes import MotionMode
-from rtcp.motion.controllers.jog import JogController
-from rtcp.motion.controllers.joint_move import JointMoveController
-from rtcp.motion.controllers.line import LineController
-from rtcp.motion.controllers.stream import StreamController
-from rtcp.motion.controllers.torque import TorqueController
-from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.controllers.velocity import VelocityController
-from rtcp.motion.drive_writers import DriveMode
-from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.limits import Limits
-from rtcp.motion.state import ArmState, Controller, Phase
+from rtcp.ipc.commands import Jog, MoveJoints
+from rtcp.ipc.states import DriveMode
+from rtcp.motion.controllers import Controller, ControllerSetup, JogController, load_controllers
+from rtcp.motion.state import ArmState, Phase
 
 DRIVE_MODES = {"csp": DriveMode.CSP, "csv": DriveMode.CSV, "cst": DriveMode.CST}
 
 
 class Motions:
-    """All modes of an arm.
+    """All controllers of an arm; see `load_controllers`."""
 
-    Args:
-        config: the arm.
-        limits: its limits as they are now.
-        trajectory_guard: what the modes ask whether they would be cut.
-        period_s: the cycle, s.
-    """
-
-    def __init__(self, config: ArmConfig, limits: Limits, trajectory_guard: TrajectoryGuard, period_s: float) -> None:
-        self.generator = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self.trajectory = TrajectoryController(limits, period_s)
-        self.stream = StreamController(limits, period_s)
-        self.velocity = VelocityController(limits, period_s)
-        self.torque = TorqueController(config.joints, limits, period_s, config.arm)
-        self.line = (
-            None if config.arm is None else LineController(config.arm, limits, period_s, config.cartesian.singularity)
-        )
-        self.jog = None if config.arm is None else JogController(config, config.arm, limits, trajectory_guard, period_s)
+    def __init__(self, setup: ControllerSetup) -> None:
+        config = setup.config
+        self.controllers = load_controllers(setup)
+        self.generator = self.controllers[MoveJoints]
+        jog = self.controllers.get(Jog)
+        self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
         self.active: Controller = self.generator
         self.mode = MotionMode[config.control_mode.upper()]
         """What the arm takes commands for."""

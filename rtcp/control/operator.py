@@ -130,10 +130,11 @@ class Operator:
                 self.grip(not joystick.grip)
             if taken:
                 blackboard.event(Code.GRIPPER, -1, float(joystick.grip))
-        jog.command(joystick.twist, joystick.frame)
+        in_tool_frame = joystick.frame == "tool"
+        jog.command(joystick.twist, in_tool_frame=in_tool_frame)
         if jog.phase is Phase.HOLD and joystick.moves:
-            jog.start(arm.state)
-            jog.command(joystick.twist, joystick.frame)
+            jog.start()
+            jog.command(joystick.twist, in_tool_frame=in_tool_frame)
             motions.active = jog
             return True
         return False

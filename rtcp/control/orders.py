@@ -19,7 +19,7 @@ from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import MotionMode
 from rtcp.ipc.machine import ALLOWED, WITHOUT_LEASE, Code, Command, Event, Refusal, State
-from rtcp.motion.drive_writers import DriveMode
+from rtcp.ipc.states import DriveMode
 
 _WAITS_FOR_MODE = frozenset(
     {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
 from typing import TYPE_CHECKING
 
 from rtcp.control.arm import Arm
@@ -9,16 +10,14 @@ from rtcp.control.failing import Failing
 from rtcp.control.homing_arm import HomingArm
 from rtcp.control.operator import Operator
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Reason
+from rtcp.ipc.events import ControllerFailed, MotionEnded, NotLeavingBox, OutOfReach
 from rtcp.ipc.machine import Code, Event, State
 from rtcp.ipc.stops import Rung
 from rtcp.motion.guards.trajectory_guard import GuardResult
-from rtcp.motion.state import Reason
 
 if TYPE_CHECKING:
     from rtcp.control.behaviour import Behaviour
-
-_ENDS_BY_ITSELF = frozenset({Reason.STREAM_ENDED, Reason.COMMAND_ENDED})
-"""Reasons that are no limit: the arm has stopped and takes commands."""
 
 
 class Tracking:
@@ -80,7 +79,7 @@ class Tracking:
             return False
         # Every drive is enabled: its controlword stays what it was, there is nothing to lead.
         verdict = arm.command()
-        if verdict is GuardResult.PASS and arm.motions.active.reason is Reason.NONE:
+        if verdict is GuardResult.PASS and arm.motions.active.ended is None:
             return True
         return self._cut(verdict)
 
@@ -137,32 +136,27 @@ class Tracking:
     def _cut(self, verdict: GuardResult) -> bool:
         """Deal with a guard that cut the target, or a mode that ends by itself; return False when the state changed."""
         arm, mode, state = self._arm, self._arm.motions.active, self._behaviour.state
-        reason = mode.reason
-        if reason is Reason.GENERATOR:
+        ended = mode.ended
+        if isinstance(ended, ControllerFailed):
             self._failing.fail(Code.GENERATOR)
             return False
         if verdict is GuardResult.STOPPING or verdict is GuardResult.STOPPED:
-            guards = arm.trajectory_guard
+            cause = arm.trajectory_guard.ended
             limited = not mode.tolerates_saturation
-            if state in (State.MOVING, State.HOLDING) or (limited and not self.limited):
-                self._end(guards.code, guards.axis, guards.value, guards.limit, limited)
+            if cause is not None and (state in (State.MOVING, State.HOLDING) or (limited and not self.limited)):
+                self._end(cause, limited)
             if verdict is GuardResult.STOPPED:
                 arm.motions.rest()
             return False
-        if reason is not Reason.NONE and state is State.MOVING:
-            self._end(
-                reason,
-                mode.axis,
-                mode.value,
-                mode.limit,
-                not mode.tolerates_saturation and reason not in _ENDS_BY_ITSELF,
-            )
+        if ended is not None and state is State.MOVING:
+            self._end(ended, ended.by_limit and not mode.tolerates_saturation)
             return False
         return True
 
-    def _end(self, reason: Reason, axis: int, value: float, limit: float, limited: bool) -> None:
+    def _end(self, ended: MotionEnded, limited: bool) -> None:
         behaviour = self._behaviour
         self._operator.wait_for_neutral()
+        reason, axis, value, limit = _in_numbers(ended)
         self._blackboard.event(Code.ENDED + reason, axis, value, limit)
         self.limited = limited
         if limited:
@@ -171,3 +165,14 @@ class Tracking:
                 self._arm.gripper.stop()
         if behaviour.state in (State.MOVING, State.HOLDING, State.STOPPING):
             behaviour.on(Event.GUARD)
+
+
+def _in_numbers(ended: MotionEnded) -> tuple[Reason, int, float, float]:
+    """Return reason, axis, value and limit of the record."""
+    if isinstance(ended, NotLeavingBox):
+        return Reason.KEEP_OUT, ended.box, -ended.depth, 0.0
+    fields = astuple(ended)
+    if isinstance(ended, OutOfReach):
+        fields = (-1, *fields)
+    axis, value, limit = [*fields, 0.0, 0.0][:3] if fields else [-1, 0.0, 0.0]
+    return Reason(ended.number - Code.ENDED), int(axis), value, limit

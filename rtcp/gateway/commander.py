@@ -16,8 +16,8 @@ from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway.carrier import MOVING, POLL_S, Carrier, CommandFailed
 from rtcp.ipc.codes import Code, MotionMode
 from rtcp.ipc.machine import Command, State
+from rtcp.ipc.states import DriveMode
 from rtcp.ipc.stops import longest_s
-from rtcp.motion.drive_writers import DriveMode
 
 DRIVE_MODES: dict[str, int] = {mode.name.lower(): mode for mode in (DriveMode.CSP, DriveMode.CSV, DriveMode.CST)}
 MOTION_MODES: dict[str, int] = {mode.name.lower(): mode for mode in MotionMode}

@@ -17,7 +17,7 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Plan, PlanRefused
-from rtcp.motion.planning.waypoints import plan_trajectory
+from rtcp.motion.planning.trajectories import plan_trajectory
 
 POSE_NUMBERS = 6
 _MOST_M, _MOST_RAD = 100.0, 100.0

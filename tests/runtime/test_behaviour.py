@@ -12,12 +12,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.events import ControllerFailed
 from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.messages import FAULTS
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.stops import Rung, bounds
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
-from rtcp.motion.state import ArmState, Reason, Setpoint
+from rtcp.motion.state import ArmState, Setpoint
 
 from .bench import (
     _WIRE,
@@ -183,8 +184,8 @@ def joint_says_where_it_is(bench: Bench) -> None:
 def generator_refuses(bench: Bench) -> None:
     generator = bench.set_in_motion().arm.motions.generator
 
-    def refuse(state: ArmState, dt: float) -> Setpoint:
-        generator.reason = Reason.GENERATOR
+    def refuse(state: ArmState) -> Setpoint:
+        generator.ended = ControllerFailed()
         target = Setpoint(2)
         target.position = list(state.commanded)
         return target
@@ -720,7 +721,7 @@ def test_a_move_arrives_where_it_was_told_to(bench: Bench) -> None:
 def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(bench: Bench) -> None:
     bench.hold()
 
-    def jump(state: ArmState, dt: float) -> Setpoint:
+    def jump(state: ArmState) -> Setpoint:
         target = Setpoint(2)
         target.position = [1.0, -2.5]
         return target

@@ -12,11 +12,10 @@ import pytest
 from kinematics.forward import forward
 from rtcp.config import default_config, load
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.codes import Code, JogFrame, MotionMode, Refusal
+from rtcp.ipc.codes import Code, JogFrame, MotionMode, Reason, Refusal
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.runtime_directory import control_socket
-from rtcp.motion.state import Reason
 from tests.runtime.played_loop import JOINTS, Loop
 
 BENT = [0.0, 0.3, 1.57, 0.0, 0.8, 0.0]

@@ -267,8 +267,7 @@ def test_for_a_lost_clock_the_arm_comes_to_rest_under_its_limits_before_it_is_a_
 ) -> None:
     bench = made(clock_lost="controlled_stop")
     # So slow that it is still on its way to rest a second later.
-    bench.arm.limits.acceleration[:] = [0.2, 0.2]
-    bench.arm.motions.generator.set_limits(bench.arm.limits.velocity, [0.2, 0.2], [2.0, 2.0])
+    bench.arm.limits.acceleration[:], bench.arm.limits.jerk[:] = [0.2, 0.2], [2.0, 2.0]
     bench.hold()
     bench.move(1.8, 1.8)
     bench.run(2.0)

@@ -7,12 +7,19 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
-from rtcp.motion.controllers.approach import Approach
-from rtcp.motion.controllers.trajectory import AT_START_RAD
-from rtcp.motion.planning.plan import Plan, PlanRefused, Point, ZoneAt
-from rtcp.motion.planning.polynomials import Coefficients, beyond, cubic, derivative, quintic, value
-from rtcp.motion.planning.rows import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC
-from rtcp.motion.planning.spline import spline_accelerations, spline_velocities
+from rtcp.config.model import Point
+from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
+from rtcp.motion.planning.interpolation import (
+    Coefficients,
+    beyond,
+    cubic,
+    derivative,
+    quintic,
+    spline_accelerations,
+    spline_velocities,
+    value,
+)
+from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -165,10 +172,10 @@ def _check_approach(
     approach, rest = Approach(limits), [0.0] * len(q_now)
     _check_derivatives(first, "point 1", limits, names)
     refused = approach.plan(q_now, rest, rest, _row(first))
-    if refused is not None and refused.at >= 0:
+    if refused is not None and refused.axis >= 0:
         raise PlanRefused(
-            f"point 1: on the way there {names[refused.at]} would be at {refused.value:.6g} rad, allowed is "
-            f"{limits.low[refused.at]:g} to {limits.high[refused.at]:g} rad"
+            f"point 1: on the way there {names[refused.axis]} would be at {refused.extreme:.6g} rad, allowed is "
+            f"{limits.low[refused.axis]:g} to {limits.high[refused.axis]:g} rad"
         )
     if refused is not None:
         raise PlanRefused(f"point 1: no way from where the arm is to this point at {first.t:g} s was found")
