@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
-from rtcp.config.motion_points import Point
+from rtcp.config.model import Point
 from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
 from rtcp.motion.planning.interpolation import (
     Coefficients,

@@ -13,20 +13,24 @@ import pytest
 
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
+from rtcp.config.model import SingularityLimits, Stop
+from rtcp.ipc.events import JointLimitReached, OutOfReach, PlanDamaged, SetpointJump, SingularityReached
+from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere
 from rtcp.motion.controllers.line import LineController
+from rtcp.motion.planning.interpolation import quaternion, turn_between
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import Stop
-from rtcp.motion.planning.rows import COLUMNS, KIND, Wrong
-from rtcp.motion.planning.slerp import quaternion, turn_between
-from rtcp.motion.state import Phase, Reason
+from rtcp.motion.planning.plan import COLUMNS, KIND
+from rtcp.motion.state import Phase
 
 PERIOD = 0.0005
+ANYWHERE = SingularityLimits(shoulder=0.0, elbow=0.0, wrist=0.0)
 Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
 
 
 @pytest.fixture
-def mode(arm: Any, bounds: Any) -> LineController:
-    return LineController(arm.arm, bounds, PERIOD)
+def mode(arm: Any, drive: Any) -> LineController:
+    made: LineController = drive.controller(LineController, cartesian=replace(arm.cartesian, singularity=ANYWHERE))
+    return made
 
 
 @pytest.fixture
@@ -41,9 +45,9 @@ def moved(arm: Any) -> Callable[..., Stop]:
 
 
 @pytest.fixture
-def rows(arm: Any, bounds: Any, memory: Callable[..., Any]) -> Callable[..., tuple[Any, int]]:
+def rows(arm: Any, drive: Any, memory: Callable[..., Any]) -> Callable[..., tuple[Any, int]]:
     def planned(stops: list[Stop], q: Sequence[float] = Q, speed: float | None = None) -> tuple[Any, int]:
-        plan = plan_lines(arm.arm, bounds, arm.cartesian, q, stops, speed=speed)
+        plan = plan_lines(arm.arm, drive.limits, arm.cartesian, q, stops, speed=speed)
         return memory(plan.rows), len(plan.rows)
 
     return planned
@@ -61,7 +65,7 @@ def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
 ) -> None:
     stops = [moved(dy=0.2), moved(dy=0.2, dz=0.1), moved()]
     drive.at(Q)
-    assert mode.start(drive.state, *rows(stops)) is None
+    assert drive.execute(mode, *rows(stops)) is None
     rests, corner = [], 0
     while mode.phase is not Phase.HOLD:
         drive.cycle(mode)
@@ -76,7 +80,7 @@ def test_the_tool_stays_on_the_line_and_rests_at_each_pose(
         point = forward(arm.arm, q).position
         worst = max(worst, min(off_line(a, b, point) for a, b in pairwise(corners)))
     assert worst < 1e-9
-    assert mode.reason is Reason.NONE
+    assert mode.ended is None
     assert mode.elapsed_s == pytest.approx(mode.duration_s, abs=0.01)
 
 
@@ -84,7 +88,7 @@ def test_the_tool_keeps_to_speed_and_acceleration(
     arm: Any, drive: Any, mode: LineController, rows: Any, moved: Any
 ) -> None:
     drive.at(Q)
-    mode.start(drive.state, *rows([moved(dz=-0.2)], speed=0.05))
+    drive.execute(mode, *rows([moved(dz=-0.2)], speed=0.05))
     drive.until_rest(mode)
     points = [forward(arm.arm, q).position for q in drive.path[::2]]
     speeds = [math.dist(a, b) / (2 * PERIOD) for a, b in pairwise(points)]
@@ -100,7 +104,7 @@ def test_a_turn_is_about_one_axis_and_ends_where_it_should(
     drive.at(Q)
     start, end = forward(arm.arm, Q), Pose.from_xyzrpy(*goal.pose)
     axis, angle = turn_between(quaternion(start.rotation), quaternion(end.rotation))
-    mode.start(drive.state, *rows([goal]))
+    drive.execute(mode, *rows([goal]))
     drive.until_rest(mode)
     done = 0.0
     for q in drive.path[::50]:
@@ -120,13 +124,13 @@ def test_a_stop_brakes_along_the_line(
 ) -> None:
     goal = moved(dy=0.2, drz=0.2)
     drive.at(Q)
-    mode.start(drive.state, *rows([goal]))
+    drive.execute(mode, *rows([goal]))
     drive.run(mode, round(after_s / PERIOD))
     mode.stop(drive.state)
     drive.until_rest(mode, 1.0)
     start = forward(arm.arm, Q).position
     assert max(off_line(start, goal.pose[:3], forward(arm.arm, q).position) for q in drive.path[1:]) < 1e-9
-    assert mode.reason is Reason.NONE
+    assert mode.ended is None
     assert math.dist(forward(arm.arm, drive.state.commanded).position, goal.pose[:3]) > 1e-3
 
 
@@ -135,7 +139,7 @@ def test_a_small_rest_at_the_start_fades_out_without_a_jump(
 ) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-4 for q in Q])
-    assert mode.start(drive.state, *plan) is None
+    assert drive.execute(mode, *plan) is None
     drive.until_rest(mode)
     assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.2).pose[:3]) < 1e-9
 
@@ -143,10 +147,8 @@ def test_a_small_rest_at_the_start_fades_out_without_a_jump(
 def test_a_line_that_begins_elsewhere_is_refused(drive: Any, mode: LineController, rows: Any, moved: Any) -> None:
     plan = rows([moved(dy=0.2)])
     drive.at([q + 3e-3 for q in Q])
-    refused = mode.start(drive.state, *plan)
-    assert refused is not None
-    assert refused.wrong is Wrong.START
-    assert refused.value > refused.limit
+    refused = drive.execute(mode, *plan)
+    assert isinstance(refused, PathStartsElsewhere)
     assert mode.phase is Phase.HOLD
 
 
@@ -155,30 +157,29 @@ def test_a_line_in_motion_is_refused_and_what_runs_goes_on(
 ) -> None:
     first, second = rows([moved(dy=0.1)]), rows([moved(dz=-0.1)])
     drive.at(Q)
-    mode.start(drive.state, *first)
+    drive.execute(mode, *first)
     drive.run(mode, 1000)
-    refused = mode.start(drive.state, *second)
-    assert refused is not None
-    assert refused.wrong is Wrong.MOVING
-    assert abs(drive.state.commanded_velocity[refused.at]) > 0.01
-    assert refused.value == drive.state.commanded_velocity[refused.at]
+    refused = drive.execute(mode, *second)
+    assert isinstance(refused, PathNeedsRest)
+    assert refused.velocity == drive.state.commanded_velocity[refused.axis]
+    assert abs(refused.velocity) > 0.01
     drive.until_rest(mode)
     assert math.dist(forward(arm.arm, drive.state.commanded).position, moved(dy=0.1).pose[:3]) < 1e-9
     # At rest it is looked at for what it is: this one begins elsewhere.
-    refused = mode.start(drive.state, *second)
-    assert refused is not None
-    assert refused.wrong is Wrong.START
+    refused = drive.execute(mode, *second)
+    assert isinstance(refused, PathStartsElsewhere)
 
 
-def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, bounds: Any, memory: Any) -> None:
+def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, memory: Any) -> None:
     for seed in range(4):
-        chance, drive, mode = random.Random(seed), new_drive().at(Q), LineController(arm.arm, bounds, PERIOD)
+        chance, drive = random.Random(seed), new_drive().at(Q)
+        mode = drive.controller(LineController)
         for _ in range(3):
             q = drive.state.commanded
             at = forward(arm.arm, q)
             goal = (*(c + chance.uniform(-0.08, 0.08) for c in at.position), *at.rpy)
-            plan = plan_lines(arm.arm, bounds, arm.cartesian, q, [Stop(goal)])
-            assert mode.start(drive.state, memory(plan.rows), 1) is None
+            plan = plan_lines(arm.arm, drive.limits, arm.cartesian, q, [Stop(goal)])
+            assert drive.execute(mode, memory(plan.rows), 1) is None
             drive.run(mode, chance.randint(1, 800))
             mode.stop(drive.state)
             drive.until_rest(mode)
@@ -191,10 +192,10 @@ def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(
     # So far and so fast that the first set-point is out of reach already.
     plan[8], plan[14], plan[15], plan[16] = 200.0, 1e6, 1e8, 1e9
     drive.at(Q)
-    assert mode.start(drive.state, plan, count) is None
+    assert drive.execute(mode, plan, count) is None
     drive.until_rest(mode)
-    assert mode.reason is Reason.NO_SOLUTION
-    assert mode.value > 1.0
+    assert isinstance(mode.ended, OutOfReach)
+    assert mode.ended.distance > 1.0
     assert drive.state.commanded == list(Q)
 
 
@@ -205,43 +206,44 @@ def test_a_line_that_stretches_the_arm_stops_before_a_joint_is_too_fast(
     # Towards the edge of the reach the elbow's speed grows without bound. The drive checks every cycle.
     plan[8], plan[14], plan[15], plan[16] = 1.5, 0.1, 0.2, 2.0
     drive.at(Q)
-    assert mode.start(drive.state, plan, count) is None
+    assert drive.execute(mode, plan, count) is None
     drive.until_rest(mode)
-    assert mode.reason is Reason.JUMP
-    assert abs(mode.value) > mode.limit
+    assert isinstance(mode.ended, SetpointJump)
+    assert abs(mode.ended.value) > mode.ended.limit
 
 
 def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it(
-    arm: Any, drive: Any, bounds: Any, rows: Any, moved: Any
+    arm: Any, drive: Any, rows: Any, moved: Any
 ) -> None:
     plan, count = rows([moved(dy=0.2)])
     plan[8], plan[14], plan[15], plan[16] = 1.5, 0.03, 0.1, 1.0
     # Far enough from the stretched elbow that no joint is too fast there.
     near = replace(arm.cartesian.singularity, elbow=0.6)
-    mode = LineController(arm.arm, bounds, PERIOD, near)
+    mode = drive.controller(LineController, cartesian=replace(arm.cartesian, singularity=near))
     drive.at(Q)
-    assert mode.start(drive.state, plan, count) is None
+    assert drive.execute(mode, plan, count) is None
     drive.until_rest(mode)
-    assert (mode.reason, mode.axis, mode.limit) == (Reason.SINGULARITY, 1, 0.6)
-    assert 0.93 * 0.6 < mode.value < 0.95 * 0.6
+    ended = mode.ended
+    assert isinstance(ended, SingularityReached)
+    assert (ended.which, ended.limit) == (1, 0.6)
+    assert 0.93 * 0.6 < ended.value < 0.95 * 0.6
     found = singularity_distances(arm.arm, drive.state.commanded).elbow
     assert found is not None
-    assert 0.5 < found < mode.value
+    assert 0.5 < found < ended.value
 
 
-def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(
-    arm: Any, drive: Any, bounds: Any, rows: Any, moved: Any
-) -> None:
+def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(arm: Any, drive: Any, rows: Any, moved: Any) -> None:
     plan, count = rows([moved(dy=0.2)])
     model = replace(
         arm.arm,
         limits=(replace(arm.arm.limits[0], lower=-0.1, upper=0.1), *arm.arm.limits[1:]),
     )
-    mode = LineController(model, bounds, PERIOD)
+    mode = drive.controller(LineController, arm=model)
     drive.at(Q)
-    assert mode.start(drive.state, plan, count) is None
+    assert drive.execute(mode, plan, count) is None
     drive.until_rest(mode)
-    assert (mode.reason, mode.axis) == (Reason.JOINT_LIMIT, 0)
+    assert isinstance(mode.ended, JointLimitReached)
+    assert mode.ended.axis == 0
 
 
 def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
@@ -253,10 +255,10 @@ def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
     # The guard is not there to hold the accelerations.
     drive.checked = False
     drive.at(Q)
-    mode.start(drive.state, plan, count)
+    drive.execute(mode, plan, count)
     drive.until_rest(mode)
-    assert mode.reason is Reason.JUMP
-    assert mode.value > mode.limit
+    assert isinstance(mode.ended, SetpointJump)
+    assert mode.ended.value > mode.ended.limit
 
 
 @pytest.mark.parametrize(
@@ -268,15 +270,16 @@ def test_a_damaged_piece_is_not_started_and_ends_what_runs(
 ) -> None:
     plan, count = rows([moved(dy=0.1), moved()])
     drive.at(Q)
-    mode.start(drive.state, plan, count)
+    drive.execute(mode, plan, count)
     drive.run(mode, 100)
     plan[COLUMNS + column] = value
     drive.until_rest(mode)
-    assert (mode.reason, mode.axis) == (Reason.PLAN, 1)
+    assert isinstance(mode.ended, PlanDamaged)
+    assert mode.ended.row == 1
     plan[column] = value
-    refused = mode.start(drive.state, plan, count)
-    assert refused is not None
-    assert (refused.wrong, refused.at) == (Wrong.DAMAGED, 0)
+    refused = drive.execute(mode, plan, count)
+    assert isinstance(refused, DamagedRow)
+    assert refused.row == 0
 
 
 def test_a_piece_that_begins_elsewhere_than_the_last_ended_is_damaged(
@@ -285,6 +288,7 @@ def test_a_piece_that_begins_elsewhere_than_the_last_ended_is_damaged(
     plan, count = rows([moved(dy=0.1), moved()])
     plan[COLUMNS + 2] += 0.01
     drive.at(Q)
-    mode.start(drive.state, plan, count)
+    drive.execute(mode, plan, count)
     drive.until_rest(mode)
-    assert (mode.reason, mode.axis) == (Reason.PLAN, 1)
+    assert isinstance(mode.ended, PlanDamaged)
+    assert mode.ended.row == 1

@@ -10,9 +10,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.planning.polynomials import beyond, cubic, derivative, extremes, quintic, value
-from rtcp.motion.planning.slerp import quaternion, rotation, turn_between, turned_by
-from rtcp.motion.planning.spline import spline_accelerations, spline_velocities
+from rtcp.motion.planning.interpolation import (
+    beyond,
+    cubic,
+    derivative,
+    extremes,
+    quaternion,
+    quintic,
+    rotation,
+    spline_accelerations,
+    spline_velocities,
+    turn_between,
+    turned_by,
+    value,
+)
 
 NUMBER = st.floats(-10.0, 10.0)
 

@@ -7,8 +7,8 @@ import math
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.controllers.joint_move import JointMoveController
-from rtcp.motion.state import ArmState, Phase, Reason
+from rtcp.motion.joint_motion import JointMotion
+from rtcp.motion.state import ArmState, Phase
 
 PERIOD = 0.0005
 SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6
@@ -18,7 +18,7 @@ class Driven:
     """The generator with the state that the loop keeps for it, where no guard cuts anything."""
 
     def __init__(self) -> None:
-        self.made = JointMoveController(PERIOD, SPEED, ACCELERATION, JERK)
+        self.made = JointMotion(PERIOD, SPEED, ACCELERATION, JERK)
         self.state = ArmState(6)
 
     @property
@@ -33,20 +33,20 @@ class Driven:
     def velocity(self) -> list[float]:
         return self.state.commanded_velocity
 
-    def move_to(self, target: list[float], speed: float, *, each: bool = False) -> bool:
-        return self.made.move_to(self.state, target, speed, each=each)
+    def move_to(self, target: list[float], speed: float, *, synchronized: bool = True) -> bool:
+        return self.made.move_to(self.state, target, speed, synchronized=synchronized)
 
     def stop(self) -> None:
         self.made.stop(self.state)
 
     def update(self) -> bool:
         state = self.state
-        target = self.made.update(state, PERIOD)
+        target = self.made.update(state)
         state.commanded_acceleration = [
             (new - old) / PERIOD for new, old in zip(target.velocity, state.commanded_velocity, strict=True)
         ]
         state.commanded, state.commanded_velocity = list(target.position), list(target.velocity)
-        return self.made.reason is Reason.NONE
+        return not self.made.failed
 
 
 def generator() -> Driven:
@@ -68,7 +68,7 @@ def test_a_move_arrives_exactly_and_all_joints_together() -> None:
 def test_each_joint_at_its_best_arrives_earlier_the_shorter_its_way() -> None:
     made = generator()
     target = [1.0, -0.5, 0.25, 0.0, 0.1, -1.0]
-    assert made.move_to(target, 0.5, each=True)
+    assert made.move_to(target, 0.5, synchronized=False)
     arrived = [0.0] * 6
     time = 0.0
     while made.phase is Phase.MOVE:

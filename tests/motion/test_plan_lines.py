@@ -11,20 +11,19 @@ from typing import Any
 import pytest
 
 from kinematics import forward
+from rtcp.config.model import Stop
 from rtcp.motion.controllers.line import LineController
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import Plan, PlanRefused, Stop
-from rtcp.motion.planning.rows import LINE
-from rtcp.motion.state import Reason
+from rtcp.motion.planning.plan import LINE, Plan, PlanRefused
 
 PERIOD = 0.0005
 Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
 
 
 @pytest.fixture
-def plan(arm: Any, bounds: Any) -> Callable[..., Plan]:
-    return lambda stops, q=Q, **given: plan_lines(arm.arm, bounds, arm.cartesian, q, stops, **given)
+def plan(arm: Any, drive: Any) -> Callable[..., Plan]:
+    return lambda stops, q=Q, **given: plan_lines(arm.arm, drive.limits, arm.cartesian, q, stops, **given)
 
 
 @pytest.fixture
@@ -103,8 +102,8 @@ def test_a_line_that_comes_too_near_to_a_singularity_is_refused(plan: Any) -> No
     assert what.endswith(" rad from its singularity, allowed is at least 0.08 rad (cartesian.singularity.wrist)")
 
 
-def test_a_line_beyond_a_limit_that_was_narrowed_is_refused(bounds: Any, plan: Any, moved: Any) -> None:
-    bounds.low[0], bounds.high[0] = -0.1, 0.1
+def test_a_line_beyond_a_limit_that_was_narrowed_is_refused(drive: Any, plan: Any, moved: Any) -> None:
+    drive.limits.low[0], drive.limits.high[0] = -0.1, 0.1
     at, what = place(refusal(plan, [moved(0.0, 0.2)]), 0.2)
     assert 0.02 < at < 0.2
     assert what.startswith("joint1 would be at ")
@@ -156,11 +155,11 @@ def test_a_line_is_slowed_down_until_the_joints_keep_their_limits(
     made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.2), moved()], speed=0.25)
     assert 0.1 < made.slowed < 0.9
     assert made.rows[0][14] <= made.slowed * 0.25 / 0.2 * 1.0001
-    mode = LineController(arm.arm, drive.limits, PERIOD)
-    assert mode.start(drive.state, memory(made.rows), len(made.rows)) is None
+    mode = drive.controller(LineController)
+    assert drive.execute(mode, memory(made.rows), len(made.rows)) is None
     # The drive checks speed and acceleration of each joint in every cycle.
     assert drive.until_rest(mode) == pytest.approx(made.duration_s, abs=0.01)
-    assert mode.reason is Reason.NONE
+    assert mode.ended is None
     assert drive.state.commanded == pytest.approx(made.end, abs=1e-9)
     fastest = max(max(abs(b - a) for a, b in zip(p, q, strict=True)) for p, q in pairwise(drive.path)) / PERIOD
     # And no slower than they demand.
@@ -173,8 +172,8 @@ def test_a_line_is_accelerated_so_gently_that_the_joints_keep_their_limits(
     drive = new_drive().at(Q)
     drive.limits.acceleration[:] = [0.3] * 6
     made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.1)], speed=0.1)
-    mode = LineController(arm.arm, drive.limits, PERIOD)
-    assert mode.start(drive.state, memory(made.rows), 1) is None
+    mode = drive.controller(LineController)
+    assert drive.execute(mode, memory(made.rows), 1) is None
     drive.until_rest(mode)
     assert drive.state.commanded == pytest.approx(made.end, abs=1e-9)
 

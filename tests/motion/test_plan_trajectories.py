@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from rtcp.config.model import Point
 from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.planning.plan import Plan, PlanRefused, Point
-from rtcp.motion.planning.rows import CUBIC, KIND, QUINTIC
-from rtcp.motion.planning.waypoints import plan_trajectory
+from rtcp.motion.planning.plan import CUBIC, KIND, QUINTIC, Plan, PlanRefused
+from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import Phase
 
 PERIOD = 0.0005
@@ -25,9 +25,9 @@ def at(*first: float) -> tuple[float, ...]:
 
 
 @pytest.fixture
-def plan(bounds: Any) -> Callable[..., Plan]:
+def plan(drive: Any) -> Callable[..., Plan]:
     def planned(points: Sequence[Point], q: Sequence[float] = ZERO, **given: Any) -> Plan:
-        return plan_trajectory(points, bounds, q, names=NAMES, **given)
+        return plan_trajectory(points, drive.limits, q, names=NAMES, **given)
 
     return planned
 
@@ -133,8 +133,8 @@ def test_rows_have_times_numbers_and_kind(plan: Any) -> None:
     assert made.rows[1][13] == pytest.approx(-6 * 0.4 / 4)
 
 
-def test_an_arm_of_fewer_joints_is_planned_for_too(arm: Any, bounds: Any) -> None:
-    made = plan_trajectory([Point(0.0, (0.0, 0.0)), Point(2.0, (0.2, -0.1))], bounds, (0.0, 0.0))
+def test_an_arm_of_fewer_joints_is_planned_for_too(arm: Any, drive: Any) -> None:
+    made = plan_trajectory([Point(0.0, (0.0, 0.0)), Point(2.0, (0.2, -0.1))], drive.limits, (0.0, 0.0))
     assert made.rows[1][:7] == (2.0, 0.2, -0.1, 0.0, 0.0, 0.0, 0.0)
 
 
@@ -154,8 +154,8 @@ def test_what_was_planned_is_driven_to_its_end_inside_the_limits(new_drive: Any,
             plan = plan_trajectory(points, drive.limits, ZERO)
         except PlanRefused:
             continue
-        mode = TrajectoryController(drive.limits, PERIOD)
-        assert mode.start(drive.state, memory(plan.rows), len(plan.rows)) is None
+        mode = drive.controller(TrajectoryController)
+        assert drive.execute(mode, memory(plan.rows), len(plan.rows)) is None
         drive.until_rest(mode)
         assert mode.phase is Phase.HOLD
         assert drive.state.commanded == pytest.approx(plan.end, abs=1e-9)
