@@ -14,7 +14,7 @@ import typer
 
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, refuse_options
 from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, code_of, interruption_code, signals_raise
+from rtcp.cli.errors import CommandError, interruption_code, signals_raise
 from rtcp.cli.output import emit, emit_json, facts, report, show, table
 from rtcp.cli.platform import refuse_second_platform
 from rtcp.config.model import VIRTUAL
@@ -99,7 +99,7 @@ def _sdo_write(
 
 
 class BusAccess(Protocol):
-    """What `scan` and `sdo` need of a bus; every method may raise `RtcpError` or `OfflineError`."""
+    """What `scan` and `sdo` need of a bus; every method may raise `RtcpError`."""
 
     name: str
     """`virtual` or the network interface."""
@@ -195,8 +195,6 @@ def _bus(command: str, bus: str | None, config: Path | None) -> Iterator[BusAcce
             with client:
                 status = client.call("status")
                 yield RunningBus(client, status) if bus in (None, status.get("bus")) else OfflineBus(bus, config)
-    except offline.OfflineError as error:
-        raise CommandError(str(error), code_of(error.kind)) from error
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
 

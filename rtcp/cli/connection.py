@@ -76,12 +76,11 @@ def stopping(client: ControlClient) -> Iterator[None]:
 
 def _replace_gateway(directory: Path, error: RtcpError) -> None:
     from rtcp.launch.launcher import replace_gateway  # seldom needed, loads slowly
-    from rtcp.launch.platform import StartError
 
     try:
         if process := replace_gateway(directory):
             complain(f"the gateway had ended; a new one was started (process {process}), nothing was enabled")
-    except StartError as refused:
+    except RtcpError as refused:
         if refused.kind != "refused":
             raise RtcpError("not running", f"{error.message}; {refused}") from refused
     except (OSError, TypeError):

@@ -10,7 +10,7 @@ import typer
 
 from rtcp.cli.arguments import BusName, ConfigFile, Poll, positive
 from rtcp.cli.connection import connect, loop_process
-from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code, signals_raise
+from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.output import report
 from rtcp.ipc.errors import RtcpError
 
@@ -87,12 +87,8 @@ def _wait_ready(hint: str) -> tuple[str, bool]:
 def _stop() -> None:
     """Stop the platform: drives disabled, slaves in INIT, processes ended."""
     from rtcp.launch import launcher
-    from rtcp.launch.platform import StartError
 
-    try:
-        problems = launcher.stop(report)
-    except StartError as error:
-        raise CommandError(str(error), code_of(error.kind)) from error
+    problems = launcher.stop(report)
     if problems:
         raise CommandError("\n".join(f"stopped, but: {problem}" for problem in problems), ExitCode.FAULT)
     report("stopped")
@@ -111,18 +107,16 @@ def launch(options: StartOptions, log: Callable[[str], None] = report) -> Platfo
     """Start the platform and return it in the state ready; `log` receives a line for each step.
 
     Raises:
-        CommandError: the launcher refused, or a signal ended the start; nothing is left running.
+        RtcpError: the launcher refused; nothing is left running.
+        CommandError: a signal ended the start; nothing is left running.
         ConfigError: names every mistake of the configuration.
     """
     from rtcp.launch import launcher
-    from rtcp.launch.platform import StartError
     from rtcp.virtual.segment import check_segment
 
     try:
         with signals_raise():
             return launcher.start(options, log, check_segment)
-    except StartError as error:
-        raise CommandError(str(error), code_of(error.kind)) from error
     except KeyboardInterrupt as interruption:
         raise CommandError(
             "interrupted while starting: nothing is left running", interruption_code(interruption)

@@ -1,16 +1,19 @@
-"""The joints as one: their drives, the active mode and its guards, the law of the drive mode, the last clamp."""
+"""The joints as one: their drives, the active controller and its guards, the writer of the drive mode, the limiter."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rtcp.config.model import ArmConfig
-from rtcp.control.gripper import FOLLOWED_RAD, DrivenGripper
-from rtcp.control.motions import Motions
+from rtcp.control.gripper import TRACKED_RAD, DrivenGripper
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.ipc.codes import Code
-from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveMode, DriveWriter
+from rtcp.ipc.commands import Command, Jog, MoveJoints
+from rtcp.ipc.events import Emergency
+from rtcp.ipc.states import ControlMode, DriveMode
+from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
+from rtcp.motion.controllers.jog import JogController
+from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
@@ -25,8 +28,8 @@ _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 """Drive states with torque: the target stands."""
 _STILL_RAD_S = 0.01
 RANGE_MARGIN_RAD = 0.02
-"""So far beyond its range a joint may stand and still be enabled, to be brought back to the edge: an overshoot in CST
-must not leave an arm that no command can move."""
+"""So far outside its range a joint may stand and still be enabled, to return to the edge: an overshoot in CST must not
+leave an arm that no command can move."""
 
 
 class Arm:
@@ -35,15 +38,16 @@ class Arm:
     Args:
         config: joints, limits, cycle, the mode at the start.
         drives: one a joint, in the order of the joints, with the index of its slave.
-        gripper: one with a drive of its own, or None. What is asked of all drives below is asked of its drive too, as
-            the one after the joints'.
+        gripper: one with a drive of its own, or None. Its drive is the last of all drives, after those of the joints.
+        plan: returns a slot of the plan area, for controllers that run plans.
     """
 
     def __init__(
         self,
         config: ArmConfig,
         drives: Sequence[tuple[int, Cia402Drive]],
-        gripper: DrivenGripper | None = None,
+        gripper: DrivenGripper | None,
+        plan: Callable[[int], memoryview[float]],
     ) -> None:
         joints = config.joints
         self.period_s = config.cycle.period_us * 1e-6
@@ -55,25 +59,44 @@ class Arm:
         self.limits = Limits(config)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.output_limiter = OutputLimiter(self.limits, self.period_s)
-        self.motions = Motions(config, self.limits, self.trajectory_guard, self.period_s)
-        self._torque_law = CstWriter(joints, self.period_s)
-        self._laws: dict[DriveMode, DriveWriter] = {
+        self.controllers: dict[type[Command], Controller] = load_controllers(
+            ControllerSetup(config, self.limits, self.trajectory_guard, self.period_s, plan)
+        )
+        """By the commands that they accept."""
+        self._holder = self.controllers[MoveJoints]
+        jog = self.controllers.get(Jog)
+        self.jog = jog if isinstance(jog, JogController) and jog.has_geometry else None
+        """The controller that the joystick commands; None where the geometry is unknown."""
+        self.active = self._holder
+        self.control_mode = ControlMode[config.control_mode.upper()]
+        self.configured_mode = DriveMode[config.drive_mode.upper()]
+        """Drive mode of moves, lines, streams and jogs."""
+        self._cst = CstWriter(joints, self.period_s)
+        self._writers: dict[DriveMode, DriveWriter] = {
             DriveMode.CSP: CspWriter(),
             DriveMode.CSV: CsvWriter(joints, self.period_s),
-            DriveMode.CST: self._torque_law,
+            DriveMode.CST: self._cst,
         }
-        self.set_mode(self.motions.drive_mode_of(self.motions.mode))
+        self.wanted_mode = self.drive_mode_of(self.control_mode)
+        """Drive mode to hold in; drives are enabled in CSP and change then."""
+        self.set_mode(self.wanted_mode)
+
+    def drive_mode_of(self, mode: ControlMode) -> DriveMode:
+        """Return the drive mode that a control mode needs."""
+        if mode is ControlMode.VELOCITY:
+            return DriveMode.CSV
+        return DriveMode.CST if mode is ControlMode.TORQUE else self.configured_mode
 
     def set_mode(self, mode: DriveMode) -> None:
-        """Let the drives change to `mode`; only at standstill."""
+        """Command the drives to change to `mode`; only at standstill."""
         self.mode = mode
-        self._law = self._laws[mode]
-        self._law.start(self.drives)
+        self._writer = self._writers[mode]
+        self._writer.start(self.drives)
         for drive in self.drives:
             drive.mode = mode
 
     def decode(self, data: ProcessData) -> None:
-        """Take the drives' inputs."""
+        """Read the inputs of the drives."""
         state = self.state
         actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
         for axis, (slot, drive) in enumerate(self.pairs):
@@ -85,66 +108,76 @@ class Arm:
             self.gripper.decode(data)
 
     def encode(self, data: ProcessData) -> None:
-        """Hand over the drives' outputs."""
+        """Write the outputs of the drives."""
         for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
         if self.gripper is not None:
             self.gripper.encode(data)
 
-    def lead(self, goal: TargetState) -> None:
-        """Lead every drive one step towards `goal`."""
+    def advance(self, target: TargetState) -> None:
+        """Command every drive one step towards `target`."""
         for drive in self.all_drives:
-            drive.advance(goal)
+            drive.advance(target)
+
+    def limits_changed(self) -> None:
+        """Limit the outputs by the limits in force."""
+        self.output_limiter.take(self.limits)
 
     def stop(self) -> None:
-        """Let all that moves come to rest, the gripper too."""
-        self.motions.stop(self.state)
+        """Bring all that moves to rest, the gripper too."""
+        if self.active.phase is Phase.MOVE:
+            self.active.stop(self.state)
         if self.gripper is not None:
             self.gripper.stop()
 
-    def hold_target(self) -> None:
-        """Hold at the set-point that was made last, at rest from now on."""
-        self.motions.rest()
+    def rest(self) -> None:
+        """Hold where the set-points are; at standstill."""
+        for controller in self.controllers.values():
+            controller.hold()
+        self.active = self._holder
+
+    def hold(self) -> None:
+        """Hold at the last set-point, at rest from now on."""
+        self.rest()
         self.trajectory_guard.latch(self.state)
 
-    def follow(self) -> None:
-        """Let set-point and guard follow the drives that have no torque: their target is where they are.
+    def track_actual(self) -> None:
+        """Let set-points and targets follow the drives that have no torque.
 
-        The set-point of a joint that stands outside its range is the edge of it, so that every mode begins inside; from
-        where the joint is to there the guard leads its target, once the drive obeys it.
+        The set-point of a joint outside its range is the edge of it, so that every controller begins inside; from where
+        the joint is to there the output limiter moves its target, once the drive follows it.
         """
-        position, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
+        commanded, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
         for i, drive in enumerate(self.drives):
             if drive.state not in _HOLDING:
                 low, high, here = limits.low[i], limits.high[i], drive.position
-                position[i] = high if here > high else low if here < low else here
+                commanded[i] = high if here > high else low if here < low else here
                 drive.target_position = here
                 latch(i, here)
         self.trajectory_guard.latch(self.state)
         if self.gripper is not None:
-            self.gripper.follow()
+            self.gripper.track_actual()
 
     def command(self) -> GuardResult:
-        """Write the targets of this cycle: the active mode, its guards, the law, the last clamp."""
-        state, drives, mode = self.state, self.drives, self.motions.active
-        target = mode.update(state, self.period_s)
-        verdict = self.trajectory_guard.apply(state, target, mode.tolerates_saturation)
-        if mode is self.motions.torque and self.motions.torque.direct:
-            self._torque_law.pass_on(state.commanded, target.torque, drives)
+        """Write the targets of this cycle: controller -> guard -> writer of the drive mode -> limiter."""
+        state, drives, controller = self.state, self.drives, self.active
+        setpoint = controller.update(state)
+        result = self.trajectory_guard.apply(state, setpoint, controller.tolerates_saturation)
+        if setpoint.direct:
+            self._cst.pass_on(state.commanded, setpoint.torque, drives)
         else:
-            self._law.update(state.commanded, state.commanded_velocity, drives)
+            self._writer.update(state.commanded, state.commanded_velocity, drives)
         self.output_limiter.check(drives)
         if self.gripper is not None:
             self.gripper.command()
-        return verdict
+        return result
 
-    def beyond(self, watch: Supervision) -> tuple[Code, int, float, float] | None:
-        """Look at what is measured of joints and gripper; return what is beyond its limit for too long, or None."""
-        found = watch.look(self.state)
-        if found is None and self.gripper is not None:
-            found = self.gripper.look()
-        # Codes follow the kinds: speed, torque, following error.
-        return None if found is None else (Code(Code.OVER_SPEED + found.kind), found.axis, found.value, found.limit)
+    def beyond_limits(self, supervision: Supervision) -> Emergency | None:
+        """Return what was measured of joints or gripper beyond its limit for too long, or None."""
+        event = supervision.check(self.state)
+        if event is None and self.gripper is not None:
+            return self.gripper.beyond_limits()
+        return event
 
     def first_not_enabled(self) -> int:
         """Return the first joint whose drive is not enabled, or -1."""
@@ -191,26 +224,26 @@ class Arm:
         return len(self.drives) if self.gripper is not None and self.gripper.outside else -1
 
     def first_off_target(self) -> int:
-        """Return the first joint that `follow` would take further than it can have turned since the last, or -1."""
-        followed = self.output_limiter.sent
+        """Return the first joint that `track_actual` would move further than it can have turned, or -1."""
+        tracked = self.output_limiter.sent
         for axis, drive in enumerate(self.drives):
-            if drive.state not in _HOLDING and not abs(drive.position - followed[axis]) <= FOLLOWED_RAD:
+            if drive.state not in _HOLDING and not abs(drive.position - tracked[axis]) <= TRACKED_RAD:
                 return axis
         return len(self.drives) if self.gripper is not None and self.gripper.off_target else -1
 
-    def followed_to(self, axis: int) -> float:
+    def tracked_to(self, axis: int) -> float:
         """Return where the drive of a joint, or of the gripper, was followed to, rad."""
         if axis < len(self.drives) or self.gripper is None:
             return self.output_limiter.sent[axis]
         return self.gripper.motion.position
 
     def beyond_range(self, axis: int) -> float:
-        """Return how far beyond its range the target of a joint is, from where the guard leads it back, rad, or 0."""
+        """Return how far beyond its range the target of a joint is, rad, or 0."""
         last, limits = self.output_limiter.sent[axis], self.limits
         return max(last - limits.high[axis], limits.low[axis] - last, 0.0)
 
-    def first_led_back(self) -> int:
-        """Return the first joint whose target the guard still leads back into its range, or -1."""
+    def first_returning(self) -> int:
+        """Return the first joint whose target still returns to its range, or -1."""
         for axis in range(len(self.drives)):
             if self.beyond_range(axis) > 0.0:
                 return axis
@@ -226,7 +259,7 @@ class Arm:
     @property
     def still(self) -> bool:
         """Whether the set-points stand still."""
-        return self.motions.active.phase is Phase.HOLD
+        return self.active.phase is Phase.HOLD
 
     @property
     def all_still(self) -> bool:

@@ -1,43 +1,47 @@
-"""A gripper with a drive of its own in the cycle: beside the arm, whose modes and guards do not know it."""
+"""A gripper with a drive of its own in the cycle, beside the arm, whose controllers and guards do not know it."""
 
 from __future__ import annotations
 
-from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
-from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
+from rtcp.config.model import ArmConfig, Joint
+from rtcp.config.model import SupervisionConfig
+from rtcp.devices.cia402 import Cia402Drive, DriveState
 from rtcp.fieldbus.bus import ProcessData
+from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed
 from rtcp.motion.controllers.gripper import GripperMotion
-from rtcp.motion.guards.supervision import FOLLOWING_ERROR, SPEED, Found
 
 _RANGE_MARGIN_RAD = 0.02
-"""So far beyond its range it may stand and still be enabled, to be brought back to the edge."""
+"""So far outside its range it may stand and still be enabled, to return to the edge."""
 
-FOLLOWED_RAD = 0.03
-"""No joint that stood turns so far between two frames: where a drive says so while it is enabled, it is not followed.
-More than what a joint may stand beyond its range, which it is not followed out of."""
+TRACKED_RAD = 0.03
+"""No joint that stood turns so far between two frames: a position further away is not tracked while enabling. More than
+a joint may stand outside its range."""
 
 
 class DrivenGripper:
-    """The gripper's drive in CSP: enabled and disabled with the arm's, on its way by itself.
+    """The drive of the gripper in CSP: enabled and disabled with the arm, moved by itself.
 
-    `decode` and `encode` beside the arm's; `follow` or `command` in each cycle in which the arm follows or commands.
+    `decode` and `encode` beside those of the arm; `track_actual` or `command` in each cycle in which the arm does so.
     """
 
-    def __init__(self, slot: int, drive: Cia402Drive, motion: GripperMotion, watch: GripperWatch) -> None:
-        """Make it of the index of its slave, its driver, its motion and what watches it; see `gripper_of`."""
+    def __init__(
+        self, slot: int, drive: Cia402Drive, motion: GripperMotion, supervision: GripperSupervision, axis: int
+    ) -> None:
+        """Take the index of its slave, its driver, its motion, its supervision and its axis; see `make_gripper`."""
         self.slot = slot
         self.drive = drive
         self.motion = motion
-        self.watch = watch
+        self.supervision = supervision
+        self._axis = axis
         self._moved = False
         self.lease = 0
-        """Lease of the commander that set it in motion; 0: the stick's, which needs none."""
+        """Lease of the commander that set it in motion; 0: the joystick, which needs none."""
 
     def decode(self, data: ProcessData) -> None:
-        """Take the drive's inputs."""
+        """Read the inputs of the drive."""
         self.drive.decode(data.input(self.slot))
 
     def encode(self, data: ProcessData) -> None:
-        """Hand over the drive's outputs."""
+        """Write the outputs of the drive."""
         data.set_output(self.slot, self.drive.encode())
 
     @property
@@ -53,18 +57,14 @@ class DrivenGripper:
 
     @property
     def off_target(self) -> bool:
-        """Whether `follow` would take the set-point further than a gripper can have turned since it was followed."""
+        """Whether `track_actual` would move the set-point further than a gripper can have turned."""
         drive = self.drive
         return drive.state is not DriveState.OPERATION_ENABLED and not (
-            abs(drive.position - self.motion.position) <= FOLLOWED_RAD
+            abs(drive.position - self.motion.position) <= TRACKED_RAD
         )
 
-    def lead(self, goal: TargetState) -> None:
-        """Lead the drive one step towards `goal`."""
-        self.drive.advance(goal)
-
-    def follow(self) -> None:
-        """Let the set-point follow a drive that does not follow it; an enabled one keeps what it has, at rest."""
+    def track_actual(self) -> None:
+        """Let the set-point follow a drive without torque; an enabled one keeps its own, at rest."""
         drive, motion = self.drive, self.motion
         if drive.state is not DriveState.OPERATION_ENABLED:
             motion.latch(drive.position)
@@ -86,29 +86,32 @@ class DrivenGripper:
         self._moved = True
         return True
 
-    def came_to_rest(self) -> bool:
-        """Whether its set-point moved, or was told to, since the last call and stands now; called once a cycle."""
+    def came_to_rest(self) -> GripperAtRest | None:
+        """Return where it rests if it moved, or was commanded to, since the last call; called once a cycle."""
         before, self._moved = self._moved, self.motion.moving
-        return before and not self._moved
+        if not before or self._moved:
+            return None
+        return GripperAtRest(self._axis, self.motion.position, self.motion.gripped)
 
-    def look(self) -> Found | None:
-        """Look at the cycle's measurements; return what has been beyond its limit for too long, or None."""
-        return self.watch.look(self.drive, self.motion)
+    def beyond_limits(self) -> Emergency | None:
+        """Return what was measured beyond its limit for too long, or None."""
+        return self.supervision.check(self.drive, self.motion)
 
     def stop(self) -> None:
-        """Come to rest on the way."""
+        """Stop on the way."""
         self.motion.stop()
 
 
-class GripperWatch:
-    """What is measured of a gripper against its limit: speed, and how far it is from where it was commanded.
+class GripperSupervision:
+    """Checks the speed and the following error of a gripper.
 
-    What it holds shows as torque, and as a distance where it is soft: its motion ends there, no stop does.
+    An object in its grip shows as torque, and as a following error where it is soft: that ends its motion and is no
+    reason to stop the arm.
 
     Args:
         config: factors, and how many cycles in a row are too many.
         joint: the gripper's.
-        axis: the joint's number, for the sentence.
+        axis: its number.
     """
 
     def __init__(self, config: SupervisionConfig, joint: Joint, axis: int) -> None:
@@ -118,24 +121,24 @@ class GripperWatch:
         self._error = config.following_error
         self._fast = self._off = 0
 
-    def look(self, drive: Cia402Drive, motion: GripperMotion) -> Found | None:
-        """Look at one cycle's measurements; return what has been beyond its limit for too long, or None."""
+    def check(self, drive: Cia402Drive, motion: GripperMotion) -> Emergency | None:
+        """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
         # A comparison with NaN is false: it counts as beyond.
         self._fast = 0 if abs(drive.velocity) <= self._speed else self._fast + 1
         if self._fast >= self._cycles:
-            return Found(SPEED, self._axis, drive.velocity, self._speed)
+            return OverSpeed(self._axis, drive.velocity, self._speed)
         error = drive.position - motion.position
         self._off = 0 if motion.gripped or abs(error) <= self._error else self._off + 1
         if self._off >= self._cycles:
-            return Found(FOLLOWING_ERROR, self._axis, error, self._error)
+            return FollowingError(self._axis, error, self._error)
         return None
 
     def reset(self) -> None:
-        """Begin to count anew."""
+        """Reset the counters."""
         self._fast = self._off = 0
 
 
-def gripper_of(config: ArmConfig) -> DrivenGripper | None:
+def make_gripper(config: ArmConfig) -> DrivenGripper | None:
     """Return the gripper with a drive, or None where there is none or one on an output.
 
     Raises:
@@ -150,4 +153,5 @@ def gripper_of(config: ArmConfig) -> DrivenGripper | None:
     drive = Cia402Drive(config.slaves[slot], speed_limit=joint.velocity, zero=zero)
     period_s = config.cycle.period_us * 1e-6
     motion = GripperMotion(joint, gripper.open_position, gripper.closed_position, period_s)
-    return DrivenGripper(slot, drive, motion, GripperWatch(config.supervision, joint, len(config.joints)))
+    axis = len(config.joints)
+    return DrivenGripper(slot, drive, motion, GripperSupervision(config.supervision, joint, axis), axis)

@@ -21,8 +21,8 @@ from typing import Any
 
 from rtcp.config.model import ArmConfig, DeviceDescription
 from rtcp.control.arm import Arm
-from rtcp.control.assembly import assemble, discipline_of, position_of
 from rtcp.control.bus_service import BusService
+from rtcp.control.cycle import Cycle, make_discipline, position_of
 from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, TargetState
 from rtcp.devices.driver import DeviceError, make_codec
 from rtcp.fieldbus.bus import ProcessData
@@ -32,7 +32,7 @@ from rtcp.fieldbus.soem import SoemBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, read_session, write_exit_report
-from rtcp.ipc.stops import quick_stop_s
+from rtcp.ipc.stop_reactions import quick_stop_s
 from rtcp.realtime import scheduling
 
 _DISABLE_CYCLES = 20
@@ -118,7 +118,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
     for note in bus.notes:
         report.tell("phase", text=note)
     report.tell("phase", text="all slaves in SAFE-OP")
-    discipline = discipline_of(config)
+    discipline = make_discipline(config)
     blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)
     scheduling.share_interpreter_quickly()
@@ -132,8 +132,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         config.cycle.priority,
         config.bus.watch_ms * 1e-3,
     )
-    parts = assemble(config, data, blackboard, service, discipline)
-    loop = parts.loop
+    cycle = Cycle(config, data, blackboard, service, discipline)
     realtime = scheduling.Realtime()
 
     def started() -> None:
@@ -152,15 +151,15 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
 
     service.on_op = started
     service.clock_followed = lambda: discipline is None or discipline.locked
-    service.on_refused = loop.shut_down
+    service.on_refused = cycle.shut_down
     service.start()
-    signal.signal(signal.SIGTERM, lambda number, frame: loop.shut_down())
+    signal.signal(signal.SIGTERM, lambda number, frame: cycle.shut_down())
     scheduling.prepare(realtime, config.cycle.priority, config.cycle.cpu)
     try:
-        loop.run()
+        cycle.run()
     except BaseException:
         # A defect in the cycle: the drives come to rest before the bus goes away.
-        stop_blindly(data, config, parts.arm)
+        stop_blindly(data, config, cycle.arm)
         raise
     else:
         if service.refused:

@@ -193,4 +193,30 @@ class Code(IntEnum):
     STANDS_ELSEWHERE = 45
     """After a reset; axis, value: where the joint stands, limit: where it was last heard before the fault, rad."""
     ENDED = 100
-    """ENDED + `rtcp.motion.state.Reason`: a mode or a guard ended the motion."""
+    """ENDED + `Reason`: a mode or a guard ended the motion."""
+
+
+class Reason(IntEnum):
+    """Why a mode ended a motion by itself, or slows it; `rtcp.ipc.messages` says it."""
+
+    NONE = 0
+    STREAM_ENDED = 1
+    """The sender fell silent."""
+    NO_SOLUTION = 2
+    """No inverse solution continues the motion: out of reach."""
+    JOINT_LIMIT = 3
+    """A joint's range ends the motion; `axis`."""
+    SINGULARITY = 4
+    """`axis`: 0 shoulder, 1 elbow, 2 wrist."""
+    CODE = 5
+    """The stick shows what is no code; `value`: the byte."""
+    PLAN = 6
+    """The plan in memory is damaged."""
+    KEEP_OUT = 7
+    """`axis`: which box, by its place in the configuration; -1: the Cartesian box."""
+    JUMP = 8
+    """The set-points would have had to jump."""
+    COMMAND_ENDED = 9
+    """A command that has to be renewed was not."""
+    GENERATOR = 10
+    """The trajectory generator refused its input: a defect."""

@@ -69,6 +69,10 @@ class Stopped(Event, number=15):
     """the arm has stopped and holds"""
 
 
+class StoppedByLimit(Event, number=51):
+    """the arm has stopped at a limit and holds; then `rtcp reset`"""
+
+
 class LimitStopReset(Event, number=32):
     """reset: the arm holds and accepts commands"""
 

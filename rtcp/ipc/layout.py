@@ -88,7 +88,7 @@ COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
 COMMANDS = 64
 
 PLAN_ROWS, PLAN_COLUMNS = 4096, 20
-"""A plan: rows of 20 doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.rows`)."""
+"""A plan: rows of 20 doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS = 2
 """Two places: one is written while the plan in the other runs."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
 else:
     # typing has it from Python 3.11 on, and typing_extensions is no dependency of the loop's process.
-    def dataclass_transform(**options: bool) -> Callable[[type], type]:
+    def dataclass_transform(**_: bool) -> Callable[[type], type]:  # noqa: D103
         return lambda kind: kind
 
 
@@ -68,7 +68,7 @@ class Message:
         cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
         cls.number = zlib.crc32(cls.name.encode()) if number is None else number
         hints = get_type_hints(cls)
-        cls._fields = tuple((field.name, hints[field.name]) for field in dataclasses.fields(cls))
+        cls._fields = tuple((field.name, hints[field.name]) for field in dataclasses.fields(cls))  # type: ignore[arg-type]
         cls._format = struct.Struct("<" + "".join(_code(kind) for _, kind in cls._fields))
         if cls._format.size > PAYLOAD_SIZE:
             raise ValueError(f"{cls.name}: {cls._format.size} bytes, at most {PAYLOAD_SIZE} fit")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rtcp.ipc.codes import Code, MotionMode, Refusal
+from rtcp.ipc.codes import Code, MotionMode, Reason, Refusal
 from rtcp.ipc.naming import Matter, Naming, number
 from rtcp.ipc.stops import Rung
-from rtcp.motion.state import Reason
 
 Say = Callable[[Matter], str]
 _SINGULARITIES = ("shoulder", "elbow", "wrist")

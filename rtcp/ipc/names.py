@@ -30,6 +30,12 @@ class Names:
         self.config = config
         self.reactions = reactions(config.stops)
         """The stop reaction to each event that has one."""
+        self.faults = frozenset(
+            kind
+            for kind, reaction in self.reactions.items()
+            if kind.is_fault or reaction > StopReaction.CONTROLLED_STOP
+        )
+        """Events that begin a fault or an emergency stop, also because their reaction is configured harder."""
 
     @property
     def file(self) -> str:

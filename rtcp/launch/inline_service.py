@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any, cast
 
 from rtcp.config.model import ArmConfig
-from rtcp.control.assembly import position_of
 from rtcp.control.bus_service import BusService
+from rtcp.control.cycle import position_of
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.protocol import State

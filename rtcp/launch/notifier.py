@@ -12,8 +12,8 @@ import socket
 import time
 from pathlib import Path
 
-from rtcp.ipc.machine import TABLE, State
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.states import State
 
 PINGS_A_WATCHDOG = 3
 """How often the cycle is looked at within systemd's patience; sd_watchdog_enabled(3) advises at least twice."""
@@ -89,7 +89,7 @@ class Notifier:
         found = observer.latest()
         if found is None:
             return
-        words = TABLE[State(int(found["state"][0]))].words
+        words = State(int(found["state"][0])).words
         if words != self._told:
             self._told = words
             self._send(f"STATUS={words}")

@@ -1,6 +1,6 @@
-"""The processes of a platform: each started and waited for until it says that it is ready, all of them ended.
+"""The processes of a platform: start each and wait until it is ready, end them all.
 
-Each has a session of its own, so that a terminal's Ctrl-C reaches the launcher alone.
+Each has a session of its own: a terminal's Ctrl-C reaches the launcher alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO
 
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.client import ControlClient
@@ -42,36 +42,61 @@ from rtcp.ipc.session import (
 )
 from rtcp.realtime.scheduling import available_cpus, choose_cpu
 
-_SEGMENT_S = 60.0
-_LOOP_S = 60.0
-_GATEWAY_S = 60.0
-_ANSWER_S = 3.0
-"""For the gateway to say how the platform is: one that does not hangs, and meanwhile the arm holds under torque."""
-_STOP_S = 20.0
-_ENDING_S = 0.5
-_LOOP_END_S = 10.0
-"""For a controlled stop, the drives' torque and the way to INIT: a loop that is killed leaves them to a watchdog."""
+_READY_TIMEOUT_S = 60.0
+"""Of each process, from its start or its last report."""
+_ANSWER_TIMEOUT_S = 3.0
+"""For the gateway's answer to `status`: one that hangs must not delay the stop, the arm is under torque."""
+_STOP_TIMEOUT_S = 20.0
+_EXIT_TIMEOUT_S = 0.5
+_LOOP_END_TIMEOUT_S = 10.0
+"""For a controlled stop, disabling the drives and the way to INIT: a loop that is killed leaves them to a watchdog."""
+_END_TIMEOUT_S = 5.0
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""Signals that stop the platform."""
 Report = Callable[[str], None]
-Kind = Literal["refused", "fault", "usage", "timeout"]
 
 
-class StartError(Exception):
-    """The platform could not be started: a sentence, and whether that is a refusal, a fault or a wrong usage."""
+def spawn(
+    module: str, *arguments: str, stdout: int | BinaryIO, stderr: int | BinaryIO, env: dict[str, str] | None = None
+) -> tuple[subprocess.Popen[bytes], int]:
+    """Start a module as a process in a session of its own; return also the pipe on which it reports, as JSON lines."""
+    reading, writing = os.pipe()
+    try:
+        child = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
+            stdin=subprocess.DEVNULL,
+            stdout=stdout,
+            stderr=stderr,
+            env=env,
+            pass_fds=(writing,),
+            start_new_session=True,
+        )
+    except BaseException:
+        os.close(reading)
+        raise
+    finally:
+        os.close(writing)
+    return child, reading
 
-    def __init__(self, message: str, kind: Kind = "fault") -> None:
-        super().__init__(message)
-        self.kind = kind
+
+def read_lines(reading: int, timeout_s: float) -> Iterator[dict[str, Any]]:
+    """Yield the JSON lines of a pipe until it ends or nothing comes for `timeout_s`; close it then."""
+    rest = b""
+    with open(reading, "rb", buffering=0) as pipe:
+        while select.select([pipe], [], [], timeout_s)[0] and (read := pipe.read(65536)):
+            *whole, rest = (rest + read).split(b"\n")
+            for line in whole:
+                yield json.loads(line)
 
 
 class Platform:
-    """A platform that runs; made by `start`.
+    """The processes of a running platform; `rtcp.launch.launcher.start` makes it.
 
     Args:
         directory: the runtime directory.
         config: the arm.
         processes: those that run already.
-        state: directory of what outlives a restart, handed to the processes; None: as this process' environment has it.
+        state: directory of persistent state, for the processes; None: as in this process's environment.
     """
 
     def __init__(self, directory: Path, config: ArmConfig, processes: Processes, state: Path | None = None) -> None:
@@ -82,110 +107,83 @@ class Platform:
         self.segment_control: Path | None = None
         """Control socket of the segment that was started."""
         self.facts: dict[str, Any] = {}
-        """What the loop told of its start: realtime, start_to_op_s."""
+        """What the loop reported of its start: realtime, start_to_op_s."""
         self._children: list[subprocess.Popen[bytes]] = []
 
     # -- starting -----------------------------------------------------------------------------------------------
 
     def _spawn(self, name: str, module: str, *arguments: str) -> tuple[subprocess.Popen[bytes], int]:
-        reading, writing = os.pipe()
-        try:
-            with open_log(self.directory / f"{name}.log") as log, undisturbed():
-                # A signal between start and registration would leave a process that nobody knows of.
-                child = subprocess.Popen(
-                    [sys.executable, "-m", module, *arguments, "--ready-fd", str(writing)],
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    env=self._environment,
-                    pass_fds=(writing,),
-                    start_new_session=True,
-                )
-                self._register(name, child)
-        except BaseException:
-            os.close(reading)
-            raise
-        finally:
-            os.close(writing)
+        """Start a process and write down its id; where the disk refuses that, kill it."""
+        # A signal between start and registration would leave a process that nobody knows of.
+        with open_log(self.directory / f"{name}.log") as log, defer_signals():
+            child, reading = spawn(module, *arguments, stdout=log, stderr=log, env=self._environment)
+            before = getattr(self.processes, name)
+            self._children.append(child)
+            setattr(self.processes, name, identify(child.pid))
+            try:
+                self.processes.write(self.directory)
+            except BaseException:
+                setattr(self.processes, name, before)
+                os.close(reading)
+                child.kill()
+                child.wait()
+                raise
+        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
+        if name != "loop" and others:
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(child.pid, others)  # off the cycle's CPU
         return child, reading
 
-    def _register(self, name: str, child: subprocess.Popen[bytes]) -> None:
-        """Write down whose process it is; where the disk refuses that, it is ended again."""
-        before = getattr(self.processes, name)
-        self._children.append(child)
-        setattr(self.processes, name, identify(child.pid))
-        try:
-            self.processes.write(self.directory)
-        except BaseException:
-            setattr(self.processes, name, before)
-            child.kill()
-            child.wait()
-            raise
-
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
-        """Start the segment; return its ready line."""
-        more = ["--poll"] if poll else []
+        """Start the segment; return its ready line: pid, interface, slaves."""
         self.segment_control = free_segment_control(self.directory)
-        more += ["--control", str(self.segment_control)]
-        child, reading = self._spawn("segment", "rtcp.virtual", "--config", str(path), *more)
-        self._keep_off(child.pid)
-        for line in _lines(reading, _SEGMENT_S):
+        arguments = ["--config", str(path), *(["--poll"] if poll else []), "--control", str(self.segment_control)]
+        child, reading = self._spawn("segment", "rtcp.virtual", *arguments)
+        for line in read_lines(reading, _READY_TIMEOUT_S):
             if "pid" in line:
                 return line
-        raise StartError(self._last_words("segment", child))
+        raise self._not_ready("segment", child)
 
     def start_loop(self, report: Report) -> None:
         """Start the loop; return when all slaves are in OP."""
         child, reading = self._spawn("loop", "rtcp.control.process", "--directory", str(self.directory))
-        for line in _lines(reading, _LOOP_S):
+        for line in read_lines(reading, _READY_TIMEOUT_S):
             if line["event"] == "phase":
                 report(line["text"])
             elif line["event"] == "error":
-                raise StartError("\n".join(line["sentences"]), "fault")
+                raise RtcpError("fault", "\n".join(line["sentences"]))
             elif line["event"] == "ready":
                 self.facts = line
                 report("all slaves in OP")
                 return
-        raise StartError(self._last_words("loop", child))
+        raise self._not_ready("loop", child)
 
     def begin_gateway(self) -> int:
-        """Start the gateway and return the pipe on which it says when the control socket listens."""
-        child, reading = self._spawn("gateway", "rtcp.gateway.server", "--directory", str(self.directory))
-        self._keep_off(child.pid)
+        """Start the gateway; return the pipe on which it reports that the control socket listens."""
+        _, reading = self._spawn("gateway", "rtcp.gateway.server", "--directory", str(self.directory))
         return reading
 
-    def start_gateway(self) -> None:
-        """Start the gateway; return when the control socket listens."""
-        self.await_gateway(self.begin_gateway())
-
     def await_gateway(self, reading: int) -> None:
-        """Return when the gateway that was begun last says on its pipe that the control socket listens."""
+        """Wait until the gateway that was started last listens at the control socket."""
         child = self._children[-1]
-        for _ in _lines(reading, _GATEWAY_S):
+        for _ in read_lines(reading, _READY_TIMEOUT_S):
             return
-        raise StartError(self._last_words("gateway", child))
+        raise self._not_ready("gateway", child)
 
     def exit_code(self, pid: int) -> int | None:
-        """Return how a child of this process has ended; None where it has not, or is no child."""
+        """Return the exit code of a child of this process; None while it runs, or where it is no child."""
         return next((child.poll() for child in self._children if child.pid == pid), None)
 
-    def _keep_off(self, pid: int) -> None:
-        """Keep a process off the cycle's CPU where there is another."""
-        others = set(available_cpus()) - {choose_cpu(self._config.cycle.cpu)}
-        if others:
-            with contextlib.suppress(OSError):
-                os.sched_setaffinity(pid, others)
-
-    def _last_words(self, name: str, child: subprocess.Popen[bytes]) -> str:
+    def _not_ready(self, name: str, child: subprocess.Popen[bytes]) -> RtcpError:
         path = self.directory / f"{name}.log"  # absent where the journal has it
         log = path.read_text(errors="replace").strip().splitlines() if path.exists() else []
         try:
             # Its pipe closes a moment before it can be waited for.
-            fate = f"ended with code {child.wait(_ENDING_S)}"
+            fate = f"ended with code {child.wait(_EXIT_TIMEOUT_S)}"
         except subprocess.TimeoutExpired:
             fate = "did not become ready in time"
-        said = f": {log[-1]}" if log else ""
-        return f"the {name} (process {child.pid}) {fate}{said}"
+        last = f": {log[-1]}" if log else ""
+        return RtcpError("fault", f"the {name} (process {child.pid}) {fate}{last}")
 
     # -- running and stopping -----------------------------------------------------------------------------------
 
@@ -203,9 +201,9 @@ class Platform:
                 child.wait(timeout=timeout_s)
 
     def stop(self, report: Report | None = None) -> tuple[str, ...]:
-        """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended. May be called twice.
+        """Stop everything: controlled stop, drives disabled, slaves in INIT, processes ended; again: no effect.
 
-        Return, and tell `report`, in sentences what of that could not be done.
+        Return, and report, in sentences what of that could not be done.
         """
         left = end_platform(self.directory, self.processes, report)
         self.reap(2.0)
@@ -216,12 +214,12 @@ class Platform:
 
 
 def end_platform(directory: Path, found: Processes, report: Report | None = None) -> tuple[str, ...]:
-    """Stop a platform, by its gateway where that answers; return in sentences what is not left as it should be.
+    """Stop a platform, by its gateway where that answers; return in sentences what was not left in order.
 
-    `report` is told why the gateway did not do it.
+    `report` receives why the gateway did not do it.
     """
     lived, answers = is_running(found.loop), is_running(found.gateway)
-    error = ask_gateway(directory)
+    error = _stop_by_gateway(directory)
     if error is not None and answers and report is not None:
         report(f"the gateway did not stop the platform: {error}; its processes are ended one by one")
     clear(directory, found)
@@ -233,59 +231,43 @@ def clear(directory: Path, found: Processes) -> None:
     now = read_processes(directory)
     # A gateway that has been replaced since.
     newer = now.gateway if now.loop == found.loop else NO_PROCESS
-    terminate(found.loop, _LOOP_END_S)
+    terminate(found.loop, _LOOP_END_TIMEOUT_S)
     for pid in (found.gateway, newer, found.segment):
-        terminate(pid, 5.0)
+        terminate(pid, _END_TIMEOUT_S)
     processes_file(directory).unlink(missing_ok=True)
     sockets = [path for path in directory.glob("segment*.sock") if not is_listening(path)]
-    # Narrowed limits are told apart by their loop's process, whose number may come again.
+    # Narrowed limits name their loop by its process id, which may come again.
     for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets):
         path.unlink(missing_ok=True)
 
 
-def ask_gateway(directory: Path) -> Exception | None:
-    """Let the gateway end the platform; return why it did not: the processes are then ended one by one."""
+def _stop_by_gateway(directory: Path) -> Exception | None:
+    """Have the gateway stop the platform; return why it did not."""
     try:
         with ControlClient("rtcp stop", control_socket(directory)) as client:
             try:
-                client.call("status", timeout_s=_ANSWER_S)
+                client.call("status", timeout_s=_ANSWER_TIMEOUT_S)
             except RtcpError as error:
                 if error.kind == "timeout":
-                    return TimeoutError(f"it has not answered for {_ANSWER_S:g} s")
-            client.call("stop", timeout_s=_STOP_S)
+                    return TimeoutError(f"it has not answered for {_ANSWER_TIMEOUT_S:g} s")
+            client.call("stop", timeout_s=_STOP_TIMEOUT_S)
     except (RtcpError, OSError) as error:
         return error
     return None
 
 
 @contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Put off Ctrl-C and its kin until the block is done: what was started is known, or ended, by then."""
+def defer_signals() -> Iterator[None]:
+    """Deliver `SIGNALS` only after the block, when what it started is known, or has ended."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came: list[int] = []
-    before = {number: signal.signal(number, lambda got, frame: came.append(got)) for number in SIGNALS}
+    received: list[int] = []
+    before = {number: signal.signal(number, lambda got, frame: received.append(got)) for number in SIGNALS}
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        if came:
-            signal.raise_signal(came[0])
-
-
-def _lines(reading: int, patience_s: float) -> Iterator[dict[str, Any]]:
-    """Yield the JSON lines of a pipe until it ends or nothing comes for `patience_s`."""
-    kept = b""
-    with open(reading, "rb", buffering=0) as pipe:
-        while True:
-            if not select.select([pipe], [], [], patience_s)[0]:
-                return
-            read = pipe.read(65536)
-            if not read:
-                return
-            kept += read
-            *whole, kept = kept.split(b"\n")
-            for line in whole:
-                yield json.loads(line)
+        if received:
+            signal.raise_signal(received[0])

@@ -1,4 +1,4 @@
-"""The loop on the in-process bus: the real parts of `rtcp.runtime` behind a real blackboard, in simulated time.
+"""The loop on the in-process bus: the real parts of `rtcp.control` behind a real blackboard, in simulated time.
 
 Everything that happens follows from the configuration, the seed and the calls, to the bit.
 """
@@ -16,11 +16,12 @@ from typing import Any, NamedTuple
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
-from rtcp.control.assembly import assemble, discipline_of
+from rtcp.control.cycle import Cycle, make_discipline
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.commands import Command
 from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
-from rtcp.ipc.machine import State as MachineState
-from rtcp.ipc.observer import Answer, Event, Observer
+from rtcp.ipc.observer import Answer, EventRecord, Observer
+from rtcp.ipc.states import State
 from rtcp.launch.inline_service import InlineService
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
@@ -84,9 +85,9 @@ class Simulation:
         self.board = Blackboard(path, len(config.joints), self.period_ns)
         self.observer = Observer(path)
         self.service = InlineService(self.bus, self.board, config)
-        discipline = discipline_of(config) if follow_clock else None
+        discipline = make_discipline(config) if follow_clock else None
         self.now_ns = _BEGIN_NS
-        self.parts = assemble(config, self.data, self.board, self.service, discipline, lambda: self.now_ns)
+        self.loop = Cycle(config, self.data, self.board, self.service, discipline, lambda: self.now_ns)
         # The instant in the cycle that the clock's discipline would have found.
         shown = self.now_ns + self.bus.offset_ns
         self._planned = self.now_ns - shown % self.period_ns + round((1 + config.bus.send_phase) * self.period_ns)
@@ -120,17 +121,17 @@ class Simulation:
         return self.bus.slaves[slot].device
 
     @property
-    def state(self) -> MachineState:
+    def state(self) -> State:
         """The machine's state."""
-        return self.parts.behaviour.state
+        return self.loop.machine.state
 
     @property
     def done(self) -> bool:
         """Whether the loop has ended."""
-        return self.parts.behaviour.done
+        return self.loop.machine.closed
 
     @property
-    def events(self) -> list[Event]:
+    def events(self) -> list[EventRecord]:
         """What happened, oldest first, as far as the blackboard remembers."""
         return self.observer.events_since(0)
 
@@ -149,10 +150,10 @@ class Simulation:
             self.board.words[LEASE_RENEWED_AT] = now
         data, watcher = self.data, self.on_frame
         if watcher is None:
-            self._planned = self.parts.loop.cycle(now, now)
+            self._planned = self.loop.cycle(now, now)
             return
         sent = tuple(data.outputs)
-        self._planned = self.parts.loop.cycle(now, now)
+        self._planned = self.loop.cycle(now, now)
         watcher(Frame(now, sent, data.heard, data.wkc, tuple(data.inputs)))
 
     def run(self, seconds: float) -> None:
@@ -185,13 +186,13 @@ class Simulation:
         """Renew the lease no longer; commands are still given under it until it has run out, and then refused."""
         self._renew_at = 1 << 62
 
-    def order(self, kind: int, numbers: Sequence[float] = (), lease: int | None = None) -> Answer:
-        """Give a command, let one cycle pass and return the answer."""
-        number = self.observer.command(self.lease if lease is None else lease, kind, numbers)
+    def send(self, command: Command, lease: int | None = None) -> Answer:
+        """Send a command, let one cycle pass and return the answer."""
+        number = self.observer.command(self.lease if lease is None else lease, command)
         self.cycle()
         answer = self.observer.answer(number)
         if answer is None:
-            raise RuntimeError(f"the loop did not answer command {kind}")
+            raise RuntimeError(f"the loop did not answer {command.name}")
         return answer
 
 

@@ -7,22 +7,14 @@ all three.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import IntEnum
 from math import exp
 from typing import Protocol
 
 from rtcp.config.model import Joint
+from rtcp.ipc.states import DriveMode
 
 _FADE_S = 0.3
 """Time constant with which the drive's own following error gives way to the position loop closed here."""
-
-
-class DriveMode(IntEnum):
-    """Modes of operation that the cycle uses (CiA 402-2, object 0x6060)."""
-
-    CSP = 8
-    CSV = 9
-    CST = 10
 
 
 class Commanded(Protocol):

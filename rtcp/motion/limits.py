@@ -8,7 +8,7 @@ from math import isfinite
 from typing import NamedTuple, TypeAlias
 
 from rtcp.config.model import ArmConfig
-from rtcp.motion.planning.rows import COLUMNS, MOST_JOINTS
+from rtcp.motion.planning.plan import COLUMNS, MOST_JOINTS
 
 LEAST_PART = 1e-3
 """Of a configured speed, acceleration, jerk or torque: less of it is no limit, but an arm that does not move."""

@@ -1,23 +1,22 @@
-"""What a mode is told in a cycle and what it answers: preallocated, plain floats, one object of each for all modes."""
+"""What a controller sees and returns in a cycle: preallocated, plain floats."""
 
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import Protocol
 
 
 class Phase(IntEnum):
-    """What a mode is doing."""
+    """What a controller is doing."""
 
     HOLD = 0
-    """At rest, and nothing to do."""
+    """At rest; nothing to do."""
     MOVE = 1
     STOP = 2
-    """On the way to rest under its limits, having been told to stop."""
+    """On the way to rest under the limits."""
 
 
 class ArmState:
-    """The arm as a mode sees it at the beginning of a cycle; lists have one number a joint, rad, rad/s, rad/s^2, Nm.
+    """The arm at the beginning of a cycle; lists have one number a joint: rad, rad/s, rad/s^2, Nm.
 
     `commanded`, `commanded_velocity`, `commanded_acceleration` are those of the last cycle, after the guards: a
     controller that continues from them is continuous whatever the guards did. `actual`, `actual_velocity`,
@@ -46,64 +45,13 @@ class ArmState:
 
 
 class Setpoint:
-    """What a mode wants of this cycle: set-points of the next, rad and rad/s; `torque`: Nm that is added in CST."""
+    """What a controller asks for in the next cycle: rad, rad/s; and in CST a torque, Nm."""
 
-    __slots__ = ("position", "torque", "velocity")
+    __slots__ = ("direct", "position", "torque", "velocity")
 
     def __init__(self, joints: int) -> None:
         self.position = [0.0] * joints
         self.velocity = [0.0] * joints
         self.torque = [0.0] * joints
-
-
-class Reason(IntEnum):
-    """Why a mode ended a motion by itself, or slows it; `rtcp.ipc.messages` says it."""
-
-    NONE = 0
-    STREAM_ENDED = 1
-    """The sender fell silent."""
-    NO_SOLUTION = 2
-    """No inverse solution continues the motion: out of reach."""
-    JOINT_LIMIT = 3
-    """A joint's range ends the motion; `axis`."""
-    SINGULARITY = 4
-    """`axis`: 0 shoulder, 1 elbow, 2 wrist."""
-    CODE = 5
-    """The stick shows what is no code; `value`: the byte."""
-    PLAN = 6
-    """The plan in memory is damaged."""
-    KEEP_OUT = 7
-    """`axis`: which box, by its place in the configuration; -1: the Cartesian box."""
-    JUMP = 8
-    """The set-points would have had to jump."""
-    COMMAND_ENDED = 9
-    """A command that has to be renewed was not."""
-    GENERATOR = 10
-    """The trajectory generator refused its input: a defect."""
-
-
-class Controller(Protocol):
-    """A mode of motion. One `update` a cycle while it is the active one; nothing in it allocates without bound, blocks
-    or logs. It is started by its own method from a `ArmState`, and begins at the state's position, velocity and
-    acceleration.
-    """
-
-    phase: Phase
-    reason: Reason
-    """Why it is ending by itself; NONE otherwise, and at every start."""
-    axis: int
-    value: float
-    limit: float
-    """What the reason is about: joint or box (or -1), the number found and the one allowed."""
-    elapsed_s: float
-    duration_s: float
-    """Progress; 0 and 0 where there is none to tell."""
-    tolerates_saturation: bool
-    """True where a guard that cuts the target is the way the mode works (jogging, velocity); False where it means that
-    the motion cannot go on, and is stopped."""
-
-    def update(self, state: ArmState, dt: float) -> Setpoint:
-        """Return the set-points of the next cycle, `dt` s later. The target is the mode's own and used up at once."""
-
-    def stop(self, state: ArmState) -> None:
-        """Come to rest under the limits: phase STOP, then HOLD. Does nothing at rest."""
+        self.direct = False
+        """Whether `torque` is the whole torque of the joints, without the position loop of CST."""

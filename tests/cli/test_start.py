@@ -54,7 +54,7 @@ def test_a_mistake_in_the_segments_file_is_named_with_file_line_and_key_and_exit
     file.write_text("slaves:\n- model: diewu-io\n- model: toaster\n  options: {colour: 3}\n")
     ended = rtcp(*command, "--config", str(arm))
     assert (ended.code, ended.out) == (2, "")
-    assert f'{file}:3: slaves[1].model: found the text "toaster", allowed is one of diewu-io' in ended.trouble
+    assert f'{file}:3: slaves[1].model: found the text "toaster", allowed is one of cubemars-orh40' in ended.trouble
 
 
 @pytest.mark.parametrize("command", [("start",), ("scan",)])

@@ -18,6 +18,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket, exclusive, stop_marker
 from rtcp.ipc.session import (
@@ -35,7 +36,7 @@ from rtcp.ipc.session import (
     write_exit_report,
 )
 from rtcp.launch import launcher, platform
-from rtcp.launch.platform import Platform, StartError
+from rtcp.launch.platform import Platform
 
 JOINTS = 6
 
@@ -144,7 +145,7 @@ def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subproces
 def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
     directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(platform, "_ANSWER_S", 0.2)
+    monkeypatch.setattr(platform, "_ANSWER_TIMEOUT_S", 0.2)
     gateway = subprocess.Popen(["sleep", "600"])
     Processes(loop=identify(other.pid), gateway=identify(gateway.pid)).write(directory)
     told: list[tuple[str, int | None]] = []
@@ -165,9 +166,9 @@ def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
 def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
     directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launcher, "STOP_WAITS_S", 0.1)
+    monkeypatch.setattr(launcher, "STOP_TIMEOUT_S", 0.1)
     Processes(segment=identify(other.pid)).write(directory)
-    with exclusive(directory), pytest.raises(StartError, match=r"another process starts or stops .* has done nothing"):
+    with exclusive(directory), pytest.raises(RtcpError, match=r"another process starts or stops .* has done nothing"):
         launcher.stop(print)
     assert other.poll() is None
 
@@ -188,7 +189,7 @@ class Replacement:
     def _replace(self) -> None:
         try:
             self.ended.append(launcher.replace_gateway(self._directory))
-        except StartError as error:
+        except RtcpError as error:
             self.ended.append(error)
 
     def until_ended(self) -> object:
@@ -236,11 +237,12 @@ def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Pat
     os.close(running.begin_gateway())
     (child,) = running._children
     try:
-        environment = Path(f"/proc/{child.pid}/environ").read_bytes().split(b"\0")
+        while not (environment := Path(f"/proc/{child.pid}/environ").read_bytes()):
+            time.sleep(0.01)  # the kernel shows it a moment after the program has started
     finally:
         child.kill()
         child.wait()
-    assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment
+    assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment.split(b"\0")
 
 
 def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
@@ -250,7 +252,7 @@ def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
     running._children.append(subprocess.Popen(["sh", "-c", "sleep 0.2; exit 7"]))
     reading, writing = os.pipe()
     os.close(writing)
-    with pytest.raises(StartError, match="ended with code 7"):
+    with pytest.raises(RtcpError, match="ended with code 7"):
         running.await_gateway(reading)
 
 
@@ -259,7 +261,7 @@ def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmCo
     (directory / "gateway.log").write_text("who asked")
     (directory / "gateway.log.1").write_text("long ago")
     broken = replace(config, bus=replace(config.bus, interface="nosuch0"))
-    with pytest.raises(StartError):
+    with pytest.raises(RtcpError):
         launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda said: None)
     assert (directory / "loop.log.1").read_text() == "what went wrong"
     assert (directory / "gateway.log.1").read_text() == "who asked"

@@ -11,7 +11,7 @@ from kinematics.forward import forward, frames
 from kinematics.jacobian import jacobian, singularity_distances
 from rtcp.config import default_config, load
 from rtcp.motion.controllers.jog_inverse import JogInverse
-from rtcp.motion.state import Phase, Reason
+from rtcp.motion.state import Phase
 
 MODEL = load(default_config()).arm
 ZERO = [0.0] * 6
@@ -104,16 +104,16 @@ def test_a_stop_that_is_under_way_is_not_taken_back_by_a_command(jogged):
     drive = jogged(BENT).run(twist_of("+z"), 1.0)
     drive.jog.stop(drive.state)
     for _ in range(round(0.8 / PERIOD)):
-        drive.jog.command(twist_of("+z"), "base")
+        drive.jog.command(twist_of("+z"), in_tool_frame=False)
         drive.cycle()
     assert drive.jog.phase is Phase.HOLD
-    assert drive.jog.reason is Reason.NONE
+    assert drive.jog.ended is None
 
 
 def test_a_command_counts_until_its_instant_and_not_longer(jogged):
     drive = jogged(BENT)
-    drive.jog.start(drive.state)
-    drive.jog.command(twist_of("+z"), "base", 500_000_000)
+    drive.jog.start()
+    drive.jog.command(twist_of("+z"), in_tool_frame=False, until_ns=500_000_000)
     while drive.state.now_ns < 500_000_000:
         drive.cycle()
     assert drive.jog.phase is Phase.MOVE
@@ -131,7 +131,7 @@ def test_a_command_that_is_no_number_stops(jogged, number):
 
 def test_started_while_the_arm_moves_it_goes_on_without_a_jump(jogged):
     drive = jogged(BENT).run(twist_of("+x"), 0.5)
-    drive.jog.start(drive.state)
+    drive.jog.start()
     drive.run(twist_of("+x"), 0.5)
     drive.until_rest()
 

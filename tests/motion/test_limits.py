@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.motion.limits import Limits, Refused, Values, Wrong, read, rows
-from rtcp.motion.planning.rows import COLUMNS
+from rtcp.motion.planning.plan import COLUMNS
 
 from .judge import ARM, JOINTS_ONLY, Judge, with_boxes
 from .reference import points

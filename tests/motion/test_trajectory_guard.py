@@ -11,12 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.ipc.commands import MoveAtVelocity
+from rtcp.ipc.events import JointLimitReached
+from rtcp.motion.controllers import ControllerSetup
 from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.guards.braking import fastest_stoppable
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
+from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.limits import Limits, Values
-from rtcp.motion.state import Phase, Reason, Setpoint
+from rtcp.motion.state import Phase, Setpoint
 
 from .judge import JOINTS_ONLY, Judge
 
@@ -121,21 +124,21 @@ def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     if jerky:
         # So that the whole move is made with the greatest acceleration there is.
         limits.jerk[:] = [1e4, 1e4]
-    generator = JointMoveController(dt, limits.velocity, limits.acceleration, limits.jerk)
+    generator = JointMotion(dt, limits.velocity, limits.acceleration, limits.jerk)
     for a, b, speed, each, cycles in [*legs, (1.0, 0.0, 9.0, True, 10**6), (0.0, 1.0, 9.0, False, 10**6)]:
         # Shares beyond a half are the edges themselves.
         goal = [
             limits.high[0] if a > 0.5 else limits.low[0] * (1.0 - 2.0 * a),
             limits.high[1] if b > 0.5 else limits.low[1] * (1.0 - 2.0 * b),
         ]
-        if not generator.move_to(judge.state, goal, speed, each=each):
+        if not generator.move_to(judge.state, goal, speed, synchronized=not each):
             continue
         for _ in range(cycles):
-            target = generator.update(judge.state, dt)
+            target = generator.update(judge.state)
             position, velocity = list(target.position), list(target.velocity)
             verdict = judge.ask(position, tolerates_saturation=False, velocity=velocity)
             guard = judge.guard
-            assert verdict is GuardResult.PASS, (guard.axis, guard.value, guard.limit, judge.mean)
+            assert verdict is GuardResult.PASS, (guard.ended, judge.mean)
             assert (judge.state.commanded, judge.state.commanded_velocity) == (position, velocity)
             if generator.phase is Phase.HOLD:
                 break
@@ -178,12 +181,11 @@ def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float
 
 def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it() -> None:
     judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.001)
-    mode = VelocityController(judge.limits, judge.dt)
-    mode.start(judge.state)
+    mode = VelocityController(ControllerSetup(JOINTS_ONLY, judge.limits, judge.guard, judge.dt, [].__getitem__))
     for cycle in range(4000):
         if cycle % 100 == 0:
-            mode.command([0.5, -1.5], 1.0, judge.state.now_ns)
-        target = mode.update(judge.state, judge.dt)
+            assert mode.accept(MoveAtVelocity((0.5, -1.5), 1.0), judge.state, continues=cycle > 0) is None
+        target = mode.update(judge.state)
         verdict = judge.ask(list(target.position), mode.tolerates_saturation, list(target.velocity))
         assert verdict in (GuardResult.PASS, GuardResult.CLAMPED)
         judge.state.now_ns += 1_000_000
@@ -218,7 +220,7 @@ def test_a_cut_of_a_mode_that_cannot_live_with_it_is_a_stop_that_looks_at_no_tar
         judge.ask([1.0, 0.0], tolerates_saturation=True)
     assert judge.ask([99.0, 0.0], tolerates_saturation=False) is GuardResult.STOPPING
     guard = judge.guard
-    assert (guard.code, guard.axis, guard.value, guard.limit) == (Reason.JOINT_LIMIT, 0, 99.0, judge.limits.high[0])
+    assert guard.ended == JointLimitReached(0, 99.0, judge.limits.high[0])
     speed = judge.state.commanded_velocity[0]
     cycles = 1
     while judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=True) is GuardResult.STOPPING:
@@ -234,7 +236,7 @@ def test_a_step_that_is_too_long_is_told_as_a_speed() -> None:
     judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
     judge.ask([0.0, 0.1], tolerates_saturation=False)
     guard = judge.guard
-    assert (guard.axis, guard.value, guard.limit) == (1, pytest.approx(100.0), pytest.approx(0.7e-3))
+    assert guard.ended == JointLimitReached(1, pytest.approx(100.0), pytest.approx(0.7e-3))
 
 
 @given(beyond=st.floats(0.0, 0.02), dt=CYCLES_S, outward=st.booleans())

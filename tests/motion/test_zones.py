@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
+from rtcp.ipc.events import BoxReached
 from rtcp.motion.guards.braking import touched
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 from rtcp.motion.limits import Limits
-from rtcp.motion.state import Reason
 
 from .judge import ARM, MODEL, Judge, with_boxes
 from .reference import Point, depth, points
@@ -140,8 +140,8 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     # And the way back in ends before the box.
     while driven(judge, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
         assert points(judge.state.commanded)[0][1] > box[4]
-    assert judge.guard.code is Reason.KEEP_OUT
-    assert judge.guard.axis == 0
+    assert isinstance(judge.guard.ended, BoxReached)
+    assert judge.guard.ended.box == 0
     here = -depth(points(judge.state.commanded)[0], box)
     assert 0.0 <= here < 0.004
 
@@ -192,10 +192,10 @@ def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
             driven(judge, direction, 1)
             if judge.guard.stopping:
                 break
-        if judge.guard.stopping and judge.guard.code is Reason.KEEP_OUT:
+        if judge.guard.stopping and isinstance(judge.guard.ended, BoxReached):
             stops += 1
             assert judge.guard.nearest_box(judge.state.commanded)[0] >= 0.0
-            assert judge.guard.value >= 0.0
+            assert judge.guard.ended.distance >= 0.0
     assert stops > 10
 
 
@@ -204,7 +204,8 @@ def test_a_stop_before_the_tools_own_box_names_it() -> None:
     judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
     verdicts = driven(judge, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 400)
     assert GuardResult.STOPPED in verdicts
-    assert (judge.guard.code, judge.guard.axis) == (Reason.KEEP_OUT, -1)
+    assert isinstance(judge.guard.ended, BoxReached)
+    assert judge.guard.ended.box == -1
     assert -0.05 < points(judge.state.commanded)[0][0] - tool[0] < 0.05
 
 

@@ -6,9 +6,9 @@ import pytest
 
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
+from rtcp.ipc.codes import Reason
 from rtcp.ipc.machine import ALLOWED, Code, Command, Refusal, State
 from rtcp.ipc.messages import Sentences
-from rtcp.motion.state import Reason
 
 SENTENCES = Sentences(load(default_config()))
 

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.zero import read_zeros, state_directory, store_zero, zero_file
-from rtcp.launch.launcher import StartOptions, _configured
+from rtcp.launch.launcher import StartOptions, _configure
 
 ARM = load(default_config())
 
@@ -127,12 +127,12 @@ def test_a_gripper_with_a_drive_has_an_offset_too() -> None:
 
 def test_the_start_puts_the_offsets_into_the_configuration() -> None:
     options = StartOptions(config=default_config())
-    assert _configured(options).zero_offsets == ()
+    assert _configure(options).zero_offsets == ()
     store_zero(ARM, 1, 0.75)
-    assert _configured(options).zero_offsets == (0.0, 0.75, 0.0, 0.0, 0.0, 0.0)
+    assert _configure(options).zero_offsets == (0.0, 0.75, 0.0, 0.0, 0.0, 0.0)
     spoil("0.75", "0.76")
     with pytest.raises(ConfigError, match="check: found"):
-        _configured(options)
+        _configure(options)
 
 
 # -- what is wrong with it ---------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from tests.sessions.driver import NONSENSE, STICK, Driver, configuration, is_fre
 
 COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
-"""Column 19 of a plan's row (`rtcp.motion.planning.rows`)."""
+"""Column 19 of a plan's row (`rtcp.motion.planning.plan`)."""
 HOLD_S = 0.2
 
 

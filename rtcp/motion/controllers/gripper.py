@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtcp.config.model import Joint
-from rtcp.motion.controllers.joint_move import JointMoveController
+from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 
 _FIRM_CYCLES = 5
@@ -23,7 +23,7 @@ class GripperMotion:
 
     def __init__(self, joint: Joint, open_position: float, closed_position: float, period_s: float) -> None:
         """Make the motion of `joint`; positions in rad inside its range, the cycle in s."""
-        self._generator = JointMoveController(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
+        self._motion = JointMotion(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
         self._state = ArmState(1)
         self._period_s = period_s
         # A way that begins in motion takes the last cycle's mean acceleration for the present one, and errs by so much.
@@ -46,27 +46,27 @@ class GripperMotion:
     @property
     def moving(self) -> bool:
         """Whether it is on its way."""
-        return self._generator.phase is not Phase.HOLD
+        return self._motion.phase is not Phase.HOLD
 
     @property
     def stops(self) -> bool:
         """Whether it comes to rest on its way."""
-        return self._generator.phase is Phase.STOP
+        return self._motion.phase is Phase.STOP
 
     def latch(self, position: float) -> None:
         """Rest at `position`, rad, or at the end of the range that it is beyond: without torque it is where it is."""
         state = self._state
         state.commanded[0] = self.clamped(position)
         state.commanded_velocity[0] = state.commanded_acceleration[0] = 0.0
-        self._generator.hold()
+        self._motion.hold()
         self._firm = 0
         self.gripped = False
 
     def grip(self, close: bool) -> bool:
         """Go to where it is closed, or open, from whatever it does; return False where no way is found."""
-        if close is self._closing and self._generator.phase is Phase.MOVE:
+        if close is self._closing and self._motion.phase is Phase.MOVE:
             return True
-        if not self._generator.move_to(self._state, [self._goals[close]], self._speed):
+        if not self._motion.move_to(self._state, [self._goals[close]], self._speed):
             return False
         self._closing = close
         self._firm = 0
@@ -77,10 +77,10 @@ class GripperMotion:
         """Come to rest under its limits."""
         state = self._state
         if any(state.commanded_velocity) or any(state.commanded_acceleration):
-            self._generator.stop(state)
+            self._motion.stop(state)
         else:
             # On a way that has not begun: the generator's stop does nothing at rest.
-            self._generator.hold()
+            self._motion.hold()
 
     def update(self, torque: float) -> float:
         """Return the set-point of the next cycle, rad; `torque`: measured, Nm."""
@@ -97,7 +97,7 @@ class GripperMotion:
             return here
         if self.gripped and torque * self._direction > self._firm_torque:
             state.commanded[0] -= self._direction * self._yielding
-        target = self._generator.update(state, self._period_s)
+        target = self._motion.update(state)
         position = self._next(state.commanded[0], target.position[0])
         velocity = target.velocity[0]
         state.commanded[0] = position

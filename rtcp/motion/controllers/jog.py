@@ -16,17 +16,19 @@ from collections.abc import Sequence
 
 from kinematics.forward import frames
 from kinematics.jacobian import jacobian_columns
-from kinematics.model import ArmModel
 from kinematics.pose import Pose, Rotation, applied, times
-from rtcp.config.model import ArmConfig
+from rtcp.ipc.commands import Command, Jog
+from rtcp.ipc.events import OutOfReach
+from rtcp.ipc.refusals import JogSpeedOutOfRange, NoGeometry, Refusal
+from rtcp.ipc.states import JogFrame
+from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.controllers.jog_bounds import JogBounds
 from rtcp.motion.controllers.jog_elbow import bend
 from rtcp.motion.controllers.jog_inverse import ELBOW, JogInverse
 from rtcp.motion.controllers.jog_ramp import JogRamp
 from rtcp.motion.controllers.jog_speeds import FULL, JogSpeeds
-from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.limits import Limits
-from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
+from rtcp.motion.controllers.velocity import VelocityController
+from rtcp.motion.state import ArmState, Phase, Setpoint
 
 FOR_EVER = 1 << 62
 _BRAKING = 0.7
@@ -39,36 +41,36 @@ _AT_REST = 2e-3
 """m/s, rad/s: what is slower is not taken for a motion that is wanted."""
 
 
-class JogController:
-    """The mode `jog`, for a stick and for commands.
+class JogController(Controller):
+    """Accepts `Jog`, and is commanded by the joystick (`start`, `command`).
 
-    Args:
-        config: Cartesian and jog limits; it must have a geometry.
-        model: the geometry; without a spherical wrist the arm stands.
-        limits: of the joints; read every cycle.
-        trajectory_guard: knows the boxes and the frames of what is commanded.
-        period_s: the cycle, s.
+    Without geometry it jogs joints only; without a spherical wrist the tool stands.
     """
 
-    def __init__(
-        self, config: ArmConfig, model: ArmModel, limits: Limits, trajectory_guard: TrajectoryGuard, period_s: float
-    ) -> None:
-        cartesian = config.cartesian
+    name = "jog"
+    commands = (Jog,)
+    tolerates_saturation = True
+
+    def __init__(self, setup: ControllerSetup) -> None:
+        super().__init__(setup)
+        cartesian, model, limits = setup.config.cartesian, setup.config.arm, setup.limits
+        self._velocity = VelocityController(setup)
+        self._by_joints = False
+        self.has_geometry = model is not None
+        if model is None:
+            return
         singularity = cartesian.singularity
         self._model = model
-        self._limits = limits
-        self._trajectory_guard = trajectory_guard
+        self._trajectory_guard = setup.trajectory_guard
         self._inverse = JogInverse(model)
         nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
         braking = _BRAKING * cartesian.acceleration
-        self._bounds = JogBounds(limits, trajectory_guard, self._inverse, braking, nearest, period_s)
+        self._bounds = JogBounds(limits, setup.trajectory_guard, self._inverse, braking, nearest, setup.period_s)
         self._ramp = JogRamp(cartesian)
         self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
-        self._zero = [0.0] * 6
-        self._target = Setpoint(6)
         self._asked = [0.0] * 6
         self._wanted = [0.0] * 6
-        self._joints = JogSpeeds(limits)
+        self._scaled = JogSpeeds(limits)
         self._in_tool = False
         self._until_ns = FOR_EVER
         self._line: Pose | None = None
@@ -76,30 +78,47 @@ class JogController:
         self._last = [0.0] * 6
         self._posed = False
         self._wrist = singularity.wrist
-        self.tolerates_saturation = True
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: ArmState) -> None:
-        """Begin at `state`; nothing is asked for yet."""
-        self.phase, self.reason = Phase.MOVE, Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
+    def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
+        """Move the tool, or the joints, at the velocities until they expire."""
+        assert isinstance(command, Jog)
+        continues = continues and self.phase is Phase.MOVE and self._by_joints is (command.frame is JogFrame.JOINTS)
+        if command.frame is JogFrame.JOINTS:
+            refusal = self._velocity.ramp_to(command.velocity, command.hold_s, state, continues)
+            if refusal is None and not continues:
+                self.begin()
+                self._by_joints = True
+            return refusal
+        if not self.has_geometry:
+            return NoGeometry()
+        bounds = (self._speed,) * 3 + (self._angular_speed,) * 3
+        refusal = self.not_within(command.velocity, bounds, command.hold_s, JogSpeedOutOfRange)
+        if refusal is not None:
+            return refusal
+        if not continues:
+            self.start()
+        until_ns = state.now_ns + round(command.hold_s * 1e9)
+        self.command(command.velocity, in_tool_frame=command.frame is JogFrame.TOOL, until_ns=until_ns)
+        return None
+
+    def start(self) -> None:
+        """Begin to jog the tool, with velocity 0."""
+        self.begin()
+        self._by_joints = False
         self._asked[:] = self._zero
         self._until_ns = FOR_EVER
         self._fresh = True
 
-    def command(self, twist: Sequence[float], frame: str, until_ns: int = FOR_EVER) -> None:
-        """Ask for a tool velocity: vx, vy, vz (m/s), wx, wy, wz (rad/s) along the axes of `frame` (base or tool).
+    def command(self, twist: Sequence[float], *, in_tool_frame: bool, until_ns: int = FOR_EVER) -> None:
+        """Move the tool at vx, vy, vz (m/s), wx, wy, wz (rad/s) along the axes of its own frame or of the base.
 
-        It counts until the instant `until_ns`. It is brought down to the greatest speeds of the configuration; numbers
-        that are none stop. While the mode stops nothing is taken: a stop that has ended is begun anew with `start`.
+        The twist counts until the instant `until_ns`. It is scaled down to the largest speeds of the configuration;
+        numbers that are not finite stop. Ignored while the controller stops: `start` begins anew.
         """
         if self.phase is not Phase.MOVE:
             return
         self._until_ns = until_ns
-        self._in_tool = frame == "tool"
+        self._in_tool = in_tool_frame
         a, b, c, d, e, f = twist
         linear, angular = a * a + b * b + c * c, d * d + e * e + f * f
         asked = self._asked
@@ -117,32 +136,30 @@ class JogController:
             asked[i] = part * twist[i]
 
     def stop(self, state: ArmState) -> None:
-        """Come to rest."""
+        """Come to rest; the tool keeps its direction."""
         if self.phase is Phase.MOVE:
-            self._asked[:] = self._zero
             self.phase = Phase.STOP
+            if self._by_joints:
+                self._velocity.stop(state)
+            else:
+                self._asked[:] = self._zero
 
-    def hold(self) -> None:
-        """End whatever is under way where the set-points are: something else has taken the arm."""
-        self._asked[:] = self._zero
-        self.phase = Phase.HOLD
-
-    def update(self, state: ArmState, dt: float) -> Setpoint:
-        """Return the set-points of the next cycle."""
-        target = self._target
-        position = state.commanded
-        if not self.phase:
-            target.position, target.velocity = position, self._zero
-            return target
+    def advance(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle."""
+        if self._by_joints:
+            setpoint = self._velocity.update(state)
+            self.phase, self.ended = self._velocity.phase, self._velocity.ended
+            return setpoint
+        position, dt = state.commanded, self.period_s
         if state.now_ns > self._until_ns and self.phase is Phase.MOVE:
             self.stop(state)
-        inverse, bounds, ramp, joints = self._inverse, self._bounds, self._ramp, self._joints
+        inverse, bounds, ramp, joints = self._inverse, self._bounds, self._ramp, self._scaled
         jumped = self._fresh or position != self._last
         poses = self._trajectory_guard.poses
         if jumped or not self._posed:
             poses = frames(self._model, position)
         if not (inverse.usable and inverse.at(poses)):
-            return self._brake(state, dt)
+            return self._stand(state)
         if jumped:
             # The beginning, or the guards have changed what was commanded: go on from where the arm is.
             ramp.begin(_reached(poses, state.commanded_velocity))
@@ -155,7 +172,7 @@ class JogController:
         twist[:] = ramp.velocity
         self._fit(poses, wanted)
         if inverse.locked[ELBOW]:
-            bend(inverse, poses, position, wanted, speeds, self._limits, self._wrist)
+            bend(inverse, poses, position, wanted, speeds, self.limits, self._wrist)
         self._back(poses[6])
         if joints.follow(state, dt):
             self._advance(dt, poses[6])
@@ -170,7 +187,7 @@ class JogController:
         return self._answer(position, dt)
 
     def _answer(self, position: Sequence[float], dt: float) -> Setpoint:
-        target, speeds = self._target, self._joints.speeds
+        target, speeds = self.setpoint, self._scaled.speeds
         target.position = self._last = [q + v * dt for q, v in zip(position, speeds, strict=True)]
         target.velocity = speeds
         return target
@@ -188,7 +205,7 @@ class JogController:
 
     def _fit(self, poses: Sequence[Pose], wanted: Sequence[float]) -> None:
         """Bring the twist, and the joint speeds with it, within all bounds."""
-        joints, bounds, rows = self._joints, self._bounds, self._inverse.rows
+        joints, bounds, rows = self._scaled, self._bounds, self._inverse.rows
         twist = joints.twist
         joints.make(rows)
         if bounds.passed(poses, twist, joints.speeds):
@@ -217,7 +234,7 @@ class JogController:
         if dx * dx + dy * dy + dz * dz + tx * tx + ty * ty + tz * tz > _OFF_LINE_M * _OFF_LINE_M:
             self._line = None
             return
-        speeds, fastest = self._joints.speeds, self._limits.velocity
+        speeds, fastest = self._scaled.speeds, self.limits.velocity
         for at, (row0, row1, row2, row3, row4, row5) in enumerate(self._inverse.rows):
             v = speeds[at] + _BACK_1_S * (row0 * dx + row1 * dy + row2 * dz + row3 * tx + row4 * ty + row5 * tz)
             most = fastest[at]
@@ -225,7 +242,7 @@ class JogController:
 
     def _advance(self, dt: float, tool: Pose) -> None:
         """Let the line go on with what the tool does in this cycle."""
-        twist = self._joints.twist
+        twist = self._scaled.twist
         if self._inverse.lost or self._bounds.axis >= 0 or not any(twist):
             self._line = None
             return
@@ -235,18 +252,18 @@ class JogController:
             rotation = times(_turn(d * dt, e * dt, f * dt), rotation)
         self._line = Pose((x + a * dt, y + b * dt, z + c * dt), rotation)
 
-    def _brake(self, state: ArmState, dt: float) -> Setpoint:
+    def _stand(self, state: ArmState) -> Setpoint:
         """Each joint brakes as fast as it may: there is no inverse."""
-        speeds = self._joints.speeds
+        speeds = self._scaled.speeds
         speeds[:] = self._zero
-        self._joints.clip(state.commanded_velocity, FULL * dt)
+        self._scaled.clip(state.commanded_velocity, FULL * self.period_s)
         self._line = None
         self._fresh = True
         self._posed = False
-        self.reason = Reason.NO_SOLUTION
+        self.ended = OutOfReach(0.0)
         if not any(speeds) and (self.phase is Phase.STOP or not any(self._asked)):
             self.phase = Phase.HOLD
-        return self._answer(state.commanded, dt)
+        return self._answer(state.commanded, self.period_s)
 
 
 def _reached(poses: Sequence[Pose], speeds: Sequence[float]) -> list[float]:

@@ -1,167 +1,44 @@
-"""Jerk-limited joint motion (ruckig): hold, move to a configuration, stop.
-
-The commanded position is continuous whatever is asked: a new target starts from the state that was commanded last.
-"""
+"""Moves of the joints to a configuration, jerk-limited; a new target begins at what was commanded last."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from math import isfinite
 
-from ruckig import (
-    ControlInterface,
-    InputParameter,
-    OutputParameter,
-    Result,
-    Ruckig,
-    RuckigError,
-    Synchronization,
-    Trajectory,
-)
-
-from rtcp.motion.controllers.room import allowed_accelerations
-from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
-
-LONGEST_S = 600.0
-"""A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
-# ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: a little less jerk
-# is not on the border any more.
-_JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
+from rtcp.ipc.commands import Command, MoveJoints
+from rtcp.ipc.refusals import NoTrajectory, Refusal, SpeedOutOfRange, TargetInBox
+from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import LONGEST_S
+from rtcp.motion.state import ArmState, Setpoint
 
 
-class JointMoveController:
-    """The modes `hold` and `joint`, and the stop that all modes share: set-points for `n` joints.
+class JointMoveController(Controller):
+    """Accepts `MoveJoints`."""
 
-    Args:
-        period_s: the cycle, s.
-        velocity, acceleration, jerk: bounds of each joint, shape (n,), rad/s, rad/s^2, rad/s^3.
-    """
+    name = "joint_move"
+    commands = (MoveJoints,)
 
-    def __init__(
-        self, period_s: float, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]
-    ) -> None:
-        n = len(velocity)
-        self._otg = Ruckig(n, period_s)
-        self._output = OutputParameter(n)
-        self._plan = Trajectory(n)
-        # A move is planned beside the one that runs, and takes over only when the plan succeeds.
-        self._inputs = [InputParameter(n), InputParameter(n), InputParameter(n)]
-        self._stop = self._inputs[2]
-        self._stop.control_interface = ControlInterface.Velocity
-        # Every joint stops as fast as it may: the path matters less than standing still.
-        self._stop.synchronization = Synchronization.No
-        self._zero = [0.0] * n
-        self._active = self._inputs[0]
-        self._target = Setpoint(n)
-        self.set_limits(velocity, acceleration, jerk)
-        self.tolerates_saturation = False
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self.duration_s = 0.0
-        self.elapsed_s = 0.0
+    def __init__(self, setup: ControllerSetup) -> None:
+        super().__init__(setup)
+        self._guard = setup.trajectory_guard
 
-    def set_limits(self, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]) -> None:
-        """Take other bounds, each of shape (n,); a motion that is under way goes on under those that it began with."""
-        self._velocity_limit = list(velocity)
-        self._acceleration_limit = list(acceleration)
-        self._jerk_limit = list(jerk)
+    def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
+        """Move to the target; a move under way is replaced without a stop."""
+        assert isinstance(command, MoveJoints)
+        fastest = max(self.limits.velocity)
+        if not isfinite(command.speed) or not 0.0 < command.speed <= fastest:
+            return SpeedOutOfRange(command.speed, fastest)
+        if (refusal := self.not_in_range(command.q)) is not None:
+            return refusal
+        box = self._guard.zone_at(command.q)
+        if box is not None:
+            return TargetInBox(box)
+        if not self.motion.move_to(state, command.q, command.speed, synchronized=command.synchronized):
+            return NoTrajectory(command.speed, LONGEST_S)
+        self.begin()
+        return None
 
-    def hold(self) -> None:
-        """Hold where the state is from now on. Only for standstill: enable, lost bus, after another mode."""
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-
-    def move_to(self, state: ArmState, target: Sequence[float], speed: float, *, each: bool = False) -> bool:
-        """Move to `target` (rad, shape (n,)); return False where no plan is found.
-
-        Without a plan, or with one longer than `LONGEST_S`, what was under way goes on.
-
-        Args:
-            state: where the motion begins.
-            target: inside the joint limits, which the caller has checked.
-            speed: bound of every joint's speed, rad/s; each joint's own limit holds besides.
-            each: every joint arrives as early as it can; otherwise all arrive together.
-        """
-        move = self._inputs[1] if self._active is self._inputs[0] else self._inputs[0]
-        self._carry_over(move, state)
-        move.synchronization = Synchronization.No if each else Synchronization.Time
-        move.target_position = list(target)
-        move.target_velocity = self._zero
-        # A joint that is faster than the new bound (a slower move begins in motion) needs room to slow down.
-        move.max_velocity = [
-            max(min(speed, limit), abs(now))
-            for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
-        ]  # fmt: skip
-        if not self._planned(move):
-            return False
-        self._active = move
-        self._begin(Phase.MOVE)
-        return True
-
-    def _planned(self, move: InputParameter) -> bool:
-        for scale in _JERK_SCALES:
-            move.max_jerk = [scale * jerk for jerk in self._jerk_limit]
-            try:
-                if self._otg.calculate(move, self._plan) >= 0:
-                    return bool(self._plan.duration <= LONGEST_S)
-            except (RuckigError, ValueError):
-                # ruckig raises where its algorithm fails, and where its own result code is unknown to its binding.
-                continue
-        return False
-
-    def stop(self, state: ArmState) -> None:
-        """Come to rest under the acceleration and jerk limits, from whatever mode; at rest nothing begins any more."""
-        if self.phase is Phase.STOP:
-            return
-        if not (any(state.commanded_velocity) or any(state.commanded_acceleration)):
-            # A move that has not begun, because no frame came since it was asked for, never does.
-            self.hold()
-            return
-        self._carry_over(self._stop, state)
-        self._stop.max_velocity = self._velocity_limit
-        self._stop.max_jerk = self._jerk_limit
-        self._stop.target_velocity = self._zero
-        self._active = self._stop
-        self._begin(Phase.STOP)
-
-    def _begin(self, phase: Phase) -> None:
-        self.phase = phase
-        self.reason = Reason.NONE
-        self.elapsed_s = 0.0
-
-    def _carry_over(self, given: InputParameter, state: ArmState) -> None:
-        given.current_position = state.commanded
-        given.current_velocity = state.commanded_velocity
-        bounds = self._acceleration_limit
-        given.max_acceleration = bounds
-        given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
-        given.target_acceleration = self._zero
-
-    def update(self, state: ArmState, dt: float) -> Setpoint:
-        """Return the set-points of the next cycle; where ruckig refuses they stand, and the reason says so."""
-        target = self._target
-        if not self.phase:
-            target.position = state.commanded
-            target.velocity = self._zero
-            return target
-        output = self._output
-        try:
-            result = self._otg.update(self._active, output)
-        except (RuckigError, ValueError):
-            result = Result.Error
-        if result < 0:
-            target.position = state.commanded
-            target.velocity = self._zero
-            self.phase = Phase.HOLD
-            self.reason = Reason.GENERATOR
-            return target
-        target.position = output.new_position
-        target.velocity = output.new_velocity
-        self.duration_s = output.trajectory.duration
-        self.elapsed_s = output.time
-        if result == Result.Finished:
-            target.velocity = self._zero
-            self.phase = Phase.HOLD
-        else:
-            output.pass_to_input(self._active)
-        return target
+    def advance(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle."""
+        setpoint = self.follow_motion(state)
+        self.elapsed_s, self.duration_s = self.motion.elapsed_s, self.motion.duration_s
+        return setpoint

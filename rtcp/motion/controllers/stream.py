@@ -4,49 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
-from typing import TYPE_CHECKING
 
 from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
 
-from rtcp.motion.controllers.joint_move import JointMoveController
-from rtcp.motion.controllers.room import allowed_accelerations, stoppable_speed
-from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
-
-if TYPE_CHECKING:
-    from rtcp.motion.limits import Limits
+from rtcp.ipc.commands import Command, StreamPosition
+from rtcp.ipc.events import ControllerFailed, StreamEnded
+from rtcp.ipc.refusals import Refusal, StampNotFinite, StreamPointDropped
+from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import allowed_accelerations, stoppable_speed
+from rtcp.motion.state import ArmState, Phase, Setpoint
 
 TIMEOUT_S = 0.2
-"""A stream that is silent for so long has ended."""
+"""A stream that is silent for this long has ended."""
 _LATE = 2.5
-"""So many intervals after the last target one is missing; until then its speed is kept."""
+"""A target is missing this many intervals after the last one; until then the speed is kept."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
-"""How much a new interval counts in the mean."""
+"""Weight of a new interval in the mean."""
 _SLACK = 1e-6
 _DRIFT = 1e-4
-"""The sender's clock may run so much slower than ours, as a fraction."""
+"""The sender's clock may be slower than ours by this fraction."""
+_TIMEOUT_NS = round(TIMEOUT_S * 1e9)
 
 
-class StreamController:
-    """The mode `stream`.
+class StreamController(Controller):
+    """Accepts `StreamPosition`. A target that is late by more than the timeout, or out of order, is dropped."""
 
-    Args:
-        limits: of the joints; read in every cycle.
-        period_s: the cycle, s.
-        timeout_s: so long after the last target the arm comes to rest.
-    """
+    name = "stream"
+    commands = (StreamPosition,)
 
-    def __init__(self, limits: Limits, period_s: float, timeout_s: float = TIMEOUT_S) -> None:
-        n = len(limits.velocity)
-        self._limits = limits
-        self._brake = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self._brakes = False
-        self._otg = Ruckig(n, period_s)
-        self._way, self._output, self._plan = InputParameter(n), OutputParameter(n), Trajectory(n)
-        self._target = Setpoint(n)
-        self._zero = [0.0] * n
-        self._joints = range(n)
-        self._timeout_ns = round(timeout_s * 1e9)
+    def __init__(self, setup: ControllerSetup) -> None:
+        super().__init__(setup)
+        n = len(self._zero)
+        self._otg = Ruckig(n, setup.period_s)
+        self._way, self._output, self._found = InputParameter(n), OutputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
         self._last: list[float] = []
@@ -54,90 +45,57 @@ class StreamController:
         self._came_ns = 0
         self._interval_s = 0.0
         self._lag_s = 0.0
-        self._samples = 0
+        self._first = True
         self._fresh = self._tracks = False
-        self.tolerates_saturation = False
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self.elapsed_s = self.duration_s = 0.0
-        self.accepted = self.dropped = 0
-        """How many targets were taken and how many were not, since the stream began."""
-        self.late_s = 0.0
-        """How late the last one that was dropped came, s; 0 for one that was none."""
 
-    def start(self, state: ArmState) -> None:
-        """Begin at `state`; the next target that `feed` takes is the first."""
-        self.phase, self.reason = Phase.MOVE, Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self._samples = self.accepted = self.dropped = 0
-        self._interval_s = 0.0
+    def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
+        """Follow the target from the next cycle on."""
+        assert isinstance(command, StreamPosition)
+        if (refusal := self.not_in_range(command.q)) is not None:
+            return refusal
+        if not isfinite(command.stamp_s):
+            return StampNotFinite(command.stamp_s)
+        if not continues or self.phase is not Phase.MOVE:
+            self._start(state)
+        late_s = self._take(command.q, command.stamp_s, state.now_ns)
+        return None if late_s is None else StreamPointDropped(late_s)
+
+    def _start(self, state: ArmState) -> None:
+        self.begin()
+        self._first, self._interval_s = True, 0.0
         self._came_ns = state.now_ns
-        self._fresh = self._tracks = self._brakes = False
-        # Until the first target comes, what moves comes to rest.
-        self._rest_from(state)
+        self._fresh = self._tracks = False
         self._wanted = list(state.commanded)
         self._speed = list(self._zero)
 
-    def feed(self, q: Sequence[float], stamp_s: float, now_ns: int) -> bool:
-        """Take a target and return True, or drop it and return False.
-
-        Dropped is what is no number or outside the joints' range, what is stamped no later than the last one taken, and
-        what comes later than the others by more than the timeout.
-
-        Args:
-            q: rad, shape (n,) at least; what is beyond is not looked at.
-            stamp_s: the sender's clock, s; only differences count.
-            now_ns: as `ArmState.now_ns`.
-        """
-        self.late_s = 0.0
-        if self.phase is not Phase.MOVE or not isfinite(stamp_s) or not self._inside(q):
-            self.dropped += 1
-            return False
-        now_s = now_ns * 1e-9
-        lag = now_s - stamp_s
-        first = self._samples == 0
-        if not first:
-            step = stamp_s - self._stamp_s
+    def _take(self, q: Sequence[float], stamp_s: float, now_ns: int) -> float | None:
+        """Take a target over, or return how late it is, s, and drop it."""
+        lag = now_ns * 1e-9 - stamp_s
+        step = stamp_s - self._stamp_s
+        if not self._first:
             if step <= 0.0:
-                self.late_s = -step
-                self.dropped += 1
-                return False
-            # The least lag of all is the clocks' difference: what exceeds it is how late a target came.
+                return -step
+            # The least lag is the difference of the clocks: what exceeds it is how late a target came.
             self._lag_s = min(lag, self._lag_s + _DRIFT * step)
-            late = lag - self._lag_s
-            if late * 1e9 > self._timeout_ns:
-                self.late_s = late
-                self.dropped += 1
-                return False
-            if step * 1e9 > self._timeout_ns:
-                first = True
-        if first:
-            if self._samples == 0:
-                self._lag_s = lag
+            if lag - self._lag_s > TIMEOUT_S:
+                return lag - self._lag_s
+        else:
+            self._lag_s = lag
+        if self._first or step > TIMEOUT_S:
             self._speed = list(self._zero)
             self._interval_s = 0.0
         else:
             self._learn(q, step)
-        wanted = self._wanted
-        for i in self._joints:
-            wanted[i] = q[i]
+        self._wanted[:] = q
         self._stamp_s, self._came_ns = stamp_s, now_ns
-        self._samples += 1
-        self.accepted += 1
-        self._fresh = True
-        return True
-
-    def _inside(self, q: Sequence[float]) -> bool:
-        low, high = self._limits.low, self._limits.high
-        # A comparison with what is no number is false.
-        return all(low[i] <= q[i] <= high[i] for i in self._joints)
+        self._first, self._fresh = False, True
+        return None
 
     def _learn(self, q: Sequence[float], step: float) -> None:
         """Estimate the interval, and with which speed the target moves."""
         interval = self._interval_s
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
-        limits, wanted, speed = self._limits, self._wanted, self._speed
+        limits, wanted, speed = self.limits, self._wanted, self._speed
         over = 1.0 / step
         for i in self._joints:
             v = (q[i] - wanted[i]) * over
@@ -148,49 +106,24 @@ class StreamController:
             bound = stops if stops < bound else bound
             speed[i] = bound if v > bound else -bound if v < -bound else v
 
-    def stop(self, state: ArmState) -> None:
-        """Come to rest under the limits; further targets are dropped."""
-        if self.phase is Phase.MOVE:
-            self.phase = Phase.STOP
-            self._rest_from(state)
-            self._brakes = True
-
-    def _rest_from(self, state: ArmState) -> None:
-        brake, limits = self._brake, self._limits
-        brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
-        brake.hold()
-        brake.stop(state)
-
-    def update(self, state: ArmState, dt: float) -> Setpoint:
-        """Return the set-points of the next cycle."""
-        target = self._target
-        if self._brakes:
-            target = self._brake.update(state, dt)
-            if not self._brake.phase:
-                self._brakes, self.phase = False, Phase.HOLD
-            return target
-        if not self.phase:
-            target.position, target.velocity = state.commanded, self._zero
-            return target
-        silent_ns = state.now_ns - self._came_ns
-        if silent_ns > self._timeout_ns:
-            self.reason, self.value, self.limit = Reason.STREAM_ENDED, silent_ns * 1e-9, self._timeout_ns * 1e-9
-            self.stop(state)
-            return self.update(state, dt)
+    def advance(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle."""
+        target = self.setpoint
+        if state.now_ns - self._came_ns > _TIMEOUT_NS:
+            return self.give_up(state, StreamEnded())
         if self._fresh:
             self._fresh = False
             self._aim(state)
         elif not self._tracks:
-            return self._brake.update(state, dt)
+            # It rests at the last target.
+            return self.rest(state)
         output = self._output
         try:
             result = self._otg.update(self._way, output)
         except (RuckigError, ValueError):
             result = Result.Error
         if result < 0:
-            self.reason = Reason.GENERATOR
-            self.stop(state)
-            return self.update(state, dt)
+            return self.give_up(state, ControllerFailed())
         target.position = self._last = output.new_position
         target.velocity = output.new_velocity
         if result == Result.Finished:
@@ -206,8 +139,7 @@ class StreamController:
 
     def _aim(self, state: ArmState) -> None:
         """Plan from the state to the newest target, with the speed that it has; where that cannot be, to rest at it."""
-        way, limits = self._way, self._limits
-        self._brake.hold()
+        way, limits = self._way, self.limits
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
         if not self._tracks or state.commanded != self._last:
             way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
@@ -222,11 +154,11 @@ class StreamController:
     def _stays_inside(self, state: ArmState) -> bool:
         """Whether there is a way to the target at its speed, and the run-up for it lies inside the range."""
         try:
-            if self._otg.calculate(self._way, self._plan) < 0:
+            if self._otg.calculate(self._way, self._found) < 0:
                 return False
         except (RuckigError, ValueError):
             return False
-        low, high, extrema = self._limits.low, self._limits.high, self._plan.position_extrema
+        low, high, extrema = self.limits.low, self.limits.high, self._found.position_extrema
         for i in self._joints:
             here = state.commanded[i]
             if extrema[i].min < min(low[i], here) - _SLACK or extrema[i].max > max(high[i], here) + _SLACK:
@@ -237,7 +169,7 @@ class StreamController:
         """Whether a target may just be late, and the joints can still stop inside their range."""
         if (state.now_ns - self._came_ns) * 1e-9 > _LATE * self._interval_s:
             return False
-        limits, speed, position = self._limits, self._speed, state.commanded
+        limits, speed, position = self.limits, self._speed, state.commanded
         for i in self._joints:
             v = speed[i]
             stopping_distance = limits.high[i] - position[i] if v > 0.0 else position[i] - limits.low[i]

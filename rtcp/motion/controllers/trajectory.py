@@ -1,48 +1,192 @@
-"""A list of timed joint points, cubic or quintic in between; the plan was checked whole by `rtcp.motion.planning`."""
+"""Timed joint waypoints, cubic or quintic in between; `rtcp.motion.planning` checked the plan as a whole.
+
+The arm gets to a first waypoint that is later than 0 by an `Approach`, and stops along the path by a `Slowdown`.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from math import sqrt
+from typing import NamedTuple
 
-from rtcp.motion.controllers.approach import Approach
-from rtcp.motion.controllers.joint_move import JointMoveController
-from rtcp.motion.controllers.slowdown import Slowdown
-from rtcp.motion.planning.polynomials import Coefficients, cubic, quintic
-from rtcp.motion.planning.rows import CUBIC, KIND, LONGEST_S, QUINTIC, Refused, Wrong, first_not_finite, read_row
-from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
+from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
 
-if TYPE_CHECKING:
-    from rtcp.motion.limits import Limits
+from rtcp.ipc.commands import Command, RunTrajectory
+from rtcp.ipc.events import PlanDamaged
+from rtcp.ipc.layout import PLAN_ROWS
+from rtcp.ipc.refusals import ApproachImpossible, DamagedRow, PlanStartsElsewhere, PlanStartsMoving, Refusal
+from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import allowed_acceleration
+from rtcp.motion.limits import Limits
+from rtcp.motion.planning.interpolation import Coefficients, cubic, quintic
+from rtcp.motion.planning.plan import CUBIC, KIND, LONGEST_S, QUINTIC, first_not_finite, read_row
+from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD = 1e-3
-"""A plan with a point at time 0 has to begin so near to where the arm is commanded; what is left fades out."""
+"""A plan with a waypoint at time 0 begins at most this far from what is commanded; the difference fades out."""
 AT_START_RAD_S = 1e-2
-"""And with so nearly the velocity that the arm has."""
+"""And with a velocity that differs at most this much."""
 _FADE_S = 0.5
 _EXACT = 1e-12
 _AT_ONCE_S = 1e-9
 _SLACK = 1e-6
+_INSIDE = 1.0 - 1e-9
+# ruckig finds no way where a distance is exactly a border between two profiles.
+_JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-2)
+_MOST_RATE = 50.0
+_MOST_JERK = 2000.0
+"""1/s and 1/s^2: bounds of how fast the path's time stops where no joint moves."""
+_STILL = 1e-9
+_OF_LIMIT = 0.99
+"""Share of a joint's acceleration that a slowdown uses, so that what is between two cycles keeps to it too."""
 
 
-class TrajectoryController:
-    """The mode `trajectory`.
+class NoApproach(NamedTuple):
+    """Why no approach was found: a joint that would leave its range, and how far, rad; or -1."""
+
+    axis: int
+    extreme: float
+
+
+class Approach:
+    """A way to a waypoint that takes as long as the waypoint's time says, or longer where the limits demand it.
 
     Args:
-        limits: of the joints; read in every cycle.
-        period_s: the cycle, s.
+        limits: of the joints; read in each `plan`.
     """
 
-    def __init__(self, limits: Limits, period_s: float) -> None:
+    def __init__(self, limits: Limits) -> None:
         n = len(limits.velocity)
         self._limits = limits
-        self._brake = JointMoveController(period_s, limits.velocity, limits.acceleration, limits.jerk)
-        self._brakes = False
+        self._otg = Ruckig(n, 0.001)
+        self._way = InputParameter(n)
+        # A way is planned beside the one that is gone, and takes over only when the plan succeeds.
+        self._found, self._spare = Trajectory(n), Trajectory(n)
+        self.duration_s = 0.0
+
+    def at(self, time_s: float) -> tuple[list[float], list[float], list[float]]:
+        """Return position, velocity and acceleration of each joint."""
+        found: tuple[list[float], list[float], list[float]] = self._found.at_time(time_s)
+        return found
+
+    def plan(
+        self,
+        position: Sequence[float],
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        waypoint: Sequence[float],
+    ) -> NoApproach | None:
+        """Plan the way from a state (rad, rad/s, rad/s^2) to a waypoint; return why not, or None."""
+        way, limits, n = self._way, self._limits, len(position)
+        bounds = limits.acceleration
+        way.current_position, way.current_velocity = list(position), list(velocity)
+        way.current_acceleration = [
+            allowed_acceleration(acceleration[i], velocity[i], limits.velocity[i], bounds[i], limits.jerk[i])
+            for i in range(n)
+        ]
+        way.target_position, way.target_velocity = list(waypoint[1 : 1 + n]), list(waypoint[7 : 7 + n])
+        # A cubic begins with any acceleration.
+        wanted = waypoint[13 : 13 + n] if waypoint[KIND] == QUINTIC else [0.0] * n
+        way.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
+        way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
+        way.max_acceleration = list(bounds)
+        way.minimum_duration = waypoint[0]
+        if not self._planned():
+            return NoApproach(-1, 0.0)
+        extrema = self._spare.position_extrema
+        for i in range(n):
+            least, largest = extrema[i].min, extrema[i].max
+            # What begins outside, as the guards let it for a rounding, has to be no further out.
+            if least < min(limits.low[i], position[i]) - _SLACK:
+                return NoApproach(i, least)
+            if largest > max(limits.high[i], position[i]) + _SLACK:
+                return NoApproach(i, largest)
+        self._found, self._spare = self._spare, self._found
+        self.duration_s = self._found.duration
+        return None
+
+    def _planned(self) -> bool:
+        for scale in _JERK_SCALES:
+            self._way.max_jerk = [scale * jerk for jerk in self._limits.jerk]
+            try:
+                if self._otg.calculate(self._way, self._spare) >= 0:
+                    return bool(self._spare.duration <= LONGEST_S)
+            except (RuckigError, ValueError):
+                continue
+        return False
+
+
+class Slowdown:
+    """Comes to rest along a path: the path's own time s passes ever slower until it stands.
+
+    A point p(s) of the path is passed with the velocity p'(s) u, where u = ds/dt falls from 1 to 0. In each cycle
+    u falls as fast as every joint's acceleration and jerk allow. `speed` is u, `rate` is du/dt, 1/s.
+    """
+
+    def __init__(self) -> None:
+        self.speed = 1.0
+        self.rate = 0.0
+
+    def begin(self) -> None:
+        """Start at full speed."""
+        self.speed, self.rate = 1.0, 0.0
+
+    def step(
+        self,
+        along: Sequence[float],
+        velocity: Sequence[float],
+        acceleration: Sequence[float],
+        jerk: Sequence[float],
+        dt: float,
+    ) -> float:
+        """Return u at the end of the next cycle.
+
+        Args:
+            along: p'(s), rad/s, at the point that the cycle ends at.
+            velocity: what was commanded last, rad/s.
+            acceleration, jerk: bounds of each joint, rad/s^2, rad/s^3.
+            dt: the cycle, s.
+        """
+        now, low, high, most = self.speed, 0.0, 1.0, _MOST_JERK
+        for at_full, before, bound, jerks in zip(along, velocity, acceleration, jerk, strict=True):
+            steep = at_full if at_full >= 0.0 else -at_full
+            if steep > 1e-6:
+                # |p' u - v| <= a dt, and what the jerk leaves of du/dt's change.
+                signed = before if at_full > 0.0 else -before
+                room = _OF_LIMIT * bound * dt
+                least, largest = (signed - room) / steep, (signed + room) / steep
+                low = least if least > low else low
+                high = largest if largest < high else high
+                allowed = jerks / steep
+                most = allowed if allowed < most else most
+        rate = self.rate - most * dt
+        # So steep that the rate comes back to 0 together with the speed.
+        landing = -sqrt(2.0 * most * now)
+        rate = rate if rate > landing else landing
+        rate = rate if rate > -_MOST_RATE else -_MOST_RATE
+        speed = now + rate * dt
+        speed = speed if speed < high else high
+        speed = speed if speed > low else low
+        speed = speed if speed < now else now
+        if speed < _STILL or (low == 0.0 and speed < most * dt * dt):
+            speed = 0.0
+        self.rate = (speed - now) / dt
+        self.speed = speed
+        return speed
+
+
+class TrajectoryController(Controller):
+    """Accepts `RunTrajectory`."""
+
+    name = "trajectory"
+    commands = (RunTrajectory,)
+
+    def __init__(self, setup: ControllerSetup) -> None:
+        super().__init__(setup)
+        n = len(self._zero)
         self._slowdown = Slowdown()
-        self._approach = Approach(limits)
+        self._approach = Approach(setup.limits)
         self._approach_s = 0.0
-        self._target = Setpoint(n)
-        self._zero = [0.0] * n
-        self._joints = range(n)
         self._position = [0.0] * n
         self._velocity = [0.0] * n
         self._pieces: list[Coefficients] = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)] * n
@@ -53,36 +197,28 @@ class TrajectoryController:
         self._row = self._count = 0
         self._from_s = self._to_s = 0.0
         self._delay_s = 0.0
-        self.tolerates_saturation = False
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: ArmState, rows: memoryview[float], count: int) -> Refused | None:
-        """Begin a plan of `count` waypoints (`rtcp.motion.planning.rows`) from `state`; return why not, or None.
+    def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
+        """Run a plan of waypoints (`rtcp.motion.planning.plan`) from `state`.
 
-        Where the first waypoint's time is 0, the arm has to be there. Otherwise an approach leads from the state's
-        position, velocity and acceleration, under the joints' limits; it ends at the waypoint's time, or later where
-        the limits demand it, and what follows is as much later. Where it is refused, what was under way goes on.
+        Where the first waypoint's time is 0, the arm has to be there. Otherwise an approach leads there under the
+        joints' limits; it ends at the waypoint's time, or later where the limits demand it, and what follows is as much
+        later. Where it is refused, what was under way continues.
         """
+        assert isinstance(command, RunTrajectory)
+        rows, count = self.rows_of(command.slot, command.rows, PLAN_ROWS), command.rows
+        if isinstance(rows, Refusal):
+            return rows
         first, last = read_row(rows, 0), read_row(rows, count - 1)
         for index, row in ((0, first), (count - 1, last)):
-            if (wrong := self._damage(row, index)) is not None:
-                return wrong
-        if last[0] <= _EXACT:
-            return Refused(Wrong.DAMAGED, count - 1, last[0], 0.0)
-        there = first[0] <= _EXACT
-        if there:
-            refused = self._is_elsewhere(state, first)
-        else:
-            refused = self._approach.plan(
-                state.commanded, state.commanded_velocity, state.commanded_acceleration, first
-            )
-        if refused is not None:
-            return refused
+            if (found := self._damage(row)) is not None:
+                return DamagedRow(index, found)
+        refusal = self._is_elsewhere(state, first) if first[0] == 0.0 else self._approach_to(first, state)
+        if refusal is not None:
+            return refusal
+        self.begin()
         self._fade_s = self._approach_s = 0.0
-        if there:
+        if first[0] == 0.0:
             self._fade_out(state, first, last[0])
         else:
             self._approach_s = self._approach.duration_s
@@ -91,35 +227,36 @@ class TrajectoryController:
         self._delay_s = max(self._approach_s - first[0], 0.0)
         self._from_s = self._to_s = first[0] + self._delay_s
         self.duration_s = last[0] + self._delay_s
-        self.elapsed_s = 0.0
-        self._brakes = False
-        self.phase, self.reason = Phase.MOVE, Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
         return None
 
-    def _damage(self, row: list[float], index: int) -> Refused | None:
+    def _approach_to(self, first: list[float], state: ArmState) -> Refusal | None:
+        refused = self._approach.plan(state.commanded, state.commanded_velocity, state.commanded_acceleration, first)
+        return None if refused is None else ApproachImpossible()
+
+    def _damage(self, row: list[float]) -> float | None:
+        """Return the number in a row that cannot be, or None."""
         column = first_not_finite(row)
         if column >= 0:
-            return Refused(Wrong.DAMAGED, index, row[min(column, KIND)], float(column))
+            return row[min(column, KIND)]
         if not 0.0 <= row[0] <= LONGEST_S:
-            return Refused(Wrong.DAMAGED, index, row[0], 0.0)
+            return row[0]
         if row[KIND] not in (CUBIC, QUINTIC):
-            return Refused(Wrong.DAMAGED, index, row[KIND], float(KIND))
-        limits = self._limits
+            return row[KIND]
+        limits = self.limits
         for i in self._joints:
             q, v = row[1 + i], row[7 + i]
             if not limits.low[i] - _SLACK <= q <= limits.high[i] + _SLACK:
-                return Refused(Wrong.DAMAGED, index, q, 1.0 + i)
+                return q
             if not -limits.velocity[i] - _SLACK <= v <= limits.velocity[i] + _SLACK:
-                return Refused(Wrong.DAMAGED, index, v, 7.0 + i)
+                return v
         return None
 
-    def _is_elsewhere(self, state: ArmState, first: list[float]) -> Refused | None:
+    def _is_elsewhere(self, state: ArmState, first: list[float]) -> Refusal | None:
         for i in self._joints:
             if not abs(state.commanded[i] - first[1 + i]) <= AT_START_RAD:
-                return Refused(Wrong.START, i, first[1 + i], state.commanded[i])
+                return PlanStartsElsewhere(i, first[1 + i], state.commanded[i])
             if not abs(state.commanded_velocity[i] - first[7 + i]) <= AT_START_RAD_S:
-                return Refused(Wrong.START_SPEED, i, first[7 + i], state.commanded_velocity[i])
+                return PlanStartsMoving(i, first[7 + i], state.commanded_velocity[i])
         return None
 
     def _fade_out(self, state: ArmState, first: list[float], last_s: float) -> None:
@@ -135,74 +272,53 @@ class TrajectoryController:
             self.phase = Phase.STOP
             self._slowdown.begin()
 
-    def update(self, state: ArmState, dt: float) -> Setpoint:
-        """Return the set-points of the next cycle."""
-        target = self._target
-        if self._brakes:
-            target = self._brake.update(state, dt)
-            self.phase = self._brake.phase
-            self._brakes = self.phase is not Phase.HOLD
-            return target
+    def advance(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle."""
+        target, dt = self.setpoint, self.period_s
         if self.phase is Phase.MOVE:
-            if not self._go_to(self.elapsed_s + dt):
-                return self._give_up(state, dt)
+            if (damaged := self._go_to(self.elapsed_s + dt)) is not None:
+                return self.give_up(state, damaged)
             self.elapsed_s = min(self.elapsed_s + dt, self.duration_s)
-            if self.elapsed_s >= self.duration_s - _AT_ONCE_S and not self._arrives():
-                return self._give_up(state, dt)
-        elif self.phase is Phase.STOP:
-            slowdown, limits = self._slowdown, self._limits
+            speed = 1.0
+        else:
+            slowdown, limits = self._slowdown, self.limits
             before = slowdown.speed
             # Where the cycle ends hardly depends on how much slower it gets.
-            if not self._go_to(self.elapsed_s + (before + 0.5 * slowdown.rate * dt) * dt):
-                return self._give_up(state, dt)
+            if (damaged := self._go_to(self.elapsed_s + (before + 0.5 * slowdown.rate * dt) * dt)) is not None:
+                return self.give_up(state, damaged)
             speed = slowdown.step(self._velocity, state.commanded_velocity, limits.acceleration, limits.jerk, dt)
             self.elapsed_s = min(self.elapsed_s + 0.5 * (before + speed) * dt, self.duration_s)
-            if not self._go_to(self.elapsed_s):
-                return self._give_up(state, dt)
+            if (damaged := self._go_to(self.elapsed_s)) is not None:
+                return self.give_up(state, damaged)
             velocity = self._velocity
             for i in self._joints:
                 velocity[i] *= speed
-            if speed == 0.0:
-                self.phase = Phase.HOLD
-            elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and not self._arrives():
-                return self._give_up(state, dt)
-        else:
-            target.position, target.velocity = state.commanded, self._zero
-            return target
+        if speed == 0.0:
+            self.phase = Phase.HOLD
+        elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and (damaged := self._arrive()) is not None:
+            return self.give_up(state, damaged)
         target.position, target.velocity = self._position, self._velocity
         return target
 
-    def _arrives(self) -> bool:
-        """Come to rest at the end; False where a damaged plan does not end at rest."""
+    def _arrive(self) -> PlanDamaged | None:
+        """Come to rest at the end, or return that the plan does not end at rest."""
         self.phase = Phase.HOLD
         for i in self._joints:
             speed = self._velocity[i]
             if not -_SLACK < speed < _SLACK:
-                self.axis, self.value, self.limit = self._count - 1, speed, 7.0 + i
-                return False
+                return PlanDamaged(self._count - 1, speed)
             self._velocity[i] = 0.0
-        return True
+        return None
 
-    def _give_up(self, state: ArmState, dt: float) -> Setpoint:
-        """The plan is damaged: come to rest from the state, whatever the path."""
-        self.reason = Reason.PLAN
-        self.phase = Phase.STOP
-        self._brakes = True
-        brake, limits = self._brake, self._limits
-        brake.set_limits(limits.velocity, limits.acceleration, limits.jerk)
-        brake.hold()
-        brake.stop(state)
-        return self.update(state, dt)
-
-    def _go_to(self, at_s: float) -> bool:
-        """Write position and velocity of the path at its time `at_s`; False where the plan is damaged."""
+    def _go_to(self, at_s: float) -> PlanDamaged | None:
+        """Write position and velocity of the path at its time `at_s`, or return where the plan is damaged."""
         position, velocity = self._position, self._velocity
         if at_s < self._approach_s:
             position[:], velocity[:], _ = self._approach.at(at_s)
-            return True
+            return None
         while at_s > self._to_s and self._row < self._count - 1:
-            if not self._next():
-                return False
+            if (damaged := self._next()) is not None:
+                return damaged
         length = self._to_s - self._from_s
         if length > 0.0:
             x = (at_s - self._from_s) / length
@@ -220,21 +336,20 @@ class TrajectoryController:
             for i, (c0, c1, c2, c3, c4, c5) in enumerate(self._fade):
                 position[i] += c0 + x * (c1 + x * (c2 + x * (c3 + x * (c4 + x * c5))))
                 velocity[i] += (c1 + x * (2.0 * c2 + x * (3.0 * c3 + x * (4.0 * c4 + x * 5.0 * c5)))) * over
-        return True
+        return None
 
-    def _next(self) -> bool:
-        """Take the next waypoint; what is between it and the last becomes the current piece."""
+    def _next(self) -> PlanDamaged | None:
+        """Make what leads to the next waypoint the current piece, or return that it is damaged."""
         rows = self._rows
         assert rows is not None
         index = self._row + 1
         before, waypoint = self._waypoint, read_row(rows, index)
-        wrong = self._damage(waypoint, index)
+        found = self._damage(waypoint)
         length = waypoint[0] - before[0]
-        if wrong is None and not 0.0 < length <= LONGEST_S:
-            wrong = Refused(Wrong.DAMAGED, index, waypoint[0], 0.0)
-        if wrong is not None:
-            self.axis, self.value, self.limit = wrong.at, wrong.value, wrong.limit
-            return False
+        if found is None and not 0.0 < length <= LONGEST_S:
+            found = waypoint[0]
+        if found is not None:
+            return PlanDamaged(index, found)
         pieces = self._pieces
         if waypoint[KIND] == CUBIC:
             for i in self._joints:
@@ -252,4 +367,4 @@ class TrajectoryController:
                 )
         self._row, self._waypoint = index, waypoint
         self._from_s, self._to_s = before[0] + self._delay_s, waypoint[0] + self._delay_s
-        return True
+        return None

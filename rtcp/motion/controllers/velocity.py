@@ -1,74 +1,63 @@
-"""Joint speeds with ramps; they have to be said again before they run out."""
+"""Joint velocities with ramps, which expire unless they are renewed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
 
-from rtcp.motion.controllers.room import allowed_accelerations
-from rtcp.motion.state import ArmState, Phase, Reason, Setpoint
-
-if TYPE_CHECKING:
-    from rtcp.motion.limits import Limits
+from rtcp.ipc.commands import Command, MoveAtVelocity
+from rtcp.ipc.events import CommandExpired, ControllerFailed
+from rtcp.ipc.refusals import JointSpeedOutOfRange, Refusal
+from rtcp.ipc.states import ControlMode
+from rtcp.motion.controllers.controller import Controller, ControllerSetup
+from rtcp.motion.joint_motion import allowed_accelerations
+from rtcp.motion.state import ArmState, Phase, Setpoint
 
 _POSITION, _VELOCITY = ControlInterface.Position, ControlInterface.Velocity
 _HALT = [0.0, 0.0, 0.0, 0.0]
 _EARLY = 1.5
 _NEAR_RAD = 0.02
-"""A joint heads for the edge of its range where it is so much nearer than it takes to stop."""
+"""A joint heads for the edge of its range when it is this much nearer than it takes to stop."""
 _SLOWEST_RAD_S = 1e-5
 
 
-class VelocityController:
-    """The mode `velocity`: each joint's speed, reached under its acceleration and jerk.
+class VelocityController(Controller):
+    """Accepts `MoveAtVelocity`: each joint's velocity is reached under its acceleration and jerk."""
 
-    Args:
-        limits: of the joints; read in every cycle.
-        period_s: the cycle, s.
-    """
+    name = "velocity"
+    commands = (MoveAtVelocity,)
+    control_modes = frozenset({ControlMode.VELOCITY})
+    tolerates_saturation = True
 
-    def __init__(self, limits: Limits, period_s: float) -> None:
-        n = len(limits.velocity)
-        self._limits = limits
-        self._otg = Ruckig(n, period_s)
+    def __init__(self, setup: ControllerSetup) -> None:
+        super().__init__(setup)
+        n = len(self._zero)
+        self._otg = Ruckig(n, setup.period_s)
         self._way, self._output = InputParameter(n), OutputParameter(n)
         self._way.synchronization = Synchronization.No
         self._way.target_acceleration = [0.0] * n
-        self._target = Setpoint(n)
-        self._zero = [0.0] * n
-        self._joints = range(n)
         self._wanted = [0.0] * n
-        self._said: list[float] = []
+        self._goals_before: list[float] = []
         self._until_ns = 0
         self._last: list[float] = []
-        self.tolerates_saturation = True
-        self.phase = Phase.HOLD
-        self.reason = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self.elapsed_s = self.duration_s = 0.0
 
-    def start(self, state: ArmState) -> None:
-        """Begin at `state`, with no speed asked for yet."""
-        self.phase, self.reason = Phase.MOVE, Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
-        self._wanted = list(self._zero)
-        self._until_ns = state.now_ns
-        self._last = []
+    def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
+        """Ramp to the velocities, and to rest when they expire."""
+        assert isinstance(command, MoveAtVelocity)
+        return self.ramp_to(command.velocity, command.hold_s, state, continues)
 
-    def command(self, speeds: Sequence[float], hold_s: float, now_ns: int) -> None:
-        """Ask for joint speeds, rad/s, of shape (n,), finite; they count for `hold_s` from `now_ns` on.
-
-        While the mode stops they are not taken; a stop that has ended is begun anew with `start`.
-        """
-        if self.phase is not Phase.MOVE:
-            return
-        wanted, bounds = self._wanted, self._limits.velocity
-        for i in self._joints:
-            v, bound = speeds[i], bounds[i]
-            wanted[i] = bound if v > bound else -bound if v < -bound else v
-        self._until_ns = now_ns + round(hold_s * 1e9)
+    def ramp_to(self, velocity: Sequence[float], hold_s: float, state: ArmState, continues: bool) -> Refusal | None:
+        """Ramp to joint velocities, rad/s, for `hold_s` s; return why not."""
+        refusal = self.not_within(velocity, self.limits.velocity, hold_s, JointSpeedOutOfRange)
+        if refusal is not None:
+            return refusal
+        if not continues or self.phase is not Phase.MOVE:
+            self.begin()
+            self._last = []
+        self._wanted = list(velocity)
+        self._until_ns = state.now_ns + round(hold_s * 1e9)
+        return None
 
     def stop(self, state: ArmState) -> None:
         """Ramp down to rest."""
@@ -76,33 +65,29 @@ class VelocityController:
             self.phase = Phase.STOP
             self._wanted = list(self._zero)
 
-    def update(self, state: ArmState, dt: float) -> Setpoint:
+    def advance(self, state: ArmState) -> Setpoint:
         """Return the set-points of the next cycle."""
-        target = self._target
-        if not self.phase:
-            target.position, target.velocity = state.commanded, self._zero
-            return target
+        target = self.setpoint
         if self.phase is Phase.MOVE and state.now_ns > self._until_ns:
             if any(self._wanted):
-                self.reason, self.value = Reason.COMMAND_ENDED, 0.0
+                self.ended = CommandExpired()
             self.stop(state)
         way, output = self._way, self._output
         goals = self._goals(state)
         # What the guards changed, or what is asked for anew, begins at the state; else the ramp goes on.
         moved = state.commanded != self._last
-        if moved or goals != self._said:
-            self._plan(state, goals, moved)
-        self._said = goals
+        if moved or goals != self._goals_before:
+            self._aim(state, goals, moved)
+        self._goals_before = goals
         result = self._step()
         if result < 0:
             # ruckig finds no way to an edge where a distance is exactly a border between two profiles: a ramp it finds.
-            self._plan(state, _HALT * len(self._wanted), moved=True)
-            self._said = []
+            self._aim(state, _HALT * len(self._wanted), moved=True)
+            self._goals_before = []
             result = self._step()
         if result < 0:
-            self.phase, self.reason = Phase.HOLD, Reason.GENERATOR
-            target.position, target.velocity = state.commanded, self._zero
-            return target
+            self.phase, self.ended = Phase.HOLD, ControllerFailed()
+            return self.rest(state)
         target.position, target.velocity = output.new_position, output.new_velocity
         self._last = output.new_position
         output.pass_to_input(way)
@@ -120,7 +105,7 @@ class VelocityController:
     def _goals(self, state: ArmState) -> list[float]:
         """Return what each joint goes to: four numbers each, of which the first says whether it is a position."""
         goals: list[float] = []
-        limits = self._limits
+        limits = self.limits
         for i, wanted in enumerate(self._wanted):
             acceleration, jerk, now = limits.acceleration[i], limits.jerk[i], state.commanded_velocity[i]
             edge = limits.high[i] if wanted > 0.0 else limits.low[i]
@@ -135,9 +120,9 @@ class VelocityController:
                 goals += (0.0, wanted, acceleration, jerk)
         return goals
 
-    def _plan(self, state: ArmState, goals: list[float], moved: bool) -> None:
+    def _aim(self, state: ArmState, goals: list[float], moved: bool) -> None:
         """Give ruckig the goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
-        way, limits = self._way, self._limits
+        way, limits = self._way, self.limits
         kinds, targets = [goal == 1.0 for goal in goals[::4]], goals[1::4]
         way.per_dof_control_interface = [_POSITION if kind else _VELOCITY for kind in kinds]
         way.target_position = [target if kind else 0.0 for kind, target in zip(kinds, targets, strict=True)]

@@ -16,10 +16,11 @@ from math import inf, isfinite
 from kinematics.forward import frames
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig
+from rtcp.ipc.events import BoxReached, JointLimitReached, MotionEnded, NotLeavingBox
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits, Refused, Values, Wrong
-from rtcp.motion.state import ArmState, Reason, Setpoint
+from rtcp.motion.state import ArmState, Setpoint
 
 # So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
 # cycle; and of a change that a limit demands.
@@ -43,8 +44,7 @@ class GuardResult(IntEnum):
 class TrajectoryGuard:
     """Guards the set-points of one arm.
 
-    After a cut, `held` is the bit mask of the joints that were clamped; `code`, `axis`, `value` and `limit` say what
-    the guard's stop was for.
+    After a cut, `held` is the bit mask of the joints that were clamped.
 
     Args:
         config: the arm; without its geometry no box is looked at.
@@ -71,8 +71,8 @@ class TrajectoryGuard:
         self._box, self._keep_out = limits.box, limits.keep_out
         self.stopping = False
         self.held = 0
-        self.code = Reason.NONE
-        self.axis, self.value, self.limit = -1, 0.0, 0.0
+        self.ended: MotionEnded | None = None
+        """What the last stop of the guard was for."""
 
     @property
     def poses(self) -> Sequence[Pose]:
@@ -101,10 +101,10 @@ class TrajectoryGuard:
             return inf, 0
         return self.zones.distance(frames(self._model, q))
 
-    def _gap_to(self, box: int, ahead: float) -> float:
-        """Return how near to `box` the stop would come, m; below 0 only where the arm itself is beyond its bounds."""
+    def _box_reached(self, box: int, ahead: float) -> MotionEnded:
+        """Return what ends the motion: its stop would come as near as `ahead`, m, or the arm is in the box already."""
         here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
-        return here if here < 0.0 and nearest == box else max(ahead, 0.0)
+        return NotLeavingBox(box, -here) if here < 0.0 and nearest == box else BoxReached(box, max(ahead, 0.0))
 
     def probe(self, state: ArmState, position: Sequence[float], velocity: Sequence[float]) -> bool:
         """Return whether a target would pass as it is."""
@@ -148,13 +148,13 @@ class TrajectoryGuard:
         position, mean, last, dt = self._position, self._next, self._mean, self._dt
         if held:
             if not tolerates_saturation:
-                return self._stop(state, Reason.JOINT_LIMIT, *self._excess(state, wanted))
+                return self._stop(state, self._excess(state, wanted))
             for i in self._joints:
                 position[i] = state.commanded[i] + mean[i] * dt if held >> i & 1 else wanted[i]
             wanted = position
         found = self._touches(state, wanted)
         if found is not None:
-            return self._stop(state, Reason.KEEP_OUT, found[0], self._gap_to(*found), 0.0)
+            return self._stop(state, self._box_reached(*found))
         self._poses, self._room = self._poses_then, self._room_then
         here, speeds, rates, most = state.commanded, target.velocity, self._limits.acceleration, self._limits.velocity
         velocity, acceleration = state.commanded_velocity, state.commanded_acceleration
@@ -230,19 +230,18 @@ class TrajectoryGuard:
         self._poses_then = frames(model, position)
         return touched(zones, self.poses, self._poses_then, position, mean, limits.acceleration, self._dt)
 
-    def _excess(self, state: ArmState, wanted: Sequence[float]) -> tuple[int, float, float]:
+    def _excess(self, state: ArmState, wanted: Sequence[float]) -> JointLimitReached:
         """Return the first joint that was cut, what was wanted of it and what is allowed."""
         axis = (self.held & -self.held).bit_length() - 1
         target, limits = wanted[axis], self._limits
         if target > limits.high[axis]:
-            return axis, target, limits.high[axis]
+            return JointLimitReached(axis, target, limits.high[axis])
         if target < limits.low[axis]:
-            return axis, target, limits.low[axis]
-        return axis, (target - state.commanded[axis]) / self._dt, self._next[axis]
+            return JointLimitReached(axis, target, limits.low[axis])
+        return JointLimitReached(axis, (target - state.commanded[axis]) / self._dt, self._next[axis])
 
-    def _stop(self, state: ArmState, code: Reason, axis: int, value: float, limit: float) -> GuardResult:
-        self.stopping = True
-        self.code, self.axis, self.value, self.limit = code, axis, value, limit
+    def _stop(self, state: ArmState, ended: MotionEnded) -> GuardResult:
+        self.stopping, self.ended = True, ended
         return self._brake(state)
 
     def _brake(self, state: ArmState) -> GuardResult:

@@ -14,10 +14,9 @@ from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import singularity_distances
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.config.model import CartesianConfig
-from rtcp.motion.planning.plan import Plan, PlanRefused, Stop, ZoneAt
-from rtcp.motion.planning.rows import LINE
-from rtcp.motion.planning.slerp import Quaternion, quaternion, rotation, turn_between, turned_by
+from rtcp.config.model import CartesianConfig, Stop
+from rtcp.motion.planning.interpolation import Quaternion, quaternion, rotation, turn_between, turned_by
+from rtcp.motion.planning.plan import LINE, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits

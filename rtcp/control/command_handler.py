@@ -1,0 +1,291 @@
+"""Commands as the loop accepts them: checked against lease, state and limits, then carried out or refused.
+
+A motion command goes to the controller that names it (`rtcp.motion.controllers`). For any other command there is a
+method here, found by the command's class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rtcp.control.machine import StateMachine
+from rtcp.devices.io_box import IoBox
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.commands import (
+    Command,
+    Disable,
+    Enable,
+    Halt,
+    Home,
+    MotionCommand,
+    MoveGripper,
+    Reset,
+    RunLines,
+    RunTrajectory,
+    SetControlMode,
+    SetDriveMode,
+    SetLimits,
+    SetOutput,
+    SetZero,
+    Shutdown,
+)
+from rtcp.ipc.events import ControlModeChanged, GripperCloses, GripperOpens, LimitsChanged, ZeroSet
+from rtcp.ipc.layout import PLANS
+from rtcp.ipc.refusals import (
+    ClockNotLocked,
+    DriveModeChanging,
+    DriveModeFixed,
+    EmergencyStopPressed,
+    GripperDisabled,
+    JointOutsideRange,
+    Malformed,
+    NoGeometry,
+    NoGripper,
+    NoLease,
+    NoOutputs,
+    NotAtStandstill,
+    NotInCsp,
+    NotInOp,
+    NotPermitted,
+    OffsetOutOfRange,
+    Refusal,
+    ReservedOutput,
+    TorqueLimitTooLow,
+    TorquePresent,
+    UnknownAxis,
+    UnknownOutput,
+    WrongControlMode,
+    WrongRowCount,
+    WrongState,
+)
+from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.motion.limits import read
+
+MOST_LIMIT_ROWS = 64
+"""Six joints and more boxes than an arm is configured with: all are checked in one cycle."""
+_LARGEST_OFFSET = 100.0
+_FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
+_AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
+
+
+class CommandHandler:
+    """Takes at most one command a cycle.
+
+    Args:
+        machine: the state machine.
+        box: the IO box, or None.
+        blackboard: where commands come from and answers go.
+    """
+
+    def __init__(self, machine: StateMachine, box: IoBox | None, blackboard: Blackboard) -> None:
+        self._machine = machine
+        self._context = machine.context
+        self._arm = machine.context.arm
+        self._operator = machine.context.operator
+        self._box = box
+        self._blackboard = blackboard
+        self._handlers: dict[type[Command], Callable[[Any, int], Refusal | None]] = {
+            Enable: self._enable,
+            Disable: self._disable,
+            Reset: self._reset,
+            SetDriveMode: self._set_drive_mode,
+            SetControlMode: self._set_control_mode,
+            Halt: self._halt,
+            SetOutput: self._set_output,
+            MoveGripper: self._move_gripper,
+            SetLimits: self._set_limits,
+            SetZero: self._set_zero,
+            Home: self._home,
+            Shutdown: self._shut_down,
+        }
+
+    def handle(self) -> None:
+        """Take the next command and answer it. Only when one waits."""
+        number, lease, command = self._blackboard.take_command()
+        self._blackboard.answer(number, self._refusal(command, lease))
+
+    def _refusal(self, command: Command | Malformed, lease: int) -> Refusal | None:
+        """Carry out a command, or return why not."""
+        if isinstance(command, Malformed):
+            return command
+        if command.needs_lease and not (lease and self._context.lease_held(lease)):
+            return NoLease()
+        state = self._machine.state
+        if state not in command.states:
+            return WrongState(command.number, state)
+        if command.waits_for_drive_mode and self._machine.changing_mode:
+            return DriveModeChanging()
+        if isinstance(command, MotionCommand):
+            return self._move(command, lease)
+        handler = self._handlers.get(type(command))
+        return handler(command, lease) if handler is not None else Malformed(command.number)
+
+    # -- motion ---------------------------------------------------------------------------------------------------
+
+    def _motion_refusal(self, modes: frozenset[ControlMode]) -> Refusal | None:
+        """Return why no motion of these control modes may begin now."""
+        active = self._arm.control_mode
+        if active not in modes:
+            return WrongControlMode(active, min(modes))
+        return None if self._operator.permitted else NotPermitted()
+
+    def _move(self, command: MotionCommand, lease: int) -> Refusal | None:
+        arm, machine = self._arm, self._machine
+        controller = arm.controllers.get(type(command))
+        if controller is None:
+            return NoGeometry()
+        refusal = self._motion_refusal(controller.control_modes)
+        if refusal is not None:
+            return refusal
+        continues = machine.state is State.MOVING and arm.active is controller
+        refusal = controller.accept(command, arm.state, continues)
+        if refusal is not None:
+            return refusal
+        if isinstance(command, (RunTrajectory, RunLines)):
+            self._blackboard.use_plan(command.slot)
+        arm.active = controller
+        if not (continues and self._context.lease == lease):
+            machine.change(command, lease)
+        return None
+
+    def _home(self, command: Home, lease: int) -> Refusal | None:
+        arm = self._arm
+        if not 0 <= command.axis < len(arm.drives):
+            return UnknownAxis(command.axis, len(arm.drives) - 1)
+        refusal = self._motion_refusal(_AUTOMATIC)
+        if refusal is None and arm.mode is not DriveMode.CSP:
+            refusal = NotInCsp()
+        if refusal is None:
+            self._machine.change(command, lease)
+        return refusal
+
+    def _halt(self, command: Halt, lease: int) -> Refusal | None:
+        if self._arm.gripper is not None:
+            self._arm.gripper.stop()
+        if self._machine.state is State.HOMING:
+            self._context.homing.stop()
+        else:
+            self._machine.change(command)
+        return None
+
+    # -- torque ---------------------------------------------------------------------------------------------------
+
+    def _enable(self, command: Enable, lease: int) -> Refusal | None:
+        arm = self._arm
+        if self._operator.emergency_stop:
+            return EmergencyStopPressed()
+        if not self._context.service.all_op:
+            return NotInOp()
+        if not self._context.clock_locked:
+            return ClockNotLocked()
+        axis = arm.first_moving()
+        if axis >= 0:
+            return NotAtStandstill(axis, arm.all_drives[axis].velocity)
+        axis = arm.first_outside()
+        if axis >= 0:
+            return JointOutsideRange(axis, arm.all_drives[axis].position)
+        self._machine.change(command)
+        return None
+
+    def _disable(self, command: Disable, lease: int) -> Refusal | None:
+        # The emergency stop removes the torque by itself. Accepted is not done: the commander looks at the drives.
+        if self._machine.state not in (State.READY, State.DISABLING, State.EMERGENCY_STOP):
+            self._machine.change(command)
+        return None
+
+    def _reset(self, command: Reset, lease: int) -> Refusal | None:
+        in_fault = self._machine.state is not State.STOPPED_BY_LIMIT
+        if in_fault and self._operator.emergency_stop and self._context.lost == 0:
+            return EmergencyStopPressed()
+        self._machine.change(command)
+        return None
+
+    def _shut_down(self, command: Shutdown, lease: int) -> Refusal | None:
+        self._machine.close()
+        return None
+
+    # -- modes, limits, outputs -----------------------------------------------------------------------------------
+
+    def _set_drive_mode(self, command: SetDriveMode, lease: int) -> Refusal | None:
+        arm = self._arm
+        if arm.control_mode in _FIXED_DRIVE_MODE:
+            return DriveModeFixed(arm.control_mode, command.mode)
+        arm.configured_mode = command.mode
+        self._machine.change_drive_mode(command.mode)
+        return None
+
+    def _set_control_mode(self, command: SetControlMode, lease: int) -> Refusal | None:
+        arm, mode = self._arm, command.mode
+        if mode in (ControlMode.CARTESIAN, ControlMode.JOYSTICK) and arm.jog is None:
+            return NoGeometry()
+        arm.control_mode = mode
+        arm.rest()
+        self._operator.require_neutral()
+        self._blackboard.event(ControlModeChanged(mode))
+        drive_mode = arm.drive_mode_of(mode)
+        if drive_mode is not arm.mode or self._machine.state is not State.HOLDING:
+            self._machine.change_drive_mode(drive_mode)
+        else:
+            arm.set_mode(drive_mode)
+        return None
+
+    def _set_limits(self, command: SetLimits, lease: int) -> Refusal | None:
+        arm = self._arm
+        if command.slot not in range(PLANS) or command.rows not in range(1, MOST_LIMIT_ROWS + 1):
+            return WrongRowCount(command.rows, MOST_LIMIT_ROWS)
+        new = read(self._blackboard.plan(command.slot), command.rows)
+        if new is None:
+            return WrongRowCount(command.rows, MOST_LIMIT_ROWS)
+        refusal = arm.trajectory_guard.refusal_of(arm.state, new)
+        if refusal is not None:
+            return refusal
+        limits = arm.limits
+        if arm.first_with_torque() >= 0:
+            for axis, held in enumerate(arm.state.actual_torque):
+                most = new.torque[axis]
+                if most < limits.torque[axis] and abs(held) > most:
+                    return TorqueLimitTooLow(axis, abs(held), most)
+        limits.apply(new)
+        arm.limits_changed()
+        self._blackboard.event(LimitsChanged())
+        return None
+
+    def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:
+        box, output = self._box, command.output
+        if box is None:
+            return NoOutputs()
+        if not 1 <= output <= box.output_count:
+            return UnknownOutput(output, box.output_count)
+        if output in self._operator.reserved:
+            return ReservedOutput(output)
+        box.set_output(output, command.value)
+        return None
+
+    def _move_gripper(self, command: MoveGripper, lease: int) -> Refusal | None:
+        if self._operator.emergency_stop:
+            return EmergencyStopPressed()
+        gripper = self._arm.gripper
+        if gripper is not None:
+            if not self._operator.permitted:
+                return NotPermitted()
+            if not gripper.grip(not command.open, lease):
+                return GripperDisabled()
+        elif self._operator.has_gripper:
+            self._operator.grip(not command.open)
+        else:
+            return NoGripper()
+        self._blackboard.event(GripperOpens() if command.open else GripperCloses())
+        return None
+
+    def _set_zero(self, command: SetZero, lease: int) -> Refusal | None:
+        arm, axis = self._arm, command.axis
+        if not 0 <= axis < len(arm.all_drives):
+            return UnknownAxis(axis, len(arm.all_drives) - 1)
+        if not abs(command.offset) <= _LARGEST_OFFSET:
+            return OffsetOutOfRange(axis, command.offset, _LARGEST_OFFSET)
+        if arm.first_with_torque() >= 0:
+            return TorquePresent()
+        arm.all_drives[axis].zero = command.offset
+        self._blackboard.event(ZeroSet(axis, command.offset))
+        return None

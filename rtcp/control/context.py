@@ -1,0 +1,271 @@
+"""What the states of the machine share: the parts of the loop, facts that outlive a state, checks of a cycle."""
+
+from __future__ import annotations
+
+from rtcp.config.model import ArmConfig
+from rtcp.control.arm import Arm
+from rtcp.control.bus_service import BusService
+from rtcp.control.homing import HomingSequence
+from rtcp.control.operator import Operator
+from rtcp.devices.cia402 import DriveState
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.events import (
+    ClockLost,
+    ControllerFailed,
+    DriveFault,
+    DriveLeftEnabled,
+    DriveModeTimeout,
+    Event,
+    GeneratorFailed,
+    HomingInBox,
+    HomingStillMoving,
+    LeaseExpired,
+    LeftRange,
+    MotionEnded,
+    PermissionWithdrawn,
+    ProcessDataLost,
+    SlaveLost,
+)
+from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.stop_reactions import StopReaction, reactions
+from rtcp.motion.guards.supervision import Supervision
+from rtcp.motion.guards.trajectory_guard import GuardResult
+from rtcp.realtime.discipline import Discipline
+
+_IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
+_CLOCK_S = 1.0
+
+
+class Context:
+    """One for the machine; a state reads it and calls it, and writes only what is said to be a state's to write.
+
+    Args:
+        config: timeouts, how many cycles may be lost, and the stop reactions.
+        arm: the joints.
+        operator: the inputs and outputs with a function.
+        blackboard: where events go, and where the lease is.
+        service: the thread beside the cycle.
+        discipline: follows the reference clock, or None without distributed clocks.
+    """
+
+    def __init__(
+        self,
+        config: ArmConfig,
+        arm: Arm,
+        operator: Operator,
+        blackboard: Blackboard,
+        service: BusService,
+        discipline: Discipline | None,
+    ) -> None:
+        self.config = config
+        self.arm = arm
+        self.operator = operator
+        self.blackboard = blackboard
+        self.service = service
+        self.period_s = config.cycle.period_us * 1e-6
+        self.supervision = Supervision(config, arm.limits)
+        self.homing = HomingSequence(arm, self.period_s)
+        self.reactions = reactions(config.stops)
+        self._discipline = discipline
+        self._lost_limit = config.bus.lost_cycles
+        self._clock_cycles = round(_CLOCK_S / self.period_s)
+        self._unlocked = 0
+        self.state = State.STARTING
+        """Written by the machine alone."""
+        self.cycle = 0
+        self.entered = 0
+        """Cycle in which the machine changed to its state."""
+        self.now_ns = 0
+        """Instant of the cycle, ns of the clock of the loop."""
+        self.good = False
+        """Whether the exchange of this cycle had the expected working counter."""
+        self.lost = 0
+        """Cycles in a row without it."""
+        self.wkc_error_count = 0
+        """Cycles without it, less those with it, 0 to `bus.lost_cycles`."""
+        self.lease = 0
+        """Lease of the commander whose motion runs; 0: the joystick's, which needs none."""
+        self.all_enabled = False
+        """Written by states: whether all drives are in Operation Enabled."""
+        self.limited = False
+        """Written by states: whether the stop under way ends in the state stopped by limit."""
+        self.pending: ClockLost | None = None
+        """A fault that begins as soon as the controlled stop that it caused has come to rest."""
+
+    # -- the cycle ------------------------------------------------------------------------------------------------
+
+    def begin_cycle(self, good: bool) -> None:
+        """Count the cycle; `good`: the exchange had the expected working counter."""
+        self.cycle += 1
+        self.good = good
+        if good:
+            self.lost = 0
+            if self.wkc_error_count:
+                self.wkc_error_count -= 1
+            self.operator.read()
+            return
+        self.lost += 1
+        if self.wkc_error_count < self._lost_limit:
+            self.wkc_error_count += 1
+
+    @property
+    def waited(self) -> int:
+        """Cycles since the machine changed to its state."""
+        return self.cycle - self.entered
+
+    def cycles(self, seconds: float) -> int:
+        """Return how many cycles a time lasts."""
+        return round(seconds / self.period_s)
+
+    def publish(self, event: Event) -> None:
+        """Report an event that changes no state."""
+        self.blackboard.event(event)
+
+    @property
+    def clock_locked(self) -> bool:
+        """Whether there is no reference clock, or the cycle is locked to it."""
+        return self._discipline is None or self._discipline.locked
+
+    @property
+    def box_in_op(self) -> bool:
+        """Whether there is an IO box, and in OP."""
+        box = self.operator.box_position
+        return box > 0 and self.blackboard.in_op(box)
+
+    @property
+    def box_left_op(self) -> bool:
+        """Whether the IO box is not in OP; where it was the first slave lost, until the reset."""
+        box = self.operator.box_position
+        return box > 0 and (self.service.lost_slave == box or not self.box_in_op)
+
+    # -- what ends a state from outside ---------------------------------------------------------------------------
+
+    def bus_fault(self) -> Event | None:
+        """Return what was lost of frames, slaves and clock."""
+        # Not those in a row alone: one good cycle in ten would keep an arm moving that is hardly heard.
+        if not self.good and self.wkc_error_count >= self._lost_limit:
+            return ProcessDataLost(self.lost, self._lost_limit)
+        if self.service.lost_slave:
+            return SlaveLost(self.service.lost_slave)
+        self._unlocked = 0 if self.clock_locked else self._unlocked + 1
+        if self._unlocked > self._clock_cycles and self.pending is None:
+            self._unlocked = 0
+            return ClockLost()
+        return None
+
+    def lease_held(self, lease: int) -> bool:
+        """Return whether the commander of `lease` still holds it; 0: the joystick, which needs none."""
+        if not lease:
+            return True
+        held, renewed, duration = self.blackboard.lease()
+        return held == lease and self.now_ns - renewed <= duration
+
+    def permission_lost(self, lease: int) -> Event | None:
+        """Return why what moves for the commander of `lease` has to stop, or None."""
+        if not self.operator.permitted:
+            return PermissionWithdrawn()
+        return None if self.lease_held(lease) else LeaseExpired()
+
+    def is_controlled(self, event: Event) -> bool:
+        """Return whether the reaction to an event leaves the drives enabled."""
+        return self.reactions[type(event)] is StopReaction.CONTROLLED_STOP
+
+    def drive_event(self, kind: type[DriveFault] | type[DriveLeftEnabled], axis: int) -> Event:
+        """Return the event of a drive, whose error code is looked up; one that shows a fault is in fault."""
+        self.service.explain_drive(axis)
+        drive = self.arm.all_drives[axis]
+        if drive.state in _IN_FAULT:
+            kind = DriveFault
+        return kind(axis, drive.statusword)
+
+    def wrong_drive_mode(self, axis: int) -> Event:
+        """Return the event of a drive that does not change its mode."""
+        return DriveModeTimeout(axis, self.arm.all_drives[axis].mode_display, DriveMode(self.arm.mode))
+
+    # -- one cycle of an enabled arm ------------------------------------------------------------------------------
+
+    def track(self) -> Event | None:
+        """Check what was lost and measured, then move the set-points on by one cycle.
+
+        Return what ends the state. Without a good cycle the set-points stand still: the slaves missed the last ones.
+        """
+        arm = self.arm
+        event = self.bus_fault()
+        if event is not None or not self.good:
+            return event
+        axis = arm.first_not_enabled()
+        if axis >= 0:
+            return self.drive_event(DriveLeftEnabled, axis)
+        event = arm.beyond_limits(self.supervision) or self._supervise_gripper()
+        if event is not None:
+            return event
+        result = arm.command()
+        if result is GuardResult.PASS and arm.active.ended is None:
+            return None
+        return self._motion_end(result)
+
+    def track_homing(self) -> Event | None:
+        """Run the homing for a cycle, supervised as any motion; return what ends the state."""
+        arm, homing = self.arm, self.homing
+        event = self.bus_fault()
+        if event is not None or not self.good:
+            return event
+        axis = arm.first_not_enabled()
+        if axis >= 0:
+            return self.drive_event(DriveLeftEnabled, axis)
+        event = self.permission_lost(self.lease)
+        if event is not None:
+            if not self.is_controlled(event):
+                return event
+            homing.stop()
+        homing.step()
+        event = arm.beyond_limits(self.supervision) or self._supervise_gripper()
+        if event is not None:
+            return event
+        if homing.stuck:
+            return self.wrong_drive_mode(homing.axis)
+        if homing.still_moving:
+            return HomingStillMoving(homing.axis, arm.drives[homing.axis].velocity)
+        axis = arm.first_outside()
+        if axis >= 0:
+            # While the drive searches, and where it counts from a new zero.
+            return LeftRange(axis, arm.all_drives[axis].position)
+        if not homing.leaving and (box := arm.trajectory_guard.zone_at(arm.state.actual)) is not None:
+            self.publish(HomingInBox(box))
+            homing.stop()
+        return None
+
+    def _supervise_gripper(self) -> Event | None:
+        """Stop a gripper that nobody commands any more; return what ends the state."""
+        gripper = self.arm.gripper
+        if gripper is None or not gripper.motion.moving or gripper.motion.stops:
+            return None
+        event = self.permission_lost(gripper.lease)
+        if event is not None:
+            if not self.is_controlled(event):
+                return event
+            self.publish(event)
+        elif gripper.lease or self.operator.holds_grip:
+            return None
+        gripper.stop()
+        return None
+
+    def _motion_end(self, result: GuardResult) -> Event | None:
+        """Return what ends the motion: a guard that stops it, or its controller."""
+        arm, controller = self.arm, self.arm.active
+        ended: MotionEnded | None = controller.ended
+        if isinstance(ended, ControllerFailed):
+            return GeneratorFailed()
+        limited = not controller.tolerates_saturation
+        if result in (GuardResult.STOPPING, GuardResult.STOPPED):
+            first = self.state in (State.MOVING, State.HOLDING) or (limited and not self.limited)
+            if result is GuardResult.STOPPED:
+                arm.rest()
+            if not first:
+                return None
+            ended = arm.trajectory_guard.ended
+        elif self.state is not State.MOVING:
+            return None
+        if ended is not None:
+            self.limited = limited and ended.by_limit
+        return ended

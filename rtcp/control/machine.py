@@ -1,0 +1,226 @@
+"""The state machine: it alone changes the state. What each state does and leads to: `rtcp.control.states`."""
+
+from __future__ import annotations
+
+from rtcp.control.context import Context
+from rtcp.control.states import (
+    Cause,
+    Closing,
+    Disabling,
+    EmergencyStopState,
+    Enabling,
+    FaultReaction,
+    FaultState,
+    Holding,
+    HomingState,
+    MachineState,
+    Moving,
+    ReadyState,
+    Resetting,
+    Signal,
+    Standstill,
+    Starting,
+    StoppedByLimitState,
+    Stopping,
+)
+from rtcp.ipc.commands import Shutdown
+from rtcp.ipc.events import (
+    ClockLost,
+    EmergencyStopActivated,
+    Enabled,
+    Event,
+    LeaseExpired,
+    MotionEnded,
+    PermissionWithdrawn,
+    ResetDone,
+)
+from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.stop_reactions import StopReaction
+
+STATES: tuple[type[MachineState], ...] = (
+    Starting,
+    ReadyState,
+    Enabling,
+    Holding,
+    Moving,
+    Stopping,
+    StoppedByLimitState,
+    HomingState,
+    Disabling,
+    FaultState,
+    EmergencyStopState,
+    Resetting,
+    Closing,
+)
+WITH_TORQUE = frozenset(
+    {
+        State.ENABLING,
+        State.HOLDING,
+        State.MOVING,
+        State.STOPPING,
+        State.STOPPED_BY_LIMIT,
+        State.HOMING,
+        State.DISABLING,
+    }
+)
+"""States in which drives may have torque and follow their targets."""
+_PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
+"""States that the input of the emergency stop ends. On the way to OP the inputs are not yet valid; while ready no drive
+has torque, and enabling is refused while it is pressed."""
+_SLAVES_RETURN = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
+"""States in which a slave that has left OP may return to it."""
+
+
+class StateMachine:
+    """Runs the active state once a cycle and changes it.
+
+    Args:
+        ctx: what the states share.
+    """
+
+    def __init__(self, ctx: Context) -> None:
+        self.context = ctx
+        reaction = FaultReaction(ctx)
+        self._holding = Holding()
+        self._states: dict[State, MachineState] = {
+            one.state: one
+            for one in (
+                Starting(),
+                ReadyState(reaction),
+                Enabling(),
+                self._holding,
+                Moving(),
+                Stopping(),
+                StoppedByLimitState(),
+                HomingState(),
+                Disabling(),
+                FaultState(reaction),
+                EmergencyStopState(reaction),
+                Resetting(reaction),
+                Closing(Standstill(ctx)),
+            )
+        }
+        self._active = self._states[State.STARTING]
+        self.fault = 0
+        """Number of the event that began the present fault; 0: there is none."""
+        self.limit = 0
+        """Number of the event by which a limit ended the last motion; 0: none, or it was reset."""
+        self.enables = 0
+        """How often the arm was enabled."""
+        self.motions = 0
+        """How many motions have begun."""
+
+    @property
+    def state(self) -> State:
+        """The machine's state."""
+        return self.context.state
+
+    @property
+    def closed(self) -> bool:
+        """Whether the loop may end."""
+        return self.context.state is State.OFF
+
+    @property
+    def changing_mode(self) -> bool:
+        """Whether the drives are changing their mode."""
+        return self.state is State.HOLDING and self._holding.changing_mode
+
+    def update(self, good: bool) -> None:
+        """Do one cycle; `good`: the exchange had the expected working counter."""
+        ctx = self.context
+        ctx.begin_cycle(good)
+        operator = ctx.operator
+        if operator.emergency_stop and ctx.state in _PRESSABLE:
+            self.change(EmergencyStopActivated())
+        event = self._active.update(ctx)
+        if event is not None and self._handle(event):
+            # The state ended before it commanded the arm: the next one does so in this cycle.
+            event = self._active.update(ctx)
+            if event is not None:
+                self._handle(event)
+        if ctx.state in _SLAVES_RETURN and ctx.box_left_op:
+            operator.clear_outputs()
+        operator.write_outputs(ctx.all_enabled, ctx.state is State.MOVING)
+        gripper = ctx.arm.gripper
+        if gripper is not None and (at_rest := gripper.came_to_rest()) is not None and ctx.all_enabled:
+            ctx.publish(at_rest)
+
+    def change(self, cause: Cause, lease: int | None = None) -> None:
+        """Change to the state that a command, an event or a signal leads to; an event is published.
+
+        Args:
+            cause: what leads on; one that leads nowhere from here changes nothing.
+            lease: of the commander of a motion; 0: the joystick.
+        """
+        ctx, before = self.context, self.context.state
+        if isinstance(cause, Event) and cause is not ctx.pending:
+            ctx.publish(cause)
+        target = self._target(cause)
+        if target is None:
+            return
+        if lease is not None:
+            ctx.lease = lease
+        self._count(cause, target)
+        ctx.state, ctx.entered = target, ctx.cycle
+        if target is not State.OFF:
+            self._active = self._states[target]
+            self._active.enter(ctx, cause, before)
+
+    def change_drive_mode(self, mode: DriveMode) -> None:
+        """Let the drives change their mode: now, at standstill, or when they are next enabled."""
+        self.context.arm.wanted_mode = mode
+        if self.state is State.HOLDING:
+            self._holding.change_mode(self.context, mode)
+        else:
+            self.context.arm.set_mode(mode)
+
+    def close(self) -> None:
+        """Stop, disable and end; nothing else is done from then on."""
+        if self.state not in (State.CLOSING, State.OFF):
+            self.change(Shutdown())
+
+    def _handle(self, event: Event | Signal) -> bool:
+        """Change the state for what ended it; return whether the arm is still to be commanded in this cycle."""
+        ctx = self.context
+        if isinstance(event, ClockLost) and event is not ctx.pending and self._stops_for_clock(event):
+            ctx.publish(event)
+            ctx.pending, self.fault = event, event.number
+            if ctx.state is not State.DISABLING:
+                self.change(Signal.STOP_FOR_CLOCK)
+            return True
+        self.change(event, 0 if event is Signal.JOYSTICK_DEFLECTED else None)
+        return ctx.state is State.STOPPING and isinstance(event, (LeaseExpired, PermissionWithdrawn))
+
+    def _stops_for_clock(self, event: ClockLost) -> bool:
+        """Return whether the arm comes to a controlled stop before the fault."""
+        ctx = self.context
+        if not ctx.is_controlled(event):
+            return False
+        # On its way to no torque it continues: who commanded none is not left with an arm that holds.
+        disabling = ctx.state is State.DISABLING
+        return disabling or (Signal.STOP_FOR_CLOCK in self._active.leads_to and not ctx.arm.all_still)
+
+    def _target(self, cause: Cause) -> State | None:
+        """Return where a cause leads from the active state; the reaction configured for an event may be harder."""
+        leads_to = self._active.leads_to
+        if isinstance(cause, Signal):
+            return leads_to.get(cause)
+        if isinstance(cause, Event) and not cause.is_fault:
+            reaction = self.context.reactions.get(type(cause), StopReaction.CONTROLLED_STOP)
+            if reaction is not StopReaction.CONTROLLED_STOP:
+                return State.FAULT
+        return next((leads_to[kind] for kind in type(cause).__mro__ if kind in leads_to), None)
+
+    def _count(self, cause: Cause, target: State) -> None:
+        if target in (State.FAULT, State.EMERGENCY_STOP) and isinstance(cause, Event):
+            self.fault = cause.number
+        elif isinstance(cause, ResetDone):
+            self.fault = 0
+        elif isinstance(cause, MotionEnded) and self.context.limited:
+            self.limit = cause.number
+        elif self.state is State.STOPPED_BY_LIMIT and target is State.HOLDING:
+            self.limit = 0
+        elif isinstance(cause, Enabled):
+            self.enables += 1
+        elif target is State.MOVING:
+            self.motions += 1

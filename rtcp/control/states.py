@@ -1,0 +1,830 @@
+"""What the machine does in each state, from start to end as `docs/machine.md` draws it.
+
+A state is a small object. `enter` is called when the machine changes to it, with the cause: the command or the event
+that leads there. `update` is called once a cycle and returns the event that ends the state, or None. `leads_to` says
+where each cause leads; only the machine (`rtcp.control.machine`) changes the state.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from math import ceil, nan
+from typing import ClassVar
+
+from rtcp.control.context import Context
+from rtcp.devices.cia402 import DriveState, TargetState
+from rtcp.ipc.commands import Disable, Enable, Halt, Home, MotionCommand, Reset, Shutdown
+from rtcp.ipc.events import (
+    Arrived,
+    Disabled,
+    DisableTimeout,
+    DriveFault,
+    DriveLeftEnabled,
+    Emergency,
+    EmergencyStopActivated,
+    Enabled,
+    EnabledInBox,
+    EnableTimeout,
+    EstopUnobservable,
+    Event,
+    Fault,
+    Homed,
+    HomingFailed,
+    HomingStillMoving,
+    LeaseExpired,
+    LeftRange,
+    LimitStopReset,
+    MotionEnded,
+    MovedSinceFault,
+    PermissionWithdrawn,
+    PositionJumped,
+    ProcessDataLost,
+    Ready,
+    ResetDone,
+    ResetTimeout,
+    ResetWhileMoving,
+    ResetWithoutFrames,
+    ResetWithoutSlaves,
+    ReturningToRange,
+    SlavesParked,
+    Stopped,
+    StoppedByLimit,
+    TorqueRemoved,
+)
+from rtcp.ipc.message import Message
+from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.stop_reactions import StopReaction, quick_stop_s
+from rtcp.motion.guards.output_limiter import BACK_RAD_S
+from rtcp.motion.guards.trajectory_guard import GuardResult
+
+
+class Signal(Enum):
+    """Causes that nobody is told of."""
+
+    JOYSTICK_DEFLECTED = 1
+    JOYSTICK_AT_REST = 2
+    STOP_FOR_CLOCK = 3
+    """The clock was lost, and its reaction is a controlled stop; the fault follows at standstill."""
+    CLOSED = 4
+
+
+Cause = Message | Signal
+
+FIRST_CYCLES = 10
+"""What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
+SETTLE_CYCLES = 5
+"""The same, before a drive counts as disabled."""
+
+_TARGETS = {
+    StopReaction.CONTROLLED_STOP: TargetState.ENABLED,
+    StopReaction.QUICK_STOP: TargetState.QUICK_STOPPED,
+    StopReaction.TORQUE_OFF: TargetState.TORQUE_OFF,
+}
+"""Where a stop reaction takes the drives."""
+_FAULTS = {Fault: State.FAULT, Emergency: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
+_TORQUE = {**_FAULTS, Disable: State.DISABLING}
+
+
+class MachineState:
+    """Base of all states."""
+
+    state: ClassVar[State]
+    drives: ClassVar[str]
+    """What the drives are commanded, for the documentation."""
+    leads_to: ClassVar[dict[type[Message] | Signal, State]]
+    """Where each cause leads; a class stands for its subclasses too."""
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Begin; `before` is the state that the machine leaves."""
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Do one cycle; return what ends the state."""
+        raise NotImplementedError
+
+
+class Starting(MachineState):
+    """From the first frame until all slaves are in OP and the clock is locked."""
+
+    state = State.STARTING
+    drives = "drives disabled; targets follow the actual positions"
+    leads_to = {Ready: State.READY, Fault: State.FAULT, Shutdown: State.CLOSING}
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Ask for OP once the clock is locked."""
+        service, arm = ctx.service, ctx.arm
+        if service.lost_slave:
+            # It fell before the first cycle in which all was well: nothing has moved yet that needs a reset.
+            service.recover()
+        if ctx.clock_locked:
+            service.want_op()
+        arm.advance(TargetState.DISABLED)
+        if ctx.good:
+            arm.track_actual()
+        if not service.all_op:
+            # Frames are not whole yet: cycles lost until all slaves are in OP do not count.
+            ctx.wkc_error_count = 0
+            return None
+        if ctx.good:
+            return Ready()
+        fault = ctx.bus_fault()
+        if fault is not None:
+            # Where no cycle was good the box was not read, which is no press of its button.
+            ctx.operator.assume_released()
+        return fault
+
+
+class ReadyState(MachineState):
+    """Slaves in OP, no torque."""
+
+    state = State.READY
+    drives = "drives disabled; targets follow the actual positions"
+    leads_to = {**_FAULTS, Enable: State.ENABLING}
+
+    def __init__(self, reaction: FaultReaction) -> None:
+        self._reaction = reaction
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Count lost cycles from now on, and after a reset report joints that stand elsewhere."""
+        ctx.wkc_error_count = 0
+        if isinstance(cause, ResetDone):
+            self._reaction.report_moved(ctx)
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Watch bus and drives."""
+        arm = ctx.arm
+        event = ctx.bus_fault()
+        if event is not None or not ctx.good:
+            return event
+        axis = arm.first_in_fault()
+        if axis >= 0:
+            return ctx.drive_event(DriveFault, axis)
+        arm.advance(TargetState.DISABLED)
+        arm.track_actual()
+        return None
+
+
+class Enabling(MachineState):
+    """To Operation Enabled: target = actual until every drive is there, in CSP.
+
+    A joint that stands a little outside its range then returns to the edge before anything else may move it. A drive
+    obeys its target some frames before it shows that it does, and no limiter cuts what is tracked: a position to which
+    it cannot have turned is not tracked.
+    """
+
+    state = State.ENABLING
+    drives = "drives advance to Operation Enabled; target = actual until each is there"
+    leads_to = {**_TORQUE, Enabled: State.HOLDING}
+
+    _REPORTED_RAD = 0.001
+    """A joint nearer to its range returns without a report: it was at the edge, and sagged as it rested."""
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Begin in CSP, where target = actual means standstill."""
+        ctx.arm.set_mode(DriveMode.CSP)
+        ctx.arm.hold()
+        ctx.operator.require_neutral()
+        self._false_cycles = 0
+        """Cycles in a row in which a drive shows a position to which it cannot have turned."""
+        self._were_enabled = 0
+        """Drives that have been enabled, a bit each."""
+        self._returning = False
+        """All are enabled; joints outside their range return to it."""
+        self._reset_supervision(ctx)
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Advance the drives by one step."""
+        arm = ctx.arm
+        event = ctx.bus_fault()
+        if event is not None or not ctx.good:
+            return event
+        event = self._drive_problem(ctx) or self._jump(ctx) or arm.beyond_limits(ctx.supervision)
+        if event is not None or self._false_cycles:
+            # While a position is false the last targets are sent again.
+            return event
+        arm.advance(TargetState.ENABLED)
+        arm.track_actual()
+        arm.command()
+        axis = arm.first_not_enabled()
+        wrong_mode = arm.first_in_another_mode() if axis < 0 else -1
+        if axis < 0 and wrong_mode < 0 and (arm.gripper is None or arm.gripper.enabled):
+            return self._all_enabled(ctx)
+        if ctx.waited <= ctx.cycles(ctx.config.enable_timeout_s):
+            return None
+        if axis >= 0:
+            ctx.service.explain_drive(axis)
+            return EnableTimeout(axis, arm.all_drives[axis].statusword)
+        return ctx.wrong_drive_mode(wrong_mode if wrong_mode >= 0 else len(arm.drives))
+
+    def _drive_problem(self, ctx: Context) -> Event | None:
+        arm = ctx.arm
+        axis = arm.first_outside()
+        if axis >= 0:
+            return LeftRange(axis, arm.all_drives[axis].position)
+        axis = arm.first_in_fault()
+        if axis >= 0:
+            return ctx.drive_event(DriveFault, axis)
+        for axis, drive in enumerate(arm.all_drives):
+            if drive.state is DriveState.OPERATION_ENABLED:
+                self._were_enabled |= 1 << axis
+            elif self._were_enabled >> axis & 1:
+                return ctx.drive_event(DriveLeftEnabled, axis)
+        return None
+
+    def _jump(self, ctx: Context) -> Event | None:
+        arm = ctx.arm
+        axis = arm.first_off_target()
+        self._false_cycles = 0 if axis < 0 else self._false_cycles + 1
+        if self._false_cycles < ctx.config.supervision.cycles:
+            return None
+        return PositionJumped(axis, arm.all_drives[axis].position, arm.tracked_to(axis))
+
+    def _all_enabled(self, ctx: Context) -> Event | None:
+        arm = ctx.arm
+        if not self._returning:
+            self._returning = True
+            for axis, fastest in enumerate(arm.limits.velocity):
+                beyond = arm.beyond_range(axis)
+                if beyond > self._REPORTED_RAD:
+                    ctx.publish(ReturningToRange(axis, beyond, min(BACK_RAD_S, fastest)))
+        if arm.first_returning() >= 0:
+            return None
+        self._reset_supervision(ctx)
+        return Enabled()
+
+    @staticmethod
+    def _reset_supervision(ctx: Context) -> None:
+        ctx.supervision.reset()
+        if ctx.arm.gripper is not None:
+            ctx.arm.gripper.supervision.reset()
+
+
+class Holding(MachineState):
+    """Enabled and at rest."""
+
+    state = State.HOLDING
+    drives = "the last set-points, unchanged"
+    leads_to = {
+        **_TORQUE,
+        MotionCommand: State.MOVING,
+        Signal.JOYSTICK_DEFLECTED: State.MOVING,
+        MotionEnded: State.STOPPING,
+        Signal.STOP_FOR_CLOCK: State.STOPPING,
+        Home: State.HOMING,
+    }
+
+    _MODE_S = 1.0
+
+    def __init__(self) -> None:
+        self.changing_mode = False
+        """Whether the drives are changing their mode."""
+        self._since = 0
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Hold; after enabling in the drive mode of the control mode."""
+        self.changing_mode = False
+        if isinstance(cause, Reset):
+            ctx.operator.require_neutral()
+            ctx.publish(LimitStopReset())
+        elif isinstance(cause, Enabled):
+            ctx.all_enabled = True
+            distance, box = ctx.arm.trajectory_guard.nearest_box(ctx.arm.state.actual)
+            if distance < 0.0:
+                ctx.publish(EnabledInBox(box, -distance))
+            if ctx.arm.wanted_mode is not DriveMode.CSP:
+                self.change_mode(ctx, ctx.arm.wanted_mode)
+
+    def change_mode(self, ctx: Context, mode: DriveMode) -> None:
+        """Let the drives, at standstill, change to `mode`."""
+        ctx.arm.set_mode(mode)
+        self.changing_mode = True
+        self._since = ctx.cycle
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Hold, wait for a mode change, or start to move by the joystick."""
+        arm = ctx.arm
+        event = ctx.track()
+        if event is not None:
+            return event
+        if self.changing_mode:
+            axis = arm.first_in_another_mode()
+            self.changing_mode = axis >= 0
+            if axis >= 0 and ctx.cycle - self._since > ctx.cycles(self._MODE_S):
+                return ctx.wrong_drive_mode(axis)
+            return None
+        return Signal.JOYSTICK_DEFLECTED if ctx.operator.jog_by_joystick(arm, ctx.blackboard) else None
+
+
+class Moving(MachineState):
+    """A controller moves the arm."""
+
+    state = State.MOVING
+    drives = "the set-points of the active controller, after the guards"
+    leads_to = {
+        **_TORQUE,
+        MotionCommand: State.MOVING,
+        Arrived: State.HOLDING,
+        Signal.JOYSTICK_AT_REST: State.HOLDING,
+        Halt: State.STOPPING,
+        LeaseExpired: State.STOPPING,
+        PermissionWithdrawn: State.STOPPING,
+        MotionEnded: State.STOPPING,
+        Signal.STOP_FOR_CLOCK: State.STOPPING,
+    }
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Begin a motion."""
+        ctx.limited = False
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Move on by one cycle."""
+        event = ctx.permission_lost(ctx.lease)
+        if event is not None:
+            return event
+        if not ctx.lease:
+            ctx.operator.jog_by_joystick(ctx.arm, ctx.blackboard)
+        event = ctx.track()
+        if event is not None or not ctx.arm.still:
+            return event
+        return Arrived() if ctx.lease else Signal.JOYSTICK_AT_REST
+
+
+class Stopping(MachineState):
+    """A controlled stop."""
+
+    state = State.STOPPING
+    drives = "set-points decelerate to standstill under the limits"
+    leads_to = {
+        **_TORQUE,
+        Stopped: State.HOLDING,
+        StoppedByLimit: State.STOPPED_BY_LIMIT,
+        MotionEnded: State.STOPPING,
+        Signal.STOP_FOR_CLOCK: State.STOPPING,
+    }
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Let the controller stop, unless it or a guard stops by itself."""
+        ctx.operator.require_neutral()
+        if not isinstance(cause, MotionEnded):
+            ctx.limited = ctx.limited and cause is Signal.STOP_FOR_CLOCK
+            ctx.arm.stop()
+        elif ctx.limited and ctx.arm.gripper is not None:
+            ctx.arm.gripper.stop()
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Decelerate; at standstill hold, or begin the fault that the stop was for."""
+        arm = ctx.arm
+        event = ctx.track()
+        if event is not None:
+            return event
+        if ctx.pending is not None:
+            return ctx.pending if arm.all_still else None
+        if not arm.still or arm.trajectory_guard.stopping:
+            return None
+        arm.rest()
+        return StoppedByLimit() if ctx.limited else Stopped()
+
+
+class StoppedByLimitState(MachineState):
+    """A limit ended the motion; a reset leads on."""
+
+    state = State.STOPPED_BY_LIMIT
+    drives = "the set-points at which it came to rest, unchanged"
+    leads_to = {**_TORQUE, Reset: State.HOLDING}
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Hold."""
+        return ctx.track()
+
+
+class HomingState(MachineState):
+    """One drive homes by itself."""
+
+    state = State.HOMING
+    drives = "one drive homes by itself (mode of operation 6), the others hold"
+    leads_to = {**_TORQUE, Homed: State.HOLDING, HomingFailed: State.HOLDING, Stopped: State.HOLDING}
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Start the homing of a joint."""
+        assert isinstance(cause, Home)
+        ctx.homing.begin(cause.axis)
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Run the homing, then return the joint to its range where its home is a little outside."""
+        event = ctx.track_homing()
+        if event is not None or not ctx.good:
+            return event
+        return ctx.homing.outcome if ctx.homing.ended and ctx.homing.returned_to_range() else None
+
+
+class Disabling(MachineState):
+    """A controlled stop first, then no torque."""
+
+    state = State.DISABLING
+    drives = "a controlled stop, then drives advance to Switch On Disabled; brakes close"
+    leads_to = {**_FAULTS, Disabled: State.READY}
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Let the arm come to rest."""
+        ctx.arm.stop()
+        self._since = ctx.cycle
+        self._commanded = 0
+        """Cycles in which the drives were commanded to disable."""
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Stop, then disable."""
+        arm = ctx.arm
+        if ctx.homing.under_way:
+            ctx.homing.stop()
+            self._since = ctx.cycle
+            return ctx.track_homing()
+        if not arm.all_still:
+            # The time to disable begins when the arm stands.
+            self._since = ctx.cycle
+            return ctx.track()
+        fault = ctx.bus_fault() or ctx.pending
+        if fault is not None or not ctx.good:
+            return fault
+        ctx.all_enabled = False
+        arm.advance(TargetState.DISABLED)
+        arm.track_actual()
+        self._commanded += 1
+        axis = arm.first_with_torque()
+        if axis < 0:
+            return Disabled() if self._commanded > SETTLE_CYCLES else None
+        if ctx.cycle - self._since > ctx.cycles(ctx.config.enable_timeout_s):
+            ctx.service.explain_drive(axis)
+            return DisableTimeout(axis, arm.all_drives[axis].statusword)
+        return None
+
+
+# -- faults -----------------------------------------------------------------------------------------------------------
+
+
+class Standstill:
+    """Whether joints in a quick stop stand; where no frames return, whether they must by now.
+
+    Args:
+        ctx: how long a quick stop takes, and the joints.
+    """
+
+    _STAND_S = 2.0
+    """A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
+    _UNHEARD_S = 0.5
+    """So much longer than the quick stop of a usual arm that a late start does not matter."""
+
+    def __init__(self, ctx: Context) -> None:
+        ramp_s = quick_stop_s(ctx.config)
+        self._stand_cycles = ctx.cycles(max(self._STAND_S, ramp_s))
+        self._unheard_cycles = ctx.cycles(max(self._UNHEARD_S, ramp_s))
+        self._cycles = self._unheard = 0
+
+    def begin(self) -> None:
+        """Begin with the quick stop."""
+        self._cycles = self._unheard = 0
+
+    @property
+    def unheard(self) -> bool:
+        """Whether the drives have not answered for as long as any quick stop takes: their states are unknown."""
+        return self._unheard > self._unheard_cycles
+
+    def reached(self, ctx: Context) -> bool:
+        """Count the cycle; return whether the joints stand, or waiting for it gains nothing."""
+        self._cycles += 1
+        if not ctx.good:
+            self._unheard += 1
+        stands = ctx.good and self._cycles > FIRST_CYCLES and ctx.arm.first_moving() < 0
+        return stands or self.unheard or self._cycles > self._stand_cycles
+
+
+class FaultReaction:
+    """What the drives do in a fault, also while it is reset: a quick stop, or no torque (CiA 402-2, 0x605E).
+
+    Args:
+        ctx: the cycle and the joints.
+    """
+
+    _ESTOP_S = 2.0
+    """The slave watcher brings back sooner what merely left OP, also what does so twice."""
+    _MOVED_RAD = 0.05
+    """A joint that stood at the fault does not move so far until its brake holds (docs/faults.md)."""
+    _RAN_ON_S = 1.0
+    """A joint that moved may have gone on so long at its speed, where frames were taken for lost late."""
+    _NOT_REMEMBERED = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP, State.RESETTING})
+
+    def __init__(self, ctx: Context) -> None:
+        self.standstill = Standstill(ctx)
+        self._estop_cycles = ctx.cycles(self._ESTOP_S)
+        self._unobservable = 0
+        """Cycles in a row in which the emergency stop could not have been read."""
+        self.torque_off = False
+        """The torque is removed: commanded, or by the reaction, or by an emergency stop."""
+        self.off_at_rest = False
+        """The torque goes when the joints stand."""
+        self.stood = [nan] * len(ctx.config.joints)
+        """Where each joint was last read before the fault, rad; NaN: nowhere."""
+        self.turned = [0.0] * len(ctx.config.joints)
+        """How fast it turned there, rad/s."""
+
+    def begin(self, ctx: Context, before: State) -> None:
+        """Begin: forget what was under way, and remember where the joints are."""
+        # Where it begins: a lost slave was last read before that. Not again until the reset, as by an emergency stop in
+        # the fault: its drive may be without supply by then. Nor in a start, in which perhaps no joint was read.
+        if before not in self._NOT_REMEMBERED:
+            self.stood[:] = ctx.arm.state.actual
+            self.turned[:] = ctx.arm.state.actual_velocity
+        ctx.pending = None
+        ctx.all_enabled = False
+        ctx.homing.abandon()
+        ctx.arm.hold()
+        self.standstill.begin()
+        self._unobservable = 0
+
+    def update(self, ctx: Context) -> None:
+        """Command the drives, whether or not frames return: slaves that hear must not keep their speed or torque."""
+        arm = ctx.arm
+        at_rest = not self.torque_off and self.off_at_rest and self.standstill.reached(ctx)
+        if not self.torque_off and (at_rest or self._estop_unobservable(ctx)):
+            self.remove_torque(ctx)
+        arm.advance(TargetState.TORQUE_OFF if self.torque_off else TargetState.QUICK_STOPPED)
+        if ctx.good:
+            arm.track_actual()
+
+    def remove_torque(self, ctx: Context) -> None:
+        """Remove the torque from now on."""
+        self.torque_off = True
+        ctx.publish(TorqueRemoved())
+
+    def report_moved(self, ctx: Context) -> None:
+        """Report joints that stand elsewhere than at the fault: moved, or their drives count from another zero.
+
+        No refusal: only a person who looks at the arm knows which of the two it is.
+        """
+        here = ctx.arm.state.actual
+        for axis, (stood, turned) in enumerate(zip(self.stood, self.turned, strict=True)):
+            # No faster than the limit: a false speed is at times what the fault was.
+            ran_on = self._RAN_ON_S * min(abs(turned), ctx.config.joints[axis].velocity)
+            if abs(here[axis] - stood) > self._MOVED_RAD + ran_on:
+                ctx.publish(MovedSinceFault(axis, here[axis], stood))
+
+    def _estop_unobservable(self, ctx: Context) -> bool:
+        """Return whether the emergency stop could not be read for too long: it counts as pressed, as a broken wire."""
+        if ctx.good or not ctx.operator.has_button or ctx.box_in_op:
+            self._unobservable = 0
+            return False
+        self._unobservable += 1
+        if self._unobservable <= self._estop_cycles:
+            return False
+        ctx.publish(EstopUnobservable(self._ESTOP_S))
+        return True
+
+
+class FaultState(MachineState):
+    """Something was lost or broke."""
+
+    state = State.FAULT
+    drives = (
+        "quick stop: each drive decelerates by itself and holds (0x605A = 6), or torque off where `stops` says so; "
+        "whether or not frames return"
+    )
+    leads_to = {
+        Reset: State.RESETTING,
+        Disable: State.FAULT,
+        Emergency: State.EMERGENCY_STOP,
+        Shutdown: State.CLOSING,
+    }
+
+    def __init__(self, reaction: FaultReaction) -> None:
+        self._reaction = reaction
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Stop all drives by the reaction to the event; what stands already holds by a quick stop."""
+        reaction = self._reaction
+        if isinstance(cause, Disable):
+            reaction.remove_torque(ctx)
+            return
+        assert isinstance(cause, Event)
+        hard = ctx.reactions[type(cause)] is StopReaction.TORQUE_OFF or (
+            before is State.DISABLING and cause is ctx.pending
+        )
+        # Who commanded no torque is not left with an arm that holds, and a reset that fails does not restore it.
+        fails = before is State.RESETTING
+        reaction.torque_off = hard or (fails and reaction.torque_off)
+        reaction.off_at_rest = before is State.DISABLING or (fails and reaction.off_at_rest)
+        reaction.begin(ctx, before)
+        ctx.arm.advance(TargetState.TORQUE_OFF if reaction.torque_off else TargetState.QUICK_STOPPED)
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Keep the drives stopped."""
+        self._reaction.update(ctx)
+        return None
+
+
+class EmergencyStopState(MachineState):
+    """The emergency stop: quick stop, torque off at standstill or at once, slaves to PRE-OP.
+
+    Source: the emergency stop of the thesis stops the network and takes the slaves to PRE-OP (facts, "The drive"). Here
+    the drives come to rest first: a drive that loses its process data in motion lets the arm fall.
+    """
+
+    state = State.EMERGENCY_STOP
+    drives = (
+        "quick stop, at standstill torque off and brakes closed, or torque off at once where `stops` says so; then the "
+        "slaves to PRE-OP"
+    )
+    leads_to = {Reset: State.RESETTING, Disable: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
+
+    _OFF_S = 1.0
+
+    def __init__(self, reaction: FaultReaction) -> None:
+        self._reaction = reaction
+        self._off = TargetState.DISABLED
+        self._since = 0
+        """Cycle in which the torque was first commanded off."""
+        self._parked = False
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Begin with the quick stop, or without torque."""
+        if isinstance(cause, Disable):
+            return
+        assert isinstance(cause, Event)
+        reaction, hard = self._reaction, ctx.reactions[type(cause)] is StopReaction.TORQUE_OFF
+        reaction.torque_off = hard
+        reaction.off_at_rest = True
+        reaction.begin(ctx, before)
+        self._off = TargetState.TORQUE_OFF if hard else TargetState.DISABLED
+        self._since = ctx.cycle
+        self._parked = False
+        ctx.arm.advance(TargetState.TORQUE_OFF if hard else TargetState.QUICK_STOPPED)
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Stop, remove the torque, then park the slaves."""
+        arm, reaction = ctx.arm, self._reaction
+        if not reaction.torque_off:
+            arm.advance(TargetState.QUICK_STOPPED)
+            if reaction.standstill.reached(ctx):
+                if reaction.standstill.unheard:
+                    # The states of the drives are unknown: from each of them this removes the torque.
+                    self._off = TargetState.TORQUE_OFF
+                reaction.torque_off = True
+                self._since = ctx.cycle
+        else:
+            arm.advance(self._off)
+            waited = ctx.cycle - self._since
+            off = ctx.good and waited > FIRST_CYCLES and arm.first_with_torque() < 0
+            if not self._parked and (off or waited > ctx.cycles(self._OFF_S)):
+                self._parked = True
+                ctx.service.park()
+                ctx.publish(SlavesParked())
+        if ctx.good:
+            arm.track_actual()
+        return None
+
+
+class Resetting(MachineState):
+    """Out of a fault: slaves back in OP, clock locked, all at rest; then drive faults reset and drives disabled."""
+
+    state = State.RESETTING
+    drives = "slaves return to OP, drive faults are reset, drives disabled"
+    leads_to = {
+        ResetDone: State.READY,
+        Fault: State.FAULT,
+        Disable: State.FAULT,
+        Emergency: State.EMERGENCY_STOP,
+        Shutdown: State.CLOSING,
+    }
+
+    _RESET_S = 3.0
+
+    def __init__(self, reaction: FaultReaction) -> None:
+        self._reaction = reaction
+
+    def enter(self, ctx: Context, cause: Cause, before: State) -> None:
+        """Bring the slaves back."""
+        # In PRE-OP the box says nothing: whether the button is still pressed shows once it is back in OP.
+        ctx.operator.assume_released()
+        ctx.service.recover()
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Reset what is back; give up after a while."""
+        arm = ctx.arm
+        if not (ctx.good and ctx.service.all_op and ctx.clock_locked):
+            self._reaction.update(ctx)
+            return self._failure(ctx)
+        # What still moves comes to rest first: its torque goes with the reset.
+        arm.advance(TargetState.RESET if arm.first_moving() < 0 else TargetState.QUICK_STOPPED)
+        arm.track_actual()
+        if arm.first_not_resting() < 0 and ctx.operator.button_known:
+            return ResetDone()
+        return self._failure(ctx)
+
+    def _failure(self, ctx: Context) -> Event | None:
+        button = ctx.config.inputs.emergency_stop
+        settling_s = 0.0 if button is None else button.debounce_ms * 1e-3
+        if ctx.waited <= ctx.cycles(self._RESET_S + settling_s):
+            return None
+        arm, all_op = ctx.arm, ctx.service.all_op
+        axis = arm.first_moving()
+        if axis >= 0 and ctx.good and all_op:
+            return ResetWhileMoving(axis, arm.all_drives[axis].velocity)
+        axis = arm.first_not_resting()
+        # Without the clock no drive was commanded to reset: that one is not at rest is not the reason.
+        if axis >= 0 and all_op and ctx.clock_locked:
+            ctx.service.explain_drive(axis)
+            return ResetTimeout(axis, arm.all_drives[axis].statusword)
+        return ResetWithoutFrames() if all_op else ResetWithoutSlaves()
+
+
+class Closing(MachineState):
+    """The end: a controlled stop, torque off; an emergency on the way takes its own reaction."""
+
+    state = State.CLOSING
+    drives = "a controlled stop, drives disabled; then INIT"
+    leads_to = {Shutdown: State.CLOSING, Signal.CLOSED: State.OFF}
+
+    _CLOSING_S = 2.0
+
+    def __init__(self, standstill: Standstill) -> None:
+        self._standstill = standstill
+        self._target = TargetState.QUICK_STOPPED
+        self._hard = False
+        """An emergency came: what still moves stops by the drives themselves."""
+        self._cycles = self._commanded = 0
+
+    def update(self, ctx: Context) -> Event | Signal | None:
+        """Stop, disable, end."""
+        return Signal.CLOSED if self._is_done(ctx) else None
+
+    def _is_done(self, ctx: Context) -> bool:
+        arm, lost_limit = ctx.arm, ctx.config.bus.lost_cycles
+        self._cycles += 1
+        if self._decelerates(ctx):
+            return False
+        if ctx.lost >= lost_limit:
+            # Slaves that still listen stay in OP until the joints stand.
+            arm.advance(self._target if self._hard else _TARGETS[ctx.reactions[ProcessDataLost]])
+            return ctx.lost >= lost_limit + ceil(quick_stop_s(ctx.config) / ctx.period_s) + SETTLE_CYCLES
+        if self._cycles > ctx.cycles(self._CLOSING_S):
+            return True
+        if not ctx.good:
+            return False
+        homing = ctx.homing
+        if homing.under_way and arm.first_not_enabled() < 0:
+            homing.stop()
+            homing.step()
+            self._cycles = 0
+            if homing.still_moving:
+                self._stop_hard(ctx, HomingStillMoving(homing.axis, arm.drives[homing.axis].velocity))
+            return False
+        return self._stop(ctx) and self._remove_torque(ctx)
+
+    def _decelerates(self, ctx: Context) -> bool:
+        """React to the emergency stop or a measurement beyond its limit; return whether the arm moves after it."""
+        arm = ctx.arm
+        if not self._hard and arm.first_with_torque() >= 0:
+            event: Event | None = None
+            if ctx.good and arm.first_not_enabled() < 0:
+                event = arm.beyond_limits(ctx.supervision)
+            if event is None and ctx.operator.emergency_stop:
+                event = EmergencyStopActivated()
+            if event is not None:
+                self._stop_hard(ctx, event)
+        if not self._hard:
+            return False
+        self._standstill.reached(ctx)
+        if self._standstill.unheard:
+            self._target = TargetState.TORQUE_OFF
+        if arm.first_moving() < 0 or self._cycles > ctx.cycles(self._CLOSING_S):
+            return False
+        arm.advance(self._target)
+        if ctx.good:
+            arm.track_actual()
+        return True
+
+    def _stop_hard(self, ctx: Context, event: Event) -> None:
+        self._hard = True
+        self._target = _TARGETS[ctx.reactions[type(event)]]
+        self._cycles = 0
+        self._standstill.begin()
+        ctx.homing.abandon()
+        ctx.arm.hold()
+        ctx.publish(event)
+
+    def _stop(self, ctx: Context) -> bool:
+        """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""
+        arm = ctx.arm
+        arm.stop()
+        if arm.all_still or arm.first_not_enabled() >= 0:
+            return True
+        self._cycles = 0
+        if arm.command() is GuardResult.STOPPED:
+            arm.rest()
+        return False
+
+    def _remove_torque(self, ctx: Context) -> bool:
+        # In a fault the drives decelerate by themselves: their torque goes when they stand.
+        arm = ctx.arm
+        ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
+        arm.advance(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)
+        arm.track_actual()
+        self._commanded = 0 if ramping else self._commanded + 1
+        return self._commanded > SETTLE_CYCLES and arm.first_with_torque() < 0

@@ -1,0 +1,198 @@
+"""Jerk-limited motion of joints (ruckig): move to a configuration, come to rest.
+
+The commanded position is continuous whatever is asked: every motion begins at the state that was commanded last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import sqrt
+
+from ruckig import (
+    ControlInterface,
+    InputParameter,
+    OutputParameter,
+    Result,
+    Ruckig,
+    RuckigError,
+    Synchronization,
+    Trajectory,
+)
+
+from rtcp.motion.state import ArmState, Phase, Setpoint
+
+LONGEST_S = 600.0
+"""A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
+# ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: a little less jerk
+# is not on the border any more.
+_JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
+_INSIDE = 1.0 - 1e-6
+"""What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
+
+
+def allowed_acceleration(acceleration: float, speed: float, fastest: float, most: float, jerk: float) -> float:
+    """Return the acceleration, rad/s^2, cut to `most`, and to what ends before the speed passes `fastest`.
+
+    An acceleration a that falls to 0 with the jerk j still adds a^2 / 2j to the speed.
+    """
+    outward = acceleration if speed >= 0.0 else -acceleration
+    bound = most
+    if outward > 0.0:
+        left = fastest - (speed if speed >= 0.0 else -speed)
+        rising = sqrt(2.0 * jerk * left) if left > 0.0 else 0.0
+        bound = rising if rising < most else most
+    bound *= _INSIDE
+    return bound if acceleration > bound else -bound if acceleration < -bound else acceleration
+
+
+def allowed_accelerations(
+    state: ArmState, fastest: Sequence[float], most: Sequence[float], jerk: Sequence[float]
+) -> list[float]:
+    """Return `allowed_acceleration` of every joint of a state; bounds of shape (n,)."""
+    return [
+        allowed_acceleration(now, state.commanded_velocity[i], fastest[i], most[i], jerk[i])
+        for i, now in enumerate(state.commanded_acceleration)
+    ]
+
+
+def stoppable_speed(distance: float, acceleration: float, jerk: float) -> float:
+    """Return the speed, rad/s, that comes to rest within `distance` rad, after an acceleration ramp.
+
+    v^2 / 2a + v a / 2j = distance, solved for v.
+    """
+    if not distance > 0.0:
+        return 0.0
+    ramp = 0.5 * acceleration * acceleration / jerk
+    return sqrt(ramp * ramp + 2.0 * acceleration * distance) - ramp
+
+
+class JointMotion:
+    """A motion of `n` joints, one `update` a cycle: HOLD at rest, MOVE to a configuration, STOP on the way to rest.
+
+    Args:
+        period_s: the cycle, s.
+        velocity, acceleration, jerk: bounds of each joint, shape (n,), rad/s, rad/s^2, rad/s^3; read when a motion
+            begins, which keeps them to its end.
+    """
+
+    def __init__(
+        self, period_s: float, velocity: Sequence[float], acceleration: Sequence[float], jerk: Sequence[float]
+    ) -> None:
+        n = len(velocity)
+        self._otg = Ruckig(n, period_s)
+        self._output = OutputParameter(n)
+        self._plan = Trajectory(n)
+        # A move is planned beside the one that runs, and takes over only when the plan succeeds.
+        self._inputs = [InputParameter(n), InputParameter(n), InputParameter(n)]
+        self._stop = self._inputs[2]
+        self._stop.control_interface = ControlInterface.Velocity
+        # Every joint stops as fast as it may: the path matters less than standing still.
+        self._stop.synchronization = Synchronization.No
+        self._zero = [0.0] * n
+        self._active = self._inputs[0]
+        self._target = Setpoint(n)
+        self._velocity_limit, self._acceleration_limit, self._jerk_limit = velocity, acceleration, jerk
+        self.phase = Phase.HOLD
+        self.failed = False
+        """Whether ruckig refused its input; the setpoints stand since."""
+        self.duration_s = 0.0
+        self.elapsed_s = 0.0
+
+    def hold(self) -> None:
+        """Hold where the state is from now on; only at standstill."""
+        self.phase = Phase.HOLD
+        self.failed = False
+
+    def move_to(self, state: ArmState, target: Sequence[float], speed: float, *, synchronized: bool = True) -> bool:
+        """Move to `target` (rad, shape (n,)); return False where no plan is found.
+
+        Without a plan, or with one longer than `LONGEST_S`, what was under way goes on.
+
+        Args:
+            state: where the motion begins.
+            target: inside the joint limits, which the caller has checked.
+            speed: bound of every joint's speed, rad/s; each joint's own limit holds besides.
+            synchronized: all joints arrive together; else each as soon as it can.
+        """
+        move = self._inputs[1] if self._active is self._inputs[0] else self._inputs[0]
+        self._carry_over(move, state)
+        move.synchronization = Synchronization.Time if synchronized else Synchronization.No
+        move.target_position = list(target)
+        move.target_velocity = self._zero
+        # A joint that is faster than the new bound (a slower move begins in motion) needs room to slow down.
+        move.max_velocity = [
+            max(min(speed, limit), abs(now))
+            for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
+        ]  # fmt: skip
+        if not self._planned(move):
+            return False
+        self._active = move
+        self._begin(Phase.MOVE)
+        return True
+
+    def _planned(self, move: InputParameter) -> bool:
+        for scale in _JERK_SCALES:
+            move.max_jerk = [scale * jerk for jerk in self._jerk_limit]
+            try:
+                if self._otg.calculate(move, self._plan) >= 0:
+                    return bool(self._plan.duration <= LONGEST_S)
+            except (RuckigError, ValueError):
+                # ruckig raises where its algorithm fails, and where its own result code is unknown to its binding.
+                continue
+        return False
+
+    def stop(self, state: ArmState) -> None:
+        """Come to rest under the acceleration and jerk limits; at rest, end a move that has not begun."""
+        if self.phase is Phase.STOP:
+            return
+        if not (any(state.commanded_velocity) or any(state.commanded_acceleration)):
+            self.hold()
+            return
+        self._carry_over(self._stop, state)
+        self._stop.max_velocity = self._velocity_limit
+        self._stop.max_jerk = self._jerk_limit
+        self._stop.target_velocity = self._zero
+        self._active = self._stop
+        self._begin(Phase.STOP)
+
+    def _begin(self, phase: Phase) -> None:
+        self.phase = phase
+        self.failed = False
+        self.elapsed_s = 0.0
+
+    def _carry_over(self, given: InputParameter, state: ArmState) -> None:
+        given.current_position = state.commanded
+        given.current_velocity = state.commanded_velocity
+        bounds = self._acceleration_limit
+        given.max_acceleration = bounds
+        given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
+        given.target_acceleration = self._zero
+
+    def update(self, state: ArmState) -> Setpoint:
+        """Return the setpoints of the next cycle; where ruckig refuses they stand, and `failed` is set."""
+        target = self._target
+        if not self.phase:
+            target.position = state.commanded
+            target.velocity = self._zero
+            return target
+        output = self._output
+        try:
+            result = self._otg.update(self._active, output)
+        except (RuckigError, ValueError):
+            result = Result.Error
+        if result < 0:
+            target.position = state.commanded
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
+            self.failed = True
+            return target
+        target.position = output.new_position
+        target.velocity = output.new_velocity
+        self.duration_s = output.trajectory.duration
+        self.elapsed_s = output.time
+        if result == Result.Finished:
+            target.velocity = self._zero
+            self.phase = Phase.HOLD
+        else:
+            output.pass_to_input(self._active)
+        return target

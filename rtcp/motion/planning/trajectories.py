@@ -1,0 +1,254 @@
+"""Plans of trajectories: timed joint points, joined by polynomials whose extremes are all inside the limits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from math import ceil, isfinite
+from typing import TYPE_CHECKING
+
+from rtcp.config.model import Point
+from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
+from rtcp.motion.planning.interpolation import (
+    Coefficients,
+    beyond,
+    cubic,
+    derivative,
+    quintic,
+    spline_accelerations,
+    spline_velocities,
+    value,
+)
+from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Plan, PlanRefused, ZoneAt
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Limits
+
+MOST_POINTS = 4096
+SHORTEST_S = 1e-3
+"""Between two points there is at least so much time."""
+ZONE_STEP_RAD = 0.01
+"""Zones are looked at whenever a joint has moved so far."""
+_ROUNDING = 1e-9
+_STILL = 1e-9
+_AT_ONCE_S = 1e-12
+
+
+def plan_trajectory(
+    points: Sequence[Point],
+    limits: Limits,
+    q_now: Sequence[float],
+    *,
+    names: Sequence[str] = (),
+    zone_at: ZoneAt | None = None,
+) -> Plan:
+    """Return the plan of a trajectory for `TrajectoryController`.
+
+    Points with positions only are joined by quintics that have the velocities and accelerations of the cubic spline
+    through them; points with velocities too by cubics; with accelerations too by quintics. All points are of one kind.
+    It begins at rest at `q_now` (time 0: there, within `AT_START_RAD`; later: it is led there) and ends at rest.
+
+    Args:
+        points: at least one, at most `MOST_POINTS`, times rising by `SHORTEST_S` at least.
+        limits: position, velocity and acceleration of every joint, kept over the whole of each piece: the extremes of
+            its polynomials are looked at, no samples.
+        q_now: where the arm is commanded, rad, shape (n,), n <= 6.
+        names: of the joints, for the sentences.
+        zone_at: looked at every `ZONE_STEP_RAD` of any joint's way.
+
+    Raises:
+        PlanRefused: with the point, the joint, what was found and what is allowed.
+    """
+    joints = len(q_now)
+    names = list(names) or [f"joint{i + 1}" for i in range(joints)]
+    _check_points(points, names)
+    waypoints = _waypoints(points, q_now)
+    first, last = waypoints[0], waypoints[-1]
+    _check_ends(first, last, len(points), q_now, names)
+    for number, waypoint in enumerate(waypoints, 1):
+        _check_waypoint(waypoint, f"point {number}", limits, names)
+    if first.t > _AT_ONCE_S:
+        _check_approach(first, limits, q_now, names, zone_at)
+    for number, (before, after) in enumerate(pairwise(waypoints), 1):
+        _check_piece(before, after, f"between points {number} and {number + 1}", limits, names, zone_at)
+    return Plan(tuple(_row(waypoint) for waypoint in waypoints), last.t, 0.0, 1.0, last.q)
+
+
+def _check_points(points: Sequence[Point], names: Sequence[str]) -> None:
+    if len(names) > MOST_JOINTS:
+        raise PlanRefused(f"a trajectory can move {MOST_JOINTS} joints, this arm has {len(names)}")
+    if not points:
+        raise PlanRefused("the trajectory has no points, at least one is needed")
+    if len(points) > MOST_POINTS:
+        raise PlanRefused(f"the trajectory has {len(points)} points, at most {MOST_POINTS} are allowed")
+    for number, point in enumerate(points, 1):
+        if not isfinite(point.t) or not 0.0 <= point.t <= LONGEST_S:
+            raise PlanRefused(f"point {number}: its time is {point.t} s, allowed is 0 to {LONGEST_S:g} s")
+        if number > 1 and point.t < points[number - 2].t + SHORTEST_S * (1.0 - _ROUNDING):
+            raise PlanRefused(
+                f"point {number}: its time is {point.t:g} s after {points[number - 2].t:g} s, "
+                f"times must rise by at least {SHORTEST_S:g} s"
+            )
+        for what, unit, given in (
+            ("position", "rad", point.q),
+            ("velocity", "rad/s", point.v),
+            ("acceleration", "rad/s^2", point.a),
+        ):
+            if given is None:
+                continue
+            if len(given) != len(names):
+                raise PlanRefused(
+                    f"point {number}: it has {len(given)} numbers for the {what}, {len(names)} are needed"
+                )
+            for name, number_given in zip(names, given, strict=True):
+                if not isfinite(number_given):
+                    raise PlanRefused(
+                        f"point {number}: the {what} of {name} is {number_given} {unit}, a number is needed"
+                    )
+        if (point.v is None) != (points[0].v is None) or (point.a is None) != (points[0].a is None):
+            raise PlanRefused(f"point {number}: velocities and accelerations must be given for all points or for none")
+        if point.a is not None and point.v is None:
+            raise PlanRefused(f"point {number}: an acceleration needs a velocity too")
+
+
+class _Knot:
+    """A point with all its numbers, and the kind of the piece that leads to it."""
+
+    __slots__ = ("a", "kind", "q", "t", "v")
+
+    def __init__(self, t: float, q: Sequence[float], v: Sequence[float], a: Sequence[float], kind: float) -> None:
+        self.t, self.kind = t, kind
+        self.q, self.v, self.a = tuple(q), tuple(v), tuple(a)
+
+
+def _waypoints(points: Sequence[Point], q_now: Sequence[float]) -> list[_Knot]:
+    zero = (0.0,) * len(q_now)
+    if points[0].v is not None:
+        kind = CUBIC if points[0].a is None else QUINTIC
+        return [_Knot(p.t, p.q, p.v or zero, p.a or zero, kind) for p in points]
+    # Led to its first point the arm does not stand still there: the spline begins where the arm is.
+    led = points[0].t > _AT_ONCE_S
+    times = [0.0] * led + [p.t for p in points]
+    columns = []
+    for i in range(len(q_now)):
+        values = [q_now[i]] * led + [p.q[i] for p in points]
+        velocities = spline_velocities(times, values)
+        columns.append((velocities[led:], spline_accelerations(times, values, velocities)[led:]))
+    return [
+        _Knot(p.t, p.q, [v[at] for v, _ in columns], [a[at] for _, a in columns], QUINTIC)
+        for at, p in enumerate(points)
+    ]  # fmt: skip
+
+
+def _check_ends(first: _Knot, last: _Knot, count: int, q_now: Sequence[float], names: Sequence[str]) -> None:
+    if first.t <= _AT_ONCE_S:
+        if count == 1:
+            raise PlanRefused("point 1: it is the only one and its time is 0 s, so that there is nothing to move to")
+        for name, planned, now in zip(names, first.q, q_now, strict=True):
+            if not abs(planned - now) <= AT_START_RAD:
+                raise PlanRefused(
+                    f"point 1: at time 0 s {name} must be where it is, at {now:.4f} rad (within {AT_START_RAD:g} rad), "
+                    f"found {planned:.4f} rad; give the point a later time and the arm is led there"
+                )
+        for name, speed in zip(names, first.v, strict=True):
+            if abs(speed) > _STILL:
+                raise PlanRefused(f"point 1: at time 0 s {name} must be at rest, found {speed:g} rad/s")
+    for name, speed in zip(names, last.v, strict=True):
+        if abs(speed) > _STILL:
+            raise PlanRefused(f"point {count}: the last point must be at rest, {name} has {speed:g} rad/s")
+
+
+def _check_waypoint(waypoint: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
+    for i, name in enumerate(names):
+        q, low, high = waypoint.q[i], limits.low[i], limits.high[i]
+        if not low <= q <= high:
+            raise PlanRefused(f"{where}: {name} is at {q:.6g} rad, allowed is {low:g} to {high:g} rad")
+
+
+def _check_approach(
+    first: _Knot, limits: Limits, q_now: Sequence[float], names: Sequence[str], zone_at: ZoneAt | None
+) -> None:
+    """The way to the first point, as `TrajectoryController.start` makes it from rest."""
+    approach, rest = Approach(limits), [0.0] * len(q_now)
+    _check_derivatives(first, "point 1", limits, names)
+    refused = approach.plan(q_now, rest, rest, _row(first))
+    if refused is not None and refused.axis >= 0:
+        raise PlanRefused(
+            f"point 1: on the way there {names[refused.axis]} would be at {refused.extreme:.6g} rad, allowed is "
+            f"{limits.low[refused.axis]:g} to {limits.high[refused.axis]:g} rad"
+        )
+    if refused is not None:
+        raise PlanRefused(f"point 1: no way from where the arm is to this point at {first.t:g} s was found")
+    if approach.duration_s > first.t * (1.0 + _ROUNDING) + 1e-6:
+        least = f"the way there from where the arm is takes {approach.duration_s:.3f} s at least"
+        raise PlanRefused(f"point 1: its time is {first.t:g} s, {least}")
+    if zone_at is not None:
+        steps = _steps(approach.duration_s, limits)
+        for k in range(steps + 1):
+            at = approach.duration_s * k / steps
+            _check_zone(approach.at(at)[0], at, "on the way to point 1", zone_at)
+
+
+def _check_derivatives(waypoint: _Knot, where: str, limits: Limits, names: Sequence[str]) -> None:
+    for what, unit, found, allowed in (
+        ("moves at", "rad/s", waypoint.v, limits.velocity),
+        ("accelerates with", "rad/s^2", waypoint.a, limits.acceleration),
+    ):
+        for name, number, most in zip(names, found, allowed, strict=True):
+            if abs(number) > most * (1.0 + _ROUNDING):
+                raise PlanRefused(f"{where}: {name} {what} {number:.4g} {unit}, allowed is at most {most:g} {unit}")
+
+
+def _steps(duration: float, limits: Limits) -> int:
+    """Into how many parts a piece is divided, so that no joint moves by more than `ZONE_STEP_RAD` in one."""
+    fastest: float = max(limits.velocity)
+    return max(2, ceil(fastest * duration / ZONE_STEP_RAD))
+
+
+def _polynomial(before: _Knot, after: _Knot, i: int) -> Coefficients:
+    length = after.t - before.t
+    if after.kind == CUBIC:
+        return cubic(before.q[i], before.v[i], after.q[i], after.v[i], length)
+    return quintic(before.q[i], before.v[i], before.a[i], after.q[i], after.v[i], after.a[i], length)
+
+
+def _check_piece(
+    before: _Knot, after: _Knot, where: str, limits: Limits, names: Sequence[str], zone_at: ZoneAt | None
+) -> None:
+    length = after.t - before.t
+    pieces = [_polynomial(before, after, i) for i in range(len(names))]
+    for i, (name, position) in enumerate(zip(names, pieces, strict=True)):
+        velocity = derivative(position)
+        low, high = limits.low[i] - _ROUNDING, limits.high[i] + _ROUNDING
+        if (found := beyond(position, low, high)) is not None:
+            at = before.t + found[1] * length
+            raise PlanRefused(
+                f"{where}: {name} would be at {found[0]:.6g} rad at {at:.3f} s, allowed is "
+                f"{limits.low[i]:g} to {limits.high[i]:g} rad"
+            )
+        for what, unit, curve, most, scale in (
+            ("move at", "rad/s", velocity, limits.velocity[i], length),
+            ("accelerate with", "rad/s^2", derivative(velocity), limits.acceleration[i], length * length),
+        ):
+            bound = most * scale * (1.0 + _ROUNDING)
+            if (found := beyond(curve, -bound, bound)) is not None:
+                at = before.t + found[1] * length
+                raise PlanRefused(
+                    f"{where}: {name} would {what} {found[0] / scale:.4g} {unit} at {at:.3f} s, "
+                    f"allowed is at most {most:g} {unit}"
+                )
+    if zone_at is not None:
+        steps = _steps(length, limits)
+        for k in range(steps + 1):
+            x = k / steps
+            _check_zone([value(piece, x) for piece in pieces], before.t + x * length, where, zone_at)
+
+
+def _check_zone(q: Sequence[float], at_s: float, where: str, zone_at: ZoneAt) -> None:
+    if (box := zone_at(q)) is not None:
+        raise PlanRefused(f"{where}: the arm would be in {box} at {at_s:.3f} s")
+
+
+def _row(waypoint: _Knot) -> tuple[float, ...]:
+    rest = (0.0,) * (MOST_JOINTS - len(waypoint.q))
+    return (waypoint.t, *waypoint.q, *rest, *waypoint.v, *rest, *waypoint.a, *rest, waypoint.kind)

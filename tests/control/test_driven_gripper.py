@@ -1,0 +1,470 @@
+"""A gripper with a drive of its own through the whole loop, in simulated time (`inprocess`): lease, stops, watch."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import pytest
+
+from rtcp.config import default_config, load, load_segment, segment_path
+from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
+from rtcp.config.operation import InputConfig
+from rtcp.config.segment import SegmentSlave
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
+from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import Event
+from rtcp.ipc.refusals import NoLease, NotPermitted
+from rtcp.ipc.states import State
+from rtcp.launch.simulation import Frame, Simulation
+from rtcp.virtual.models import CubemarsDrive
+
+SHIPPED = load(default_config())
+PERIOD_S = 0.002
+FINGER = Joint("finger", "drive7", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
+OPEN, CLOSED, START = 1.4, 0.0, 1.0
+CONFIG = replace(
+    SHIPPED,
+    slaves=(*SHIPPED.slaves, SlaveConfig("drive7", SHIPPED.slaves[1].device)),
+    cycle=replace(SHIPPED.cycle, period_us=PERIOD_S * 1e6),
+    gripper=GripperConfig(joint=FINGER, open_position=OPEN, closed_position=CLOSED),
+)
+BENT = (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)
+SLOT, AXIS = 7, 6
+ENABLED = b"\x0f\x00"
+EMERGENCY_STOP, ENABLING_SWITCH, TOGGLE = 1 << 9, 1 << 10, 1 << 8
+NEUTRAL, BACKWARD, PADDLE_UP = 63, 61, 47
+
+
+class Hand:
+    """The arm, enabled, with its gripper at `START`; remembers the set-points and what each frame told the drive."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self.received: list[bytes] = []
+        self.gripper = simulation.loop.arm.gripper
+        model = simulation.bus.slaves[SLOT].device
+        assert self.gripper is not None
+        assert isinstance(model, CubemarsDrive)
+        self.model = model
+        self.path: list[float] = []
+        self.told: list[bytes] = []
+        self.object_at: float | None = None
+        """Where something hard lies between the fingers, rad."""
+        simulation.on_frame = self._see
+
+    def _see(self, frame: Frame) -> None:
+        self.path.append(self.gripper.motion.position)
+        self.told.append(frame.sent[SLOT])
+        self.received.append(frame.received[SLOT])
+        if self.object_at is not None:
+            mechanics = self.model.mechanics
+            inside = max(0.0, self.object_at - mechanics.position)
+            mechanics.external_torque = 2000.0 * inside - (20.0 * mechanics.velocity if inside else 0.0)
+
+    @property
+    def state(self) -> State:
+        return self.simulation.state
+
+    @property
+    def moving(self) -> bool:
+        return self.gripper.motion.moving
+
+    @property
+    def position(self) -> float:
+        """Where the fingers really are, rad."""
+        return self.model.mechanics.position
+
+    def reports_of(self, kind: type[Event]) -> list[Event]:
+        return [record.event for record in self.simulation.events if isinstance(record.event, kind)]
+
+    def message(self, kind: type[Event]) -> str:
+        (event,) = self.reports_of(kind)
+        return Names(CONFIG).message(event)
+
+    def close(self) -> None:
+        assert self.simulation.send(MoveGripper(False)).refusal is None
+
+    def open(self) -> None:
+        assert self.simulation.send(MoveGripper(True)).refusal is None
+
+    def on_its_way(self) -> None:
+        self.close()
+        self.simulation.run(0.4)
+        assert self.moving
+        assert CLOSED + 0.2 < self.position < START - 0.05
+
+    def rest(self, seconds: float = 5.0) -> None:
+        assert self.simulation.until(lambda: not self.moving, seconds)
+        self.simulation.run(0.1)
+
+    def until(self, state: State) -> None:
+        assert self.simulation.until(lambda: self.state is state, 10.0)
+
+    def inputs(self, clear: int = 0, put: int = 0) -> None:
+        assert self.simulation.box is not None
+        self.simulation.box.inputs = self.simulation.box.inputs & ~clear | put
+
+
+def kept_to_its_limits(path: list[float]) -> bool:
+    """Whether no step of a set-point, and no change of step, was beyond the joint's limits."""
+    speeds = [(b - a) / PERIOD_S for a, b in itertools.pairwise(path)]
+    changes = [(b - a) / PERIOD_S for a, b in itertools.pairwise(speeds)]
+    return max(map(abs, speeds)) <= FINGER.velocity * 1.0001 and max(map(abs, changes)) <= FINGER.acceleration * 1.01
+
+
+@pytest.fixture
+def with_hand() -> Iterator[Callable[..., Hand]]:
+    begun: list[Simulation] = []
+
+    def begin(config: ArmConfig = CONFIG, start: float = START) -> Hand:
+        segment = load_segment(segment_path(SHIPPED))
+        fingers = SegmentSlave("cubemars-orh40", options={"load_inertia": 0.02, "initial_position": start})
+        segment = replace(segment, slaves=(*segment.slaves, fingers))
+        simulation = Simulation(config, positions=BENT, segment=segment, follow_clock=False)
+        begun.append(simulation)
+        hand = Hand(simulation)
+        hand.until(State.READY)
+        simulation.run(0.1)
+        simulation.acquire()
+        assert simulation.send(Enable()).refusal is None
+        hand.until(State.HOLDING)
+        hand.path.clear()
+        return hand
+
+    yield begin
+    for simulation in begun:
+        simulation.close()
+
+
+@pytest.fixture
+def hand(with_hand: Callable[..., Hand]) -> Hand:
+    return with_hand()
+
+
+# -- the way ----------------------------------------------------------------------------------------------------------
+
+
+def test_it_closes_and_opens_under_the_lease_and_tells_each_time_where_it_rests(hand: Hand) -> None:
+    hand.close()
+    hand.rest()
+    assert hand.position == pytest.approx(CLOSED, abs=2e-3)
+    hand.open()
+    hand.rest()
+    assert hand.position == pytest.approx(OPEN, abs=2e-3)
+    told = [(event.axis, event.position, event.holds) for event in hand.reports_of(GripperAtRest)]
+    assert told == [(AXIS, pytest.approx(CLOSED), False), (AXIS, pytest.approx(OPEN), False)]
+    assert kept_to_its_limits(hand.path)
+    assert hand.state is State.HOLDING
+
+
+def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
+    assert hand.simulation.send(MoveGripper(False), lease=hand.simulation.lease + 1).refusal == NoLease()
+    hand.simulation.run(0.2)
+    assert max(abs(position - START) for position in hand.path) < 1e-4
+
+
+def test_where_it_already_is_it_tells_so_all_the_same(with_hand: Callable[..., Hand]) -> None:
+    hand = with_hand(start=OPEN)
+    hand.open()
+    hand.simulation.run(0.1)
+    hand.open()
+    hand.simulation.run(0.1)
+    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(OPEN, abs=2e-4)] * 2
+
+
+def test_it_goes_on_and_ends_well_while_a_joint_homes(hand: Hand) -> None:
+    # The search for the next index pulse: slow enough to last longer than the gripper's way.
+    hand.simulation.models[0].objects[0x6098, 0].value = 34
+    hand.simulation.models[0].objects[0x6099, 2].value = 150
+    hand.on_its_way()
+    assert hand.simulation.send(Home(0)).refusal is None
+    hand.rest()
+    assert hand.state is State.HOMING
+    assert hand.position == pytest.approx(CLOSED, abs=2e-3)
+    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(CLOSED)]
+    hand.until(State.HOLDING)
+    assert hand.reports_of(Homed)
+    assert kept_to_its_limits(hand.path)
+
+
+def test_what_it_grips_ends_its_way_and_is_no_emergency(hand: Hand) -> None:
+    hand.object_at = 0.5
+    hand.close()
+    hand.rest()
+    hand.simulation.run(2.0)
+    assert hand.state is State.HOLDING
+    (rest,) = hand.reports_of(GripperAtRest)
+    assert (rest.position, rest.holds) == (pytest.approx(0.5, abs=0.05), True)
+    assert hand.message(GripperAtRest) == f"finger rests at {rest.position:.6g} rad"
+    assert 0.5 * FINGER.torque < abs(hand.gripper.drive.torque) < 1.2 * FINGER.torque
+    assert kept_to_its_limits(hand.path[: hand.path.index(rest.position)])
+    hand.open()
+    hand.rest()
+    assert hand.position == pytest.approx(OPEN, abs=2e-3)
+    assert hand.state is State.HOLDING
+
+
+# -- controlled stops -------------------------------------------------------------------------------------------------
+
+
+def stopped_on_its_way(hand: Hand) -> None:
+    """It has come to rest under its limits, between where it was and where it should be, has said so, and stays."""
+    (rest,) = hand.reports_of(GripperAtRest)
+    assert CLOSED + 0.1 < rest.position < START - 0.05
+    assert not rest.holds
+    assert kept_to_its_limits(hand.path)
+    hand.path.clear()
+    hand.simulation.run(1.0)
+    assert set(hand.path) == {rest.position}
+    assert hand.position == pytest.approx(rest.position, abs=2e-3)
+
+
+def test_it_stops_when_its_commander_falls_silent(hand: Hand) -> None:
+    hand.simulation.run(0.01)
+    hand.simulation.fall_silent()
+    hand.on_its_way()
+    hand.rest()
+    stopped_on_its_way(hand)
+    assert hand.state is State.HOLDING
+
+
+def test_it_stops_when_another_holds_the_lease(hand: Hand) -> None:
+    hand.on_its_way()
+    hand.simulation.acquire()
+    hand.rest()
+    stopped_on_its_way(hand)
+
+
+def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_arm(
+    with_hand: Callable[..., Hand],
+) -> None:
+    hand = with_hand(replace(CONFIG, stops=replace(CONFIG.stops, lease_ended="quick_stop")))
+    hand.on_its_way()
+    hand.simulation.acquire()
+    hand.until(State.FAULT)
+    hand.simulation.run(0.2)
+    assert len(hand.reports_of(LeaseExpired)) == 1
+    assert not hand.moving
+    assert abs(hand.model.mechanics.velocity) < 0.01
+    assert {drive.controlword for drive in hand.simulation.loop.arm.all_drives} == {0x0002}
+
+
+def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand) -> None:
+    hand.simulation.models[0].objects[0x6098, 0].value = 34
+    hand.simulation.models[0].objects[0x6099, 2].value = 1
+    hand.on_its_way()
+    assert hand.simulation.send(Home(0)).refusal is None
+    hand.simulation.run(0.1)
+    hand.simulation.acquire()
+    hand.simulation.run(0.02)
+    assert hand.state is State.HOMING
+    before, now = (hand.path[at] - hand.path[at + 1] for at in (-10, -2))
+    assert now < 0.999 * before
+    hand.rest()
+    stopped_on_its_way(hand)
+
+
+def test_it_stops_when_the_enabling_switch_is_let_go(with_hand: Callable[..., Hand]) -> None:
+    hand = with_hand(replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(11))))
+    assert hand.simulation.send(MoveGripper(False)).refusal == NotPermitted()
+    hand.inputs(put=ENABLING_SWITCH)
+    hand.simulation.run(0.05)
+    hand.on_its_way()
+    hand.inputs(clear=ENABLING_SWITCH)
+    hand.rest()
+    hand.inputs(put=ENABLING_SWITCH)
+    stopped_on_its_way(hand)
+
+
+def test_it_stops_by_halt(hand: Hand) -> None:
+    hand.on_its_way()
+    assert hand.simulation.send(Halt()).refusal is None
+    hand.rest()
+    stopped_on_its_way(hand)
+
+
+def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
+    hand.simulation.data.lose(5, heard=True)
+    hand.close()
+    assert hand.simulation.send(Halt()).refusal is None
+    hand.simulation.run(0.5)
+    assert max(abs(position - START) for position in hand.path) < 1e-4
+    assert [event.position for event in hand.reports_of(GripperAtRest)] == [pytest.approx(START, abs=1e-4)]
+
+
+@pytest.fixture
+def by_stick(with_hand: Callable[..., Hand]) -> Hand:
+    """The stick closes it; nobody holds a lease."""
+    hand = with_hand(replace(CONFIG, motion="joystick"))
+    hand.simulation.lease = 0
+    for code in [PADDLE_UP, NEUTRAL] * 3:
+        hand.inputs(clear=0x3F, put=code)
+        hand.simulation.run(0.05)
+    hand.inputs(clear=0x3F, put=BACKWARD)
+    hand.simulation.run(0.4)
+    assert hand.moving
+    return hand
+
+
+def test_the_stick_closes_it_without_a_lease(by_stick: Hand) -> None:
+    by_stick.rest()
+    assert by_stick.position == pytest.approx(CLOSED, abs=2e-3)
+
+
+@pytest.mark.parametrize("code", [NEUTRAL, 0, 1, PADDLE_UP], ids=["released", "no code", "another", "paddle"])
+def test_it_stops_when_the_stick_that_closes_it_is_let_go_or_shows_no_code(by_stick: Hand, code: int) -> None:
+    by_stick.inputs(clear=0x3F, put=code)
+    by_stick.rest()
+    stopped_on_its_way(by_stick)
+
+
+def test_it_stops_when_the_stick_that_closes_it_is_given_to_the_chair(by_stick: Hand) -> None:
+    by_stick.inputs(clear=TOGGLE)
+    by_stick.rest()
+    by_stick.inputs(put=TOGGLE)
+    stopped_on_its_way(by_stick)
+
+
+@pytest.mark.parametrize("command", [Disable, Shutdown])
+def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command: Command) -> None:
+    hand.on_its_way()
+    hand.path.clear()
+    hand.told.clear()
+    hand.simulation.send(command())
+    assert hand.simulation.until(lambda: hand.state is State.READY or hand.simulation.done, 10.0)
+    off = next(at for at, told in enumerate(hand.told) if told[:2] != ENABLED)
+    assert off > 10
+    assert hand.told[off - 1][2:6] == hand.told[off - 2][2:6]
+    (rest,) = hand.reports_of(GripperAtRest)
+    assert CLOSED + 0.1 < rest.position < START - 0.05
+    assert not hand.model.powered
+    assert kept_to_its_limits(hand.path[:off])
+
+
+# -- faults and emergencies -------------------------------------------------------------------------------------------
+
+
+def goes_nowhere_by_itself(hand: Hand) -> None:
+    """Reset and enabled again it stays where it is; of what became of its way nobody was told that it had an end."""
+    assert not hand.moving
+    assert hand.reports_of(GripperAtRest) == []
+    assert hand.simulation.send(Reset()).refusal is None
+    hand.until(State.READY)
+    here = hand.position
+    assert hand.simulation.send(Enable()).refusal is None
+    hand.until(State.HOLDING)
+    hand.simulation.run(1.0)
+    assert hand.position == pytest.approx(here, abs=2e-3)
+
+
+def test_a_fault_of_another_drive_stops_it(hand: Hand) -> None:
+    hand.on_its_way()
+    hand.simulation.models[2].inject_fault(0x7305)
+    hand.until(State.FAULT)
+    hand.simulation.run(1.0)
+    assert abs(hand.model.mechanics.velocity) < 1e-3
+    assert hand.position > CLOSED + 0.1
+    goes_nowhere_by_itself(hand)
+
+
+def test_a_fault_of_its_own_drive_stops_the_arm_and_names_its_joint(hand: Hand) -> None:
+    hand.on_its_way()
+    hand.model.inject_fault(0x7305)
+    hand.until(State.FAULT)
+    assert hand.message(DriveFault).startswith("finger: the drive is in fault")
+    hand.simulation.run(1.0)
+    goes_nowhere_by_itself(hand)
+
+
+def test_the_emergency_stop_stops_it(hand: Hand) -> None:
+    hand.on_its_way()
+    hand.inputs(clear=EMERGENCY_STOP)
+    hand.until(State.EMERGENCY_STOP)
+    hand.simulation.run(1.5)
+    assert not hand.model.powered
+    assert hand.position > CLOSED + 0.1
+    hand.inputs(put=EMERGENCY_STOP)
+    hand.simulation.run(0.1)
+    goes_nowhere_by_itself(hand)
+
+
+def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
+    hand.model.mechanics.external_torque = 40.0
+    beyond = 0
+    while hand.state is State.HOLDING:
+        hand.simulation.cycle()
+        beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
+    assert beyond == CONFIG.supervision.cycles
+    assert hand.state is State.EMERGENCY_STOP
+    assert hand.message(OverSpeed).startswith("finger")
+
+
+def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
+    # Just more than the drive can hold: it yields slowly.
+    hand.model.mechanics.external_torque = 19.6
+    beyond = 0
+    while hand.state is State.HOLDING:
+        hand.simulation.cycle()
+        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.supervision.following_error
+    assert beyond == CONFIG.supervision.cycles
+    assert hand.state is State.EMERGENCY_STOP
+    assert hand.message(FollowingError).startswith("finger")
+
+
+def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
+    hand.on_its_way()
+    hand.simulation.send(Shutdown())
+    hand.model.mechanics.external_torque = -60.0
+    assert hand.simulation.until(lambda: bool(hand.reports_of(OverSpeed)), 1.0)
+    hand.simulation.run(0.01)
+    assert {drive.controlword for drive in hand.simulation.loop.arm.all_drives} == {0x0002}
+
+
+def disabled(hand: Hand) -> Hand:
+    assert hand.simulation.send(Disable()).refusal is None
+    hand.until(State.READY)
+    return hand
+
+
+def test_it_does_not_follow_a_false_position_while_it_is_being_enabled(hand: Hand) -> None:
+    disabled(hand)
+    data, said = hand.simulation.data, hand.simulation.data.input
+    assert hand.simulation.send(Enable()).refusal is None
+    assert hand.simulation.until(lambda: hand.told[-1][:2] == ENABLED, 1.0)
+
+    def false(slot: int) -> bytes:
+        if slot != SLOT:
+            return said(slot)
+        _, position, *others = struct.unpack("<Hiiib", hand.received[-1])
+        return struct.pack("<Hiiib", 0x0233, position + 1000, *others)
+
+    data.input = false  # type: ignore[method-assign]
+    hand.path.clear()
+    hand.simulation.run(2 * PERIOD_S)
+    data.input = said  # type: ignore[method-assign]
+    hand.until(State.HOLDING)
+    hand.simulation.run(0.2)
+    assert max(abs(position - START) for position in hand.path) < 1e-3
+    assert hand.position == pytest.approx(START, abs=2e-3)
+
+
+def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_names_its_joint(hand: Hand) -> None:
+    disabled(hand)
+    assert hand.simulation.send(Enable()).refusal is None
+    hand.model.mechanics.position += 0.1
+    hand.until(State.FAULT)
+    assert hand.message(PositionJumped).startswith("finger jumped from 1 to")
+
+
+def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:
+    supervision = hand.gripper.supervision
+    supervision._fast = supervision._off = CONFIG.supervision.cycles - 1
+    hand.simulation.send(Disable())
+    hand.until(State.READY)
+    hand.simulation.send(Enable())
+    hand.until(State.HOLDING)
+    assert (supervision._fast, supervision._off) == (0, 0)

@@ -1,0 +1,391 @@
+"""The emergency path and the stop by a limit: the real classes and device models, cycle by cycle, as test_behaviour."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from rtcp.config.operation import InputConfig
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
+from rtcp.ipc.events import (
+    EmergencyStopActivated,
+    FollowingError,
+    Homed,
+    HomingStillMoving,
+    JointLimitReached,
+    LeftRange,
+    OverSpeed,
+    PermissionWithdrawn,
+    ProcessDataLost,
+    SlavesParked,
+    StoppedByLimit,
+    TorqueRemoved,
+)
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.refusals import WrongState
+from rtcp.ipc.states import State
+
+from .rig import CONFIG, COUNTS, LONGEST_STEP, PERIOD_S, QUICK_STOP, SPEED, LoopRig, move_to
+
+WITH_TORQUE = [State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.HOMING, State.STOPPED_BY_LIMIT]
+PRESSED_SAYS = (
+    "the emergency stop is pressed (inputs.emergency_stop in assistive_arm.yaml): release it, then `rtcp reset`"
+)
+
+
+# -- the button -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("state", WITH_TORQUE, ids=lambda state: state.name.lower())
+def test_the_emergency_stop_ends_every_state_with_torque(rig: LoopRig, state: State) -> None:
+    rig.bring_to(state)
+    rig.press()
+    assert rig.state is State.EMERGENCY_STOP
+    rig.run(2.5)
+    assert rig.arm.first_with_torque() == -1
+    assert rig.arm.first_moving() == -1
+
+
+def test_in_motion_the_drives_ramp_down_before_the_torque_goes_and_the_slaves_are_parked_last(rig: LoopRig) -> None:
+    parked: list[int] = []
+    rig.set_in_motion()
+    rig.service.park = lambda: parked.append(rig.context.cycle)  # type: ignore[method-assign]
+    begun = len(rig.log)
+    rig.press()
+    rig.wait(lambda: bool(parked))
+    seen = rig.log[begun:]
+    moving = [n for n, cycle in enumerate(seen) if any(abs(said.velocity) > 200 for said in cycle.drives)]
+    torque = [n for n, cycle in enumerate(seen) if any(said.has_torque for said in cycle.drives)]
+    assert moving
+    assert max(moving) < max(torque) < len(seen)
+    assert parked == [rig.context.cycle]
+    assert rig.kinds[-2:] == [EmergencyStopActivated, SlavesParked]
+
+
+def test_the_emergency_stop_makes_no_target_jump(rig: LoopRig) -> None:
+    rig.set_in_motion()
+    rig.press()
+    rig.run(1.0)
+    assert all(rig.longest_step(axis) <= LONGEST_STEP for axis in range(2))
+
+
+def test_while_it_is_pressed_neither_reset_nor_enable_is_taken(rig: LoopRig) -> None:
+    rig.hold().press()
+    assert rig.refused(rig.send(Reset())) == PRESSED_SAYS
+    rig.run(2.0)
+    assert rig.refused(rig.send(Reset())) == PRESSED_SAYS
+    rig.press(False)
+    rig.do(Reset())
+    rig.until(State.READY)
+    rig.press()
+    assert rig.refused(rig.send(Enable())) == PRESSED_SAYS
+
+
+def test_released_while_the_parked_box_says_nothing_it_is_reset(rig: LoopRig) -> None:
+    rig.hold().press()
+    rig.run(1.0)
+    rig.data.carries = False
+    rig.run(0.1)
+    rig.press(False)
+    rig.do(Reset())
+    rig.data.carries = True
+    rig.until(State.READY)
+    rig.enable()
+
+
+def test_still_pressed_when_the_parked_box_is_heard_again_it_is_an_emergency_stop_and_no_drive_is_enabled(
+    rig: LoopRig,
+) -> None:
+    rig.hold().press()
+    rig.run(1.0)
+    rig.data.carries = False
+    rig.run(0.1)
+    at = len(rig.log)
+    rig.do(Reset())
+    rig.data.carries = True
+    rig.run(0.5)
+    assert rig.state is State.EMERGENCY_STOP
+    assert State.READY not in {cycle.state for cycle in rig.log[at:]}
+    assert rig.refused(rig.send(Enable()))
+    assert rig.arm.first_with_torque() == -1
+
+
+def test_the_gripper_is_not_switched_while_it_is_pressed(rig: LoopRig) -> None:
+    rig.start().press()
+    assert "the emergency stop is pressed" in rig.refused(rig.send(MoveGripper(False)))
+
+
+def test_released_it_moves_nothing_until_reset_and_enable(rig: LoopRig) -> None:
+    rig.set_in_motion().press()
+    rig.run(2.0)
+    rig.press(False)
+    rig.run(1.0)
+    assert rig.state is State.EMERGENCY_STOP
+    assert rig.arm.first_with_torque() == -1
+    rig.do(Reset())
+    rig.until(State.READY)
+    rig.run(0.1)
+    assert rig.arm.first_with_torque() == -1
+    rig.enable()
+    rig.move(0.1, 0.1)
+    rig.until(State.HOLDING)
+
+
+def test_a_bounce_shorter_than_the_debounce_is_no_press(rig: LoopRig) -> None:
+    rig.hold()
+    for level in (False, True) * 5:
+        rig.data.devices[0].set_input(9, level)
+        rig.run(0.002)
+    assert rig.state is State.HOLDING
+
+
+def test_it_counts_while_frames_are_lost_as_soon_as_they_come_again(rig: LoopRig) -> None:
+    rig.hold()
+    rig.data.carries = False
+    rig.run(0.01)
+    rig.data.devices[0].set_input(9, False)
+    rig.data.carries = True
+    rig.run(0.02)
+    assert rig.state is State.EMERGENCY_STOP
+
+
+# -- what is measured -----------------------------------------------------------------------------------------------
+
+
+def test_a_joint_that_is_pushed_beyond_its_speed_ends_in_the_emergency_stop(rig: LoopRig) -> None:
+    rig.hold()
+    rig.models[1].mechanics.external_torque = 400.0
+    rig.until(State.EMERGENCY_STOP)
+    assert rig.kinds[-1] in (OverSpeed, FollowingError)
+    assert rig.last.axis == 1
+    assert abs(rig.last.value) > rig.last.limit
+
+
+def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(rig: LoopRig) -> None:
+    rig.hold()
+    rig.data.deaf[1, 0x607A] = dict.fromkeys(range(-40000, 40000), 0)
+    rig.do(move_to(0.0, 0.4, speed=SPEED))
+    rig.until(State.EMERGENCY_STOP)
+    assert (rig.kinds[-1], rig.last.axis) == (FollowingError, 1)
+    assert "supervision in assistive_arm.yaml" in rig.messages[-1]
+
+
+@pytest.mark.parametrize("cycles", [4, 5])
+def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(rig: LoopRig, cycles: int) -> None:
+    rig.hold()
+    drive = rig.arm.drives[0]
+    decode = rig.arm.decode
+
+    def too_much(data: object) -> None:
+        decode(data)  # type: ignore[arg-type]
+        rig.arm.state.actual_torque[0] = 1.6 * CONFIG.joints[0].torque
+
+    rig.arm.decode = too_much  # type: ignore[method-assign]
+    for _ in range(cycles):
+        rig.cycle()
+    rig.arm.decode = decode  # type: ignore[method-assign]
+    rig.run(0.01)
+    assert drive.name == "drive1"
+    assert rig.state is (State.HOLDING if cycles < 5 else State.EMERGENCY_STOP)
+
+
+# -- stopped by a limit ---------------------------------------------------------------------------------------------
+
+
+def test_a_move_that_meets_a_limit_is_stopped_before_it_and_says_which(rig: LoopRig) -> None:
+    rig.bring_to(State.STOPPED_BY_LIMIT)
+    limit = rig.arm.limits.high[0]
+    assert max(cycle.drives[0].target for cycle in rig.log) <= limit * COUNTS
+    assert rig.kinds[-2:] == [JointLimitReached, StoppedByLimit]
+    assert rig.events[-2].event.axis == 0
+    assert "`rtcp reset`" in rig.messages[-2]
+    assert all(rig.longest_step(axis) <= LONGEST_STEP for axis in range(2))
+
+
+def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(rig: LoopRig) -> None:
+    rig.bring_to(State.STOPPED_BY_LIMIT)
+    held = [cycle.target for cycle in rig.log[-1].drives]
+    rig.run(0.2)
+    assert [said.target for said in rig.log[-1].drives] == held
+    assert rig.arm.first_not_enabled() == -1
+    answer = rig.send(move_to(0.0, 0.0))
+    assert isinstance(answer.refusal, WrongState)
+    assert rig.refused(answer).endswith("`rtcp reset` first")
+    rig.do(Reset())
+    assert rig.state is State.HOLDING
+    rig.move(0.0, 0.0)
+    rig.until(State.HOLDING)
+    assert rig.arm.drives[0].position == pytest.approx(0.0, abs=1e-3)
+
+
+# -- homing ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("beyond", [-0.05, 0.015, 0.019])
+@pytest.mark.parametrize("speed", [0.1, 0.3, 0.5])
+def test_a_move_right_after_a_homing_beyond_the_range_begins_as_any_other(
+    rig: LoopRig, beyond: float, speed: float
+) -> None:
+    rig.hold()
+    high = rig.arm.limits.high[0]
+    rig.models[0].objects[0x6098, 0].value = 37
+    rig.models[0].objects[0x607C, 0].value = round((high + beyond) * COUNTS)
+    rig.do(Home(0))
+    rig.until(State.HOLDING)
+    begun = len(rig.log) - 1
+    rig.move(high - 0.8, rig.arm.drives[1].position, speed=speed)
+    rig.run(1.2)
+    targets = [cycle.drives[0].target for cycle in rig.log[begun:]]
+    speeds = [(after - before) / COUNTS / PERIOD_S for before, after in pairwise(targets)]
+    faster = max(abs(after - before) for before, after in pairwise(speeds))
+    # The targets are whole counts.
+    rounding = 2 / COUNTS / PERIOD_S
+    assert faster <= CONFIG.joints[0].acceleration * PERIOD_S + rounding
+    assert max(map(abs, speeds)) <= speed * 1.01 + rounding
+
+
+def test_a_drive_is_homed_where_it_stands_and_the_others_hold(rig: LoopRig) -> None:
+    rig.models[0].mechanics.position = 0.5
+    rig.hold()
+    rig.models[0].objects[0x6098, 0].value = 37
+    rig.do(Home(0))
+    rig.until(State.HOLDING)
+    rig.run(0.1)
+    assert Homed in rig.kinds
+    assert rig.arm.drives[0].position == pytest.approx(0.0, abs=1e-3)
+    assert rig.longest_step(1) <= 1
+    rig.move(0.2, 0.0)
+    rig.until(State.HOLDING)
+    rig.run(0.2)
+    assert rig.arm.drives[0].position == pytest.approx(0.2, abs=1e-3)
+
+
+def test_a_homing_that_is_stopped_leaves_the_arm_holding(rig: LoopRig) -> None:
+    rig.bring_to(State.HOMING)
+    rig.run(0.2)
+    rig.do(Halt())
+    rig.until(State.HOLDING)
+    assert [said.mode_display for said in rig.log[-1].drives] == [8, 8]
+
+
+def test_disabling_ends_a_homing_before_the_torque_goes(rig: LoopRig) -> None:
+    rig.bring_to(State.HOMING)
+    rig.run(0.2)
+    rig.do(Disable())
+    rig.until(State.READY)
+    assert rig.arm.first_with_torque() == -1
+
+
+def test_frames_that_stay_away_while_a_homing_is_ended_by_disabling_are_a_fault(rig: LoopRig) -> None:
+    rig.bring_to(State.HOMING)
+    rig.run(0.1)
+    rig.do(Disable())
+    rig.data.carries = False
+    rig.run(1.0)
+    assert rig.state is State.FAULT
+    assert rig.kinds[-2:] == [ProcessDataLost, TorqueRemoved]
+
+
+def test_the_button_counts_while_a_homing_is_ended_by_disabling(rig: LoopRig) -> None:
+    rig.bring_to(State.HOMING)
+    rig.run(0.1)
+    rig.do(Disable())
+    rig.press()
+    assert rig.state is State.EMERGENCY_STOP
+
+
+@pytest.mark.parametrize("command", [Disable, Shutdown])
+def test_a_joint_that_turns_on_after_its_homing_is_stopped_hard_whatever_ended_it(
+    rig: LoopRig, command: Command
+) -> None:
+    rig.bring_to(State.HOMING)
+    rig.run(0.1)
+    turned = rig.models[0].mechanics
+    turned.inertia, turned.velocity, turned.external_torque = 1e5, 0.015, 117.0
+    rig.do(command())
+    rig.run(3.2)
+    assert HomingStillMoving in rig.kinds
+    assert rig.log[-1].drives[0].controlword == QUICK_STOP
+
+
+def test_a_drive_that_reads_a_place_outside_its_range_after_homing_is_a_fault(rig: LoopRig) -> None:
+    rig.hold()
+    rig.models[1].objects[0x6098, 0].value = 37
+    rig.models[1].objects[0x607C, 0].value = 30000
+    rig.do(Home(1))
+    rig.until(State.FAULT)
+    assert (rig.kinds[-1], rig.last.axis) == (LeftRange, 1)
+
+
+# -- the enabling switch --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def held(rig_board: tuple[Blackboard, Observer]) -> Iterator[LoopRig]:
+    """A rig with an enabling switch at input 11."""
+    switch = InputConfig(11)
+    made = LoopRig(*rig_board, config=replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=switch)))
+    yield made
+    rig_board[1].release(made.lease)
+
+
+def permit(rig: LoopRig, pressed: bool) -> None:
+    rig.data.devices[0].set_input(10, pressed)
+    rig.run(0.01)
+
+
+def test_without_the_enabling_switch_no_motion_begins(held: LoopRig) -> None:
+    held.hold()
+    answer = held.send(move_to(0.1, 0.1))
+    assert held.refused(answer) == ("the enabling switch is not pressed (inputs.enabling_switch in assistive_arm.yaml)")
+    assert held.state is State.HOLDING
+
+
+def test_letting_go_of_the_enabling_switch_is_a_controlled_stop_and_pressing_it_again_moves_nothing(
+    held: LoopRig,
+) -> None:
+    held.hold()
+    permit(held, True)
+    held.move(1.0, 1.0)
+    held.run(0.5)
+    permit(held, False)
+    assert PermissionWithdrawn in held.kinds
+    held.until(State.HOLDING)
+    rest = [said.target for said in held.log[-1].drives]
+    permit(held, True)
+    held.run(0.5)
+    assert [said.target for said in held.log[-1].drives] == rest
+    assert all(held.longest_step(axis) <= LONGEST_STEP for axis in range(2))
+
+
+# -- lamps and the gripper ------------------------------------------------------------------------------------------
+
+
+def test_the_lamps_show_torque_and_motion_and_the_heartbeat_changes_each_cycle(rig: LoopRig) -> None:
+    rig.start()
+    assert rig.data.devices[0].outputs & 3 == 0
+    rig.enable()
+    rig.run(0.01)
+    assert rig.data.devices[0].outputs & 3 == 1
+    rig.move(0.3, 0.3)
+    rig.run(0.1)
+    assert rig.data.devices[0].outputs & 3 == 3
+    beats = []
+    for _ in range(6):
+        rig.cycle()
+        beats.append(rig.data.devices[0].outputs >> 2 & 1)
+    assert beats in ([0, 1] * 3, [1, 0] * 3)
+
+
+def test_the_gripper_opens_and_closes_on_its_output(rig: LoopRig) -> None:
+    rig.hold()
+    rig.do(MoveGripper(False))
+    rig.run(0.005)
+    assert rig.data.devices[0].outputs >> 3 & 1 == 1
+    rig.do(MoveGripper(True))
+    rig.run(0.005)
+    assert rig.data.devices[0].outputs >> 3 & 1 == 0

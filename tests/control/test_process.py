@@ -1,0 +1,149 @@
+"""What the loop's process does for the drives after a defect in its cycle: on the device models, frame by frame."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from rtcp.config.model import ArmConfig, SlaveConfig
+from rtcp.control.cycle import make_drives
+from rtcp.control.process import stop_blindly
+from rtcp.devices.cia402 import Cia402Drive
+from rtcp.fieldbus.pdo import layout
+
+from .rig import CONFIG, CSP, CST, CSV, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
+
+DISABLE_OPERATION_OPTION = 0x605C
+STILL_RAD_S = 0.01
+RAMP_S = CONFIG.joints[0].velocity / 10.0
+"""From full speed, at what 0x6085 is set to."""
+
+
+class Defective:
+    """A drive of which one step raises."""
+
+    def __init__(self, drive: Cia402Drive, step: str) -> None:
+        self._drive, self._step = drive, step
+
+    def __getattr__(self, name: str) -> Any:
+        if name == self._step:
+            raise ZeroDivisionError("a defect for the test")
+        return getattr(self._drive, name)
+
+
+class Watched:
+    """What each frame of a process image finds: of every drive its true speed, and whether it has torque."""
+
+    def __init__(self, rig: LoopRig) -> None:
+        self.seen: list[list[tuple[float, bool]]] = []
+        self._rig = rig
+        self._receive = rig.data.receive
+        rig.data.receive = self.receive  # type: ignore[method-assign]
+
+    def receive(self) -> int:
+        wkc = self._receive()
+        self.seen.append([(abs(model.mechanics.velocity), model.powered) for model in self._rig.models])
+        return wkc
+
+
+def set_in_motion(rig: LoopRig, mode: int = CSP) -> Watched:
+    """Both joints at full speed, with drives whose torque goes at once on `disable operation`."""
+    for model in rig.models:
+        model.objects[DISABLE_OPERATION_OPTION, 0].value = 0
+        model.objects[0x6085, 0].value = 100_000
+    rig.set_in_motion(mode)
+    return Watched(rig)
+
+
+def ramps_down_under_torque(watched: Watched) -> bool:
+    """Whether all joints come to rest by their drives' torque, which goes then."""
+    moving = [powered for cycle in watched.seen for speed, powered in cycle if speed > STILL_RAD_S]
+    at_rest = all(speed < STILL_RAD_S and not powered for speed, powered in watched.seen[-1])
+    return len(moving) > 10 and all(moving) and at_rest
+
+
+@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(rig: LoopRig, mode: int) -> None:
+    watched = set_in_motion(rig, mode)
+    stop_blindly(rig.data, CONFIG, rig.arm)
+    assert ramps_down_under_torque(watched)
+
+
+@pytest.mark.parametrize("step", ["decode", "advance", "encode"])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_defect_in_one_drive_keeps_neither_it_nor_the_others_from_ramping_down(
+    rig: LoopRig, axis: int, step: str
+) -> None:
+    watched = set_in_motion(rig)
+    slot, drive = rig.arm.pairs[axis]
+    rig.arm.pairs[axis] = (slot, Defective(drive, step))  # type: ignore[assignment]
+    stop_blindly(rig.data, CONFIG, rig.arm)
+    assert ramps_down_under_torque(watched)
+
+
+def test_a_frame_that_cannot_be_sent_is_followed_by_others(rig: LoopRig) -> None:
+    watched = set_in_motion(rig)
+    send, tries = rig.data.send, iter(range(1000))
+
+    def sends() -> None:
+        if next(tries) < 3:
+            raise OSError("a defect for the test")
+        send()
+
+    rig.data.send = sends  # type: ignore[method-assign]
+    stop_blindly(rig.data, CONFIG, rig.arm)
+    assert ramps_down_under_torque(watched)
+
+
+class Sent:
+    """A process image that keeps what is sent."""
+
+    def __init__(self, config: ArmConfig) -> None:
+        self.outputs = dict.fromkeys(range(len(config.slaves)), b"")
+        self.frames: list[dict[int, bytes]] = []
+
+    def input(self, index: int) -> bytes:
+        raise ZeroDivisionError("a defect for the test")
+
+    def set_output(self, index: int, data: bytes) -> None:
+        self.outputs[index] = data
+
+    def send(self) -> None:
+        self.frames.append(dict(self.outputs))
+
+    def receive(self) -> int:
+        return -1
+
+
+def turned_round(slave: SlaveConfig) -> SlaveConfig:
+    """The same drive with its outputs mapped the other way round: the controlword last."""
+    pdos = [replace(pdo, channels=tuple(reversed(pdo.channels))) for pdo in slave.device.rpdo]
+    return replace(slave, device=replace(slave.device, rpdo=tuple(reversed(pdos))))
+
+
+def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_own_image() -> None:
+    slaves = (*CONFIG.slaves[:2], turned_round(CONFIG.slaves[2]))
+    config = replace(CONFIG, slaves=slaves)
+    data = Sent(config)
+    arm = SimpleNamespace(pairs=make_drives(config), gripper=None)
+    stop_blindly(data, config, arm)  # type: ignore[arg-type]
+    rest = layout(slaves[1].device.rpdo).bytes - 2
+    ramp = [frame for frame in data.frames if struct.unpack_from("<H", frame[1])[0] == QUICK_STOP]
+    assert len(ramp) * PERIOD_S >= RAMP_S
+    assert data.frames[: len(ramp)] == ramp
+    assert {frame[1] for frame in ramp} == {struct.pack("<H", QUICK_STOP) + bytes(rest)}
+    assert {frame[2] for frame in ramp} == {bytes(rest) + struct.pack("<H", QUICK_STOP)}
+    assert {word for frame in data.frames[len(ramp) :] for word in (*frame[1], *frame[2])} == {VOLTAGE_OFF}
+
+
+def test_the_grippers_drive_is_told_as_the_joints_are() -> None:
+    data = Sent(CONFIG)
+    joint, (slot, drive) = make_drives(CONFIG)
+    arm = SimpleNamespace(pairs=[joint], gripper=SimpleNamespace(slot=slot, drive=drive))
+    stop_blindly(data, CONFIG, arm)  # type: ignore[arg-type]
+    assert all(frame[slot] == frame[joint[0]] for frame in data.frames)
+    assert struct.unpack_from("<H", data.frames[0][slot])[0] == QUICK_STOP

@@ -1,0 +1,282 @@
+"""Time and way to standstill on each rung, by the joints' own truth, within what the configuration allows.
+
+The shipped arm on the in-process bus; `pytest -s` prints what was measured.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from docs.stops_page import section
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, SetDriveMode
+from rtcp.ipc.states import DriveMode, JogFrame, State
+from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
+from rtcp.launch.simulation import NAME, Frame, Simulation
+
+CONFIG = load(default_config())
+CONFIG = replace(CONFIG, bus=replace(CONFIG.bus, interface=NAME))
+"""The shipped arm on a bus where no limit is widened."""
+PERIOD_S = CONFIG.cycle.period_us * 1e-6
+COUNTS = 10000
+UPRIGHT_LESS = [-0.3] * 6
+"""rad; from here all joints run at full speed past the upright pose, around which no box is."""
+BENT = [0.0, -0.3, 1.2, 0.0, 0.9, 0.0]
+JOG_SPEED = 0.2
+"""m/s"""
+STANDS_RAD_S = 0.01
+"""A joint that is slower stands."""
+SAFE_OP, AL_WATCHDOG = 4, 0x001B
+OUTPUTS = struct.Struct("<Hiiib")
+ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
+FAULTS_PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
+SITUATIONS = ("holding", "moving", "jogging")
+
+
+class Measured:
+    """A stop from the cycle in which its cause happens on: what every joint truly does, and what is sent."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+        self._slots = [
+            next(slot for slot, slave in enumerate(simulation.config.slaves) if slave.name == joint.slave)
+            for joint in simulation.config.joints
+        ]
+        self.begun_ns = simulation.now_ns
+        self._began = [model.mechanics.position for model in simulation.models]
+        self.time_s = 0.0
+        self.ways = [0.0] * len(self._began)
+        self.sent: list[list[tuple[int, ...]]] = []
+        self.before = self._outputs(simulation.data.outputs)
+        simulation.on_frame = self._see
+
+    def _outputs(self, sent: Sequence[bytes]) -> list[tuple[int, ...]]:
+        return [OUTPUTS.unpack(sent[slot]) for slot in self._slots]
+
+    def _see(self, frame: Frame) -> None:
+        models = self.simulation.models
+        if any(abs(model.mechanics.velocity) > STANDS_RAD_S for model in models):
+            self.time_s = (frame.now_ns - self.begun_ns) * 1e-9
+        now = [abs(model.mechanics.position - began) for model, began in zip(models, self._began, strict=True)]
+        self.ways = [max(most, way) for most, way in zip(self.ways, now, strict=True)]
+        self.sent.append(self._outputs(frame.sent))
+
+    @property
+    def longest_step(self) -> list[int]:
+        """For each joint the longest step, in counts, between two targets in a row that its drive obeys."""
+        rows = [self.before, *self.sent]
+        return [
+            max(
+                (
+                    abs(after[axis][1] - earlier[axis][1])
+                    for earlier, after in pairwise(rows)
+                    if {earlier[axis][0], after[axis][0]} <= {ENABLE_OPERATION, QUICK_STOP}
+                ),
+                default=0,
+            )
+            for axis in range(len(self._began))
+        ]
+
+    def within(self, what: str, limits: Sequence[Bound]) -> None:
+        """Compare with the bounds of all joints, and print it."""
+        longest_s = max(bound.time_s for bound in limits)
+        print(f"\n{what}: stands after {1000 * self.time_s:.1f} ms (at most {1000 * longest_s:.1f})", end="")
+        assert self.time_s <= longest_s
+        self.not_beyond(what, limits)
+
+    def not_beyond(self, what: str, limits: Sequence[Bound]) -> None:
+        """Compare the ways alone, where the joints need not stand at the end; and every step of a target."""
+        most = max(bound.way_rad for bound in limits)
+        print(f"\n{what}: longest way {max(self.ways):.4f} rad (at most {most:.4f})", end="")
+        assert [way <= bound.way_rad for way, bound in zip(self.ways, limits, strict=True)] == [True] * len(limits)
+        steps = [joint.velocity * PERIOD_S * COUNTS + 1 for joint in CONFIG.joints]
+        assert [step <= most for step, most in zip(self.longest_step, steps, strict=True)] == [True] * len(steps)
+
+
+@pytest.fixture
+def arm() -> Iterator[Callable[..., Simulation]]:
+    """Bring an arm with these rungs into a situation."""
+    made: list[Simulation] = []
+
+    def bring(situation: str, mode: int = 8, **rungs: str) -> Simulation:
+        config: ArmConfig = replace(CONFIG, stops=replace(CONFIG.stops, **rungs))
+        positions = BENT if situation == "jogging" else UPRIGHT_LESS
+        simulation = Simulation(config, seed=5, positions=positions, follow_clock=False)
+        made.append(simulation)
+        simulation.acquire()
+        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
+        if mode != 8:
+            do(simulation, SetDriveMode(DriveMode(mode)))
+        do(simulation, Enable())
+        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        assert simulation.until(lambda: not simulation.loop.machine.changing_mode, 1.0)
+        simulation.run(0.1)
+        if situation == "moving":
+            do(simulation, MoveJoints((0.3,) * 6, 0.5, synchronized=False))
+            simulation.run(0.55)
+            assert min(simulation.loop.arm.state.commanded_velocity) == pytest.approx(0.5, abs=1e-6)
+        elif situation == "jogging":
+            for _ in range(2):
+                do(simulation, Jog((0.0, 0.0, -JOG_SPEED, 0.0, 0.0, 0.0), JogFrame.BASE, 0.5))
+                simulation.run(0.4)
+            assert max(map(abs, simulation.loop.arm.state.commanded_velocity)) > 0.15
+        return simulation
+
+    yield bring
+    for simulation in made:
+        simulation.close()
+
+
+def do(simulation: Simulation, command: Command) -> None:
+    assert simulation.send(command).refusal is None
+
+
+def lose_the_box(simulation: Simulation) -> None:
+    simulation.bus.drop(1, SAFE_OP, AL_WATCHDOG)
+    # The service thread sees it some time later; the bound counts from the cycle that is told.
+    simulation.service.lost_slave = 1
+
+
+def brakes(simulation: Simulation) -> list[float]:
+    """What each joint's closed brake slows it down by at least, rad/s2, with the load pulling the other way."""
+    joints = [model.mechanics for model in simulation.models]
+    return [(one.holding_torque + one.coulomb - one.gravity_torque) / one.inertia for one in joints]
+
+
+# -- hold -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+@pytest.mark.parametrize("heard", [True, False], ids=["the answer is lost", "nothing is heard"])
+def test_held_cycles_send_no_new_target_and_carry_no_joint_farther_than_its_speed_times_their_time(
+    arm: Callable[..., Simulation], situation: str, heard: bool
+) -> None:
+    simulation = arm(situation)
+    measured = Measured(simulation)
+    cycles = CONFIG.bus.lost_cycles - 1
+    simulation.data.lose(cycles, heard)
+    simulation.run(cycles * PERIOD_S)
+    assert all(row == measured.before for row in measured.sent)
+    assert simulation.state is (State.HOLDING if situation == "holding" else State.MOVING)
+    limits = bounds(CONFIG, StopReaction.HOLD)
+    measured.not_beyond(f"hold, {situation}", limits)
+
+
+@pytest.mark.parametrize("situation", ["holding", "moving"])
+@pytest.mark.parametrize("mode", [9, 10], ids=["csv", "cst"])
+def test_in_csv_and_cst_held_cycles_keep_to_the_same_way(
+    arm: Callable[..., Simulation], situation: str, mode: int
+) -> None:
+    simulation = arm(situation, mode)
+    measured = Measured(simulation)
+    cycles = CONFIG.bus.lost_cycles - 1
+    simulation.data.lose(cycles, True)
+    simulation.run(cycles * PERIOD_S)
+    assert all(row == measured.before for row in measured.sent)
+    limits = bounds(CONFIG, StopReaction.HOLD)
+    if mode == 10:
+        # A torque that is held is no speed: what it makes of it is the inertia's affair, and a tenth is granted here.
+        limits = tuple(bound._replace(way_rad=1.1 * bound.way_rad) for bound in limits)
+    measured.not_beyond(f"hold in mode {mode}, {situation}", limits)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_frames_that_stay_away_are_held_and_then_a_quick_stop(arm: Callable[..., Simulation], situation: str) -> None:
+    simulation = arm(situation)
+    measured = Measured(simulation)
+    simulation.data.lose(100_000, True)
+    simulation.run(0.6)
+    assert simulation.state is State.FAULT
+    held, stop = bounds(CONFIG, StopReaction.HOLD), bounds(CONFIG, StopReaction.QUICK_STOP)
+    both = [Bound(a.time_s + b.time_s, a.way_rad + b.way_rad) for a, b in zip(held, stop, strict=True)]
+    measured.within(f"frames lost on the way back, {situation}", both)
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_drives_that_hear_nothing_are_stopped_by_their_watchdog(arm: Callable[..., Simulation], situation: str) -> None:
+    simulation = arm(situation)
+    measured = Measured(simulation)
+    simulation.data.lose(100_000, False)
+    simulation.run(0.6)
+    assert simulation.state is State.FAULT
+    assert not any(model.powered for model in simulation.models)
+    measured.within(f"nothing is heard, {situation}", unheard(CONFIG))
+
+
+# -- controlled stop, quick stop, torque off ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("situation", ["moving", "jogging"])
+@pytest.mark.parametrize(
+    "rung",
+    [StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF],
+    ids=lambda rung: rung.words,
+)
+def test_a_motion_whose_commander_is_lost_stands_within_the_bound_of_the_rung(
+    arm: Callable[..., Simulation], situation: str, rung: StopReaction
+) -> None:
+    simulation = arm(situation, lease_ended=rung.name.lower())
+    measured = Measured(simulation)
+    simulation.observer.release(simulation.lease)
+    simulation.run(0.6)
+    assert simulation.state is (State.HOLDING if rung is StopReaction.CONTROLLED_STOP else State.FAULT)
+    assert [model.powered for model in simulation.models] == [rung is not StopReaction.TORQUE_OFF] * 6
+    limits = bounds(CONFIG, rung, brakes(simulation))
+    if situation == "jogging" and rung is StopReaction.CONTROLLED_STOP:
+        # The tool's own ramp may be longer; no joint passes its speed meanwhile.
+        slow = tool_bounds(CONFIG, JOG_SPEED, CONFIG.jog.angular_speed)[0].time_s
+        limits = tuple(
+            Bound(max(bound.time_s, slow), max(bound.way_rad, joint.velocity * slow))
+            for bound, joint in zip(limits, CONFIG.joints, strict=True)
+        )
+    measured.within(f"{rung.words}, {situation}", limits)
+
+
+@pytest.mark.parametrize("rung", [StopReaction.QUICK_STOP, StopReaction.TORQUE_OFF], ids=lambda rung: rung.words)
+def test_an_arm_that_holds_stays_where_it_is_on_every_rung(arm: Callable[..., Simulation], rung: StopReaction) -> None:
+    simulation = arm("holding", slave_lost=rung.name.lower())
+    measured = Measured(simulation)
+    lose_the_box(simulation)
+    simulation.run(0.2)
+    assert simulation.state is State.FAULT
+    assert [model.powered for model in simulation.models] == [rung is StopReaction.QUICK_STOP] * 6
+    measured.within(f"{rung.words}, holding", bounds(CONFIG, rung, brakes(simulation)))
+    assert max(measured.ways) < 0.001
+
+
+# -- the bounds themselves ------------------------------------------------------------------------------------------
+
+
+def test_each_rung_is_bound_by_what_the_configuration_says() -> None:
+    slow = replace(CONFIG, joints=tuple(replace(joint, acceleration=1.0) for joint in CONFIG.joints))
+    few = replace(CONFIG, bus=replace(CONFIG.bus, lost_cycles=10))
+    assert bounds(slow, StopReaction.CONTROLLED_STOP)[0].time_s > bounds(CONFIG, StopReaction.CONTROLLED_STOP)[0].time_s
+    assert bounds(few, StopReaction.HOLD)[0].time_s == pytest.approx(0.25 * bounds(CONFIG, StopReaction.HOLD)[0].time_s)
+    late = 3 * PERIOD_S + 0.03
+    assert bounds(CONFIG, StopReaction.QUICK_STOP)[0].time_s == pytest.approx(0.5 / 10.0 + late)
+    assert bounds(CONFIG, StopReaction.QUICK_STOP)[0].way_rad == pytest.approx(0.5**2 / 20.0 + 0.5 * late)
+    assert bounds(CONFIG, StopReaction.TORQUE_OFF, [50.0] * 6)[0].time_s == pytest.approx(0.01 + late)
+
+
+def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
+    with pytest.raises(ValueError, match="joint1: what its brake can do is not known"):
+        bounds(CONFIG, StopReaction.TORQUE_OFF)
+    bare = replace(CONFIG.slaves[1].device, sdo=())
+    without = replace(CONFIG, slaves=tuple(replace(slave, device=bare) for slave in CONFIG.slaves))
+    with pytest.raises(ValueError, match="0x6085 is not among its start-up SDOs"):
+        bounds(without, StopReaction.QUICK_STOP)
+
+
+# -- what the docs say ----------------------------------------------------------------------------------------------
+
+
+def test_the_section_in_the_docs_is_printed_from_the_table_and_the_bounds() -> None:
+    # `python docs/generate.py` writes it.
+    assert section(load(default_config())) in FAULTS_PAGE.read_text()

@@ -1,0 +1,205 @@
+"""Two processes, one file in memory: records, events, texts, lease, commands."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.layout import PER_JOINT, RECORDS, SCALARS, records_for
+from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
+
+JOINTS = 6
+FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
+
+
+@pytest.fixture
+def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
+    made = Observer(path)
+    yield made
+    made.close()
+
+
+def record(cycle: int) -> list[float]:
+    return [cycle, *([0] * (len(SCALARS) - 2)), *(float(cycle) for _ in range(4 * JOINTS)), *([cycle & 0xFFFF] * 6)]
+
+
+def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observer) -> None:
+    values: list[float] = [0] * FIELDS
+    for at, (name, _) in enumerate(SCALARS[1:]):
+        values[at] = {"state": 4, "wkc": -1, "dc_filtered_ns": -77, "elapsed_s": 0.5}.get(name, at)
+    values[len(SCALARS) - 1 :] = [*(0.1 * i for i in range(4 * JOINTS)), *range(100, 100 + JOINTS)]
+    board.publish(values)
+    latest = observer.latest()
+    assert latest is not None
+    assert int(latest[0]["number"]) == 1
+    assert int(latest[0]["state"]) == 4
+    assert int(latest[0]["wkc"]) == -1
+    assert int(latest[0]["dc_filtered_ns"]) == -77
+    assert list(latest[0]["position"]) == [0.1 * i for i in range(JOINTS)]
+    assert list(latest[0]["target"]) == [0.1 * i for i in range(3 * JOINTS, 4 * JOINTS)]
+    assert list(latest[0]["statusword"]) == list(range(100, 100 + JOINTS))
+
+
+def test_before_the_first_cycle_there_is_no_record(observer: Observer) -> None:
+    assert observer.latest() is None
+    assert observer.since(0)[1] == 0
+
+
+def test_a_reader_that_keeps_up_loses_nothing(board: Blackboard, observer: Observer) -> None:
+    seen: list[int] = []
+    for cycle in range(1, 3 * RECORDS // 2):
+        board.publish(record(cycle))
+        if cycle % 1000 == 0:
+            records, lost = observer.since(seen[-1] if seen else 0)
+            assert lost == 0
+            seen += [int(number) for number in records["number"]]
+    assert seen == list(range(1, len(seen) + 1))
+
+
+def test_a_reader_that_comes_late_is_told_how_much_it_lost(board: Blackboard, observer: Observer) -> None:
+    for cycle in range(1, RECORDS + 1001):
+        board.publish(record(cycle))
+    records, lost = observer.since(0)
+    assert lost >= 1000
+    assert lost + len(records) == RECORDS + 1000
+    assert [int(value) for value in records["cycle"]] == [int(value) for value in records["number"]]
+
+
+@pytest.mark.parametrize("period_us", [100, 125, 250, 366, 367, 500, 1000, 4000, 100_000])
+def test_the_ring_holds_twelve_seconds_of_every_cycle(period_us: int) -> None:
+    records = records_for(period_us * 1000)
+    assert records * period_us >= 12_000_000
+    assert records & records - 1 == 0
+    assert records == RECORDS or records * period_us < 24_000_000
+
+
+def test_a_writer_in_another_process_is_never_read_torn(path: Path) -> None:
+    child = os.fork()
+    if child == 0:
+        board = Blackboard(path, JOINTS, 500_000)
+        for cycle in range(1, 100_000):
+            board.publish(record(cycle))
+        os._exit(0)
+    while not path.exists():
+        time.sleep(0.001)
+    observer = Observer(path)
+    at, read = 0, 0
+    ended = False
+    while not ended:
+        ended = os.waitpid(child, os.WNOHANG)[0] != 0
+        records, _ = observer.since(at)
+        if len(records):
+            at = int(records[-1]["number"])
+            read += len(records)
+            assert (records["cycle"] == records["number"]).all()
+            assert (records["position"] == records["cycle"][:, None]).all()
+            assert (records["target"] == records["cycle"][:, None]).all()
+    observer.close()
+    assert at == 99_999
+    assert read > 1000
+
+
+def test_events_and_texts_arrive_in_order(board: Blackboard, observer: Observer) -> None:
+    for number in range(300):
+        board.event(5, number % 6, number, 1.0)
+    board.text("the drive's temperature is 91 °C")
+    events = observer.events_since(0)
+    assert [event.value for event in events] == list(range(300 - 256, 300))
+    assert observer.events_since(299)[0].axis == 299 % 6
+    assert [text.sentence for text in observer.texts_since(0)] == ["the drive's temperature is 91 °C"]
+
+
+def test_an_event_has_its_instant_on_both_clocks(board: Blackboard, observer: Observer) -> None:
+    wall, monotonic = time.time_ns(), time.monotonic_ns()
+    board.event(5, 3, 0.25, 1.5)
+    (event,) = observer.events_since(0)
+    assert wall <= event.time_ns <= time.time_ns()
+    assert monotonic <= event.monotonic_ns <= time.monotonic_ns()
+    assert (event.number, type(event.event), event.axis, event.value, event.limit) == (1, 5, 3, 0.25, 1.5)
+
+
+def test_a_long_text_is_cut_and_not_lost(board: Blackboard, observer: Observer) -> None:
+    board.text("ä" * 1000)
+    assert observer.texts_since(0)[0].sentence.startswith("ää")
+
+
+def test_a_second_commander_is_refused_with_the_holders_name(observer: Observer, path: Path) -> None:
+    other = Observer(path)
+    lease = observer.acquire("rtcp move (pid 7)", 10.0)
+    with pytest.raises(LeaseRefused, match=r"rtcp move \(pid 7\)"):
+        other.acquire("the panel", 10.0)
+    observer.release(lease)
+    assert other.acquire("the panel", 10.0) != lease
+    other.close()
+
+
+def test_a_lease_that_is_not_renewed_is_free_again(observer: Observer) -> None:
+    lease = observer.acquire("first", 0.05)
+    assert observer.renew(lease)
+    time.sleep(0.06)
+    assert not observer.renew(lease)
+    assert observer.holder() == ""
+    observer.acquire("second", 10.0)
+    observer.release(lease)
+    assert observer.holder() == "second"
+
+
+def test_a_lease_that_is_being_renewed_never_looks_free_to_another_process(board: Blackboard, path: Path) -> None:
+    reading, writing = os.pipe()
+    child = os.fork()
+    if child == 0:
+        observer = Observer(path)
+        lease = observer.acquire("renewer", 60.0)
+        os.write(writing, b"!")
+        for _ in range(50_000):
+            observer.renew(lease)
+        os._exit(0)
+    os.read(reading, 1)
+    seen = set()
+    while os.waitpid(child, os.WNOHANG)[0] == 0:
+        for _ in range(2000):
+            lease, renewed, duration = board.lease()
+            seen.add((lease, duration))
+            assert renewed >= lease
+    assert len(seen) == 1
+    os.close(reading)
+    os.close(writing)
+
+
+def test_commands_are_taken_in_order_and_answered(board: Blackboard, observer: Observer) -> None:
+    lease = observer.acquire("test", 10.0)
+    assert not board.command_waits()
+    first = observer.command(lease, 5, [0.1, -0.2])
+    second = observer.command(lease, 1)
+    assert board.command_waits()
+    assert board.take_command()[:5] == (first, lease, 5, 0.1, -0.2)
+    board.answer(first, 3, 2, 9.0, 1.5)
+    answer = observer.answer(first)
+    assert answer is not None
+    assert (answer.refusal, answer.axis, answer.value, answer.limit) == (3, 2, 9.0, 1.5)
+    assert observer.answer(second) is None
+    assert board.take_command()[0] == second
+    assert not board.command_waits()
+
+
+def test_a_ring_that_nobody_empties_is_refused(observer: Observer) -> None:
+    for _ in range(64):
+        observer.command(1, 1)
+    with pytest.raises(BlackboardError, match="takes no commands"):
+        observer.command(1, 1)
+
+
+def test_a_file_that_is_no_blackboard_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BlackboardError, match="cannot be opened"):
+        Observer(tmp_path / "none")
+    (tmp_path / "short").write_bytes(b"x" * 100)
+    with pytest.raises(BlackboardError, match="cut short"):
+        Observer(tmp_path / "short")
+    (tmp_path / "zeros").write_bytes(bytes(1 << 22))
+    with pytest.raises(BlackboardError, match="not of this version"):
+        Observer(tmp_path / "zeros")
