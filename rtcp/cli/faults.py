@@ -18,11 +18,16 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-    from rtcp.gateway.blackbox_file import Listed
+    from rtcp.ipc.recording import Listed
 
 SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
 """Recordings of the service and of root; StateDirectory= of the unit."""
-JOINT_COLUMNS = (("position", "rad"), ("target", "rad"), ("velocity", "rad/s"), ("torque", "Nm"))
+JOINT_COLUMNS = (
+    ("actual_position", "rad"),
+    ("sent_position", "rad"),
+    ("actual_velocity", "rad/s"),
+    ("actual_torque", "Nm"),
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -37,7 +42,7 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
     """List the recorded faults, the newest last."""
     if context.invoked_subcommand is not None:
         return
-    from rtcp.gateway.blackbox_file import faults_directory, listed
+    from rtcp.ipc.recording import faults_directory, listed
 
     with _readable():
         found = listed(faults_directory())
@@ -63,7 +68,7 @@ def _show(
     if plot is not None:
         check_picture("--plot", plot)
     path = _recording(number)
-    from rtcp.gateway.blackbox_file import read
+    from rtcp.ipc.recording import read
     from rtcp.telemetry.fault_report import draw, summary
 
     with _readable():
@@ -86,7 +91,7 @@ def _show(
 
 @contextmanager
 def _readable() -> Iterator[None]:
-    from rtcp.gateway.blackbox_file import RecordingError
+    from rtcp.ipc.recording import RecordingError
 
     try:
         yield
@@ -96,7 +101,7 @@ def _readable() -> Iterator[None]:
 
 def _recording(number: int) -> Path:
     """Return the recording of this number; raises CommandError with the numbers that exist."""
-    from rtcp.gateway.blackbox_file import faults_directory, files
+    from rtcp.ipc.recording import faults_directory, files
 
     with _readable():
         recorded = dict(files(faults_directory()))
@@ -108,7 +113,7 @@ def _recording(number: int) -> Path:
 
 def _service_hint() -> str:
     """Return where the service records, for a user whose own list is empty."""
-    from rtcp.gateway.blackbox_file import faults_directory
+    from rtcp.ipc.recording import faults_directory
 
     if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
         return ""

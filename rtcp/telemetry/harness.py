@@ -14,11 +14,11 @@ import numpy as np
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.machine import State
-from rtcp.ipc.messages import Sentences
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
+from rtcp.ipc.states import State
 from rtcp.telemetry.recording import target_steps
 from rtcp.virtual.faults.client import SegmentClient
 
@@ -59,7 +59,7 @@ class Harness:
         self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
         self.observer = Observer(blackboard_file(directory))
         self.segment.clear_peaks()  # from the first request on the segment observes its joints
-        self._sentences = Sentences(config)
+        self._names = Names(config)
         self._speeds = np.array([joint.velocity for joint in config.joints])
         self._seen = self.observer.head
         self._last: Any = None
@@ -111,18 +111,17 @@ class Harness:
     def speed(self) -> float:
         """Return the measured speed of the fastest joint, rad/s."""
         latest = self.observer.latest()
-        return 0.0 if latest is None else float(np.abs(latest[0]["velocity"]).max())
+        return 0.0 if latest is None else float(np.abs(latest[0]["actual_velocity"]).max())
 
     def moment(self) -> Moment:
         """Return this moment, for `messages_since`."""
-        events, texts = self.observer.events_since(0), self.observer.texts_since(0)
-        return Moment(events[-1].number if events else 0, texts[-1].number if texts else 0)
+        texts = self.observer.texts_since(0)
+        return Moment(self.observer.last_event, texts[-1].number if texts else 0)
 
     def messages_since(self, moment: Moment) -> list[str]:
         """Return the platform's messages since a moment, in their order."""
         found = [
-            (event.time_ns, self._sentences.event(event.code, event.axis, event.value, event.limit))
-            for event in self.observer.events_since(moment.event)
+            (record.time_ns, self._names.message(record.event)) for record in self.observer.events_since(moment.event)
         ]
         found += [(text.time_ns, text.sentence) for text in self.observer.texts_since(moment.text)]
         return [sentence for _, sentence in sorted(found)]
@@ -173,9 +172,9 @@ class Harness:
         self.segment.fault(fault)
         self.injected += 1
 
-    def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
+    def call(self, method: str, /, **params: Any) -> dict[str, Any]:
         """Send a command to the platform; raises RtcpError."""
-        return self.client.call(verb, arguments, timeout_s=60.0)
+        return self.client.call(method, params, timeout_s=60.0)
 
     def enable(self) -> tuple[int, str]:
         """Reset and enable until the arm holds.
@@ -208,8 +207,8 @@ class Harness:
             if refusal:
                 break
             try:
-                self.call("motion", name="joint")
-                self.call("move", q=list(q), speed=_SPEED)
+                self.call("mode", name="joint")
+                self.call("move_joints", q=list(q), speed=_SPEED)
             except RtcpError as error:
                 refusal = error.message
                 continue

@@ -60,7 +60,7 @@ class Workload:
         harness = self._harness
         if self.mode != "joint":
             try:
-                harness.call("motion", name=self.mode)
+                harness.call("mode", name=self.mode)
             except RtcpError as error:
                 raise TrialFailed(f"{self.name} cannot begin: {error.message}") from error
         if not self.moves:
@@ -102,7 +102,7 @@ class Moving(Workload):
         sign = 1.0
         while not self._ended.is_set():
             target = [start + sign * by for start, by in zip(START, _SWING, strict=True)]
-            client.call("move", {"q": target, "speed": _SPEED}, timeout_s=60.0)
+            client.call("move_joints", {"q": target, "speed": _SPEED}, timeout_s=60.0)
             sign = -sign
 
     def end(self) -> None:
@@ -124,7 +124,7 @@ class Jogging(Workload):
         while not self._ended.is_set():
             sign = 1.0 if (time.monotonic() - begun) % (2 * _REVERSE_S) < _REVERSE_S else -1.0
             speeds = [sign * _JOG_M_S, 0.0, 0.0, 0.0, 0.0, 0.0]
-            client.call("jog", {"v": speeds, "frame": "base", "hold_s": _JOG_HOLD_S})
+            client.call("jog", {"velocity": speeds, "frame": "base", "hold_s": _JOG_HOLD_S})
             self._ended.wait(_JOG_INTERVAL_S)
 
 
@@ -137,13 +137,13 @@ class Joystick(Workload):
 
     def _command(self, client: ControlClient) -> None:
         # The arm waits for a neutral joystick before it tracks it.
-        client.call("stick", {"pressed": [], "byte": _NEUTRAL, "hold_s": _JOYSTICK_HOLD_S})
+        client.call("joystick", {"byte": _NEUTRAL, "hold_s": _JOYSTICK_HOLD_S})
         self._ended.wait(_JOYSTICK_HOLD_S / 2)
         begun = time.monotonic()
         while not self._ended.is_set():
             forward = (time.monotonic() - begun) % (2 * _REVERSE_S) < _REVERSE_S
             pressed = ["forward" if forward else "backward"]
-            client.call("stick", {"pressed": pressed, "hold_s": _JOYSTICK_HOLD_S})
+            client.call("joystick", {"pressed": pressed, "hold_s": _JOYSTICK_HOLD_S})
             self._ended.wait(_JOYSTICK_HOLD_S / 3)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from rtcp.cli import faults
-from rtcp.gateway.blackbox_file import About, Moment, Recording, faults_directory, write
+from rtcp.ipc.recording import About, Moment, Recording, faults_directory, write
 from rtcp.ipc.layout import FLAG_ENABLED, RecordLayout
 from rtcp.ipc.machine import State
 from rtcp.ipc.observer import record_type
