@@ -15,16 +15,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rtcp.fieldbus.al_state import AlState
+from rtcp.ipc.commands import COMMANDS as COMMAND_KINDS
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import Event
 from rtcp.ipc.layout import (
     ANSWER,
     ANSWER_AT,
     ANSWER_NUMBER_AT,
     COMMAND,
     COMMAND_HEAD_AT,
+    COMMAND_SIZE,
     COMMAND_TAKEN_AT,
     COMMANDS,
     COMMANDS_AT,
     EVENT,
+    EVENT_SIZE,
     EVENTS,
     EVENTS_AT,
     EVENTS_HEAD_AT,
@@ -35,6 +40,7 @@ from rtcp.ipc.layout import (
     LEASE_ID_AT,
     LEASE_RENEWED_AT,
     MAGIC,
+    PLAN_IN_USE_AT,
     PLANS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
@@ -44,13 +50,15 @@ from rtcp.ipc.layout import (
     TEXTS,
     TEXTS_AT,
     TEXTS_HEAD_AT,
+    AtomicWords,
     RecordLayout,
+    plan_slot,
     records_for,
 )
-from rtcp.ipc.plans import mark_in_use, place
-from rtcp.ipc.words import Words
+from rtcp.ipc.message import MalformedMessage
+from rtcp.ipc.refusals import Malformed, Refusal
 
-_U16, _U32 = 0xFFFF, 0xFFFF_FFFF
+_U16, _U32, _I63 = 0xFFFF, 0xFFFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
 
 
@@ -85,8 +93,8 @@ class Blackboard:
         self._ring_mask = records - 1
         # The record without its first number, which is published last.
         self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
-        self._words = Words(self._map)
-        self._plans = [place(self._map, slot) for slot in range(PLANS)]
+        self._words = AtomicWords(self._map)
+        self._plans = [plan_slot(self._map, slot) for slot in range(PLANS)]
         self._records = 0
         self._events = 0
         self._texts = 0
@@ -109,11 +117,12 @@ class Blackboard:
         words[RECORDS_HEAD_AT] = number
         self._records = number
 
-    def event(self, code: int, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
-        """Append an event: a code that readers put into words."""
+    def event(self, event: Event) -> None:
+        """Append an event."""
         number = self._events + 1
-        at = EVENTS_AT + (number % EVENTS) * EVENT.size
-        EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), code, axis, value, limit)
+        at = EVENTS_AT + (number % EVENTS) * EVENT_SIZE
+        EVENT.pack_into(self._map, at, number, time.time_ns(), time.monotonic_ns(), event.number)
+        event.pack_into(self._map, at + EVENT.size)
         self._words.fence()
         self._words[EVENTS_HEAD_AT] = number
         self._events = number
@@ -155,18 +164,25 @@ class Blackboard:
         """Whether a command waits to be taken."""
         return self._words[COMMAND_HEAD_AT] != self._taken
 
-    def take_command(self) -> tuple[float, ...]:
-        """Take the next command: number, lease id, kind, twelve numbers. Only when `command_waits`."""
-        number = self._taken + 1
-        found = COMMAND.unpack_from(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size)
-        self._taken = number
-        self._words[COMMAND_TAKEN_AT] = number
-        return found
+    def take_command(self) -> tuple[int, int, Command | Malformed]:
+        """Take the next command: its number in the ring, the lease id, and what it is. Only when `command_waits`."""
+        at = COMMANDS_AT + ((self._taken + 1) % COMMANDS) * COMMAND_SIZE
+        number, lease, kind = COMMAND.unpack_from(self._map, at)
+        self._taken += 1
+        self._words[COMMAND_TAKEN_AT] = self._taken
+        try:
+            return number, lease, COMMAND_KINDS.unpack_from(kind, self._map, at + COMMAND.size)
+        except MalformedMessage:
+            return number, lease, Malformed(kind & _I63)
 
-    def answer(self, number: int, refusal: int = 0, axis: int = -1, value: float = 0.0, limit: float = 0.0) -> None:
-        """Answer the command `number`: accepted (0) or the code of a refusal with what it is about."""
+    def answer(self, number: int, refusal: Refusal | None = None) -> None:
+        """Answer the command `number`; None: accepted."""
+        if refusal is None:
+            ANSWER.pack_into(self._map, ANSWER_AT, 0)
+        else:
+            ANSWER.pack_into(self._map, ANSWER_AT, refusal.number)
+            refusal.pack_into(self._map, ANSWER_AT + ANSWER.size)
         # The number goes in last: a reader that finds its own number finds the whole answer.
-        ANSWER.pack_into(self._map, ANSWER_AT, refusal, axis, value, limit)
         self._words.fence()
         self._words[ANSWER_NUMBER_AT] = number
 
@@ -176,17 +192,17 @@ class Blackboard:
         return self._map
 
     @property
-    def words(self) -> Words:
+    def words(self) -> AtomicWords:
         """The same by words."""
         return self._words
 
     def plan(self, slot: int) -> memoryview[float]:
-        """Return the doubles of a place for plans, row by row."""
+        """Return the doubles of a slot of the plan area, row by row."""
         return self._plans[slot]
 
     def use_plan(self, slot: int) -> None:
-        """Say which place is being read from, so that the next plan goes into another; -1: none."""
-        mark_in_use(self._words, slot)
+        """Note which slot is being read, so that the next plan goes into another; -1: none."""
+        self._words[PLAN_IN_USE_AT] = slot + 1
 
     def close(self) -> None:
         """Unmap; the file stays for those who read what happened last."""

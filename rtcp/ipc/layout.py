@@ -4,9 +4,10 @@
 |---|---|---|
 | 0 | header: magic, sizes, period, loop's pid | loop, once |
 | 128 | lease: id, renewed at, duration, holder's name | commanders, under a file lock |
-| 256 | command head; 264: commands taken; 272: answer to the last | commander; loop; loop |
+| 256 | command head; 264: commands taken; 272: number of the last answer | commander; loop; loop |
 | 384 | published records; published events; published texts | loop |
 | 512 | request and answer of the service thread | commander; service thread |
+| 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
 | 3072 | slave health: lost, recovered, error counters | service thread |
 | 8192 | service text, texts, events, commands, plans, cycle records | loop and commanders |
@@ -16,11 +17,17 @@ Nothing here imports numpy: its threads would keep the loop's process from joini
 
 from __future__ import annotations
 
+import array
 import math
+import mmap
 import struct
+import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-MAGIC = 0x5254_4350_0000_0004
+from rtcp.ipc.message import PAYLOAD_SIZE
+
+MAGIC = 0x5254_4350_0000_0005
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -37,9 +44,9 @@ COMMAND_HEAD_AT = 256
 COMMAND_TAKEN_AT = 264
 ANSWER_NUMBER_AT = 272
 """Number of the command that the answer belongs to; written last."""
-ANSWER_AT = 280
-ANSWER = struct.Struct("<Iidd")
-"""refusal (0: accepted), axis, value, limit"""
+ANSWER_AT = 768
+ANSWER = struct.Struct("<Q")
+"""number of the refusal's kind (0: accepted); its fields follow (`rtcp.ipc.message`)"""
 
 RECORDS_HEAD_AT = 384
 EVENTS_HEAD_AT = 392
@@ -69,14 +76,15 @@ TEXT = struct.Struct("<QqH502s")
 TEXTS = 64
 
 EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size
-EVENT = struct.Struct("<QqqIidd")
-"""number, CLOCK_REALTIME ns, CLOCK_MONOTONIC ns, code, axis, value, limit"""
+EVENT = struct.Struct("<QqqQ")
+"""number, CLOCK_REALTIME ns, CLOCK_MONOTONIC ns, number of the event's kind; its fields follow (`rtcp.ipc.message`)"""
+EVENT_SIZE = EVENT.size + PAYLOAD_SIZE
 EVENTS = 256
 
-COMMANDS_AT = EVENTS_AT + EVENTS * EVENT.size
-COMMAND_NUMBERS = 12
-COMMAND = struct.Struct(f"<QQI4x{COMMAND_NUMBERS}d")
-"""number, lease id, kind, numbers: the joints' first, what else there is from the end (`rtcp.control.orders`)"""
+COMMANDS_AT = EVENTS_AT + EVENTS * EVENT_SIZE
+COMMAND = struct.Struct("<QQQ")
+"""number, lease id, number of the command's kind; its fields follow (`rtcp.ipc.message`)"""
+COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
 COMMANDS = 64
 
 PLAN_ROWS, PLAN_COLUMNS = 4096, 20
@@ -84,7 +92,7 @@ PLAN_ROWS, PLAN_COLUMNS = 4096, 20
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS = 2
 """Two places: one is written while the plan in the other runs."""
-PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND.size + 4095) & ~4095
+PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND_SIZE + 4095) & ~4095
 
 RECORDS_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
@@ -98,9 +106,9 @@ SCALARS = (
     ("time_ns", "q"),
     ("dc_time_ns", "q"),
     ("state", "B"),
-    ("mode", "B"),
-    ("motion", "B"),
-    ("stick_mode", "B"),
+    ("drive_mode", "B"),
+    ("control_mode", "B"),
+    ("joystick_mode", "B"),
     ("flags", "H"),
     ("wkc", "h"),
     ("wkc_expected", "h"),
@@ -124,8 +132,21 @@ SCALARS = (
 )
 """Fields of a cycle record that are one number: name and struct code. `number` is written last."""
 
-PER_JOINT = (("position", "d"), ("velocity", "d"), ("torque", "d"), ("target", "d"), ("statusword", "H"))
-"""Fields of a cycle record that are one number a joint, SI."""
+PER_JOINT = (
+    ("actual_position", "d"),
+    ("actual_velocity", "d"),
+    ("actual_torque", "d"),
+    ("commanded_position", "d"),
+    ("sent_position", "d"),
+    ("sent_velocity", "d"),
+    ("sent_torque", "d"),
+    ("statusword", "H"),
+)
+"""Fields of a cycle record that are one number a joint, rad, rad/s, Nm.
+
+`commanded_position` is the set-point of the controller after the trajectory guard; `sent_...` are the targets in the
+frame, after the output limiter: of those, the drive mode decides which one the drive follows.
+"""
 
 FLAG_DC_LOCKED = 1
 FLAG_ALL_OP = 2
@@ -135,7 +156,7 @@ FLAG_EMERGENCY_STOP = 16
 """The emergency stop's input is pressed."""
 FLAG_MOTION_ALLOWED = 32
 """The enabling switch is pressed, or there is none."""
-FLAG_ARM_HAS_STICK = 64
+FLAG_ARM_HAS_JOYSTICK = 64
 
 
 def records_for(period_ns: int) -> int:
@@ -163,3 +184,65 @@ class RecordLayout:
     def file_size(self, records: int) -> int:
         """Size of a whole blackboard with so many records."""
         return RECORDS_AT + records * self.size
+
+
+class AtomicWords:
+    """64-bit unsigned words of a mapped file, by byte offset (a multiple of 8), each read and written by one access.
+
+    `struct` does not do that: `pack_into` clears the buffer first, and "<Q" goes byte by byte, so that another process
+    could see a lease of 0 or half of a counter.
+    """
+
+    def __init__(self, memory: mmap.mmap) -> None:
+        self._view = memoryview(memory)
+        self._words = self._view.cast("Q")
+        self._lock = threading.Lock()
+
+    def __getitem__(self, at: int) -> int:
+        return self._words[at >> 3]
+
+    def __setitem__(self, at: int, value: int) -> None:
+        self._words[at >> 3] = value
+
+    def fence(self) -> None:
+        """Order the stores before against those after, also on weakly ordered CPUs (aarch64): two passes of a lock."""
+        lock = self._lock
+        lock.acquire()
+        lock.release()
+        lock.acquire()
+        lock.release()
+
+    def close(self) -> None:
+        """Release the file, which cannot be unmapped before."""
+        self._words.release()
+        self._view.release()
+
+
+class PlanTooLong(ValueError):
+    """More rows than fit."""
+
+
+def plan_slot(memory: mmap.mmap, slot: int) -> memoryview[float]:
+    """Return the doubles of a slot of the plan area, row by row."""
+    at = PLANS_AT + slot * PLAN_SIZE
+    return memoryview(memory)[at : at + PLAN_SIZE].cast("d")
+
+
+def write_plan(memory: mmap.mmap, words: AtomicWords, rows: Sequence[Sequence[float]]) -> int:
+    """Write a plan into the slot that the loop does not read from, and return that slot. Only under the lease.
+
+    Raises:
+        PlanTooLong: with the number of rows and how many fit.
+    """
+    if len(rows) > PLAN_ROWS:
+        raise PlanTooLong(f"the plan has {len(rows)} rows, at most {PLAN_ROWS} fit: give fewer points")
+    flat = array.array("d")
+    for row in rows:
+        flat.extend(row)
+        flat.extend([0.0] * (PLAN_COLUMNS - len(row)))
+    slot = 0 if words[PLAN_IN_USE_AT] != 1 else PLANS - 1
+    at = PLANS_AT + slot * PLAN_SIZE
+    encoded = flat.tobytes()
+    memory[at : at + len(encoded)] = encoded
+    words.fence()
+    return slot

@@ -16,12 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeAlias, TypeVar, ge
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
-
-    _frozen_dataclasses = dataclass_transform(frozen_default=True)
 else:
     # typing has it from Python 3.11 on, and typing_extensions is no dependency of the loop's process.
-    def _frozen_dataclasses(kind: type) -> type:
-        return kind
+    def dataclass_transform(**options: bool) -> Callable[[type], type]:
+        return lambda kind: kind
 
 
 JOINTS_MAX = 8
@@ -39,7 +37,7 @@ class MalformedMessage(ValueError):
     """Bytes that are no message: unknown number, or a field without a meaning."""
 
 
-@_frozen_dataclasses
+@dataclass_transform(frozen_default=True)
 class Message:
     """Base of all families. A subclass is a frozen dataclass; its `name` and `number` identify it in every process.
 

@@ -17,17 +17,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import EVENTS as EVENT_KINDS
+from rtcp.ipc.events import Event
 from rtcp.ipc.layout import (
     ANSWER,
     ANSWER_AT,
     ANSWER_NUMBER_AT,
     COMMAND,
     COMMAND_HEAD_AT,
-    COMMAND_NUMBERS,
+    COMMAND_SIZE,
     COMMAND_TAKEN_AT,
     COMMANDS,
     COMMANDS_AT,
     EVENT,
+    EVENT_SIZE,
     EVENTS,
     EVENTS_AT,
     EVENTS_HEAD_AT,
@@ -53,11 +57,13 @@ from rtcp.ipc.layout import (
     TEXTS,
     TEXTS_AT,
     TEXTS_HEAD_AT,
+    AtomicWords,
     RecordLayout,
     records_for,
+    write_plan,
 )
-from rtcp.ipc.plans import write_plan
-from rtcp.ipc.words import Words
+from rtcp.ipc.message import MalformedMessage
+from rtcp.ipc.refusals import REFUSALS, Refusal
 
 _NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
                 "d": "<f8"}  # fmt: skip
@@ -87,18 +93,15 @@ class LeaseRefused(Exception):
 
 
 @dataclass(frozen=True)
-class Event:
-    """Something that happened in the cycle: a code (see `rtcp.ipc.messages`) and what it is about."""
+class EventRecord:
+    """An event of the loop, and when it happened."""
 
     number: int
     time_ns: int
     """CLOCK_REALTIME, for people: it may be set meanwhile, forwards and back."""
     monotonic_ns: int
     """CLOCK_MONOTONIC, as in the cycle records."""
-    code: int
-    axis: int
-    value: float
-    limit: float
+    event: Event
 
 
 @dataclass(frozen=True)
@@ -126,12 +129,9 @@ class Health:
 
 @dataclass(frozen=True)
 class Answer:
-    """The loop's answer to a command: `refusal` 0 is acceptance."""
+    """The loop's answer to a command; no refusal: it was accepted."""
 
-    refusal: int
-    axis: int
-    value: float
-    limit: float
+    refusal: Refusal | None
 
 
 _LOCK_TURNS, _LOCK_WAIT_S = 50, 0.002
@@ -157,7 +157,7 @@ class Observer:
             os.close(self._descriptor)
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
-        self._words = Words(self._map)
+        self._words = AtomicWords(self._map)
         magic, joints, record_size, records, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
         # A number of joints that no record has would be a layout of gigabytes.
         layout = RecordLayout(joints) if magic == MAGIC and joints <= record_size else None
@@ -217,14 +217,20 @@ class Observer:
 
     # -- events and texts ---------------------------------------------------------------------------------------
 
-    def events_since(self, number: int) -> list[Event]:
+    def events_since(self, number: int) -> list[EventRecord]:
         """Return the events after `number`, oldest first."""
         head = self._words[EVENTS_HEAD_AT]
         found = []
         for wanted in range(max(number + 1, head - EVENTS + 1, 1), head + 1):
-            values = EVENT.unpack_from(self._map, EVENTS_AT + (wanted % EVENTS) * EVENT.size)
-            if values[0] == wanted:
-                found.append(Event(*values))
+            at = EVENTS_AT + (wanted % EVENTS) * EVENT_SIZE
+            made, when, monotonic, kind = EVENT.unpack_from(self._map, at)
+            if made != wanted:
+                continue
+            # An event may be overwritten while it is read, and be of a kind that only the loop's process knows.
+            with contextlib.suppress(MalformedMessage):
+                found.append(
+                    EventRecord(made, when, monotonic, EVENT_KINDS.unpack_from(kind, self._map, at + EVENT.size))
+                )
         return found
 
     def texts_since(self, number: int) -> list[Text]:
@@ -315,7 +321,7 @@ class Observer:
 
     # -- commands -----------------------------------------------------------------------------------------------
 
-    def command(self, lease: int, kind: int, numbers: Sequence[float] = ()) -> int:
+    def command(self, lease: int, command: Command) -> int:
         """Put a command into the ring; return its number. The lease's holder is the only writer.
 
         Raises:
@@ -324,8 +330,9 @@ class Observer:
         number = self._words[COMMAND_HEAD_AT] + 1
         if number - self._words[COMMAND_TAKEN_AT] > COMMANDS:
             raise BlackboardError("the loop takes no commands: its process hangs or is gone")
-        padded = [*numbers, *([0.0] * (COMMAND_NUMBERS - len(numbers)))]
-        COMMAND.pack_into(self._map, COMMANDS_AT + (number % COMMANDS) * COMMAND.size, number, lease, kind, *padded)
+        at = COMMANDS_AT + (number % COMMANDS) * COMMAND_SIZE
+        COMMAND.pack_into(self._map, at, number, lease, command.number)
+        command.pack_into(self._map, at + COMMAND.size)
         self._words.fence()
         self._words[COMMAND_HEAD_AT] = number
         return number
@@ -342,7 +349,8 @@ class Observer:
         """Return the loop's answer to the command `number`, or None while there is none."""
         if self._words[ANSWER_NUMBER_AT] != number:
             return None
-        return Answer(*ANSWER.unpack_from(self._map, ANSWER_AT))
+        (kind,) = ANSWER.unpack_from(self._map, ANSWER_AT)
+        return Answer(REFUSALS.unpack_from(kind, self._map, ANSWER_AT + ANSWER.size) if kind else None)
 
     # -- the service thread -------------------------------------------------------------------------------------
 
