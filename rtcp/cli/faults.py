@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import AsJson, check_picture
+from rtcp.cli.arguments import AsJson, check_picture, option
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit_json, facts, report, show, table
 
@@ -53,9 +53,7 @@ def _show(
     number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
     plot: Annotated[
         Path | None,
-        typer.Option(
-            "--plot", metavar="FILE", help="Picture: .png, .svg or .pdf. Default: a .png beside the recording."
-        ),
+        option("--plot", "FILE", "Picture: .png, .svg or .pdf. Default: a .png beside the recording."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
