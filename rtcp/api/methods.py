@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero
-from rtcp.ipc.states import ControlMode, DriveMode, JogFrame
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 T = TypeVar("T")
 OnProgress = Callable[[Progress], None]
@@ -69,9 +69,13 @@ def disable(self: object) -> Call[tuple[str, ...]]:
     return Call("disable", {}, lambda answer: tuple(answer["unconfirmed"]))
 
 
-def reset(self: object) -> Call[None]:
-    """Leave a fault or an emergency stop (drives are disabled then), or a stop by a limit (the arm holds)."""
-    return Call("reset", {}, _nothing)
+def reset(self: object) -> Call[State]:
+    """Leave a fault or an emergency stop (drives are disabled then), or a stop by a limit (the arm holds).
+
+    Returns:
+        the state that was left; `READY` or `HOLDING`: there was nothing to reset.
+    """
+    return Call("reset", {}, lambda answer: State[answer["from"].upper()])
 
 
 def halt(self: object) -> Call[None]:
@@ -273,7 +277,12 @@ def set_limits(self: object, changes: Mapping[str, float]) -> Call[Json]:
 
 
 def zero(self: object, joint: str, at: float = 0.0) -> Call[Zero]:
-    """Define the present position of a joint as `at`, rad, now and in the file of offsets; drives have no torque."""
+    """Define the present position of a joint as `at`, rad, now and in the file of offsets; drives have no torque.
+
+    Args:
+        joint: its configured name, or its number from 1, as text.
+        at: rad
+    """
     return Call("zero", {"joint": joint, "at": at}, lambda found: Zero(**found))
 
 
@@ -297,7 +306,7 @@ def sdo_write(self: object, slave: int, index: int, subindex: int, data: bytes) 
 def joystick(
     self: object, *pressed: str, byte: int | None = None, hold_s: float = 1.0, sent_s: float | None = None
 ) -> Call[None]:
-    """Hold the joystick of the virtual IO box for `hold_s`, at most 1 s; without arguments: release it.
+    """Hold the joystick of the virtual IO box for `hold_s`, at most 1 s; nothing pressed: neutral.
 
     Args:
         pressed: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.

@@ -166,7 +166,7 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
 
 def _offline(name: str | None, config: Path | None) -> Bus:
     from rtcp.config.loader import segment_path
-    from rtcp.virtual.check import check_segment
+    from rtcp.virtual.segment import check_segment
 
     arm = offline.configuration(config)
     name = arm.bus.interface if name is None else name

@@ -112,7 +112,7 @@ def launch(options: StartOptions, log: Callable[[str], None] = report) -> Platfo
     """
     from rtcp.launch import launcher
     from rtcp.launch.platform import StartError
-    from rtcp.virtual.check import check_segment
+    from rtcp.virtual.segment import check_segment
 
     try:
         with signals_raise():

@@ -18,7 +18,6 @@ from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.events import (
     AliasEvent,
     DocumentStartEvent,
-    Event,
     MappingEndEvent,
     MappingStartEvent,
     ScalarEvent,
@@ -45,6 +44,8 @@ _KINDS = {
 }  # fmt: skip
 _CONSTANTS = {"": None, "~": None, "null": None, "Null": None, "NULL": None, "true": True, "True": True, "TRUE": True,
               "false": False, "False": False, "FALSE": False}  # fmt: skip
+_OPEN = object()
+"""Value of an anchor whose end is not read yet."""
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
 _FLOAT = re.compile(
     r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
@@ -83,6 +84,21 @@ def sentence(finding: Finding) -> str:
     """Return a finding as text, its key first."""
     where, text = finding
     return f"{dotted(where)}: {text}" if where else text
+
+
+def shown(found: object) -> str:
+    """Return a value as a sentence names it."""
+    if isinstance(found, bool):
+        return "true" if found else "false"
+    if found is None:
+        return "nothing"
+    if isinstance(found, str):
+        return f'the text "{found if len(found) <= 60 else found[:57] + "..."}"'
+    if isinstance(found, dict):
+        return "a mapping"
+    if isinstance(found, list):
+        return "an empty list" if not found else "a list"
+    return str(found)
 
 
 def read(path: Path) -> Document:
@@ -156,25 +172,15 @@ class _TooMuch(Exception):
     """The file is larger than any configuration, or unfolds to more: the rest of a sentence."""
 
 
-@dataclass
-class _Size:
-    """Extent of a value: values and characters in it, and levels below it."""
-
-    values: int = 0
-    characters: int = 0
-    levels: int = 0
-
-
 class _Builder:
     """Turns YAML's events into values, noting lines and what is not allowed."""
 
     def __init__(self, text: str, lines: dict[KeyPath, int]) -> None:
         self.findings: list[Finding] = []
-        self._events: Iterator[Event] = YAML(typ="safe", pure=True).parse(text)
+        self._events: Iterator[Any] = YAML(typ="safe", pure=True).parse(text)
         self._lines = lines
-        self._read = _Size()
-        self._depth = 0
-        self._anchors: dict[str, tuple[object, _Size] | None] = {}
+        self._values = self._characters = self._depth = 0
+        self._anchors: dict[str, object] = {}
 
     def document(self) -> object:
         """Return the value of the only document; None where there is none."""
@@ -189,29 +195,29 @@ class _Builder:
             raise MarkedYAMLError(problem="found a second document", problem_mark=after.start_mark)
         return value
 
-    def _count(self, values: int, characters: int, levels: int = 0) -> None:
-        self._read.values += values
-        self._read.characters += characters
-        self._read.levels = max(self._read.levels, self._depth + levels)
+    def _count(self, text: str = "") -> None:
+        """Add a value, or the text of one, to what the file holds."""
+        self._values += not text
+        self._characters += len(text)
         for found, limit, what in (
-            (self._read.values, _MOST_VALUES, "values"), (self._read.characters, _LARGEST, "characters"),
-        ):  # fmt: skip
+            (self._values, _MOST_VALUES, "values"),
+            (self._characters, _LARGEST, "characters"),
+        ):
             if found > limit:
                 told = f"the file holds more than {limit} {what}, the limit of a configuration"
                 raise _TooMuch(f"{told}; an alias counts as everything that it stands for")
-        if self._read.levels > _DEEPEST:
+        if self._depth >= _DEEPEST:
             raise _TooMuch("the lists and mappings are nested too deeply")
 
     def _value(self, event: Any, where: KeyPath) -> object:
         self._lines.setdefault(where, event.start_mark.line + 1)
         if isinstance(event, AliasEvent):
             return self._alias(event, where)
-        anchor: str | None = event.anchor
-        if anchor is not None:
-            self._anchors[anchor] = None
-        values, characters, levels = self._read.values, self._read.characters, self._read.levels
-        self._read.levels = self._depth
-        self._count(1, 0)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = _OPEN
+        self._count()
+        if event.tag is not None:
+            self.findings.append((where, f"the tag {event.tag} is not allowed; write a plain value"))
         self._depth += 1
         value: object
         if isinstance(event, MappingStartEvent):
@@ -221,25 +227,29 @@ class _Builder:
         else:
             value = self._scalar(event, where)
         self._depth -= 1
-        if not (isinstance(event, ScalarEvent) or event.tag is None):
-            self._refuse_tag(event.tag, where)
-        if anchor is not None:
-            inner = self._read.levels - self._depth
-            size = _Size(self._read.values - values, self._read.characters - characters, inner)
-            self._anchors[anchor] = value, size
-        self._read.levels = max(levels, self._read.levels)
+        if event.anchor is not None:
+            self._anchors[event.anchor] = value
         return value
 
     def _alias(self, event: AliasEvent, where: KeyPath) -> object:
         if event.anchor not in self._anchors:
             raise MarkedYAMLError(problem=f"found undefined alias {event.anchor!r}", problem_mark=event.start_mark)
-        known = self._anchors[event.anchor]
-        if known is None:
+        value = self._anchors[event.anchor]
+        if value is _OPEN:
             self.findings.append((where, "this alias contains itself"))
             return None
-        value, size = known
-        self._count(size.values, size.characters, size.levels)
+        self._count_again(value)
         return value
+
+    def _count_again(self, value: object) -> None:
+        self._count()
+        self._depth += 1
+        if isinstance(value, str):
+            self._count(value)
+        elif isinstance(value, list | dict):
+            for inner in value if isinstance(value, list) else (*value, *value.values()):
+                self._count_again(inner)
+        self._depth -= 1
 
     def _sequence(self, where: KeyPath) -> list[object]:
         values: list[object] = []
@@ -270,11 +280,8 @@ class _Builder:
 
     def _scalar(self, event: ScalarEvent, where: KeyPath) -> object:
         text = str(event.value)
-        self._count(0, len(text))
-        if event.tag is not None:
-            self._refuse_tag(event.tag, where)
-            return None
-        if not event.implicit[0]:
+        self._count(text)
+        if event.tag is not None or not event.implicit[0]:
             return text
         if text in _CONSTANTS:
             return _CONSTANTS[text]
@@ -284,6 +291,3 @@ class _Builder:
                 return None
             return int(text) if text.lstrip("+-").isdigit() else int(text, 0)
         return float(text.lower().replace(".inf", "inf").replace(".nan", "nan")) if _FLOAT.fullmatch(text) else text
-
-    def _refuse_tag(self, tag: object, where: KeyPath) -> None:
-        self.findings.append((where, f"the tag {tag} is not allowed; write a plain value"))

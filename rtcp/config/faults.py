@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.document import Finding, dotted, read
+from rtcp.config.document import Finding, dotted, read, shown
 from rtcp.config.fault_kinds import (
     FAULTS,
     ONCE,
@@ -43,7 +43,7 @@ from rtcp.config.fault_kinds import (
     WorkingCounter,
 )
 from rtcp.config.model import ConfigError
-from rtcp.config.validation import Checker, shown, unknown_key
+from rtcp.config.validation import Checker, unknown_key
 
 __all__ = [
     "FAULTS", "ONCE", "AlFall", "AlHang", "AlRefuse", "CableFault", "ClockDrift", "ClockJump", "Corrupt", "Delay",

@@ -7,6 +7,7 @@ of the attribute docstrings here.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,6 +45,10 @@ MOST_POINTS = 4096
 
 DataTypeName = Literal["bool", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64",
                        "float32", "float64"]  # fmt: skip
+BITS: dict[str, int] = {
+    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
+    "float32": 32, "float64": 64,
+}  # fmt: skip
 DriveModeName = Literal["csp", "csv", "cst"]
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
@@ -134,6 +139,20 @@ class DeviceDescription:
     """SYNC0 shift, us; less than one cycle in either direction."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
+
+    def wire_range(self, channel: str) -> tuple[float, float]:
+        """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
+        for entry in (entry for pdo in self.rpdo for entry in pdo.channels):
+            if entry.name == channel and not entry.type.startswith("float"):
+                low, high = sorted(end * entry.factor for end in integer_range(entry.type))
+                return low, high
+        return -math.inf, math.inf
+
+
+def integer_range(kind: str) -> tuple[int, int]:
+    """Return the smallest and the largest number of an integer type."""
+    bits = BITS[kind]
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
 
 
 # -- the arm: config/assistive_arm.yaml --------------------------------------------------------------------------------

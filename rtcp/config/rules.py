@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.model import (
+    BITS,
     MOST_AXES,
     VIRTUAL,
     ArmConfig,
@@ -29,13 +30,10 @@ from rtcp.config.model import (
     Range,
     StartupSdo,
     Stop,
+    integer_range,
 )
 from rtcp.config.validation import EVERY_KEY, rule
 
-BITS = {
-    "bool": 1, "int8": 8, "uint8": 8, "int16": 16, "uint16": 16, "int32": 32, "uint32": 32, "int64": 64, "uint64": 64,
-    "float32": 32, "float64": 64,
-}  # fmt: skip
 _NUMERIC = tuple(name for name in BITS if name != "bool")
 _INTEGERS = tuple(name for name in _NUMERIC if "int" in name)
 
@@ -171,21 +169,6 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
     if abs(device.sync0_shift_us) >= period_us:
         wanted = f"less than one cycle in either direction ({cycles})"
         yield ("sync0_shift_us",), f"found {device.sync0_shift_us:g} us, allowed is {wanted}"
-
-
-def integer_range(kind: str) -> tuple[int, int]:
-    """Return the smallest and the largest number of an integer type."""
-    bits = BITS[kind]
-    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if kind.startswith("int") else (0, 2**bits - 1)
-
-
-def wire_range(device: DeviceDescription, name: str) -> tuple[float, float]:
-    """Return the range of a channel to a device, SI; infinite where the channel is a float or does not exist."""
-    for entry in (entry for pdo in device.rpdo for entry in pdo.channels):
-        if entry.name == name and not entry.type.startswith("float"):
-            low, high = sorted(end * entry.factor for end in integer_range(entry.type))
-            return low, high
-    return -math.inf, math.inf
 
 
 # -- the arm -----------------------------------------------------------------------------------------------------------
@@ -348,7 +331,7 @@ def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> 
         (("torque",), (-joint.torque, joint.torque), "target_torque"),
     )
     for where, ends, name in limits:
-        low, high = wire_range(device, name)
+        low, high = device.wire_range(name)
         if not all(low <= end <= high for end in ends):
             entry = next(entry for pdo in device.rpdo for entry in pdo.channels if entry.name == name)
             why = f"{name} of {device.name} is {entry.type} with factor {entry.factor:g}"

@@ -9,10 +9,10 @@ from typing import Annotated
 
 from annotated_types import Ge, Le, MinLen
 
-from rtcp.config.document import Finding, read
+from rtcp.config.document import Finding, read, shown
 from rtcp.config.model import ConfigError
 from rtcp.config.numbers import U16, Name
-from rtcp.config.validation import Checker, shown
+from rtcp.config.validation import Checker
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class SegmentSlave:
     """A virtual slave. Which models there are and which options they take is known to `rtcp.virtual.models` alone."""
 
     model: Name
+    """Model of the slave; `rtcp segment` lists those that exist."""
     drift_ppm: Annotated[float, Ge(-1000), Le(1000)] = 0.0
     """How much faster than the host its own clock runs, parts per million."""
     delay_ns: Annotated[int, Ge(0), Le(1_000_000)] | None = None

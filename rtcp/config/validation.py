@@ -18,7 +18,7 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
-from rtcp.config.document import Finding, KeyPath, dotted
+from rtcp.config.document import Finding, KeyPath, dotted, shown
 from rtcp.config.numbers import FractionOfPi
 
 T = TypeVar("T")
@@ -200,21 +200,6 @@ def allowed(kind: object) -> str:
     if is_dataclass(bare):
         return f"a mapping with the keys {', '.join(keys(bare))}"
     return "a mapping"
-
-
-def shown(found: object) -> str:
-    """Return a value as a sentence names it."""
-    if isinstance(found, bool):
-        return "true" if found else "false"
-    if found is None:
-        return "nothing"
-    if isinstance(found, str):
-        return f'the text "{found if len(found) <= 60 else found[:57] + "..."}"'
-    if isinstance(found, dict):
-        return "a mapping"
-    if isinstance(found, list):
-        return "an empty list" if not found else "a list"
-    return str(found)
 
 
 def bare_type(kind: object) -> Any:

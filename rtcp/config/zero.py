@@ -1,13 +1,11 @@
 """The zero offsets of the axes in a file: read and checked whole at the start, replaced as a whole or not at all.
 
-An offset is what an axis' drive shows, rad, where the axis is at 0. Absolute encoders keep it for ever: it is found
-once and stored, not driven to at each start.
+An offset is what an axis' drive shows, rad, where the axis is at 0. Absolute encoders keep it: it is measured once.
 """
 
 from __future__ import annotations
 
 import fcntl
-import math
 import os
 import re
 import zlib
@@ -15,9 +13,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rtcp.config.document import Document, Finding, read
+from rtcp.config.document import Document, Finding, read, shown
 from rtcp.config.model import ArmConfig, ConfigError
-from rtcp.config.rules import wire_range
 
 LARGEST = 100.0
 """rad; a larger offset was written in degrees."""
@@ -132,28 +129,25 @@ def _check(arm: str, offsets: Mapping[str, float]) -> int:
 
 
 def _findings(document: Document, config: ArmConfig) -> list[Finding]:
-    data = document.data if isinstance(document.data, dict) else {}
-    keys = ", ".join(_KEYS)
+    data, known = document.data, ", ".join(_KEYS)
     findings: list[Finding] = [
-        ((), f"the key {key} is missing; there must be {keys}") for key in _KEYS if key not in data
+        ((), f"the key {key} is missing; there must be {known}") for key in _KEYS if key not in data
     ]
-    findings += [((key,), f"this key is not known here; allowed are {keys}") for key in data if key not in _KEYS]
+    findings += [((key,), f"this key does not exist; allowed are {known}") for key in data if key not in _KEYS]
     if data.get("arm", config.name) != config.name:
         findings.append((("arm",), f'found {data["arm"]!r}, allowed is "{config.name}", the name of this arm'))
     offsets = data.get("offsets", {})
     if not isinstance(offsets, dict):
         return [*findings, (("offsets",), "found no mapping, allowed is a number for each axis")]
     names = [axis.name for axis in config.axes]
-    findings += [
-        (("offsets", name), f"this is no axis of {config.name}; its axes are {', '.join(names)}")
-        for name in offsets
-        if name not in names
-    ]
+    for name in offsets.keys() - set(names):
+        told = f"this is no axis of {config.name}; its axes are {', '.join(names)}"
+        findings.append((("offsets", name), told))
     for i, name in enumerate(names):
         if "offsets" in data and name not in offsets:
             findings.append((("offsets",), f"the key {name} is missing: each axis of {config.name} has its offset"))
-        elif name in offsets and (lacking := _wrong(config, i, offsets[name])):
-            findings.append((("offsets", name), lacking))
+        elif name in offsets and (told := _wrong(config, i, offsets[name])):
+            findings.append((("offsets", name), told))
     if not findings and data["check"] != (right := _check(config.name, offsets)):
         told = f"found {data['check']}, allowed is {right}: the file is damaged, or was edited"
         findings.append((("check",), f"{told}; if its offsets are right write {right}"))
@@ -161,17 +155,15 @@ def _findings(document: Document, config: ArmConfig) -> list[Finding]:
 
 
 def _wrong(config: ArmConfig, axis: int, offset: object) -> str:
-    if isinstance(offset, bool) or not isinstance(offset, int | float) or not math.isfinite(offset):
-        return f"found {offset!r}, allowed is a number from {-LARGEST:g} to {LARGEST:g} (rad)"
-    if abs(offset) > LARGEST:
-        return f"found {offset:g}, allowed is {-LARGEST:g} to {LARGEST:g} (rad)"
+    """Return what is wrong with the offset of an axis; empty where nothing is."""
+    if isinstance(offset, bool) or not isinstance(offset, int | float) or not abs(offset) <= LARGEST:
+        return f"found {shown(offset)}, allowed is a number from {-LARGEST:g} to {LARGEST:g} (rad)"
     joint = config.axes[axis]
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave)
-    low, high = wire_range(device, "target_position")
+    low, high = device.wire_range("target_position")
     ends = (joint.position.min + offset, joint.position.max + offset)
-    if not all(low <= end <= high for end in ends):
-        reach = f"position {joint.position.min:g} to {joint.position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
-        return f"found {offset:g}, with which the drive of {joint.name} cannot be sent its range: {reach}, " + (
-            f"allowed is {low:g} to {high:g}, what target_position of {device.name} can say"
-        )
-    return ""
+    if all(low <= end <= high for end in ends):
+        return ""
+    reach = f"position {joint.position.min:g} to {joint.position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
+    told = f"found {offset:g}, with which the drive of {joint.name} cannot be sent its range: {reach}"
+    return f"{told}, allowed is {low:g} to {high:g}, the range of target_position of {device.name}"

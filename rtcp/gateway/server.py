@@ -1,6 +1,6 @@
-"""The gateway: the control socket, and the picture of the platform that it serves.
+"""The gateway's process: JSON-RPC on the control socket, and what follows the loop beside it.
 
-It may die and be started again while the loop holds the arm still: a motion that it was carrying ends with its lease.
+It may die and be started again while the loop holds the arm: a motion that it was carrying ends with its lease.
 """
 
 from __future__ import annotations
@@ -12,21 +12,20 @@ import json
 import logging
 import os
 import signal
-import struct
+import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-from rtcp.gateway.arguments import Arguments
-from rtcp.gateway.blackbox import BlackBox
-from rtcp.gateway.blackbox_file import faults_directory
-from rtcp.gateway.carrier import CommandFailed, Progress
-from rtcp.gateway.held import Caller
-from rtcp.gateway.picture import Picture
-from rtcp.gateway.verbs import Verb, Verbs
+from rtcp.gateway.black_box import BlackBox
+from rtcp.gateway.command_channel import Caller, Json
+from rtcp.gateway.methods import Methods
+from rtcp.gateway.status_snapshot import StatusSnapshot
+from rtcp.ipc import jsonrpc
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.recording import faults_directory
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, log_format, stop_marker
 from rtcp.ipc.session import (
     SessionError,
@@ -41,13 +40,142 @@ from rtcp.ipc.session import (
 )
 
 _FOLLOW_S = 0.02
-_COMPLAINT_S = 10.0
+_REPEAT_LOG_S = 10.0
 """Between two lines of the log on the same defect."""
-_LINE_LIMIT = 1 << 16
-_TOO_LONG = b""
-"""Stands for a line beyond the limit; a true one has its newline at least."""
-_LET_GO_S = 1.0
+_MOST_PENDING = 256
+"""Requests of one connection that wait for their answers."""
+_SEND_BUFFER = 4096
+"""Bytes, before doubling by the kernel: a client that does not read is noticed after about ten progress reports."""
+_LINGER_S = 1.0
 log = logging.getLogger("rtcp.gateway")
+
+
+class _Connection:
+    """One client: its requests in their turn, but for the methods that are carried out at once."""
+
+    def __init__(
+        self, number: int, writer: asyncio.StreamWriter, methods: Methods, answered: Callable[[], None]
+    ) -> None:
+        self._number = number
+        self._writer = writer
+        self._methods = methods
+        self._answered = answered
+        self._name = "an unnamed client"
+        self._turn = asyncio.Lock()
+        self._requests: dict[asyncio.Task[None], jsonrpc.RequestId] = {}
+        self._unread_since: float | None = None
+        writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+
+    async def serve(self, reader: asyncio.StreamReader) -> None:
+        """Answer requests until the client has gone; what it asked for ends with it."""
+        try:
+            while given := await _read_line(reader):
+                self._receive(given)
+            if given is None:
+                if self._requests:
+                    await asyncio.wait(self._requests)
+                message = f"the request is a line longer than {jsonrpc.LINE_LIMIT} bytes: the connection is closed"
+                self._send(jsonrpc.failure(None, RtcpError("invalid", message), jsonrpc.INVALID_REQUEST))
+                await _discard(reader)
+        finally:
+            for task in self._requests:
+                task.cancel()
+            await asyncio.gather(*self._requests, return_exceptions=True)
+            await self._methods.end_connection(self._number)
+
+    def _receive(self, given: bytes) -> None:
+        try:
+            number, method, params, is_notification = jsonrpc.read_request(given)
+            if is_notification:
+                return self._notified(method, params)
+            if method not in self._methods.table:
+                allowed = ", ".join(self._methods.table)
+                message = f'method: found the text "{method}", allowed is one of {allowed}'
+                raise jsonrpc.InvalidMessage(jsonrpc.METHOD_NOT_FOUND, message, number)
+        except jsonrpc.InvalidMessage as error:
+            return self._send(jsonrpc.failure(error.request, RtcpError("invalid", str(error)), error.code))
+        if len(self._requests) >= _MOST_PENDING:
+            many = RtcpError("refused", f"{_MOST_PENDING} requests of this connection wait already")
+            return self._send(jsonrpc.failure(number, many))
+        task = asyncio.create_task(self._answer(number, method, params))
+        self._requests[task] = number
+        task.add_done_callback(self._requests.pop)
+        return None
+
+    def _notified(self, method: str, params: Json) -> None:
+        if method == "identify":
+            self._name = str(params.get("name") or self._name).encode(errors="replace").decode()
+        elif method == "cancel":
+            for task, number in self._requests.items():
+                if number is not None and number == params.get("request"):
+                    task.cancel()
+        else:
+            message = "id: it is missing; only identify and cancel are notifications"
+            raise jsonrpc.InvalidMessage(jsonrpc.INVALID_REQUEST, message)
+
+    async def _answer(self, number: jsonrpc.RequestId, method: str, params: Json) -> None:
+        caller = Caller(self._name, self._number, lambda progress: self._report(number, progress), self._is_stalled)
+        at_once = self._methods.table[method].at_once
+        try:
+            async with contextlib.AsyncExitStack() as turn:
+                if not at_once:
+                    await turn.enter_async_context(self._turn)
+                answer = {"id": number, "result": await self._methods.call(method, caller, params)}
+        except RtcpError as error:
+            answer = jsonrpc.failure(number, error)
+        except asyncio.CancelledError:
+            answer = jsonrpc.failure(number, RtcpError("refused", f"{method} was cancelled"))
+        except BlackboardError as error:
+            answer = jsonrpc.failure(number, RtcpError("fault", str(error)))
+        except Exception as error:
+            # A defect met by one request is answered and logged; the others are still served.
+            log.exception("request %.200r", {"method": method, "params": params})
+            message = f"the gateway met a defect: {type(error).__name__} {error}"
+            answer = jsonrpc.failure(number, RtcpError("internal", message))
+        self._send(answer)
+        with contextlib.suppress(ConnectionError):
+            await self._writer.drain()
+        self._answered()
+
+    def _send(self, message: Json) -> None:
+        self._writer.write(jsonrpc.answer(message))
+
+    def _report(self, number: jsonrpc.RequestId, progress: Json) -> None:
+        if self._unread() == 0:
+            self._unread_since = None
+        elif self._unread_since is None:
+            self._unread_since = time.monotonic()
+        if self._unread() < jsonrpc.LINE_LIMIT:
+            self._send({"method": "progress", "params": {"request": number, **progress}})
+
+    def _unread(self) -> int:
+        """Return how many bytes wait because the client does not read."""
+        return self._writer.transport.get_write_buffer_size()
+
+    def _is_stalled(self, seconds: float) -> bool:
+        since = self._unread_since
+        return since is not None and self._unread() > 0 and time.monotonic() - since > seconds
+
+
+async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
+    """Return the next line; nothing where the client has gone, None for a line beyond the limit."""
+    try:
+        return await reader.readline()
+    except ConnectionError:
+        return b""
+    except ValueError:
+        return None
+
+
+async def _discard(reader: asyncio.StreamReader) -> None:
+    """Read what a client still sends, for a while: it reads its answer only when it has sent everything."""
+
+    async def rest() -> None:
+        while await reader.read(jsonrpc.LINE_LIMIT):
+            pass
+
+    with contextlib.suppress(asyncio.TimeoutError, ConnectionError):
+        await asyncio.wait_for(rest(), _LINGER_S)
 
 
 class Gateway:
@@ -62,22 +190,16 @@ class Gateway:
         session = read_session(directory)
         self._observer = Observer(blackboard_file(directory))
         started = read_json(directory / "started.json", dict)
-        self._picture = Picture(self._observer, session, started)
-        self._picture.follow()  # what an earlier gateway has logged, with its time, is not logged again
-        self._arm = Verbs(self._observer, self._picture, session.config, session.bus, directory)
-        self._box = BlackBox(self._observer, session, faults_directory(), self._picture.note)
-        self._complained: dict[str, float] = {}
+        self._snapshot = StatusSnapshot(self._observer, session, started)
+        self._snapshot.follow()  # what an earlier gateway has logged, with its time, is not logged again
+        self._box = BlackBox(self._observer, session, faults_directory(), self._snapshot.note)
+        self._methods = Methods(self._observer, self._snapshot, session, directory, self._end_platform)
+        self._logged: dict[str, float] = {}
         """When a defect was logged, by what met it."""
         self._connections = 0
         self._ended = asyncio.Event()
         self._stopping = False
         self._following: asyncio.Task[None] | None = None
-        self._verbs: dict[str, Verb] = {
-            "status": self._status,
-            "scan": self._scan,
-            "stop": self._stop,
-            **self._arm.table,
-        }
 
     async def serve(self, ready: Callable[[], None]) -> None:
         """Serve until the platform is stopped or SIGTERM comes; call `ready` when the socket listens."""
@@ -85,27 +207,42 @@ class Gateway:
         path.unlink(missing_ok=True)
         before = os.umask(0o177)
         try:
-            server = await asyncio.start_unix_server(self._client, path, limit=_LINE_LIMIT)
+            server = await asyncio.start_unix_server(self._serve_client, path, limit=jsonrpc.LINE_LIMIT)
         finally:
             os.umask(before)
         loop = asyncio.get_running_loop()
         for number in (signal.SIGTERM, signal.SIGINT):
             loop.add_signal_handler(number, self._ended.set)
         self._watch_loop(loop)
+        channel = asyncio.create_task(self._methods.channel.follow())
         self._following = asyncio.create_task(self._follow())
+        joystick = self._methods.joystick_override
         # An earlier gateway may have died with inputs forced.
-        await self._arm.stick.let_go()
-        watching = asyncio.create_task(self._arm.stick.watch())
+        await joystick.release()
+        watching = asyncio.create_task(joystick.watch())
         ready()
         await self._ended.wait()
         # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
         server.close()
         watching.cancel()
-        if self._picture.loop_lives and not self._stopping:
-            await self._arm.stick.let_go()
+        if self._snapshot.loop_lives and not self._stopping:
+            await joystick.release()
         self._following.cancel()
+        channel.cancel()
         path.unlink(missing_ok=True)
         await asyncio.to_thread(self._box.finish)
+
+    async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._connections += 1
+        connection = _Connection(self._connections, writer, self._methods, self._after_answer)
+        with contextlib.suppress(ConnectionError, asyncio.CancelledError):
+            await connection.serve(reader)
+        with contextlib.suppress(ConnectionError):
+            writer.close()
+
+    def _after_answer(self) -> None:
+        if self._stopping:
+            self._ended.set()
 
     def _watch_loop(self, loop: asyncio.AbstractEventLoop) -> None:
         try:
@@ -123,124 +260,41 @@ class Gateway:
         loop.add_reader(descriptor, gone)
 
     def _loop_has_ended(self) -> None:
-        self._picture.loop_lives = False
+        self._snapshot.loop_lives = False
         self._box.loop_has_ended()
 
     async def _follow(self) -> None:
         while True:
-            self._go_on("the picture", self._tell_news)
-            self._go_on("the black box", self._box.look)
+            self._try("the status snapshot", self._log_messages)
+            self._try("the black box", self._box.look)
             await asyncio.sleep(_FOLLOW_S)
 
-    def _tell_news(self) -> None:
-        for sentence in self._picture.follow():
-            log.info("%s", sentence)
+    def _log_messages(self) -> None:
+        for message in self._snapshot.follow():
+            log.info("%s", message)
 
-    def _go_on(self, what: str, turn: Callable[[], None]) -> None:
+    def _try(self, what: str, turn: Callable[[], None]) -> None:
         """Take one turn; a defect in it is logged, now and then, and ends neither the others nor the next one."""
         try:
             turn()
         except Exception:
             now = time.monotonic()
-            if now - self._complained.get(what, -_COMPLAINT_S) >= _COMPLAINT_S:
-                self._complained[what] = now
+            if now - self._logged.get(what, -_REPEAT_LOG_S) >= _REPEAT_LOG_S:
+                self._logged[what] = now
                 log.exception("%s cannot follow the loop; it is tried again", what)
 
-    # -- clients ------------------------------------------------------------------------------------------------
-
-    async def _client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        self._connections += 1
-        connection = self._connections
-        try:
-            with contextlib.suppress(ConnectionError, asyncio.CancelledError):
-                await self._converse(reader, writer, connection)
-        finally:
-            await self._arm.gone(connection)
-        with contextlib.suppress(ConnectionError):
-            writer.close()
-
-    async def _converse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, connection: int) -> None:
-        line = asyncio.ensure_future(_read_line(reader))
-        while True:
-            given = await line
-            if given is None:
-                return
-            if given is _TOO_LONG:
-                sentence = f"the request is a line longer than {_LINE_LIMIT} bytes: the connection is closed"
-                await _send(writer, _refusal(None, "invalid", sentence))
-                await _let_go(reader)
-                return
-            line = asyncio.ensure_future(_read_line(reader))
-            work = asyncio.ensure_future(self._answer(given, writer, connection))
-            # A client that goes away ends what it asked for: its lease goes with it.
-            await asyncio.wait({line, work}, return_when=asyncio.FIRST_COMPLETED)
-            if not work.done() and line.done() and line.result() is None:
-                work.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await work
-                return
-            await work
-
-    async def _answer(self, given: bytes, writer: asyncio.StreamWriter, connection: int) -> None:
-        number: Any = None
-        try:
-            request = _parse(given)
-            number = request.get("id")
-
-            async def tell(progress: dict[str, Any]) -> None:
-                await _send(writer, {"id": number, "progress": progress})
-
-            verb = self._verbs.get(str(request.get("do")))
-            if verb is None:
-                raise CommandFailed("invalid", f"{request.get('do')!r} is unknown: one of {', '.join(self._verbs)}")
-            args = request.get("args") or {}
-            if not isinstance(args, dict):
-                raise CommandFailed("invalid", f"args must be an object, not {type(args).__name__}")
-            client = Caller(str(request.get("client") or "an unnamed client"), connection)
-            result = await verb(client, Arguments(args), tell)
-            await _send(writer, {"id": number, "ok": True, "result": result})
-        except CommandFailed as failed:
-            await _send(writer, _refusal(number, failed.kind, str(failed)))
-        except (KeyError, TypeError, ValueError, OverflowError, struct.error, BlackboardError) as error:
-            sentence = f"the request's arguments are not of the verb's form: {type(error).__name__} {error}"
-            await _send(writer, _refusal(number, "invalid", sentence))
-        except ConnectionError:
-            raise
-        except Exception as error:
-            # One request's defect is answered and logged; the others are served on.
-            log.exception("request %.200r", given)
-            sentence = f"the gateway met a defect: {type(error).__name__} {error}"
-            await _send(writer, _refusal(number, "internal", sentence))
-        if self._stopping:
-            self._ended.set()
-
-    # -- verbs --------------------------------------------------------------------------------------------------
-
-    async def _status(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
-        self._picture.follow()
-        return self._picture.status(read_processes(self._directory))
-
-    async def _scan(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
-        try:
-            slaves = read_json(self._directory / "scan.json", list)
-        except SessionError as error:
-            raise CommandFailed("internal", str(error)) from error
-        states = self._picture.status(read_processes(self._directory))["slaves"]
-        for slave, now in zip(slaves, states, strict=False):
-            slave["state"] = now["state"]
-        return {"slaves": slaves}
-
-    async def _stop(self, client: Caller, args: Arguments, tell: Progress) -> dict[str, Any]:
+    async def _end_platform(self) -> list[str]:
+        """End all processes but this one, which ends after its answer; return what could not be left in order."""
         processes = read_processes(self._directory)
-        lived = is_running(processes.loop)
-        if processes.loop and not lived:
-            # It has died before it was told to, and whoever saw that was quicker here than its end.
+        was_running = is_running(processes.loop)
+        if processes.loop and not was_running:
+            # It died before it was told to, and whoever saw that was quicker here than its end.
             self._loop_has_ended()
         self._box.end_is_wanted()
         stop_marker(self._directory).touch(mode=0o600)
-        if self._picture.loop_lives:
+        if self._snapshot.loop_lives:
             with contextlib.suppress(BlackboardError):
-                await self._arm.commander.shut_down()
+                await self._methods.machine.end_loop()
             # The blocking waits run beside, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_for_exit, processes.loop, 6.0):
                 await asyncio.to_thread(terminate, processes.loop, 4.0)
@@ -251,55 +305,7 @@ class Gateway:
         blackboard_file(self._directory).unlink(missing_ok=True)
         processes_file(self._directory).unlink(missing_ok=True)
         self._stopping = True
-        return {"left": list(exit_problems(self._directory, processes.loop, lived))}
-
-
-async def _read_line(reader: asyncio.StreamReader) -> bytes | None:
-    """Return the next line, `_TOO_LONG` in place of one beyond the limit, None where the client is gone."""
-    try:
-        line = await reader.readline()
-    except ConnectionError:
-        return None
-    except ValueError:
-        return _TOO_LONG
-    return line or None
-
-
-async def _let_go(reader: asyncio.StreamReader) -> None:
-    """Take what a client still sends, for a while: it reads its answer only when it has sent all."""
-
-    async def rest() -> None:
-        while await reader.read(_LINE_LIMIT):
-            pass
-
-    with contextlib.suppress(asyncio.TimeoutError):
-        await asyncio.wait_for(rest(), _LET_GO_S)
-
-
-def _parse(given: bytes) -> dict[str, Any]:
-    try:
-        request = json.loads(given, parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise CommandFailed("invalid", f"the request is no JSON: {error}") from None
-    if not isinstance(request, dict):
-        raise CommandFailed("invalid", f"the request must be an object, not {type(request).__name__}")
-    if type(number := request.get("id")) not in (int, str, type(None)):
-        raise CommandFailed("invalid", f"id: found {type(number).__name__}, allowed is an integer or a text")
-    return request
-
-
-def _no_constant(found: str) -> float:
-    """NaN and Infinity, which Python takes for JSON, are none."""
-    raise ValueError(f"{found} is no number")
-
-
-def _refusal(number: Any, kind: str, sentence: str) -> dict[str, Any]:
-    return {"id": number, "ok": False, "error": {"kind": kind, "message": sentence}}
-
-
-async def _send(writer: asyncio.StreamWriter, answer: dict[str, Any]) -> None:
-    writer.write(json.dumps(answer).encode() + b"\n")
-    await writer.drain()
+        return list(exit_problems(self._directory, processes.loop, was_running))
 
 
 def main() -> int:

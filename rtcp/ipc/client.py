@@ -1,8 +1,8 @@
-"""The client's end of the control socket: one request at a time, newline-delimited JSON, standard library only."""
+"""The client's end of the control socket: one request at a time, JSON-RPC 2.0, a message a line."""
 
 from __future__ import annotations
 
-import json
+import contextlib
 import os
 import socket
 import struct
@@ -10,9 +10,10 @@ import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, cast
+from typing import Any
 
-from rtcp.ipc.errors import ErrorKind, RtcpError
+from rtcp.ipc import jsonrpc
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
@@ -26,8 +27,6 @@ LONGEST_SOCKET_PATH = 107
 
 _PEER = struct.Struct("3i")
 """Process, user and group at the other end (unix(7), SO_PEERCRED)."""
-
-_KINDS_ON_THE_WIRE = frozenset({"refused", "fault", "timeout", "invalid", "internal"})
 
 
 class ControlClient:
@@ -48,7 +47,8 @@ class ControlClient:
                 when its path is too long for a socket.
         """
         self._path = control_socket(runtime_directory()) if path is None else path
-        self._name = client_name(name)
+        self._greeting = jsonrpc.line({"method": "identify", "params": {"name": client_name(name)}})
+        """Sent with the first request."""
         self._request = 0
         self._received = bytearray()
         self._socket = _connect(self._path)
@@ -67,77 +67,79 @@ class ControlClient:
 
     def call(
         self,
-        verb: str,
-        arguments: Mapping[str, Any] | None = None,
+        method: str,
+        params: Mapping[str, Any] | None = None,
         progress: Progress | None = None,
         timeout_s: float = ANSWER_TIMEOUT_S,
     ) -> dict[str, Any]:
-        """Send one request and return the `result` of its answer.
+        """Send one request and return the result of its answer.
+
+        A call that an exception leaves before its answer (Ctrl-C, or one out of `progress`) ends what it asked for.
 
         Args:
-            verb: what to do (`status`, `move`, ...).
-            arguments: the verb's arguments.
-            progress: is called with each progress report that comes before the answer.
+            method: what to do (`docs/protocol.md`).
+            params: its parameters.
+            progress: called with each progress report that comes before the answer.
             timeout_s: longest silence, not longest duration: a progress report starts it anew.
 
         Raises:
             RtcpError: what the platform answered; `timeout` after `timeout_s` of silence; `lost` when the
                 connection ends first.
         """
-        self._request += 1
-        request = {"id": self._request, "do": verb, "args": dict(arguments or {}), "client": self._name}
+        self._request = number = self._request + 1
         self._socket.settimeout(timeout_s)
-        self._send(verb, json.dumps(request, allow_nan=False).encode() + b"\n")
-        while True:
-            reply = self._receive(verb, timeout_s)
-            # null: of a request of which no number could be read.
-            if reply.get("id") not in (self._request, None):
-                continue  # a late word on a request that was given up
-            if "progress" in reply:
-                if progress is not None and isinstance(reply["progress"], dict):
-                    progress(reply["progress"])
-            elif reply.get("ok") is True:
-                result = reply.get("result")
-                return result if isinstance(result, dict) else {}
-            else:
-                raise _refusal(verb, reply.get("error"))
-
-    def _send(self, verb: str, line: bytes) -> None:
+        self._send(method, self._greeting + jsonrpc.request(number, method, params or {}))
+        self._greeting = b""
         try:
-            self._socket.sendall(line, socket.MSG_NOSIGNAL)
-        except TimeoutError as error:
-            raise self._silence(verb, self._socket.gettimeout()) from error
-        except OSError as error:
-            raise RtcpError(
-                "lost", f"the platform closed the connection before it took the request {verb!r}"
-            ) from error
+            reply = self._reply(number, method, progress, timeout_s)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                self._socket.sendall(jsonrpc.line({"method": "cancel", "params": {"request": number}}))
+            raise
+        return jsonrpc.result(reply, method)
 
-    def _receive(self, verb: str, timeout_s: float) -> dict[str, Any]:
+    def _reply(self, number: int, method: str, progress: Progress | None, timeout_s: float) -> dict[str, Any]:
+        """Return the answer to a request; pass on the progress before it."""
+        while True:
+            reply = jsonrpc.read_reply(self._receive(method, timeout_s), method)
+            told = jsonrpc.progress(reply)
+            if told is not None:
+                if progress is not None and told.get("request") == number:
+                    progress(told)
+            elif "id" in reply and reply["id"] in (number, None):
+                # null: the answer to a line whose id could not be read.
+                return reply
+
+    def _send(self, method: str, data: bytes) -> None:
+        try:
+            self._socket.sendall(data, socket.MSG_NOSIGNAL)
+        except TimeoutError as error:
+            raise self._silence(method, self._socket.gettimeout()) from error
+        except OSError as error:
+            message = f"the platform closed the connection before it received the request {method!r}"
+            raise RtcpError("lost", message) from error
+
+    def _receive(self, method: str, timeout_s: float) -> bytes:
+        """Return the next line."""
         while (end := self._received.find(b"\n")) < 0:
             try:
                 chunk = self._socket.recv(65536)
             except TimeoutError as error:
-                raise self._silence(verb, timeout_s) from error
+                raise self._silence(method, timeout_s) from error
             except OSError:
                 chunk = b""
             if not chunk:
-                raise RtcpError("lost", f"the platform closed the connection before it answered {verb!r}")
+                raise RtcpError("lost", f"the platform closed the connection before it answered {method!r}")
             self._received += chunk
         line = bytes(self._received[:end])
         del self._received[: end + 1]
-        try:
-            reply = json.loads(line)
-        except ValueError as error:
-            raise RtcpError("internal", f"the answer to {verb!r} is not JSON: {line[:80]!r}") from error
-        if not isinstance(reply, dict):
-            raise RtcpError("internal", f"the answer to {verb!r} is not an object: {line[:80]!r}")
-        return reply
+        return line
 
-    def _silence(self, verb: str, timeout_s: float | None) -> RtcpError:
+    def _silence(self, method: str, timeout_s: float | None) -> RtcpError:
         gateway, _, _ = _PEER.unpack(self._socket.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))
         return RtcpError(
             "timeout",
-            f"the platform has not answered {verb!r} for {timeout_s:g} s: if its gateway (process {gateway}) hangs, "
+            f"the platform has not answered {method!r} for {timeout_s:g} s: if its gateway (process {gateway}) hangs, "
             f"`kill -9 {gateway}` and `rtcp start` give the loop another, `rtcp stop` ends all of it",
         )
 
@@ -179,11 +181,3 @@ def _who_runs(path: Path) -> str:
     if is_running(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
     return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
-
-
-def _refusal(verb: str, error: object) -> RtcpError:
-    """Turn the `error` of an answer into an exception, whatever shape it came in."""
-    found = error if isinstance(error, dict) else {}
-    kind = found.get("kind")
-    message = str(found.get("message") or f"the platform refused {verb!r} without saying why")
-    return RtcpError(cast("ErrorKind", kind) if kind in _KINDS_ON_THE_WIRE else "fault", message)

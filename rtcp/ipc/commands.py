@@ -95,7 +95,7 @@ class SetOutput(Command):
     """Set a digital output of the IO box."""
 
     states = CALM | {State.ENABLING, State.STOPPING, State.HOMING, State.FAULT}
-    number: int
+    output: int
     """From 1."""
     value: bool
 

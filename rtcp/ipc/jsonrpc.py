@@ -7,6 +7,7 @@ motion reports its progress before (`docs/dependencies.md`).
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from typing import Any, cast
 
@@ -29,11 +30,12 @@ RequestId = int | str | None
 
 
 class InvalidMessage(ValueError):
-    """A line that is no request; `code` says which part of the specification it breaks."""
+    """A line that is no request; `code` says what of the specification it breaks, `request` is its id if it has one."""
 
-    def __init__(self, code: int, message: str) -> None:
+    def __init__(self, code: int, message: str, request: RequestId = None) -> None:
         super().__init__(message)
         self.code = code
+        self.request = request
 
 
 def line(message: Mapping[str, Any]) -> bytes:
@@ -51,6 +53,22 @@ def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
         return line({"id": number, "method": method, "params": dict(params)})
     except (TypeError, ValueError) as error:
         raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {error}") from error
+
+
+def answer(message: Mapping[str, Any]) -> bytes:
+    """Return an answer or a notification as it is sent; numbers that are not finite become null."""
+    try:
+        return line(message)
+    except ValueError:
+        return line(_finite(message))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def failure(number: RequestId, error: RtcpError, code: int = 0) -> dict[str, Any]:
@@ -76,11 +94,12 @@ def read_request(given: bytes) -> tuple[RequestId, str, dict[str, Any], bool]:
     if type(number) not in (int, str, type(None)):
         raise InvalidMessage(INVALID_REQUEST, f"id: found {type(number).__name__}, allowed is an integer or a text")
     if found.get("jsonrpc") != VERSION:
-        raise InvalidMessage(INVALID_REQUEST, f'jsonrpc: found {found.get("jsonrpc")!r}, allowed is "{VERSION}"')
+        version = json.dumps(found.get("jsonrpc"))[:60]
+        raise InvalidMessage(INVALID_REQUEST, f'jsonrpc: found {version}, allowed is "{VERSION}"', number)
     if not isinstance(method, str):
-        raise InvalidMessage(INVALID_REQUEST, f"method: found {type(method).__name__}, allowed is a text")
+        raise InvalidMessage(INVALID_REQUEST, f"method: found {type(method).__name__}, allowed is a text", number)
     if not isinstance(params, dict):
-        raise InvalidMessage(INVALID_REQUEST, f"params: found {type(params).__name__}, allowed is an object")
+        raise InvalidMessage(INVALID_REQUEST, f"params: found {type(params).__name__}, allowed is an object", number)
     return number, method, params, number is None
 
 

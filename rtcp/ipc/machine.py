@@ -1,6 +1,6 @@
 """The machine's states, what happens in them and what leads from one to another: one table; the loop walks it.
 
-`docs/machine.md` is drawn from it by `rtcp.telemetry.machine_drawing`. Names of codes: `rtcp.ipc.codes`.
+`docs/machine.md` is made from it by `docs/generate.py`. Names of codes: `rtcp.ipc.codes`.
 """
 
 from __future__ import annotations

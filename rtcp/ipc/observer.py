@@ -217,6 +217,11 @@ class Observer:
 
     # -- events and texts ---------------------------------------------------------------------------------------
 
+    @property
+    def last_event(self) -> int:
+        """Number of the last event; 0 before the first."""
+        return self._words[EVENTS_HEAD_AT]
+
     def events_since(self, number: int) -> list[EventRecord]:
         """Return the events after `number`, oldest first."""
         head = self._words[EVENTS_HEAD_AT]

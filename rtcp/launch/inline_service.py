@@ -10,7 +10,7 @@ from rtcp.control.assembly import position_of
 from rtcp.control.bus_service import BusService
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.launch.inprocess import InProcessBus
-from rtcp.virtual.registers import State
+from rtcp.virtual.protocol import State
 
 _WATCH_TURNS = 10
 _ERROR_CODE = 0x603F

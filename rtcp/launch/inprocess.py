@@ -17,9 +17,9 @@ from typing import NamedTuple
 from rtcp.config.model import SlaveConfig
 from rtcp.launch.inprocess_data import InProcessData
 from rtcp.launch.inprocess_slave import InProcessError, InProcessSlave, identity_faults
-from rtcp.virtual.device import Device
-from rtcp.virtual.registers import State
-from rtcp.virtual.statemachine import AlStatusCode
+from rtcp.virtual.al_state import AlStatusCode
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.protocol import State
 
 _EPOCH_NS = 1_000_000_000
 """The reference clock shows at least this at the start of time."""
@@ -80,7 +80,7 @@ class InProcessBus:
         now_ns: the instant at which time begins.
     """
 
-    def __init__(self, devices: Sequence[Device], seed: int = 0, now_ns: int = 0) -> None:
+    def __init__(self, devices: Sequence[DeviceModel], seed: int = 0, now_ns: int = 0) -> None:
         self.slaves = [InProcessSlave(device, position) for position, device in enumerate(devices, 1)]
         self._random = Random(seed)
         self.notes: list[str] = []

@@ -6,13 +6,12 @@ import struct
 from collections.abc import Sequence
 
 from rtcp.config.model import DeviceDescription, Pdo, SlaveConfig, StartupSdo
-from rtcp.virtual import sdo_access
-from rtcp.virtual.abort import AbortCode
-from rtcp.virtual.device import Device
-from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual import coe as sdo_access
+from rtcp.virtual.al_state import AlStatusCode
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.objects import AbortCode, SdoAbort
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
-from rtcp.virtual.registers import State
-from rtcp.virtual.statemachine import AlStatusCode
+from rtcp.virtual.protocol import State
 
 TYPES = {
     "bool": (1, "B"), "int8": (8, "b"), "uint8": (8, "B"), "int16": (16, "h"), "uint16": (16, "H"), "int32": (32, "i"),
@@ -38,7 +37,7 @@ class InProcessError(Exception):
 class InProcessSlave:
     """A device on the bus at `position` (from 1), in INIT at first."""
 
-    def __init__(self, device: Device, position: int) -> None:
+    def __init__(self, device: DeviceModel, position: int) -> None:
         self.device = device
         self.position = position
         self.name = device.identity.name

@@ -1,16 +1,193 @@
-"""CoE: services, SDO transfers and emergency messages (ETG.1000.6, 5.6)."""
+"""CoE: SDO transfers, SDO information and emergency messages (ETG.1000.6, 5.6)."""
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from enum import IntEnum
+from enum import IntEnum, IntFlag
 
-from rtcp.virtual.abort import AbortCode
-from rtcp.virtual.device import Emergency
-from rtcp.virtual.objects import ObjectDictionary, SdoAbort
-from rtcp.virtual.sdo_access import check_download, read, write
-from rtcp.virtual.slave_faults import SlaveFaults
+from rtcp.virtual.device import Emergency, SlaveFaults
+from rtcp.virtual.objects import (
+    SIGNED,
+    AbortCode,
+    Access,
+    DataType,
+    DictionaryObject,
+    Entry,
+    ObjectCode,
+    ObjectDictionary,
+    SdoAbort,
+    Value,
+    byte_size,
+    decode,
+    encode,
+    from_bits,
+    to_bits,
+)
+
+_READ = {2: Access.READ_PREOP, 4: Access.READ_SAFEOP, 8: Access.READ_OP}
+_WRITE = {2: Access.WRITE_PREOP, 4: Access.WRITE_SAFEOP, 8: Access.WRITE_OP}
+_STATE = 0x0F
+_COUNT_BITS = 16
+"""Subindex 0 and a byte of padding, at the head of a complete access that begins with subindex 0."""
+
+
+def read(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int) -> bytes:
+    """Return the bytes of one entry, or (`complete`) of an object from `subindex` 0 or 1 on.
+
+    Complete access returns as many entries as subindex 0 tells; those that may not be read are sent as zero. `state` is
+    the AL state (2 PRE-OP, 4 SAFE-OP, 8 OP), its error flag ignored.
+
+    Raises:
+        SdoAbort: absent, write-only, or not to be read in the AL state `state`.
+    """
+    found = objects.object(index)
+    if not complete or found.code == ObjectCode.VARIABLE:
+        entry = objects[index, subindex]
+        _check_right(entry, Access.RO, _READ.get(state & _STATE, Access(0)), AbortCode.WRITE_ONLY)
+        return encode(entry, entry.value)
+    _check_first(subindex)
+    entries = [found.entries[0]] if subindex == 0 else []
+    entries += _members(found, int(found.entries[0].value))
+    right = _READ.get(state & _STATE, Access(0))
+    if entries and not any(entry.access & right for entry in entries):
+        known = next((entry for entry in entries if entry.access & Access.RO), entries[0])
+        _check_right(known, Access.RO, right, AbortCode.WRITE_ONLY)
+    image = offset = 0
+    for entry in entries:
+        if entry.access & right:
+            image |= to_bits(entry) << offset
+        offset += entry.bit_length if entry.subindex else _COUNT_BITS
+    return image.to_bytes((offset + 7) // 8, "little")
+
+
+def check_download(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int, size: int) -> None:
+    """Refuse a download of `size` bytes that cannot succeed whatever the bytes are.
+
+    Raises:
+        SdoAbort: absent, read-only, not to be written in the AL state `state`, or a size that does not fit.
+    """
+    found = objects.object(index)
+    if not complete or found.code == ObjectCode.VARIABLE:
+        entry = objects[index, subindex]
+        _check_right(entry, Access.WO, _WRITE.get(state & _STATE, Access(0)), AbortCode.READ_ONLY)
+        if size > byte_size(entry):
+            raise SdoAbort(AbortCode.TOO_LONG)
+        # Strings have a largest length, all others one length.
+        if size < byte_size(entry) and not entry.is_bytes:
+            raise SdoAbort(AbortCode.TOO_SHORT)
+        return
+    _check_first(subindex)
+    entries = [entry for entry in found.entries.values() if entry.access & Access.WO]
+    for entry in entries or [found.entries[0]]:
+        _check_right(entry, Access.WO, _WRITE.get(state & _STATE, Access(0)), AbortCode.READ_ONLY)
+    whole = sum(entry.bit_length for entry in _members(found, found.highest_subindex))
+    if size > ((_COUNT_BITS if subindex == 0 else 0) + whole + 7) // 8:
+        raise SdoAbort(AbortCode.TOO_LONG)
+
+
+def write(objects: ObjectDictionary, index: int, subindex: int, complete: bool, state: int, data: bytes) -> None:
+    """Store `data` in one entry, or (`complete`) in an object from `subindex` 0 or 1 on.
+
+    Complete access is all or nothing; read-only entries in its data are passed over. Where subindex 0 can be written
+    (PDO assignment and mapping) it is cleared first and written last.
+
+    Raises:
+        SdoAbort: as `check_download`, or a value out of its range, or refused by the entry's `on_write`.
+    """
+    check_download(objects, index, subindex, complete, state, len(data))
+    found = objects.object(index)
+    if complete and found.code != ObjectCode.VARIABLE:
+        _write_object(found, subindex, data)
+    else:
+        entry = objects[index, subindex]
+        _store(entry, decode(entry, data))
+
+
+def _write_object(found: DictionaryObject, first: int, data: bytes) -> None:
+    count = found.entries[0]
+    counted = bool(count.access & Access.WO)
+    members = _members(found, found.highest_subindex if counted else int(count.value))
+    offset = 0
+    if first == 0:
+        if len(data) < _COUNT_BITS // 8:
+            raise SdoAbort(AbortCode.TOO_SHORT)
+        offset = _COUNT_BITS
+        if counted:
+            _check_range(count, data[0])
+            members = _members(found, data[0])
+    elif counted:
+        members = _that_fit(members, 8 * len(data))
+    size = (offset + sum(entry.bit_length for entry in members) + 7) // 8
+    if len(data) != size:
+        raise SdoAbort(AbortCode.TOO_LONG if len(data) > size else AbortCode.TOO_SHORT)
+    image = int.from_bytes(data, "little")
+    values: list[tuple[Entry, Value]] = [(count, 0)] if counted and first == 0 else []
+    for entry in members:
+        if entry.access & Access.WO:
+            values.append((entry, from_bits(entry, image >> offset & ((1 << entry.bit_length) - 1))))
+        offset += entry.bit_length
+    if counted and first == 0:
+        values.append((count, data[0]))
+    before = [(entry, entry.value) for entry in found.entries.values()]
+    try:
+        for entry, value in values:
+            _store(entry, value)
+    except SdoAbort:
+        for entry, value in before:
+            entry.value = value
+        raise
+
+
+def _members(found: DictionaryObject, last: int) -> list[Entry]:
+    """Return the entries of subindices 1 to `last`, in order."""
+    return [found.entries[subindex] for subindex in sorted(found.entries) if 0 < subindex <= last]
+
+
+def _that_fit(entries: list[Entry], bits: int) -> list[Entry]:
+    """Return as many of `entries`, from the first on, as have room in `bits`."""
+    taken = []
+    for entry in entries:
+        bits -= entry.bit_length
+        if bits < 0:
+            break
+        taken.append(entry)
+    return taken
+
+
+def _check_first(subindex: int) -> None:
+    """Complete access begins with subindex 0 or 1 (ETG.1000.6, 5.6.2.1)."""
+    if subindex > 1:
+        raise SdoAbort(AbortCode.UNSUPPORTED_ACCESS)
+
+
+def _check_right(entry: Entry, any_state: Access, right: Access, never: AbortCode) -> None:
+    """Refuse with `never` what no AL state allows, with 0x08000022 what another one would."""
+    if not entry.access & any_state:
+        raise SdoAbort(never)
+    if not entry.access & right:
+        raise SdoAbort(AbortCode.DEVICE_STATE)
+
+
+def _check_range(entry: Entry, value: Value) -> None:
+    """Refuse a number beyond the entry's limits, or beyond its bits where these do not fill bytes (BOOLEAN)."""
+    if isinstance(value, bytes):
+        return
+    if entry.maximum is not None and value > entry.maximum:
+        raise SdoAbort(AbortCode.VALUE_TOO_HIGH)
+    if entry.minimum is not None and value < entry.minimum:
+        raise SdoAbort(AbortCode.VALUE_TOO_LOW)
+    if isinstance(value, int) and entry.data_type not in SIGNED and value >> entry.bit_length:
+        raise SdoAbort(AbortCode.VALUE_TOO_HIGH)
+
+
+def _store(entry: Entry, value: Value) -> None:
+    _check_range(entry, value)
+    if entry.on_write is not None:
+        entry.on_write(entry, value)
+    entry.value = value
+
 
 MAILBOX_AND_COE_HEADER = 8
 """Bytes of a mailbox message before the SDO: six of the mailbox header, two of the CoE header."""
@@ -200,3 +377,150 @@ def _check_toggle(command: int, transfer: _Upload | _Download) -> None:
     """Refuse a segment whose toggle bit is not the other of the segment before (ETG.1000.6, 5.6.2.3)."""
     if command & _TOGGLE != transfer.toggle:
         raise SdoAbort(AbortCode.TOGGLE_BIT)
+
+
+_HEADER = struct.Struct("<BBH")
+_INCOMPLETE = 0x80
+"""Bit 7 of the operation code: more fragments follow."""
+_OBJECT = struct.Struct("<HHBB")
+_ENTRY = struct.Struct("<HBBHHH")
+_ENTRY_REQUEST = struct.Struct("<HBB")
+
+
+class Operation(IntEnum):
+    """Operation codes of SDO information (ETG.1000.6, 5.6.3.2)."""
+
+    LIST_REQUEST = 1
+    LIST_RESPONSE = 2
+    OBJECT_REQUEST = 3
+    OBJECT_RESPONSE = 4
+    ENTRY_REQUEST = 5
+    ENTRY_RESPONSE = 6
+    ERROR = 7
+
+
+class ListType(IntEnum):
+    """Lists of objects (ETG.1000.6, 5.6.3.3)."""
+
+    COUNTS = 0
+    """How many objects each of the five lists has."""
+    ALL = 1
+    RXPDO = 2
+    TXPDO = 3
+    REPLACEMENT = 4
+    """Objects to be stored for the replacement of a device."""
+    STARTUP = 5
+    """Start-up parameters."""
+
+
+class ValueInfo(IntFlag):
+    """What an entry description tells beside type and length (ETG.1000.6, 5.6.3.6)."""
+
+    ACCESS = 0x01
+    CATEGORY = 0x02
+    MAPPABLE = 0x04
+    UNIT = 0x08
+    DEFAULT = 0x10
+    MINIMUM = 0x20
+    MAXIMUM = 0x40
+
+
+_ALWAYS_TOLD = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
+_RECORD_TYPES = {
+    **dict.fromkeys(range(0x1600, 0x1800), DataType.PDO_MAPPING),
+    **dict.fromkeys(range(0x1A00, 0x1C00), DataType.PDO_MAPPING),
+    0x1018: DataType.IDENTITY,
+}
+"""Data types of the records that the standard defines (ETG.1000.6, table 64)."""
+
+
+class SdoInformation:
+    """The SDO information server of a slave."""
+
+    MINIMUM_REQUEST = 8
+    """Bytes of the shortest request, CoE header included."""
+
+    def __init__(self, objects: ObjectDictionary, send_size: int) -> None:
+        """Describe `objects` through a send mailbox of `send_size` bytes."""
+        self._objects = objects
+        # Even, so that no index is torn between two fragments.
+        self._fragment_size = (send_size - MAILBOX_AND_COE_HEADER - _HEADER.size) & ~1
+        self._services: dict[int, tuple[Operation, Callable[[bytes], bytes]]] = {
+            Operation.LIST_REQUEST: (Operation.LIST_RESPONSE, self._list),
+            Operation.OBJECT_REQUEST: (Operation.OBJECT_RESPONSE, self._object),
+            Operation.ENTRY_REQUEST: (Operation.ENTRY_RESPONSE, self._entry),
+        }
+
+    def answer(self, request: bytes) -> list[bytes]:
+        """Return the fragments that answer `request` (six bytes or more), all without CoE header."""
+        operation = request[0] & ~_INCOMPLETE
+        try:
+            if operation not in self._services:
+                raise SdoAbort(AbortCode.COMMAND_SPECIFIER)
+            response, service = self._services[operation]
+            return self._fragments(response, service(request[_HEADER.size :]))
+        except SdoAbort as abort:
+            return self._fragments(Operation.ERROR, struct.pack("<I", abort.code))
+
+    def _fragments(self, operation: Operation, data: bytes) -> list[bytes]:
+        size = self._fragment_size
+        parts = [data[start : start + size] for start in range(0, len(data), size)]
+        left = range(len(parts) - 1, -1, -1)
+        return [
+            _HEADER.pack(operation | (_INCOMPLETE if after else 0), 0, after) + part
+            for part, after in zip(parts, left, strict=True)
+        ]
+
+    def _list(self, request: bytes) -> bytes:
+        """Return list type and indices, or the lengths of the five lists."""
+        (kind,) = struct.unpack_from("<H", request)
+        if kind == ListType.COUNTS:
+            numbers = [len(self._indices(listed)) for listed in ListType if listed != ListType.COUNTS]
+        elif kind <= ListType.STARTUP:
+            numbers = self._indices(ListType(kind))
+        else:
+            raise SdoAbort(AbortCode.VALUE_RANGE)
+        return struct.pack(f"<H{len(numbers)}H", kind, *numbers)
+
+    def _indices(self, kind: ListType) -> list[int]:
+        """Return the indices of one list; no entry can be marked for replacement or start-up: those lists are empty."""
+        if kind == ListType.ALL:
+            return [found.index for found in self._objects]
+        wanted = {ListType.RXPDO: Access.RXPDO, ListType.TXPDO: Access.TXPDO}.get(kind, Access(0))
+        return [
+            found.index for found in self._objects if any(entry.access & wanted for entry in found.entries.values())
+        ]
+
+    def _object(self, request: bytes) -> bytes:
+        """Return index, data type, highest subindex, object code and name."""
+        (index,) = struct.unpack_from("<H", request)
+        found = self._objects.object(index)
+        head = _OBJECT.pack(index, _data_type(found), found.highest_subindex, found.code)
+        return head + found.name.encode("ascii", "replace")
+
+    def _entry(self, request: bytes) -> bytes:
+        """Return the description of an entry with as much of the value information asked for as there is."""
+        if len(request) < _ENTRY_REQUEST.size:
+            raise SdoAbort(AbortCode.LENGTH)
+        index, subindex, asked = _ENTRY_REQUEST.unpack_from(request)
+        entry = self._objects[index, subindex]
+        told, limits = _limits(entry, ValueInfo(asked & 0x7F))
+        head = _ENTRY.pack(index, subindex, told, entry.data_type, entry.bit_length, entry.access)
+        return head + limits + entry.name.encode("ascii", "replace")
+
+
+def _limits(entry: Entry, asked: ValueInfo) -> tuple[ValueInfo, bytes]:
+    """Return which of `asked` is told, and the bytes of minimum and maximum where they are."""
+    told, data = asked & _ALWAYS_TOLD, b""
+    for flag, limit in ((ValueInfo.MINIMUM, entry.minimum), (ValueInfo.MAXIMUM, entry.maximum)):
+        if flag & asked and limit is not None:
+            told |= flag
+            data += encode(entry, limit).ljust(byte_size(entry), b"\0")
+    return told, data
+
+
+def _data_type(found: DictionaryObject) -> int:
+    """Return the data type of an object: of a variable or an array that of its elements, of a record its own."""
+    if found.code == ObjectCode.RECORD:
+        return _RECORD_TYPES.get(found.index, 0)
+    return found.entries[found.highest_subindex].data_type

@@ -1,9 +1,189 @@
-"""The distributed clock unit of a slave controller: registers 0x0900 to 0x09FF (ETG.1000.4, 6.6)."""
+"""Distributed clocks: local time, SYNC0 and their registers 0x0900 to 0x09FF (ETG.1000.4, 6.6)."""
 
 from __future__ import annotations
 
-from rtcp.virtual.clock import Clock, SyncGenerator
-from rtcp.virtual.registers import Register
+from rtcp.virtual.protocol import Register
+
+PROPORTIONAL = 40.0
+"""Share of a phase error taken away a second; with INTEGRAL a critically damped loop, settled within half a second."""
+INTEGRAL = 400.0
+LONGEST_STEP = 0.02
+"""Longest time between two references, in s, that the loop counts: rarer references are followed more slowly."""
+SLEW_LIMIT = 1e-3
+"""The phase moves by no more than this share of the time passed: time never runs backwards."""
+RATE_LIMIT = 500e-6
+INTEGRATED_ERROR_LIMIT = 20_000.0
+"""Phase errors, in ns, above this do not drive the rate: they are offsets not set yet, not drift."""
+HALF_RANGE = 1 << 31
+RANGE_32 = 1 << 32
+
+
+class Clock:
+    """A free-running local time with a drift, steered by drift compensation when references arrive.
+
+    All instants `t` are those of the slave's place on the wire, in ns of the host's monotonic clock. `offset` (0x0920)
+    and `delay` (0x0928) are the registers' values in ns; system time is local time plus offset.
+    """
+
+    __slots__ = (
+        "_fraction", "_last", "_local", "_natural", "_rate", "_t", "delay", "difference", "offset",
+    )  # fmt: skip
+
+    def __init__(self, drift_ppm: float, start: int, t: int) -> None:
+        """A clock that shows `start` ns at instant `t` and runs fast by `drift_ppm` millionths."""
+        self._natural = drift_ppm * 1e-6
+        self._rate = self._natural
+        self._t = t
+        self._local = start
+        self._fraction = 0.0
+        self._last = t
+        self.offset = 0
+        self.delay = 0
+        self.difference = 0
+        """Last measured system time minus the reference's, in ns (0x092C)."""
+
+    def local(self, t: int) -> int:
+        """Local time at `t`, in ns."""
+        passed = t - self._t
+        return self._local + passed + int(passed * self._rate + self._fraction)
+
+    def system(self, t: int) -> int:
+        """System time at `t`, in ns."""
+        return self.local(t) + self.offset
+
+    def instant(self, system: int) -> int:
+        """The instant at which the system time is or was `system`, as far as the present rate tells."""
+        passed = system - self.offset - self._local
+        return self._t + passed - int((passed * self._rate + self._fraction) / (1.0 + self._rate))
+
+    def jump(self, ns: int) -> None:
+        """Show `ns` more from now on."""
+        self._local += ns
+
+    def change_drift(self, ppm: float, t: int) -> None:
+        """Run fast by `ppm` millionths more than before, from `t` on."""
+        passed = t - self._t
+        moved = passed * self._rate + self._fraction
+        self._t, self._local, self._fraction = t, self._local + passed + int(moved), moved - int(moved)
+        self._natural += ppm * 1e-6
+        self._rate += ppm * 1e-6
+
+    def reset_control(self) -> None:
+        """Forget what drift compensation has learnt (a write to 0x0930 does it)."""
+        self._rate = self._natural
+        self.difference = 0
+
+    def follow(self, t: int, reference: int) -> None:
+        """Steer towards `reference`, the low 32 bits of the reference's system time that passed this slave at `t`."""
+        passed = t - self._t
+        moved = passed * self._rate + self._fraction
+        whole = int(moved)
+        local = self._local + passed + whole
+        error = (local + self.offset - self.delay - reference + HALF_RANGE) % RANGE_32 - HALF_RANGE
+        self.difference = error
+        seconds = (t - self._last) * 1e-9
+        self._last = t
+        if seconds < 0.0:
+            return
+        seconds = min(seconds, LONGEST_STEP)
+        limit = seconds * 1e9 * SLEW_LIMIT
+        step = error * PROPORTIONAL * seconds
+        if step > limit:
+            step = limit
+        elif step < -limit:
+            step = -limit
+        if -INTEGRATED_ERROR_LIMIT < error < INTEGRATED_ERROR_LIMIT:
+            rate = self._rate - error * INTEGRAL * seconds * 1e-9
+            if -RATE_LIMIT < rate - self._natural < RATE_LIMIT:
+                self._rate = rate
+        fraction = moved - whole - step
+        whole = int(fraction)
+        self._t = t
+        self._local = local + whole
+        self._fraction = fraction - whole
+
+
+class SyncGenerator:
+    """SYNC0: a pulse whenever the system time reaches the start time plus a multiple of the cycle (0x0981..0x09A3).
+
+    The hardware compares for equality: where the system time has already passed the next pulse, because the start time
+    lay in the past or the offset was rewritten while running, no pulse comes any more.
+    """
+
+    __slots__ = ("_clock", "_suspended", "cycle", "due", "next", "pulses", "running")
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._suspended = False
+        self.cycle = 0
+        """Period in ns; 0: a single pulse."""
+        self.next = 0
+        """System time of the next pulse."""
+        self.due: int | None = None
+        """Instant of the next pulse; None while none will come."""
+        self.pulses = 0
+        """Pulses since activation."""
+        self.running = False
+        """Whether SYNC0 is activated."""
+
+    @property
+    def lost(self) -> bool:
+        """Whether SYNC0 is activated but no pulse will come."""
+        return self.running and self.due is None
+
+    def activate(self, start: int, cycle: int, t: int) -> None:
+        """Begin at system time `start` with period `cycle` ns."""
+        self.running = True
+        self.cycle = cycle
+        self.next = start
+        self.pulses = 0
+        self.schedule(t)
+
+    def deactivate(self) -> None:
+        """No more pulses."""
+        self.running = False
+        self.due = None
+
+    def schedule(self, t: int) -> None:
+        """Find the instant of the next pulse anew; the pulse is lost where the system time has passed it."""
+        if not self.running or self._suspended:
+            return
+        due = self._clock.instant(self.next)
+        self.due = due if due >= t else None
+
+    def suspend(self) -> None:
+        """Let no pulse come, whatever is activated, until `resume`."""
+        self._suspended = True
+        self.due = None
+
+    def resume(self, t: int) -> None:
+        """Let pulses come again from `t` on, in the grid in which they would have come all the time."""
+        self._suspended = False
+        late = self._clock.system(t) - self.next
+        if self.cycle and late >= 0:
+            self.next += (late // self.cycle + 1) * self.cycle
+        self.schedule(t)
+
+    def fire(self) -> None:
+        """The next pulse has come: count it and find the one after it."""
+        self.pulses += 1
+        if not self.cycle:
+            self.due = None
+            return
+        self.next += self.cycle
+        self.due = self._clock.instant(self.next)
+
+    def skip_to(self, t: int) -> None:
+        """Let the pulses before `t` pass without anybody looking, keeping to the grid."""
+        if self.due is None or not self.cycle:
+            return
+        late = self._clock.system(t) - self.next
+        if late > 0:
+            count = late // self.cycle
+            self.pulses += count
+            self.next += count * self.cycle
+            self.due = self._clock.instant(self.next)
+
 
 CYCLIC = 0x01
 SYNC0 = 0x02
@@ -30,9 +210,9 @@ class DistributedClockUnit:
         return bool(self._memory[Register.DC_ACTIVATION] & CYCLIC)
 
     @property
-    def activation(self) -> int:
-        """The activation register 0x0981."""
-        return self._memory[Register.DC_ACTIVATION]
+    def sync0_active(self) -> bool:
+        """Whether SYNC0 is activated (0x0981 bits 0 and 1)."""
+        return self._memory[Register.DC_ACTIVATION] & (CYCLIC | SYNC0) == CYCLIC | SYNC0
 
     @property
     def sync0_cycle(self) -> int:
@@ -82,7 +262,7 @@ class DistributedClockUnit:
             self._activate(t)
 
     def _activate(self, t: int) -> None:
-        wanted = self.activation & (CYCLIC | SYNC0) == CYCLIC | SYNC0
+        wanted = self.sync0_active
         if wanted and not self.sync0.running:
             self.sync0.activate(self._get(Register.DC_START_TIME, 8), self.sync0_cycle, t)
         elif not wanted:

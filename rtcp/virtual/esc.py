@@ -1,15 +1,14 @@
-"""A slave controller: its memory as the master and as the device see it (ETG.1000.4, clause 6)."""
+"""A slave controller: sync managers, and its memory as the master and the device see it (ETG.1000.4, clause 6)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rtcp.virtual.clock import Clock
-from rtcp.virtual.distributed_clock import DistributedClockUnit
-from rtcp.virtual.eeprom import EepromInterface
-from rtcp.virtual.registers import (
+from rtcp.virtual.distributed_clock import Clock, DistributedClockUnit
+from rtcp.virtual.protocol import (
     DC_SPACE,
     DEFAULTS,
+    ERROR_COUNTERS,
     FEATURE_DC,
     FEATURE_DC_64,
     FEATURE_DC_SYNC_ENHANCED,
@@ -26,7 +25,7 @@ from rtcp.virtual.registers import (
     Register,
     State,
 )
-from rtcp.virtual.syncmanager import SyncManager
+from rtcp.virtual.sii import EepromInterface
 
 MEMORY_SIZE = REGISTER_SPACE + RAM_SIZE
 ALIAS_ENABLE = 0x01
@@ -35,23 +34,199 @@ LINK = 0x0010
 """Bit of the DL status for a physical link at port 0; that of port n is n places further up."""
 LOOP_CLOSED = 0x0100
 COMMUNICATION = 0x0200
-"""Bits of the DL status for port 0: the frame turns round there, or goes on; those of port n are 2n further up."""
+"""Bits of the DL status for port 0: the frame turns round there, or continues; those of port n are 2n further up."""
 PORTS_2_3_CLOSED = 0x5000
+LOOP_AUTO_CLOSE, LOOP_OPEN, LOOP_ALWAYS_CLOSED = 1, 2, 3
+"""Loop settings of a port, two bits each in 0x0101 (ETG.1000.4, 6.1.3); 0: automatic."""
 PDI_RUNS = 0x0001
 WATCHDOG_OK = 0x0002
 WATCHDOG_CLOCK_NS = 40
 """The watchdog divider counts periods of 25 MHz (ETG.1000.4, table 50)."""
+RESET_SEQUENCE = b"RES"
+"""Three consecutive writes to 0x0040 that reset the controller and its device."""
+
+CONTROL_MODE = 0x03
+MODE_MAILBOX = 0x02
+CONTROL_DIRECTION = 0x0C
+DIRECTION_MASTER_WRITES = 0x04
+CONTROL_ECAT_EVENT = 0x10
+CONTROL_WATCHDOG = 0x40
+ACTIVATE = 0x01
+REPEAT_REQUEST = 0x02
+PDI_DEACTIVATE = 0x01
+REPEAT_ACKNOWLEDGE = 0x02
+STATUS_WRITTEN = 0x01
+STATUS_READ = 0x02
+STATUS_FULL = 0x08
+# Offsets of the bytes within a sync manager's registers.
+CONTROL, STATUS, ACTIVATION, PDI = 4, 5, 6, 7
 
 
 def _nothing() -> None:
     return
 
 
-def _dl_status(links: Sequence[bool]) -> int:
-    status = PDI_RUNS | WATCHDOG_OK | PORTS_2_3_CLOSED
-    for port, linked in enumerate(links):
-        status |= LINK << port | COMMUNICATION << 2 * port if linked else LOOP_CLOSED << 2 * port
-    return status
+class SyncManager:
+    """One sync manager. `memory` is the controller's whole memory, `writable` its map of bytes open to the master.
+
+    A buffered area is held as the last complete buffer in `buffer`; what the master writes in parts gathers in the RAM
+    and is handed over with its last byte, as with three buffers. A mailbox is the RAM itself and the full flag.
+    """
+
+    __slots__ = (
+        "_memory", "_open", "_writable", "base", "buffer", "control", "enabled", "end", "index", "length", "locked",
+        "on_event", "start",
+    )  # fmt: skip
+
+    def __init__(self, index: int, memory: bytearray, writable: bytearray) -> None:
+        self.index = index
+        self.base = Register.SYNC_MANAGER + SM_SIZE * index
+        self._memory = memory
+        self._writable = writable
+        self._open = False
+        self.buffer: memoryview = memoryview(bytearray())
+        """The last complete buffer of a buffered sync manager: what the other side sees. Set by the segment."""
+        self.on_event: Callable[[], None] = _nothing
+        """Called when the event of a sync manager with `ecat_event` may have changed."""
+        self.start = self.end = self.length = self.control = 0
+        self.enabled = False
+        self.locked = False
+        self.load()
+
+    @property
+    def mailbox(self) -> bool:
+        """Whether it works as a mailbox (full or empty) and not as a buffer."""
+        return self.control & CONTROL_MODE == MODE_MAILBOX
+
+    @property
+    def master_writes(self) -> bool:
+        """Whether the master writes and the device reads."""
+        return self.control & CONTROL_DIRECTION == DIRECTION_MASTER_WRITES
+
+    @property
+    def watchdog_trigger(self) -> bool:
+        """Whether a complete write feeds the process data watchdog."""
+        return bool(self.control & CONTROL_WATCHDOG)
+
+    @property
+    def ecat_event(self) -> bool:
+        """Whether it has a bit in the ECAT event request register 0x0210."""
+        return bool(self.control & CONTROL_ECAT_EVENT)
+
+    @property
+    def pending(self) -> bool:
+        """Whether the device has written what the master reads, or read what the master has written."""
+        wanted = STATUS_READ if self.master_writes else STATUS_WRITTEN
+        return self.enabled and self.ecat_event and bool(self._memory[self.base + STATUS] & wanted)
+
+    @property
+    def full(self) -> bool:
+        """Whether a mailbox holds a message."""
+        return bool(self._memory[self.base + STATUS] & STATUS_FULL)
+
+    @property
+    def repeat_wanted(self) -> bool:
+        """Whether the master has requested the last message again and has no acknowledgement yet."""
+        memory, base = self._memory, self.base
+        return bool((memory[base + ACTIVATION] & REPEAT_REQUEST) ^ (memory[base + PDI] & REPEAT_ACKNOWLEDGE))
+
+    def load(self) -> None:
+        """Read the settings from the registers after these were written."""
+        memory, base = self._memory, self.base
+        was_enabled, length = self.enabled, self.length
+        self.start = int.from_bytes(memory[base : base + 2], "little")
+        self.length = int.from_bytes(memory[base + 2 : base + 4], "little")
+        self.end = self.start + self.length
+        self.control = memory[base + CONTROL]
+        self.enabled = bool(memory[base + ACTIVATION] & ACTIVATE) and self.length > 0
+        self.locked = bool(memory[base + PDI] & PDI_DEACTIVATE)
+        # Start, length and control are open only while the sync manager is off (ETG.1000.4, table 58).
+        self._writable[base : base + 5] = bytes(5) if memory[base + ACTIVATION] & ACTIVATE else b"\x01" * 5
+        self._writable[base + STATUS] = self._writable[base + PDI] = 0
+        if self.length != length:
+            self.buffer = memoryview(bytearray(self.length))
+        if not self.enabled or not was_enabled:
+            self._open = False
+            memory[base + STATUS] = 0
+        self.on_event()
+
+    def lock(self, locked: bool) -> None:
+        """The device closes the area to the master (`locked`) or opens it; closing empties it."""
+        pdi = self.base + PDI
+        self._memory[pdi] = self._memory[pdi] & ~PDI_DEACTIVATE | locked
+        if locked:
+            self._set_status(0, 0xFF)
+            self._open = False
+        self.locked = locked
+
+    def _set_status(self, bits: int, cleared: int) -> None:
+        status = self.base + STATUS
+        self._memory[status] = self._memory[status] & ~cleared | bits
+        if self.control & CONTROL_ECAT_EVENT:
+            self.on_event()
+
+    def write(self, address: int, data: bytes) -> bool | None:
+        """The master writes within the area. Returns None if refused, True if the buffer is complete, else False."""
+        if self.locked or not self.master_writes:
+            return None
+        if address == self.start:
+            if self.mailbox and self.full:
+                return None
+            self._open = True
+        elif not self._open:
+            return None
+        self._memory[address : address + len(data)] = data
+        if address + len(data) < self.end:
+            return False
+        self._open = False
+        if self.mailbox:
+            self._set_status(STATUS_FULL | STATUS_WRITTEN, STATUS_READ)
+        else:
+            self.buffer[:] = self._memory[self.start : self.end]
+            self._set_status(STATUS_WRITTEN, STATUS_READ)
+        return True
+
+    def read(self, address: int, length: int) -> tuple[bytes, bool] | None:
+        """The master reads within the area. Returns None if refused, else the data and whether the last byte was read.
+
+        The last byte empties a mailbox.
+        """
+        if self.locked or self.master_writes:
+            return None
+        if address == self.start:
+            if self.mailbox:
+                if not self.full:
+                    return None
+            else:
+                self._memory[self.start : self.end] = self.buffer
+            self._open = True
+        elif not self._open:
+            return None
+        data = bytes(self._memory[address : address + length])
+        last = address + length == self.end
+        if last:
+            self._open = False
+            self._set_status(STATUS_READ, STATUS_FULL | STATUS_WRITTEN)
+        return data, last
+
+    def take(self) -> bytes:
+        """The device reads a message from a mailbox that the master writes; the mailbox is empty then."""
+        self._set_status(STATUS_READ, STATUS_FULL | STATUS_WRITTEN)
+        return bytes(self._memory[self.start : self.end])
+
+    def put(self, message: bytes) -> None:
+        """The device puts a message into a mailbox that the master reads; the rest of the area is zeroed."""
+        self._memory[self.start : self.end] = message.ljust(self.length, b"\0")[: self.length]
+        self._set_status(STATUS_FULL | STATUS_WRITTEN, STATUS_READ)
+
+    def exchanged(self) -> None:
+        """The device has read (outputs) or written (inputs) the buffer: raise the event where there is one."""
+        self._set_status(*((STATUS_READ, STATUS_WRITTEN) if self.master_writes else (STATUS_WRITTEN, STATUS_READ)))
+
+    def acknowledge_repeat(self) -> None:
+        """The device has put the last message there again: make the acknowledge bit equal to the request."""
+        memory, base = self._memory, self.base
+        memory[base + PDI] = memory[base + PDI] & ~REPEAT_ACKNOWLEDGE | memory[base + ACTIVATION] & REPEAT_REQUEST
 
 
 class Esc:
@@ -59,7 +234,7 @@ class Esc:
 
     `turnaround` is the time in ns that a frame takes from this slave to the end of the chain and back; None for the
     last slave. `clock` is None for a slave without distributed clocks. Instants `t` are those of the frame's arrival at
-    this slave, in ns of the host's monotonic clock. `links` tells of ports 0 and 1 whether they have a link.
+    this slave, in ns of the host's monotonic clock. `links` says of ports 0 and 1 whether they have a link.
     """
 
     def __init__(
@@ -79,7 +254,10 @@ class Esc:
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
         self.put(Register.FEATURES, features, 2)
-        self.put(Register.DL_STATUS, _dl_status(links), 2)
+        self._links = links
+        self.put(Register.DL_STATUS, self._dl_status(links), 2)
+        # The link comes up after power-on: the first change of the DL status (ET1100, 0x0210.2).
+        self.put(Register.EVENT_REQUEST, EcatEvent.DL_STATUS, 2)
         self.eeprom = EepromInterface(self.memory, self.writable, eeprom)
         self.sync_managers = tuple(SyncManager(n, self.memory, self.writable) for n in range(SM_COUNT))
         self.watchdog_ns = 0
@@ -92,25 +270,51 @@ class Esc:
         self.sync_managers_written = False
         self.mailbox_touched = False
         """A mailbox was filled or emptied; the device has not looked yet."""
+        self.loops_written = False
+        self.reset_requested = False
+        """The master completed the reset sequence (0x0040)."""
+        self._reset_progress = 0
+        self.detach()
+        for manager in self.sync_managers:
+            manager.on_event = self._mirror_sync_managers
+
+    def detach(self) -> None:
+        """Drop all callbacks: another controller replaces this one."""
         self.on_layout: Callable[[], None] = _nothing
         """Called when FMMUs or sync managers have changed."""
         self.on_address: Callable[[], None] = _nothing
         """Called when the station address or the use of the alias may have changed."""
         self.on_attention: Callable[[], None] = _nothing
-        """Called when the device has to look: AL control, sync managers or mailboxes."""
+        """Called when device or segment have to look: AL control, sync managers, mailboxes, loops, reset."""
         self.on_event: Callable[[], None] = _nothing
         """Called when `event` has changed."""
         self.on_outputs: Callable[[SyncManager, int], None] = lambda manager, t: None
         """Called with the sync manager and the instant when a buffer of outputs is complete."""
+        for manager in self.sync_managers:
+            manager.on_event = _nothing
 
-    def detach(self) -> None:
-        """Call nobody any more: the supply has gone, another takes this one's place."""
-        self.on_layout = self.on_address = self.on_attention = self.on_event = _nothing
-        self.on_outputs = lambda manager, t: None
+    def loop(self, port: int) -> int:
+        """Loop setting of a port in 0x0101."""
+        return self.memory[Register.DL_CONTROL + 1] >> 2 * port & 3
+
+    def closed(self, port: int, linked: bool) -> bool:
+        """Whether the loop of port 0 or 1 is closed, so that frames turn round there."""
+        setting = self.loop(port)
+        if setting == LOOP_AUTO_CLOSE and not self.get(Register.DL_STATUS, 2) & COMMUNICATION << 2 * port:
+            # It closed when the link was lost, and opens only by a write to 0x0101.
+            return not (linked and self.loops_written)
+        return setting == LOOP_ALWAYS_CLOSED or (setting != LOOP_OPEN and not linked)
+
+    def _dl_status(self, links: Sequence[bool]) -> int:
+        status = PDI_RUNS | WATCHDOG_OK | PORTS_2_3_CLOSED
+        for port, linked in enumerate(links):
+            status |= LINK << port if linked else 0
+            status |= LOOP_CLOSED << 2 * port if self.closed(port, linked) else COMMUNICATION << 2 * port
+        return status
 
     def set_links(self, *links: bool) -> None:
-        """Show which of the ports 0 and 1 have a link now; one that has lost it counts that."""
-        before, after = self.get(Register.DL_STATUS, 2), _dl_status(links)
+        """Show which of the ports 0 and 1 have a link now; a port that has lost it counts that."""
+        before, after = self.get(Register.DL_STATUS, 2), self._dl_status(links)
         if before == after:
             return
         self.put(Register.DL_STATUS, after, 2)
@@ -149,20 +353,17 @@ class Esc:
         """The AL state that the device reports."""
         return State(self.memory[Register.AL_STATUS] & 0x0F)
 
-    def raise_event(self, event: int) -> None:
-        """Set bits of the ECAT event request register."""
-        self.put(Register.EVENT_REQUEST, self.get(Register.EVENT_REQUEST, 2) | event, 2)
-        self._refresh_event()
-
-    def _clear_event(self, event: int) -> None:
-        self.put(Register.EVENT_REQUEST, self.get(Register.EVENT_REQUEST, 2) & ~event, 2)
-        self._refresh_event()
-
-    def _refresh_event(self) -> None:
+    def raise_event(self, event: int, cleared: int = 0) -> None:
+        """Set bits of the ECAT event request register, and clear others."""
+        self.put(Register.EVENT_REQUEST, self.get(Register.EVENT_REQUEST, 2) & ~cleared | event, 2)
         event = self.get(Register.EVENT_REQUEST, 2) & self.get(Register.EVENT_MASK, 2)
         if event != self.event:
             self.event = event
             self.on_event()
+
+    def _mirror_sync_managers(self) -> None:
+        pending = sum(EcatEvent.SYNC_MANAGER_0 << manager.index for manager in self.sync_managers if manager.pending)
+        self.raise_event(pending, 0x0FF0)
 
     def read(self, address: int, length: int, t: int) -> bytes | None:
         """The master reads; None where the access is refused, and the working counter does not count it."""
@@ -173,15 +374,18 @@ class Esc:
             return self._read_ram(address, length)
         if end > REGISTER_SPACE:
             return None
-        if self.dc is not None and address < DC_SPACE[1] and end > DC_SPACE[0]:
-            self.dc.before_read(t)
+        if address < DC_SPACE[1] and end > DC_SPACE[0]:
+            if self.dc is not None:
+                self.dc.before_read(t)
+            elif address >= DC_SPACE[0] and end <= DC_SPACE[1]:
+                return None
         if address <= Register.EEPROM_CONTROL + 1 < end:
             self.eeprom.before_read(t)
         data = bytes(self.memory[address:end])
         if address < Register.AL_STATUS + 2 and end > Register.AL_STATUS:
-            self._clear_event(EcatEvent.AL_STATUS)
+            self.raise_event(0, EcatEvent.AL_STATUS)
         if address < Register.DL_STATUS + 2 and end > Register.DL_STATUS:
-            self._clear_event(EcatEvent.DL_STATUS)
+            self.raise_event(0, EcatEvent.DL_STATUS)
         return data
 
     def write(self, address: int, data: bytes, t: int) -> bool:
@@ -192,6 +396,9 @@ class Esc:
         if address >= REGISTER_SPACE:
             return self._write_ram(address, data, t)
         if end > REGISTER_SPACE:
+            return False
+        if self.al_control_written and Register.AL_CONTROL <= address < Register.AL_CONTROL + 2:
+            # AL control is locked until the device has read it (ET1100, 0x0120).
             return False
         mask = self.writable[address:end]
         if 0 not in mask:
@@ -209,20 +416,29 @@ class Esc:
     def _after_write(self, first: int, end: int, t: int) -> None:
         """Let the units behind the registers from `first` up to `end` act on their new values."""
         memory = self.memory
-        if first < 0x0122 and end > Register.AL_CONTROL:
+        if first < Register.AL_CONTROL + 2 and end > Register.AL_CONTROL:
             self.al_control_written = True
             self.on_attention()
-        elif first < 0x0012 or Register.DL_CONTROL <= first < 0x0104:
+        elif first < Register.STATION_ADDRESS + 2:
             self.on_address()
-        elif Register.EVENT_MASK <= first < 0x0202:
-            self._refresh_event()
-        elif Register.RX_ERRORS <= first < 0x0314:
-            memory[Register.RX_ERRORS : 0x0314] = bytes(0x14)  # a write of any value clears the counters
-        elif Register.WATCHDOG_COUNTERS <= first < 0x0444:
-            memory[Register.WATCHDOG_COUNTERS : 0x0444] = bytes(2)
+        elif first == Register.ESC_RESET:
+            self._reset(memory[first])
+        elif Register.DL_CONTROL <= first < Register.DL_CONTROL + 4:
+            self.on_address()
+            self.loops_written = first <= Register.DL_CONTROL + 1 < end
+            if self.loops_written:
+                self.on_attention()
+        elif Register.EVENT_MASK <= first < Register.EVENT_MASK + 2:
+            self.raise_event(0)
+        elif Register.RX_ERRORS <= first < Register.LOST_LINKS + 4:
+            for start, behind in ERROR_COUNTERS:
+                if first < behind and end > start:
+                    memory[start:behind] = bytes(behind - start)  # a write of any value clears the group
+        elif Register.WATCHDOG_COUNTERS <= first < Register.WATCHDOG_COUNTERS + 2:
+            memory[Register.WATCHDOG_COUNTERS : Register.WATCHDOG_COUNTERS + 2] = bytes(2)
         elif Register.WATCHDOG_DIVIDER <= first <= Register.WATCHDOG_PROCESS_DATA + 1:
             self._load_watchdog()
-        elif first < 0x0510 and end > Register.EEPROM_CONFIG:
+        elif first < Register.EEPROM_DATA + 8 and end > Register.EEPROM_CONFIG:
             if first == Register.EEPROM_CONFIG:
                 self.eeprom.write_config()
             if first <= Register.EEPROM_CONTROL + 1 < end and self.writable[Register.EEPROM_CONTROL]:
@@ -234,19 +450,28 @@ class Esc:
         elif self.dc is not None and first < DC_SPACE[1] and end > DC_SPACE[0]:
             self.dc.wrote(first, end, t)
 
+    def _reset(self, byte: int) -> None:
+        """Advance the reset sequence; the register then reads how many of its bytes have come."""
+        self._reset_progress = self._reset_progress + 1 if byte == RESET_SEQUENCE[self._reset_progress] else 0
+        if self._reset_progress == len(RESET_SEQUENCE):
+            self._reset_progress = 0
+            self.reset_requested = True
+            self.on_attention()
+        self.memory[Register.ESC_RESET] = self._reset_progress
+
     def _load_watchdog(self) -> None:
         step = (self.get(Register.WATCHDOG_DIVIDER, 2) + 2) * WATCHDOG_CLOCK_NS
         self.watchdog_ns = step * self.get(Register.WATCHDOG_PROCESS_DATA, 2)
 
     def _load_sync_managers(self, first: int, end: int) -> None:
-        settings = []
+        changed = False
         for manager in self.sync_managers:
             if first < manager.base + SM_SIZE and end > manager.base:
                 before = (manager.start, manager.length, manager.control, manager.enabled)
                 manager.load()
-                settings.append(before != (manager.start, manager.length, manager.control, manager.enabled))
+                changed |= before != (manager.start, manager.length, manager.control, manager.enabled)
                 self.mailbox_touched |= manager.repeat_wanted
-        if any(settings):
+        if changed:
             self.sync_managers_written = True
             self.on_layout()
         self.on_attention()

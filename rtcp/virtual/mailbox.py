@@ -1,4 +1,4 @@
-"""The mailbox of a slave: headers, counters, error replies and the queue of what waits to be sent (ETG.1000.4, 5.6)."""
+"""The mailbox of a slave: headers, counters, error replies, and what waits to be sent (ETG.1000.4, 5.6 and 6.4)."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import struct
 from collections import deque
 from enum import IntEnum
 
-from rtcp.virtual.coe import ABORT, CoeService, SdoServer, emergency_message
-from rtcp.virtual.device import Emergency
+from rtcp.virtual.coe import ABORT, CoeService, SdoInformation, SdoServer, emergency_message
+from rtcp.virtual.device import DeviceModel, Emergency, SlaveFaults
+from rtcp.virtual.esc import SyncManager
 from rtcp.virtual.objects import ObjectDictionary
-from rtcp.virtual.sdo_info import SdoInformation
-from rtcp.virtual.slave_faults import SlaveFaults
 
 _HEADER = struct.Struct("<HHBB")
 _ERROR_REPLY = struct.Struct("<HH")
@@ -88,6 +87,8 @@ class Mailbox:
         if len(data) < _HEADER.size:
             self._refuse(0, MailboxError.SYNTAX)
             return
+        # What waits by now goes out before the answer, an emergency that the service causes after it.
+        self._queue_emergencies()
         length, address, channel, kind = _HEADER.unpack_from(data)
         counter = kind >> 4 & 0x7
         if counter and counter == self._master_counter:
@@ -114,15 +115,14 @@ class Mailbox:
     def next_message(self, t: int = 0) -> bytes | None:
         """Return the next message for SM1, with its mailbox header, at most `send_size` bytes; None when none waits.
 
-        Emergencies go before answers, but wait behind one that comes late. What follows the message in SM1's buffer has
-        no meaning.
+        Answers and emergencies go out in the order in which they arose. What follows the message in SM1's buffer has no
+        meaning.
         """
         if not self.pending(t):
             return None
-        if self._emergencies:
-            kind, address, content = MailboxType.COE, 0, emergency_message(self._emergencies.popleft())
-        else:
-            kind, address, content, _ = self._waiting.popleft()
+        if not self._waiting:
+            self._queue_emergencies()
+        kind, address, content, _ = self._waiting.popleft()
         self._own_counter = self._own_counter % 7 + 1
         return _HEADER.pack(len(content), address, 0, self._own_counter << 4 | kind) + content
 
@@ -133,6 +133,10 @@ class Mailbox:
         self._sdo.reset()
         self._master_counter = 0
         self._own_counter = 0
+
+    def _queue_emergencies(self) -> None:
+        while self._emergencies:
+            self._waiting.append((MailboxType.COE, 0, emergency_message(self._emergencies.popleft()), 0))
 
     def _refuse(self, address: int, error: MailboxError) -> None:
         self._waiting.append((MailboxType.ERROR, address, _error(error), 0))
@@ -173,3 +177,50 @@ class Mailbox:
 def _error(error: MailboxError) -> bytes:
     """Return the content of an error reply (ETG.1000.4, table 30)."""
     return _ERROR_REPLY.pack(_ERROR_COMMAND, error)
+
+
+class MailboxService:
+    """Carries messages between sync managers and `Mailbox`, and repeats the last one when the master lost it."""
+
+    def __init__(self, device: DeviceModel, out: SyncManager, in_: SyncManager, faults: SlaveFaults) -> None:
+        """`out` is SM0, which the master writes, `in_` is SM1, which it reads; both configured by now."""
+        self._out = out
+        self._in = in_
+        device.emergencies.clear()
+        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length, faults)
+        self._outbox: deque[bytes] = deque()
+        self._present: bytes | None = None
+        self._last: bytes | None = None
+
+    def serve(self, state: int, t: int) -> None:
+        """Take what the master wrote, in AL state `state` at instant `t`, and put the next message where it reads."""
+        if self._out.full:
+            self._mailbox.receive(self._out.take(), state, t)
+        reader = self._in
+        if not reader.full and self._present is not None:
+            self._last, self._present = self._present, None
+        if reader.repeat_wanted:
+            self._repeat()
+        if not reader.full:
+            message = self._outbox.popleft() if self._outbox else self._mailbox.next_message(t)
+            if message is not None:
+                self._present = message
+                reader.put(message)
+
+    def pending(self, t: int) -> bool:
+        """Whether a message waits at instant `t` and SM1 has room for it."""
+        return self._mailbox.pending(t) and not self._in.full
+
+    def stop(self) -> None:
+        """The slave goes to INIT: forget everything."""
+        self._mailbox.reset()
+
+    def _repeat(self) -> None:
+        """Put the last message that was read there again, and what stands there now after it."""
+        if self._present is not None:
+            self._outbox.appendleft(self._present)
+            self._present = None
+        if self._last is not None:
+            self._present = self._last
+            self._in.put(self._last)
+        self._in.acknowledge_repeat()

@@ -1,10 +1,8 @@
-"""The object dictionary of a virtual slave: entries by index and subindex (ETG.1000.6, 5.6.7).
-
-A device model reads and writes `Entry.value`; the CoE server and the PDO mapping turn entries into bytes.
-"""
+"""The object dictionary of a slave: entries, and their values as bytes (ETG.1000.6, 5.2 and 5.6.7)."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
@@ -198,3 +196,110 @@ class ObjectDictionary:
     def __iter__(self) -> Iterator[DictionaryObject]:
         """Iterate over the objects in the order of their indices."""
         return iter(sorted(self._objects.values(), key=lambda found: found.index))
+
+
+SIGNED = frozenset({DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32, DataType.INTEGER64})
+STRUCT_CODES = {
+    DataType.INTEGER8: "b",
+    DataType.INTEGER16: "h",
+    DataType.INTEGER32: "i",
+    DataType.INTEGER64: "q",
+    DataType.UNSIGNED8: "B",
+    DataType.UNSIGNED16: "H",
+    DataType.UNSIGNED32: "I",
+    DataType.UNSIGNED64: "Q",
+    DataType.REAL32: "f",
+    DataType.REAL64: "d",
+}
+"""Codes of the `struct` module for the types that fill whole bytes."""
+
+
+def byte_size(entry: Entry) -> int:
+    """Return the number of bytes that `entry` takes in an SDO; of a string, the largest number."""
+    return (entry.bit_length + 7) // 8
+
+
+def encode(entry: Entry, value: Value) -> bytes:
+    """Return `value` as the bytes of `entry`'s type; an integer out of range is cut to the type's bits."""
+    if isinstance(value, bytes):
+        return value
+    if entry.is_float:
+        return struct.pack("<" + STRUCT_CODES[entry.data_type], value)
+    return (int(value) & ((1 << entry.bit_length) - 1)).to_bytes(byte_size(entry), "little")
+
+
+def decode(entry: Entry, data: bytes) -> Value:
+    """Return the value that `data` means for `entry`.
+
+    Raises:
+        struct.error: a floating-point entry whose data has another length than its type.
+    """
+    if entry.is_bytes:
+        return bytes(data)
+    if entry.is_float:
+        value: float = struct.unpack("<" + STRUCT_CODES[entry.data_type], data)[0]
+        return value
+    return int.from_bytes(data, "little", signed=entry.data_type in SIGNED)
+
+
+def to_bits(entry: Entry) -> int:
+    """Return the stored value as an unsigned integer of `entry.bit_length` bits."""
+    return int.from_bytes(encode(entry, entry.value), "little") & ((1 << entry.bit_length) - 1)
+
+
+def from_bits(entry: Entry, bits: int) -> Value:
+    """Return the value that the unsigned integer `bits` of `entry.bit_length` bits means for `entry`."""
+    if entry.data_type in SIGNED:
+        sign = 1 << (entry.bit_length - 1)
+        return (bits ^ sign) - sign
+    if entry.is_float or entry.is_bytes:
+        return decode(entry, bits.to_bytes(byte_size(entry), "little"))
+    return bits
+
+
+def struct_code(entry: Entry) -> str | None:
+    """Return the `struct` code of `entry`, None where it does not fill the bytes of its type."""
+    if entry.is_bytes:
+        return f"{byte_size(entry)}s" if entry.bit_length % 8 == 0 else None
+    if entry.bit_length != BITS.get(entry.data_type):
+        return None
+    return STRUCT_CODES.get(entry.data_type)
+
+
+class AbortCode(IntEnum):
+    """Why an SDO service was refused (ETG.1000.6, table 41)."""
+
+    TOGGLE_BIT = 0x05030000
+    """Toggle bit not changed."""
+    COMMAND_SPECIFIER = 0x05040001
+    """Client or server command specifier not valid or unknown."""
+    UNSUPPORTED_ACCESS = 0x06010000
+    """Unsupported access to an object."""
+    WRITE_ONLY = 0x06010001
+    """Attempt to read a write-only object."""
+    READ_ONLY = 0x06010002
+    """Attempt to write a read-only object."""
+    SUBINDEX_0_NOT_ZERO = 0x06010003
+    """Subindex cannot be written, subindex 0 must be 0 for write access."""
+    NO_OBJECT = 0x06020000
+    """The object does not exist in the object dictionary."""
+    NOT_MAPPABLE = 0x06040041
+    """The object cannot be mapped into the PDO."""
+    PDO_LENGTH = 0x06040042
+    """The number and length of the objects to be mapped would exceed the PDO length."""
+    LENGTH = 0x06070010
+    """Data type does not match, length of service parameter does not match."""
+    TOO_LONG = 0x06070012
+    """Data type does not match, length of service parameter too high."""
+    TOO_SHORT = 0x06070013
+    """Data type does not match, length of service parameter too low."""
+    NO_SUBINDEX = 0x06090011
+    """Subindex does not exist."""
+    VALUE_RANGE = 0x06090030
+    """Value range of parameter exceeded (write access only)."""
+    VALUE_TOO_HIGH = 0x06090031
+    """Value of parameter written too high."""
+    VALUE_TOO_LOW = 0x06090032
+    """Value of parameter written too low."""
+    DEVICE_STATE = 0x08000022
+    """Data cannot be transferred or stored because of the present device state."""

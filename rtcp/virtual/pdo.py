@@ -8,9 +8,19 @@ from dataclasses import dataclass
 from enum import IntEnum
 from operator import attrgetter
 
-from rtcp.virtual.abort import AbortCode
-from rtcp.virtual.encoding import from_bits, struct_code, to_bits
-from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary, SdoAbort, Value
+from rtcp.virtual.objects import (
+    AbortCode,
+    Access,
+    DataType,
+    Entry,
+    ObjectCode,
+    ObjectDictionary,
+    SdoAbort,
+    Value,
+    from_bits,
+    struct_code,
+    to_bits,
+)
 
 SM_TYPES = 0x1C00
 """Sync manager communication type (ETG.1000.6, table 67)."""

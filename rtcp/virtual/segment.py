@@ -4,13 +4,107 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
-from rtcp.virtual.chain import Chain
-from rtcp.virtual.registers import Register
-from rtcp.virtual.slave import Slave
+from rtcp.config.document import Finding, read
+from rtcp.config.model import ConfigError
+from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.virtual.device import DeviceModel, OptionError, create
+from rtcp.virtual.protocol import Register
+from rtcp.virtual.slave import Slave, make_slaves
 from rtcp.virtual.wire import Miscount, Wire
 
+
+class Chain:
+    """Cable n lies behind slave n (0: between the master and slave 1); slaves count from 1.
+
+    What is broken twice must be joined twice.
+    """
+
+    def __init__(self, slaves: Sequence[Slave]) -> None:
+        self._slaves = tuple(slaves)
+        self._cuts = [0] * len(self._slaves)
+        self._outages = [0] * len(self._slaves)
+        self.reach = len(self._slaves)
+        """Number of slaves that a frame reaches."""
+        self.returns = True
+        """Whether frames come back: False where the loop of a port without a link is open."""
+
+    def cut(self, cable: int) -> None:
+        """Break a cable."""
+        self._cuts[cable] += 1
+        self._follow()
+
+    def join(self, cable: int) -> None:
+        """Join a cable again."""
+        self._cuts[cable] -= 1
+        self._follow()
+
+    def power_off(self, number: int, t: int) -> None:
+        """Take the supply from a slave."""
+        self._outages[number - 1] += 1
+        if self._outages[number - 1] == 1:
+            self._slaves[number - 1].power_off(t)
+        self._follow()
+
+    def power_on(self, number: int, t: int) -> None:
+        """Give a slave its supply back."""
+        self._outages[number - 1] -= 1
+        if not self._outages[number - 1]:
+            self._slaves[number - 1].power_on(t)
+        self._follow()
+
+    def _linked(self, cable: int) -> bool:
+        """Whether the cable is whole and what is at both of its ends has supply."""
+        if cable == len(self._slaves) or self._cuts[cable] or self._outages[cable]:
+            return False
+        return cable == 0 or not self._outages[cable - 1]
+
+    def _follow(self) -> None:
+        """Update ports and turnaround times to the state of the chain."""
+        links = [self._linked(cable) for cable in range(len(self._slaves) + 1)]
+        self.reach, self.returns = 0, True
+        blocked = False
+        for place, slave in enumerate(self._slaves):
+            if self._outages[place]:
+                blocked = True
+                continue
+            esc = slave.esc
+            esc.set_links(links[place], links[place + 1])
+            blocked = blocked or not links[place] or esc.closed(0, links[place])
+            esc.loops_written = False
+            if blocked:
+                continue
+            self.reach = place + 1
+            if esc.closed(1, links[place + 1]):
+                blocked = True
+            elif not links[place + 1]:
+                self.returns, blocked = False, True
+        if self.reach:
+            self._turn_round(self._slaves[: self.reach])
+
+    def restart(self, slave: Slave, t: int) -> None:
+        """Reset a slave's controller and device, as its supply going and coming back would."""
+        slave.power_off(t)
+        slave.power_on(t)
+        self._follow()
+
+    update = _follow
+
+    @staticmethod
+    def _turn_round(reached: Sequence[Slave]) -> None:
+        last = reached[-1]
+        for slave in reached:
+            if slave.esc.dc is not None:
+                slave.esc.dc.turnaround = None if slave is last else 2 * (last.delay - slave.delay)
+
+
+DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
+"""Propagation delays in ns from the master to the slaves of the robot (facts of the machine)."""
+FURTHER_DELAY = 840
+"""What every slave after these adds, in ns."""
 IDLE_TICK = 1_000_000
 """Longest time in ns between two looks at watchdogs and devices."""
 TOGETHER = 2_000
@@ -65,16 +159,16 @@ class Segment:
 
     def process(self, frame: bytearray, size: int, t: int) -> bool:
         """Answer a frame in place, see `Wire.process`; False: nothing comes back of it."""
-        if self.damages or not self._wire.slaves:
-            return self._process_in_trouble(frame, size, t)
+        if self.damages or not self._wire.slaves or not self.chain.returns:
+            return self._process_faulty(frame, size, t)
         return self._wire.process(frame, size, t)
 
-    def _process_in_trouble(self, frame: bytearray, size: int, t: int) -> bool:
+    def _process_faulty(self, frame: bytearray, size: int, t: int) -> bool:
         """Answer a frame that may not come back, or not come far."""
         reach = self.chain.reach
         struck = [damage for damage in tuple(self.damages) if damage.cable < reach and damage.strikes()]
         if not struck:
-            return bool(reach) and self._wire.process(frame, size, t)
+            return bool(reach) and self._wire.process(frame, size, t) and self.chain.returns
         out = [damage.cable for damage in struck if not damage.back]
         if out:
             self._damage_out(frame, size, t, min(out))
@@ -129,6 +223,12 @@ class Segment:
             asking, self._attention = self._attention, []
             for slave in asking:
                 slave.application.attend(t)
+                if slave.esc.reset_requested:
+                    self.chain.restart(slave, t)
+                    self.rewire()
+                elif slave.esc.loops_written:
+                    self.chain.update()
+                    self.rewire()
             self.look_at(t)
 
     def look_at(self, t: int) -> None:
@@ -195,3 +295,46 @@ class Segment:
         if until is not None:
             slave.application.advance(until)
         return slave
+
+
+def default_delays(count: int) -> tuple[int, ...]:
+    """Propagation delays in ns for a chain of `count` slaves."""
+    further = range(max(0, count - len(DELAYS)))
+    return (DELAYS + tuple(DELAYS[-1] + FURTHER_DELAY * (n + 1) for n in further))[:count]
+
+
+def make_segment(config: SegmentConfig, t: int) -> Segment:
+    """Build the slaves that `config` lists; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
+
+    Raises:
+        ConfigError: one sentence for each mistake: an unknown model or option, or delays that fall along the chain.
+    """
+    devices: list[DeviceModel] = []
+    findings: list[Finding] = []
+    for i, entry in enumerate(config.slaves):
+        try:
+            devices.append(create(entry.model, **entry.options))
+        except OptionError as error:
+            findings += [(("slaves", i, *where), text) for where, text in error.findings]
+    delays = [
+        usual if entry.delay_ns is None else entry.delay_ns
+        for entry, usual in zip(config.slaves, default_delays(len(config.slaves)), strict=True)
+    ]
+    for i, (before, delay) in enumerate(pairwise(delays), 1):
+        if delay < before:
+            text = f"found {delay} ns, allowed is at least the {before} ns of the slave before it"
+            findings.append((("slaves", i, "delay_ns"), text))
+    if findings:
+        raise ConfigError(read(config.source).sentences(findings))
+    drifts = [entry.drift_ppm for entry in config.slaves]
+    aliases = [entry.alias for entry in config.slaves]
+    return Segment(make_slaves(devices, drifts, delays, aliases, t), t)
+
+
+def check_segment(path: Path) -> None:
+    """Check that a segment can be made of the file.
+
+    Raises:
+        ConfigError: one sentence for each mistake: file, line, key, what was found and what is allowed.
+    """
+    make_segment(load_segment(path), 0)

@@ -17,21 +17,15 @@ from pathlib import Path
 from types import FrameType
 
 from rtcp.config.faults import Planned, load_script
-from rtcp.config.segment import SegmentConfig, load_segment
+from rtcp.config.segment import load_segment
 from rtcp.virtual.faults.control import Control, control_socket
 from rtcp.virtual.faults.frames import FOR_EVER
 from rtcp.virtual.faults.ground_truth import GroundTruth
 from rtcp.virtual.faults.registry import FaultRegistry
-from rtcp.virtual.frame import ETHERTYPE
-from rtcp.virtual.models import create
 from rtcp.virtual.network import NetworkError, private_pair, public_pair
-from rtcp.virtual.segment import Segment
-from rtcp.virtual.slave import make_slaves
+from rtcp.virtual.protocol import ETHERTYPE
+from rtcp.virtual.segment import Segment, make_segment
 
-DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
-"""Propagation delays in ns from the master to the slaves of the robot (facts of the machine)."""
-FURTHER_DELAY = 840
-"""What every slave after these adds, in ns."""
 PRIORITY = 70
 PR_SET_TIMERSLACK = 29
 MCL_CURRENT, MCL_FUTURE = 1, 2
@@ -55,32 +49,6 @@ LOOK = 1_000_000
 """The control socket is looked at no more often than once in so many ns."""
 
 Ready = Callable[[dict[str, int | str | bool]], None]
-
-
-def default_delays(count: int) -> tuple[int, ...]:
-    """Propagation delays in ns for a chain of `count` slaves."""
-    further = range(max(0, count - len(DELAYS)))
-    return (DELAYS + tuple(DELAYS[-1] + FURTHER_DELAY * (n + 1) for n in further))[:count]
-
-
-def make_segment(config: SegmentConfig, t: int) -> Segment:
-    """Build the slaves that `config` lists; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
-
-    Raises:
-        ValueError: an unknown model or option, or delays that fall along the chain; the message is a sentence.
-    """
-    delays: list[int] = []
-    for position, (entry, usual) in enumerate(zip(config.slaves, default_delays(len(config.slaves)), strict=True)):
-        delay = usual if entry.delay_ns is None else entry.delay_ns
-        if delays and delay < delays[-1]:
-            raise ValueError(
-                f"slave {position + 1} has delay_ns {delay}, less than the {delays[-1]} ns of the slave before it"
-            )
-        delays.append(delay)
-    devices = [create(entry.model, **entry.options) for entry in config.slaves]
-    drifts = [entry.drift_ppm for entry in config.slaves]
-    aliases = [entry.alias for entry in config.slaves]
-    return Segment(make_slaves(devices, drifts, delays, aliases, t), t)
 
 
 class StopRequest:

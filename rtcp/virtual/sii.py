@@ -1,4 +1,4 @@
-"""The slave information interface: the EEPROM image that tells what a device is (ETG.1000.6, 5.4; ETG.2010)."""
+"""The slave information interface: the EEPROM of a device and its registers (ETG.1000.6, 5.4; ETG.1000.4, 6.5)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import struct
 from collections.abc import Iterable
 from enum import IntEnum, IntFlag
 
-from rtcp.virtual.device import Device
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.objects import Access, ObjectDictionary
 from rtcp.virtual.pdo import (
     RX_ASSIGN,
@@ -20,6 +20,7 @@ from rtcp.virtual.pdo import (
     listed,
     split_mapping,
 )
+from rtcp.virtual.protocol import Register
 
 _CATEGORIES_AT = 2 * 0x40
 """Byte address of the first category (ETG.2010, table 2)."""
@@ -113,7 +114,7 @@ def crc8(data: bytes) -> int:
     return crc
 
 
-def build_sii(device: Device, layout: SyncManagerLayout, alias: int) -> bytes:
+def build_sii(device: DeviceModel, layout: SyncManagerLayout, alias: int) -> bytes:
     """Return the whole EEPROM image of `device`, a power of two of bytes; words are little endian.
 
     The PDO categories and the lengths of SM2 and SM3 are those of the PDO assignment at the time of the call.
@@ -132,7 +133,7 @@ def build_sii(device: Device, layout: SyncManagerLayout, alias: int) -> bytes:
     return image.ljust(kbit * 128, _ERASED)
 
 
-def _head(device: Device, layout: SyncManagerLayout, alias: int, kbit: int) -> bytes:
+def _head(device: DeviceModel, layout: SyncManagerLayout, alias: int, kbit: int) -> bytes:
     """Return words 0 to 0x3F: configuration, identity, mailboxes, size and version (ETG.1000.6, table 16)."""
     configuration = _CONFIG.pack(_CONTROL, 0, _SYNC_PULSE, 0, alias)
     identity = device.identity
@@ -153,7 +154,7 @@ def _category(number: Category, content: bytes) -> bytes:
     return struct.pack("<HH", number, len(content) // 2) + content
 
 
-def _contents(device: Device, layout: SyncManagerLayout) -> Iterable[tuple[Category, bytes]]:
+def _contents(device: DeviceModel, layout: SyncManagerLayout) -> Iterable[tuple[Category, bytes]]:
     """Return the categories in order; those of a device without PDOs of a direction or without DC are left out."""
     strings = _Strings()
     # SOEM and others take string 1 as the name.
@@ -175,7 +176,7 @@ def _contents(device: Device, layout: SyncManagerLayout) -> Iterable[tuple[Categ
     return [(Category.STRINGS, strings.content()), *later]
 
 
-def _general(device: Device, strings: _Strings) -> bytes:
+def _general(device: DeviceModel, strings: _Strings) -> bytes:
     """Return the category General (ETG.1000.6, table 21)."""
     group = strings.number(device.identity.group)
     order = strings.number(device.identity.order_code)
@@ -228,3 +229,101 @@ def _dc(strings: _Strings) -> bytes:
     synchron = _DC_MODE.pack(0, 0, 0, 0, _DC_SYNC0, 1, strings.number("DC Synchron"), 0)
     free = _DC_MODE.pack(0, 0, 0, 0, 0, 0, strings.number("SM Synchron"), 0)
     return synchron + free
+
+
+READ_8_BYTES = 0x0040
+TWO_ADDRESS_BYTES = 0x0080
+WRITE_ENABLE = 0x0001
+COMMAND_MASK = 0x0700
+READ = 0x0100
+WRITE = 0x0200
+RELOAD = 0x0400
+CHECKSUM_ERROR = 0x0800
+COMMAND_ERROR = 0x2000
+WRITE_ENABLE_ERROR = 0x4000
+BUSY = 0x8000
+BUSY_NS = {READ: 20_000, RELOAD: 20_000, WRITE: 500_000}
+"""How long a command keeps the interface busy, in ns."""
+CONFIGURATION_BYTES = 14
+"""Bytes that the checksum in word 7 covers (ETG.1000.6, table 16)."""
+ALIAS_WORD = 4
+
+
+class EepromInterface:
+    """Serves the EEPROM registers in `memory`; `writable` opens and closes them for the master with their ownership."""
+
+    def __init__(self, memory: bytearray, writable: bytearray, image: bytes) -> None:
+        self._memory = memory
+        self._writable = writable
+        self.image = bytearray(image)
+        """The EEPROM's content, word addressed, little endian; kept through the life of the process."""
+        self._busy_until = 0
+        self._command = 0
+        self._errors = 0
+        self._reload()
+        self._store_status()
+
+    def write_config(self) -> None:
+        """0x0500 was written: the interface is the master's (0) or the device's (1); bit 1 takes it back by force."""
+        config = self._memory[Register.EEPROM_CONFIG]
+        if config & 0x02:
+            self._memory[Register.EEPROM_PDI_ACCESS] = 0
+        open_to_master = not config & 0x01
+        for address in range(Register.EEPROM_CONTROL, Register.EEPROM_DATA + 8):
+            self._writable[address] = open_to_master
+
+    def before_read(self, t: int) -> None:
+        """Update the busy flag and the command before the master reads at instant `t`."""
+        high = Register.EEPROM_CONTROL + 1
+        running = (BUSY | self._command) >> 8 if t < self._busy_until else 0
+        self._memory[high] = self._memory[high] & ~((BUSY | COMMAND_MASK) >> 8) | running
+
+    def write_control(self, t: int) -> None:
+        """0x0502 was written at instant `t`: carry the command out."""
+        memory = self._memory
+        control = int.from_bytes(memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2], "little")
+        command = control & COMMAND_MASK
+        word = int.from_bytes(memory[Register.EEPROM_ADDRESS : Register.EEPROM_ADDRESS + 4], "little")
+        self._errors &= CHECKSUM_ERROR
+        if t < self._busy_until:
+            # The command that runs continues; a new one is lost.
+            self._errors |= COMMAND_ERROR if command else 0
+        else:
+            self._command = command
+            if command == READ:
+                self._read(word)
+            elif command == WRITE:
+                self._write(word, bool(control & WRITE_ENABLE))
+            elif command == RELOAD:
+                self._reload()
+            elif command:
+                self._errors |= COMMAND_ERROR
+            if command in BUSY_NS and not self._errors & (COMMAND_ERROR | WRITE_ENABLE_ERROR):
+                self._busy_until = t + BUSY_NS[command]
+        self._store_status()
+
+    def _read(self, word: int) -> None:
+        data = self.image[2 * word : 2 * word + 8]
+        # An EEPROM answers every address; erased cells read as ones.
+        self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 8] = bytes(data).ljust(8, b"\xff")
+
+    def _write(self, word: int, enabled: bool) -> None:
+        if not enabled:
+            self._errors |= WRITE_ENABLE_ERROR
+        elif 2 * word + 2 > len(self.image):
+            self._errors |= COMMAND_ERROR
+        else:
+            self.image[2 * word : 2 * word + 2] = self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 2]
+
+    def _reload(self) -> None:
+        """Take PDI control and station alias from the EEPROM, if its checksum is right."""
+        self._errors = 0
+        if len(self.image) < 16 or self.image[CONFIGURATION_BYTES] != crc8(bytes(self.image[:CONFIGURATION_BYTES])):
+            self._errors = CHECKSUM_ERROR
+            return
+        self._memory[Register.PDI_CONTROL : Register.PDI_CONTROL + 2] = self.image[0:2]
+        self._memory[Register.ALIAS : Register.ALIAS + 2] = self.image[2 * ALIAS_WORD : 2 * ALIAS_WORD + 2]
+
+    def _store_status(self) -> None:
+        status = READ_8_BYTES | TWO_ADDRESS_BYTES | self._errors
+        self._memory[Register.EEPROM_CONTROL : Register.EEPROM_CONTROL + 2] = status.to_bytes(2, "little")

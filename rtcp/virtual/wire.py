@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rtcp.virtual.esc import Esc
-from rtcp.virtual.frame import (
+from rtcp.virtual.esc import Esc, SyncManager
+from rtcp.virtual.fmmu import Plan, compile_plan, transfer
+from rtcp.virtual.protocol import (
     COUNTER,
     DATAGRAM_HEADER,
     FIRST_DATAGRAM,
@@ -14,12 +15,11 @@ from rtcp.virtual.frame import (
     LOCAL_BIT,
     MORE_FOLLOWS,
     TYPE_DATAGRAMS,
+    VLAN_TAG,
     Command,
+    Register,
 )
-from rtcp.virtual.logical import Plan, compile_plan, transfer
-from rtcp.virtual.registers import Register
 from rtcp.virtual.slave import Slave
-from rtcp.virtual.syncmanager import SyncManager
 
 MOST_KNOWN = 256
 """What is worked out for an address is kept for so many of them: what a master may send knows no end."""
@@ -80,14 +80,16 @@ class Wire:
 
         A datagram that does not fit the frame ends the work: it and what follows go back as they came.
         """
-        if size < FIRST_DATAGRAM or frame[12] != 0x88 or frame[13] != 0xA4:
+        at = FIRST_DATAGRAM
+        if size > FIRST_DATAGRAM + VLAN_TAG and frame[12] == 0x81 and not frame[13]:
+            at += VLAN_TAG
+        if size < at or frame[at - 4] != 0x88 or frame[at - 3] != 0xA4:
             return False
-        header = frame[14] | frame[15] << 8
-        end = FIRST_DATAGRAM + (header & LENGTH_MASK)
+        header = frame[at - 2] | frame[at - 1] << 8
+        end = at + (header & LENGTH_MASK)
         if header >> 12 != TYPE_DATAGRAMS or end > size:
             return False
         frame[6] |= LOCAL_BIT
-        at = FIRST_DATAGRAM
         while at + DATAGRAM_HEADER + COUNTER <= end:
             command, _, address, offset, flags, event = HEADER.unpack_from(frame, at)
             length = flags & LENGTH_MASK

@@ -194,9 +194,9 @@ class Platform:
         for step in range(self.move_steps):
             connection.settimeout(self.step_s)
             try:
-                if not connection.recv(1, socket.MSG_PEEK):
-                    self.left_while_moving.set()
-                    raise ConnectionError
+                connection.recv(1, socket.MSG_PEEK)  # the notification `cancel`, or the end of the connection
+                self.left_while_moving.set()
+                raise ConnectionError
             except TimeoutError:
                 pass
             finally:

@@ -9,7 +9,7 @@ import pytest
 
 from rtcp.devices import Cia402Drive, DriveState, TargetState
 from rtcp.devices.homing import ENDED, HOMING, SHOWN, START, Homing, HomingPhase, Shown
-from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.models import create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
 from .conftest import slave
@@ -238,7 +238,7 @@ class Line:
     """The driver and the model of a drive, with the bus's two cycles in between."""
 
     def __init__(self, zero: float = 0.0, **options: object) -> None:
-        self.model = CubemarsDrive("orh60", load_inertia=0.05, **options)
+        self.model = create("cubemars-orh60", load_inertia=0.05, **options)
         self.model.set_outputs_valid(True)
         self.model.step(0.2)
         self._rx = PdoImage.from_assignment(self.model.objects, RX_ASSIGN)

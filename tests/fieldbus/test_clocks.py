@@ -11,7 +11,7 @@ from rtcp.fieldbus import clocks
 from rtcp.fieldbus.clocks import settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Command, finish
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm, with_device
 

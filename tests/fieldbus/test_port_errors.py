@@ -10,7 +10,7 @@ from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import port_errors
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import Command
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 
 NAMES = ("io", "drive1", "drive2")

@@ -10,7 +10,7 @@ from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.registers import Command, finish
 from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm
 

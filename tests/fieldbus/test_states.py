@@ -8,7 +8,7 @@ import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.al_state import AlState, read_al, wait_for_state
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 
 STATION = 0x1001

@@ -21,9 +21,9 @@ from random import Random
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from rtcp.config.segment import load_segment
-from rtcp.virtual.frame import ETHERTYPE, FIRST_DATAGRAM
 from rtcp.virtual.network import private_pair
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.protocol import ETHERTYPE, FIRST_DATAGRAM
+from rtcp.virtual.segment import make_segment
 from tests.malformed.mutate import garbled, shape
 
 ORDER = b"\xff" * 6 + b"\x02" * 6 + ETHERTYPE.to_bytes(2, "big") + b"\x00\xf0"

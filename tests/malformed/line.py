@@ -5,9 +5,11 @@ from __future__ import annotations
 import struct
 
 from rtcp.config.segment import load_segment
-from rtcp.virtual.frame import Command, Datagram, build, parse
-from rtcp.virtual.server import BUFFER, make_segment
+from rtcp.virtual.protocol import Command
+from rtcp.virtual.segment import make_segment
+from rtcp.virtual.server import BUFFER
 from tests.malformed.cable import CONFIG
+from tests.virtual.frames import Datagram, build, parse
 
 STATION = 0x1001
 INIT, PRE_OP, SAFE_OP, OP, ACK = 1, 2, 4, 8, 0x10

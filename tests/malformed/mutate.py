@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from random import Random
 
-from rtcp.virtual.frame import (
+from rtcp.virtual.protocol import (
     COUNTER,
     DATAGRAM_HEADER,
     FIRST_DATAGRAM,

@@ -36,7 +36,7 @@ from rtcp.ipc.session import (
     read_session,
     session_file,
 )
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import make_segment
 from tests.malformed.files import damaged
 
 SHIPPED = default_config().parent

@@ -7,12 +7,13 @@ from random import Random
 
 import pytest
 
-from rtcp.virtual.clock import SyncGenerator
-from rtcp.virtual.frame import Command, Datagram, build, parse
+from rtcp.virtual.distributed_clock import SyncGenerator
+from rtcp.virtual.protocol import Command
 from tests.malformed.corpus import frames
 from tests.malformed.line import OP, SAFE_OP, Line
 from tests.malformed.mutate import MUTATIONS, mutated, shape
 from tests.malformed.segment_play import play
+from tests.virtual.frames import Datagram, build, parse
 
 SHARE = 20_000
 """Of the million that `benchmarks/mutations.py` gives."""

@@ -19,7 +19,7 @@ from rtcp.ipc.messages import Sentences
 from rtcp.ipc.observer import Answer, Event, Observer
 from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
-from rtcp.virtual.models import CubemarsDrive, create
+from rtcp.virtual.models import create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
 PERIOD_S = 0.001
@@ -68,7 +68,7 @@ class Segment:
     """A process image whose other end are the device models, mapped by the virtual segment's own code."""
 
     def __init__(self) -> None:
-        self.drives = [CubemarsDrive("orh70", load_inertia=2.0), CubemarsDrive("orh60", load_inertia=0.5)]
+        self.drives = [create("cubemars-orh70", load_inertia=2.0), create("cubemars-orh60", load_inertia=0.5)]
         self.devices = [create("diewu-io", inputs=NOTHING_PRESSED), *self.drives]
         self.expected_wkc = 3 * len(self.devices)
         self.dc_time = self.missed = self.stale = 0

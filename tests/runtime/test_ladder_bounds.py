@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from docs.stops_page import section
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.machine import Command, State
 from rtcp.ipc.stops import Bound, Rung, bounds, tool_bounds, unheard
 from rtcp.launch.simulation import NAME, Frame, Simulation
-from rtcp.telemetry.stops_page import section
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, bus=replace(CONFIG.bus, interface=NAME))
@@ -273,5 +273,5 @@ def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
 
 
 def test_the_section_in_the_docs_is_printed_from_the_table_and_the_bounds() -> None:
-    # `python -m rtcp.telemetry.stops_page` prints it anew.
+    # `python docs/generate.py` writes it.
     assert section(load(default_config())) in FAULTS_PAGE.read_text()

@@ -14,7 +14,7 @@ from rtcp.ipc.messages import Sentences
 from rtcp.launch.inprocess_slave import InProcessSlave
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create
-from rtcp.virtual.registers import State as AlState
+from rtcp.virtual.protocol import State as AlState
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))

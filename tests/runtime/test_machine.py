@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from docs.machine_page import diagram, page
 from rtcp.gateway.robot_status import robot_status
 from rtcp.ipc.codes import Command, MotionMode
 from rtcp.ipc.layout import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
 from rtcp.ipc.machine import ALLOWED, TABLE, WITHOUT_LEASE, Event, State
-from rtcp.telemetry.machine_drawing import diagram, page
 
 ROOT = Path(__file__).parents[2]
 ALLOWED_TO_MOVE = FLAG_ENABLED | FLAG_MOTION_ALLOWED
@@ -65,8 +65,8 @@ def test_whoever_has_no_lease_can_only_make_the_arm_safer() -> None:
 
 
 def test_the_page_in_the_docs_is_drawn_from_the_table() -> None:
-    # `python -m rtcp.telemetry.machine_drawing` draws it anew.
-    assert (ROOT / "docs" / "machine.md").read_text() == page()
+    # `python docs/generate.py` writes it.
+    assert page().strip() in (ROOT / "docs" / "machine.md").read_text()
 
 
 def test_the_picture_shows_every_state() -> None:

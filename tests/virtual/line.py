@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 
-from rtcp.virtual.device import Emergency, Identity
-from rtcp.virtual.frame import Command, Datagram, build, parse
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
+from rtcp.virtual.protocol import Command
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import make_slaves
+from tests.virtual.frames import Datagram, build, parse
 
 STATION = 0x1001
 MS = 1_000_000
@@ -20,43 +20,39 @@ SM_OUTPUTS = bytes.fromhex("0011 0200 64 00 01 00")
 SM_INPUTS = bytes.fromhex("0014 0200 20 00 01 00")
 
 
-class TinyDevice:
+class TinyDevice(DeviceModel):
     """Two bytes each way: the input is the output plus one; `sync_limit` adds object 0x10F1:02."""
 
-    def __init__(self, supports_dc: bool = True, sync_limit: int | None = None, fixed: bool = False) -> None:
-        self.identity = Identity(0x0BAD, 0xCAFE, 1, 7, "Tiny", "Tests", "T1")
-        self.objects = ObjectDictionary()
-        self.emergencies: deque[Emergency] = deque()
-        self.supports_dc = supports_dc
+    vendor_id, product_code, revision, name, group, order_code = 0x0BAD, 0xCAFE, 1, "Tiny", "Tests", "T1"
+
+    def __init__(self, supports_dc: bool = True, sync_limit: int | None = None, fixed: bool = False,
+                 **options: object) -> None:  # fmt: skip
+        self._sync_limit, self._fixed = sync_limit, fixed
         self.valid: list[bool] = []
         self.passed = 0.0
         self.steps = 0
+        super().__init__(serial=7, **options)
+        self.supports_dc = supports_dc
+
+    def define(self, objects: ObjectDictionary) -> None:
         word = DataType.UNSIGNED16
         self.out = Entry(0x7000, 1, "Out", word, 0, Access.RW | Access.RXPDO)
         self.in_ = Entry(0x6000, 1, "In", word, 0, Access.RO | Access.TXPDO)
-        self.objects.record(0x7000, "Outputs", [self.out])
-        self.objects.record(0x6000, "Inputs", [self.in_])
-        self.objects.record(0x1018, "Identity", [Entry(0x1018, 1, "Vendor", DataType.UNSIGNED32, 0x0BAD),
-                                                 Entry(0x1018, 2, "Product", DataType.UNSIGNED32, 0xCAFE)])  # fmt: skip
-        if sync_limit is not None:
-            limit = Entry(0x10F1, 2, "Sync error counter limit", word, sync_limit, Access.RW)
-            self.objects.record(0x10F1, "Error settings", [Entry(0x10F1, 1, "Reaction", word), limit])
-        define_pdo_objects(self.objects, {0x1600: [(0x7000, 1, 16)]}, {0x1A00: [(0x6000, 1, 16)]},
-                           [0x1600], [0x1A00], fixed)  # fmt: skip
+        objects.record(0x7000, "Outputs", [self.out])
+        objects.record(0x6000, "Inputs", [self.in_])
+        if self._sync_limit is not None:
+            limit = Entry(0x10F1, 2, "Sync error counter limit", word, self._sync_limit, Access.RW)
+            objects.record(0x10F1, "Error settings", [Entry(0x10F1, 1, "Reaction", word), limit])
+        define_pdo_objects(objects, {0x1600: [(0x7000, 1, 16)]}, {0x1A00: [(0x6000, 1, 16)]},
+                           [0x1600], [0x1A00], self._fixed)  # fmt: skip
 
     def step(self, dt: float) -> None:
         self.passed += dt
         self.steps += 1
         self.in_.value = (int(self.out.value) + 1) & 0xFFFF
 
-    def power_off(self) -> None:
-        self.valid.append(False)
-        self.out.value = 0
-
-    def power_on(self) -> None:
-        self.in_.value = 0
-
     def set_outputs_valid(self, valid: bool) -> None:
+        super().set_outputs_valid(valid)
         self.valid.append(valid)
         if not valid:
             self.out.value = 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import ConfigError, default_config, load, segment_path
-from rtcp.virtual.check import check_segment
+from rtcp.virtual.segment import check_segment
 
 MISTAKES = {
     "its form": (
@@ -16,13 +16,13 @@ MISTAKES = {
     ),
     "an unknown model": (
         "slaves:\n- model: diewu-io\n- model: toaster\n",
-        ['3: slaves[1].model: found the text "toaster", allowed is one of diewu-io, cubemars-orh40'],
+        ['3: slaves[1].model: found the text "toaster", allowed is one of cubemars-orh40, cubemars-orh50'],
     ),
     "options that the model has not or not so": (
         "slaves:\n- model: diewu-io\n  options:\n    serial: 5\n    colour: 3\n    counter_rate: yes\n",
         [
-            "5: slaves[0].options.colour: model diewu-io has no option 'colour'; it has: serial",
-            "6: slaves[0].options.counter_rate: option counter_rate of model diewu-io",
+            "5: slaves[0].options.colour: the model has no option 'colour'; it has: serial",
+            '6: slaves[0].options.counter_rate: found the text "yes", allowed is a number',
         ],
     ),
     "a delay that falls": (

@@ -6,9 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.virtual.clock import Clock, SyncGenerator
-from rtcp.virtual.frame import Command, Datagram
-from rtcp.virtual.server import default_delays
+from rtcp.virtual.distributed_clock import Clock, SyncGenerator
+from rtcp.virtual.protocol import Command
+from rtcp.virtual.segment import default_delays
+from tests.virtual.frames import Datagram
 from tests.virtual.line import MS, STATION, Line, TinyDevice, start_sync0
 
 FACTS = (0, 820, 1660, 2500, 3320, 4160, 5020)

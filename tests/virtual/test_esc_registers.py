@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.virtual.frame import Command, Datagram
+from rtcp.virtual.protocol import Command
+from tests.virtual.frames import Datagram
 from tests.virtual.line import (
     INIT,
     MS,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.virtual.frame import Command, Datagram, build
+from rtcp.virtual.protocol import Command
+from tests.virtual.frames import Datagram, build
 from tests.virtual.line import SM_MAILBOXES, STATION, Line, fmmu
 
 USER_RAM = 0x0F80

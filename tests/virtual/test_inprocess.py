@@ -21,8 +21,8 @@ from rtcp.launch.inprocess import Emergency, InProcessBus, SlaveFacts, SlaveStat
 from rtcp.launch.inprocess_data import InProcessData
 from rtcp.launch.inprocess_slave import InProcessError
 from rtcp.launch.simulation import Frame, Simulation
-from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
-from rtcp.virtual.registers import State
+from rtcp.virtual.models import create
+from rtcp.virtual.protocol import State
 
 PERIOD_NS = 1_000_000
 MS = 1_000_000
@@ -57,8 +57,8 @@ class Master:
     """A bus in OP, with frames half a cycle before SYNC0."""
 
     def __init__(self, config: ArmConfig, seed: int = 1, start: bool = True) -> None:
-        self.box = DiewuIoBox()
-        self.drives = [CubemarsDrive("orh70", initial_position=0.5), CubemarsDrive("orh60")]
+        self.box = create("diewu-io")
+        self.drives = [create("cubemars-orh70", initial_position=0.5), create("cubemars-orh60")]
         self.bus = InProcessBus([self.box, *self.drives], seed)
         self.config = config
         if start:
@@ -152,7 +152,7 @@ def test_the_start_up_objects_are_written_and_the_interpolation_time_is_the_cycl
 
 
 def test_another_slave_than_the_configuration_lists_is_refused_with_both_named(config: ArmConfig) -> None:
-    bus = InProcessBus([CubemarsDrive("orh70"), DiewuIoBox(), CubemarsDrive("orh70")])
+    bus = InProcessBus([create("cubemars-orh70"), create("diewu-io"), create("cubemars-orh70")])
     with pytest.raises(InProcessError, match=r"position 1 \(io\): expected vendor 0x00000D1E.*found Cubemars ORH70"):
         bus.configure(config.slaves, PERIOD_NS)
     with pytest.raises(InProcessError, match=r"3 slaves are on the bus, the configuration .* lists 2"):

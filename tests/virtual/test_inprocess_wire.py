@@ -10,9 +10,9 @@ import pytest
 
 from rtcp.config import default_config, load
 from rtcp.launch.inprocess import InProcessBus
-from rtcp.virtual.frame import Command, Datagram
-from rtcp.virtual.models import CubemarsDrive
-from rtcp.virtual.registers import State
+from rtcp.virtual.models import CubemarsDrive, create
+from rtcp.virtual.protocol import Command, State
+from tests.virtual.frames import Datagram
 from tests.virtual.line import MS, OP, SAFE_OP, Line, fmmu, start_sync0
 
 DRIVE = struct.Struct("<Hiiib")
@@ -36,7 +36,7 @@ def schedule(mode: int) -> list[bytes]:
 
 
 def drive() -> CubemarsDrive:
-    made = CubemarsDrive("orh60", initial_position=0.1, load_mass_moment=1.0)
+    made = create("cubemars-orh60", initial_position=0.1, load_mass_moment=1.0)
     made.objects[0x605A, 0].value = 6
     made.objects[0x60C2, 1].value, made.objects[0x60C2, 2].value = 1, -3
     return made

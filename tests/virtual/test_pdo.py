@@ -2,9 +2,9 @@ import struct
 
 import pytest
 
+from rtcp.virtual.coe import read, write
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, SdoAbort
 from rtcp.virtual.pdo import PdoImage, SyncManagerLayout, define_pdo_objects
-from rtcp.virtual.sdo_access import read, write
 
 PREOP, SAFEOP, OP = 2, 4, 8
 RX_MAP, TX_MAP, RX_ASSIGN, TX_ASSIGN = 0x1600, 0x1A00, 0x1C12, 0x1C13

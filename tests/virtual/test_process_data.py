@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.virtual.frame import Command
+from rtcp.virtual.protocol import Command
 from rtcp.virtual.segment import REPLAYED_PULSES
 from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, start_sync0
 

@@ -2,8 +2,8 @@ import struct
 
 import pytest
 
+from rtcp.virtual.coe import SdoInformation
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary
-from rtcp.virtual.sdo_info import SdoInformation
 
 
 def dictionary() -> ObjectDictionary:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.virtual.frame import Command
 from rtcp.virtual.objects import DataType, Entry
+from rtcp.virtual.protocol import Command
 from tests.virtual.line import (
     ACK,
     BOOT,

@@ -18,8 +18,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from rtcp.config.document import shown
 from rtcp.config.faults import FAULTS, parse, sentence_of
-from rtcp.config.validation import shown, unknown_key
+from rtcp.config.validation import unknown_key
 from rtcp.virtual.faults.ground_truth import GroundTruth
 from rtcp.virtual.faults.registry import FaultRegistry
 from rtcp.virtual.faults.slaves import FaultRefused

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from rtcp.config.faults import DriveFault, InputsFrozen, StickCode, TerminalFault
-from rtcp.virtual.device import Device
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
 from rtcp.virtual.models.protection import (
@@ -30,14 +30,14 @@ CODES = MappingProxyType({
 })  # fmt: skip
 """Error codes (0x603F) by the names that faults give them."""
 
-_D = TypeVar("_D", bound=Device)
+_D = TypeVar("_D", bound=DeviceModel)
 
 
 class FaultRefused(Exception):
     """This segment cannot have this fault: a sentence."""
 
 
-def begin(devices: Sequence[Device], fault: DeviceFault) -> Callable[[int], None]:
+def begin(devices: Sequence[DeviceModel], fault: DeviceFault) -> Callable[[int], None]:
     """Let `fault` begin in one of `devices` (in the order of the cable); return what ends it, called with an instant.
 
     Raises:
@@ -59,7 +59,7 @@ def begin(devices: Sequence[Device], fault: DeviceFault) -> Callable[[int], None
     return lambda _: box.release_terminals(broken)
 
 
-def _at(devices: Sequence[Device], number: int, kind: type[_D], words: str) -> _D:
+def _at(devices: Sequence[DeviceModel], number: int, kind: type[_D], words: str) -> _D:
     if number > len(devices):
         raise FaultRefused(f"there is no slave {number}: the segment has slaves 1 to {len(devices)}")
     device = devices[number - 1]

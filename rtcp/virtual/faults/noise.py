@@ -7,7 +7,7 @@ from collections.abc import Callable
 from random import Random
 from types import MappingProxyType
 
-from rtcp.virtual.frame import DATAGRAM_HEADER, ETHERTYPE, HEADER, LENGTH_MASK, MORE_FOLLOWS
+from rtcp.virtual.protocol import DATAGRAM_HEADER, ETHERTYPE, HEADER, LENGTH_MASK, MORE_FOLLOWS
 
 _BROADCAST = b"\xff" * 6
 _LLDP_GROUP = bytes.fromhex("0180c200000e")

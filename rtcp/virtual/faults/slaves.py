@@ -25,11 +25,11 @@ from rtcp.config.faults import (
     TerminalFault,
     WorkingCounter,
 )
-from rtcp.virtual.clock import Clock, SyncGenerator
+from rtcp.virtual.distributed_clock import Clock, SyncGenerator
 from rtcp.virtual.faults import devices
 from rtcp.virtual.faults.devices import FaultRefused
 from rtcp.virtual.faults.selector import FrameSelector
-from rtcp.virtual.registers import State
+from rtcp.virtual.protocol import State
 from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
 from rtcp.virtual.wire import Miscount

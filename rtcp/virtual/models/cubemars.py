@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from collections import deque
-from math import ceil
+from math import ceil, pi
+from types import MappingProxyType
+from typing import ClassVar
 
-from rtcp.virtual.device import Emergency, Identity
-from rtcp.virtual.models.axis import Axis
+from rtcp.virtual.device import DeviceModel, Option, number
 from rtcp.virtual.models.cia402 import STATE_BITS, State, StateMachine, Status
-from rtcp.virtual.models.defaults import Defaults
-from rtcp.virtual.models.drive_objects import UNIT, build_objects
-from rtcp.virtual.models.feedback import ErrorLog, Feedback
-from rtcp.virtual.models.mechanics import SIZES, Mechanics
-from rtcp.virtual.models.modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion, Stop
-from rtcp.virtual.models.number import number
-from rtcp.virtual.models.options import DRIVE_OPTIONS, read_options
+from rtcp.virtual.models.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion, Stop
+from rtcp.virtual.models.drive_objects import UNIT, define_objects
+from rtcp.virtual.models.mechanics import SIZES, ActuatorSize, Axis, Mechanics
 from rtcp.virtual.models.profile_modes import Homing, Profile, ProfilePosition, ProfileVelocity
 from rtcp.virtual.models.protection import (
     COMMUNICATION,
@@ -24,13 +20,11 @@ from rtcp.virtual.models.protection import (
     OVER_SPEED,
     POSITION_RANGE,
     Condition,
+    ErrorLog,
+    Feedback,
 )
+from rtcp.virtual.objects import ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
-
-VENDOR_ID = 0x00000B5C
-PRODUCT_CODE = 0x00040201
-REVISION = 0x00010000
-"""The maker's true numbers are not known to this project; these stand in for them."""
 
 RX_PDO = ((0x6040, 0, 16), (0x607A, 0, 32), (0x60FF, 0, 32), (0x6071, 0, 32), (0x6060, 0, 8))
 TX_PDO = ((0x6041, 0, 16), (0x6064, 0, 32), (0x606C, 0, 32), (0x6077, 0, 32), (0x6061, 0, 8))
@@ -43,58 +37,61 @@ _ERROR = int(Status.MODE_ERROR)
 _LONGEST = Axis.LONGEST_STEP * 1.000001
 
 
-class CubemarsDrive:
-    """A Cubemars ORH drive, `size` one of the keys of `SIZES`; options as in `DRIVE_OPTIONS`.
+class CubemarsDrive(DeviceModel):
+    """A Cubemars ORH drive; each size is a subclass.
 
-    With the power stage off a brake holds the joint, as the self-holding of its gear alone would not under an arm's
-    weight. `mechanics` and `condition` may be changed from outside: a payload, a collision, heat.
-
-    Raises:
-        ValueError: an option that does not exist or is out of range.
+    With the power stage off a brake holds the joint, which its gear alone would not do under the
+    weight of an arm. `mechanics` and `condition` may be changed from outside: a payload, a collision, heat.
     """
 
-    supports_dc = True
+    # The true numbers of the manufacturer are not known to this project; these are placeholders.
+    vendor_id = 0x00000B5C
+    product_code = 0x00040201
+    device_type = 0x00020192  # servo drive, CiA 402
+    group = "Servo drives"
+    size: ClassVar[ActuatorSize]
+    options = MappingProxyType({
+        "load_inertia": Option(None, 0.0, 50.0, "inertia of the load at the joint, kg m^2"),
+        "load_mass_moment": Option(0.0, -50.0, 50.0, "mass of the load times its distance from the axis, kg m"),
+        "gravity_phase": Option(0.0, -2 * pi, 2 * pi, "0: the load stands upright at q = 0, pi: it hangs, rad"),
+        "friction": Option(None, 0.0, 50.0, "Coulomb friction, Nm"),
+        "viscous_friction": Option(None, 0.0, 50.0, "viscous friction, Nm s/rad"),
+        "holding_torque": Option(None, 0.0, 500.0, "torque of the brake that closes with the power stage off, Nm"),
+        "initial_position": Option(0.0, -20.0, 20.0, "position of the encoder at power-on, rad"),
+        "temperature": Option(30.0, -40.0, 200.0, "ambient temperature, and of the motor at power-on, C"),
+        "bus_voltage": Option(48.0, 0.0, 100.0, "supply, V"),
+    })  # fmt: skip
 
-    def __init__(self, size: str, **options: object) -> None:
-        actuator = SIZES[size]
-        chosen = read_options(f"cubemars-{size}", DRIVE_OPTIONS, options)
-
-        def value(name: str, otherwise: float = 0.0) -> float:
-            found = chosen[name]
-            return otherwise if found is None else found
-
-        self.identity = Identity(
-            VENDOR_ID, PRODUCT_CODE, REVISION, int(value("serial")), f"Cubemars {actuator.name}",
-            "Servo drives", f"Cubemars-{actuator.name}",
-        )  # fmt: skip
+    def __init__(self, **options: object) -> None:
+        super().__init__(**options)
+        size, option, objects = self.size, self.option, self.objects
         self.mechanics = Mechanics(
-            actuator.rotor_inertia + value("load_inertia", actuator.load_inertia),
-            value("friction", actuator.coulomb),
-            value("viscous_friction", actuator.viscous),
-            holding_torque=value("holding_torque", actuator.start_stop_torque),
-            load_mass_moment=value("load_mass_moment"),
-            gravity_phase=value("gravity_phase"),
-            position=value("initial_position"),
+            size.rotor_inertia + option("load_inertia", size.load_inertia),
+            option("friction", size.coulomb),
+            option("viscous_friction", size.viscous),
+            holding_torque=option("holding_torque", size.start_stop_torque),
+            load_mass_moment=option("load_mass_moment"),
+            gravity_phase=option("gravity_phase"),
+            position=option("initial_position"),
         )
-        self.condition = Condition(actuator, value("temperature"), value("bus_voltage"))
+        self.condition = Condition(size, option("temperature"), option("bus_voltage"))
         self.axis = Axis(self.mechanics)
-        self._actuator = actuator
         self._lasting: list[int] = []
         """Faults whose cause lasts, made from outside."""
-        self.objects = objects = build_objects(self.identity, actuator)
-        self._feedback = Feedback(objects, actuator.rated_torque)
-        self._errors = ErrorLog(objects)
-        self.emergencies: deque[Emergency] = self._errors.emergencies
+        self._feedback = Feedback(objects, size.rated_torque)
+        self._errors = ErrorLog(objects, self.emergencies)
         self._bind()
-        define_pdo_objects(objects, {0x1600: RX_PDO}, {0x1A00: TX_PDO}, [0x1600], [0x1A00], fixed=False)
-        self._defaults = Defaults(objects)
         self.power_on()
+
+    def define(self, objects: ObjectDictionary) -> None:
+        """Add the objects of the drive and its PDOs, which the master may map anew."""
+        define_objects(objects, self.size, int(self.option("sync_error_limit")))
+        define_pdo_objects(objects, {0x1600: RX_PDO}, {0x1A00: TX_PDO}, [0x1600], [0x1A00], fixed=False)
 
     def power_on(self) -> None:
         """The supply comes back: all is as at power-on. The joint stands where it stands; its encoder is absolute."""
+        super().power_on()
         objects = self.objects
-        self._defaults.restore()
-        self.emergencies.clear()
         self.condition.overload = 0.0
         self.axis.offset = self.axis.torque_limit = 0.0
         self.axis.synchronise()
@@ -118,7 +115,7 @@ class CubemarsDrive:
         """Whether a ramp is under way that ends in transition 5 or 8."""
         self._busy = True
         self._last_controlword = 0
-        self._outputs_valid = False
+        self.outputs_valid = False
         self._self_test = _SELF_TEST
         self._following_time = 0.0
         self._torque_counts = -1
@@ -156,7 +153,7 @@ class CubemarsDrive:
     def power_off(self) -> None:
         """The supply goes: no torque, the brake closes."""
         self._supplied = False
-        self._outputs_valid = False
+        self.outputs_valid = False
         self._switch_off(State.NOT_READY_TO_SWITCH_ON)
 
     def set_outputs_valid(self, valid: bool) -> None:
@@ -164,9 +161,9 @@ class CubemarsDrive:
 
         Losing them with the power stage on is fault 0x8130.
         """
-        if self._outputs_valid and not valid and self._motion is not None:
+        if self.outputs_valid and not valid and self._motion is not None:
             self._fail(COMMUNICATION)
-        self._outputs_valid = valid
+        self.outputs_valid = valid
         self._compose()
 
     def inject_fault(self, code: int) -> None:
@@ -196,7 +193,7 @@ class CubemarsDrive:
         if not self._supplied:
             self._stand(dt)
             return
-        controlword = self._controlword.value if self._outputs_valid else 0
+        controlword = self._controlword.value if self.outputs_valid else 0
         if self._busy or controlword != self._last_controlword:
             self._last_controlword = controlword
             self._control(controlword, dt)
@@ -204,7 +201,7 @@ class CubemarsDrive:
             self._choose_mode(self._mode_wanted.value)
         if self._max_torque.value != self._torque_counts:
             self._torque_counts = self._max_torque.value
-            self.axis.torque_limit = min(self._torque_counts * UNIT, self._actuator.start_stop_torque)
+            self.axis.torque_limit = min(self._torque_counts * UNIT, self.size.start_stop_torque)
         if dt <= _LONGEST:
             count, h = 1, dt
         else:
@@ -269,7 +266,7 @@ class CubemarsDrive:
             bits |= Status.VOLTAGE_ENABLED
         if self.condition.warning:
             bits |= Status.WARNING
-        if self._outputs_valid:
+        if self.outputs_valid:
             bits |= Status.REMOTE
         self._bits = int(bits)
 
@@ -402,3 +399,27 @@ class CubemarsDrive:
             return
         self._errors.reset()
         self._enter(State.SWITCH_ON_DISABLED)
+
+
+class CubemarsOrh40(CubemarsDrive):
+    """ORH40, 5.4 Nm rated."""
+
+    size, name, order_code = SIZES["orh40"], "Cubemars ORH40", "Cubemars-ORH40"
+
+
+class CubemarsOrh50(CubemarsDrive):
+    """ORH50, 16 Nm rated."""
+
+    size, name, order_code = SIZES["orh50"], "Cubemars ORH50", "Cubemars-ORH50"
+
+
+class CubemarsOrh60(CubemarsDrive):
+    """ORH60, 28 Nm rated."""
+
+    size, name, order_code = SIZES["orh60"], "Cubemars ORH60", "Cubemars-ORH60"
+
+
+class CubemarsOrh70(CubemarsDrive):
+    """ORH70, 40 Nm rated."""
+
+    size, name, order_code = SIZES["orh70"], "Cubemars ORH70", "Cubemars-ORH70"

@@ -6,7 +6,6 @@ would say increments and per mille of the rated torque: that is this maker's way
 
 from __future__ import annotations
 
-from rtcp.virtual.device import Identity
 from rtcp.virtual.models.mechanics import ENCODER_INCREMENTS, GEAR_RATIO, ActuatorSize
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectCode, ObjectDictionary, SdoAbort, Value, WriteHook
 
@@ -114,18 +113,17 @@ _BOUNDS = {
 }
 
 
-def build_objects(identity: Identity, size: ActuatorSize) -> ObjectDictionary:
-    """Return the object dictionary of a drive of this size, PDO objects (0x16xx, 0x1Axx, 0x1Cxx) left out."""
-    objects = ObjectDictionary()
+def define_objects(objects: ObjectDictionary, size: ActuatorSize, sync_error_limit: int) -> None:
+    """Add the objects of a drive of this size, identity and PDO objects (0x16xx, 0x1Axx, 0x1Cxx) left out."""
     for index, name, data_type, value, access in _STATE_AND_MODE + _POSITION + _VELOCITY + _TORQUE:
         low, high = _BOUNDS.get(index, (None, None))
         hook = _only(*_ALLOWED[index]) if index in _ALLOWED else None
         objects.variable(index, name, data_type, value, access, minimum=low, maximum=high, on_write=hook)
-    _add_identity(objects, identity)
-    _add_synchronisation(objects)
+    # A drive's error register may be mapped.
+    objects[0x1001, 0].access = _TX
+    _add_synchronisation(objects, sync_error_limit)
     _add_limits(objects, size)
     _add_history(objects)
-    return objects
 
 
 def _record(objects: ObjectDictionary, index: int, name: str, *entries: Entry) -> None:
@@ -133,25 +131,11 @@ def _record(objects: ObjectDictionary, index: int, name: str, *entries: Entry) -
     made.entries[0].value = made.highest_subindex
 
 
-def _add_identity(objects: ObjectDictionary, identity: Identity) -> None:
-    text = DataType.VISIBLE_STRING
-    objects.variable(0x1000, "Device type", _U32, 0x00020192)  # servo drive, CiA 402
-    objects.variable(0x1001, "Error register", _U8, 0, _TX)
-    objects.variable(0x1008, "Manufacturer device name", text, identity.name.encode())
-    objects.variable(0x1009, "Manufacturer hardware version", text, b"1.0")
-    objects.variable(0x100A, "Manufacturer software version", text, b"1.0")
-    _record(objects, 0x1018, "Identity",
-            Entry(0x1018, 1, "Vendor ID", _U32, identity.vendor_id),
-            Entry(0x1018, 2, "Product code", _U32, identity.product_code),
-            Entry(0x1018, 3, "Revision number", _U32, identity.revision),
-            Entry(0x1018, 4, "Serial number", _U32, identity.serial))  # fmt: skip
-
-
-def _add_synchronisation(objects: ObjectDictionary) -> None:
+def _add_synchronisation(objects: ObjectDictionary, limit: int) -> None:
     """Add 0x10F1 and 0x1C32/0x1C33 (ETG.1020): the slave's application counts in them."""
     _record(objects, 0x10F1, "Error settings",
             Entry(0x10F1, 1, "Local error reaction", _U32, 1, _RW),
-            Entry(0x10F1, 2, "Sync error counter limit", _U16, 4, _RW))  # fmt: skip
+            Entry(0x10F1, 2, "Sync error counter limit", _U16, limit, _RW))  # fmt: skip
     for index, name in ((0x1C32, "Output sync manager parameter"), (0x1C33, "Input sync manager parameter")):
         _record(objects, index, name,
                 Entry(index, 1, "Synchronization type", _U16, 1, _RW),

@@ -4,15 +4,50 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from math import floor, pi
+from math import floor, pi, sqrt
 
-from rtcp.virtual.models.axis import Axis
+from rtcp.virtual.device import number
 from rtcp.virtual.models.cia402 import Status
 from rtcp.virtual.models.drive_objects import HOMING_METHODS, UNIT
-from rtcp.virtual.models.mechanics import GEAR_RATIO
-from rtcp.virtual.models.number import number
-from rtcp.virtual.models.profile import approach, ramp
+from rtcp.virtual.models.mechanics import GEAR_RATIO, Axis
 from rtcp.virtual.objects import ObjectDictionary
+
+
+def approach(
+    position: float, velocity: float, target: float, top: float, acceleration: float, deceleration: float, h: float
+) -> tuple[float, float]:
+    """Return position and velocity after `h` seconds on the way to rest at `target`, at most `top` fast.
+
+    SI units; `top`, `acceleration`, `deceleration` are positive. The target is met exactly, without overshoot unless
+    the velocity at the start forces one.
+    """
+    distance = target - position
+    direction = 1.0 if distance >= 0.0 else -1.0
+    distance *= direction
+    along = velocity * direction
+    # The fastest speed from which whole steps of deceleration * h still stop at the target.
+    allowed = deceleration * (sqrt(0.25 * h * h + 2.0 * distance / deceleration) - 0.5 * h)
+    wanted = min(top, allowed, distance / h)
+    if along > wanted:
+        along = max(wanted, along - deceleration * h)
+    elif along < 0.0:
+        along = min(wanted, along + deceleration * h)
+    else:
+        along = min(wanted, along + acceleration * h)
+    # The last step is shorter than one of deceleration: it ends on the target, at rest.
+    if distance <= along * h * (1.0 + 1e-9) and along <= deceleration * h * (1.0 + 1e-9):
+        return target, 0.0
+    return position + direction * along * h, direction * along
+
+
+def ramp(velocity: float, target: float, acceleration: float, deceleration: float, h: float) -> float:
+    """Return the velocity after `h` seconds on the way to `target`, by `deceleration` when slowing."""
+    slowing = abs(target) < abs(velocity) or target * velocity < 0.0
+    change = (deceleration if slowing else acceleration) * h
+    if velocity < target:
+        return min(target, velocity + change)
+    return max(target, velocity - change)
+
 
 _REACHED = int(Status.TARGET_REACHED)
 _LIMIT = int(Status.INTERNAL_LIMIT)

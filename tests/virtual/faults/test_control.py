@@ -17,8 +17,9 @@ import pytest
 
 from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
 from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS
-from rtcp.virtual.frame import Command, Datagram, build, parse
+from rtcp.virtual.protocol import Command
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
+from tests.virtual.frames import Datagram, build, parse
 
 pytestmark = pytest.mark.alone
 

@@ -11,8 +11,7 @@ from rtcp.config.segment import load_segment
 from rtcp.virtual.faults.client import SegmentClient
 from rtcp.virtual.faults.ground_truth import PATIENCE, GroundTruth
 from rtcp.virtual.models import CubemarsDrive
-from rtcp.virtual.segment import Segment
-from rtcp.virtual.server import make_segment
+from rtcp.virtual.segment import Segment, make_segment
 from rtcp.virtual.slave import Slave
 from tests.virtual.faults.conftest import BeginSegment
 from tests.virtual.line import MS

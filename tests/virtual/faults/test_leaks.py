@@ -15,8 +15,9 @@ from rtcp.virtual.faults.control import Control, control_socket
 from rtcp.virtual.faults.ground_truth import GroundTruth
 from rtcp.virtual.faults.registry import FaultRegistry
 from rtcp.virtual.faults.slaves import FaultRefused
-from rtcp.virtual.frame import Command, Datagram, build
+from rtcp.virtual.protocol import Command
 from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
+from tests.virtual.frames import Datagram, build
 
 ROUNDS = 8
 MS = 1_000_000

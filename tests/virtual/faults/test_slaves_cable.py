@@ -7,12 +7,13 @@ import gc
 import pytest
 
 from rtcp.config.faults import CableFault, PowerFault
-from rtcp.virtual import sdo_access
-from rtcp.virtual.device import Device
+from rtcp.virtual import coe as sdo_access
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.slaves import FaultRefused, SlaveUndo, begin
-from rtcp.virtual.frame import Command, Datagram, build
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from rtcp.virtual.objects import Value
+from rtcp.virtual.protocol import Command
+from tests.virtual.frames import Datagram, build
 from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, STATION, Line, TinyDevice, start_sync0
 
 DL_STATUS, LOST_LINKS = 0x0110, 0x0310
@@ -138,6 +139,7 @@ def test_both_ends_of_a_broken_cable_show_no_link_and_count_its_loss() -> None:
 
 def test_a_lost_link_raises_the_event_of_the_dl_status_until_it_is_read() -> None:
     line = in_op()
+    line.read(1, DL_STATUS, 2)
     line.write(1, 0x0200, b"\x04\x00")
     assert line.one(Command.BRD, 0, 0, bytes(1)).event == 0
     cut(line, 2)
@@ -299,7 +301,7 @@ def enabled_drive() -> tuple[Line, CubemarsDrive]:
     return line, drive
 
 
-def values_of(device: Device) -> dict[tuple[int, int], Value]:
+def values_of(device: DeviceModel) -> dict[tuple[int, int], Value]:
     """All objects, but for the temperature: the motor stays as warm as it is."""
     entries = [entry for found in device.objects for entry in found.entries.values()]
     return {(e.index, e.subindex): e.value for e in entries if (e.index, e.subindex) != (0x2000, 1)}

@@ -6,7 +6,8 @@ import pytest
 
 from rtcp.config.faults import ClockDrift, ClockJump, PowerFault, Sync0Lost
 from rtcp.virtual.faults.slaves import FaultRefused, begin
-from rtcp.virtual.frame import Command, Datagram
+from rtcp.virtual.protocol import Command
+from tests.virtual.frames import Datagram
 from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, start_sync0
 
 

@@ -10,7 +10,8 @@ from rtcp.config.faults import CableFault, Corrupt, WorkingCounter
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import Answer, RegisterPort
 from rtcp.virtual.faults.slaves import FaultRefused, begin
-from rtcp.virtual.frame import Command, Datagram, build
+from rtcp.virtual.protocol import Command
+from tests.virtual.frames import Datagram, build
 from tests.virtual.line import MS, STATION, Line, TinyDevice
 
 COUNTERS = 0x0300

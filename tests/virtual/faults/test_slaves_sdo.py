@@ -9,7 +9,7 @@ import pytest
 from rtcp.config.faults import PowerFault, SdoAbort, SdoLate
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.faults.slaves import FaultRefused, begin
-from rtcp.virtual.frame import Command
+from rtcp.virtual.protocol import Command
 from tests.virtual.line import MS, PRE_OP, SM_MAILBOXES, STATION, Line, TinyDevice
 
 OUT, IN, SIZE = 0x1000, 0x1080, 0x80

@@ -6,7 +6,8 @@ import pytest
 
 from rtcp.config.faults import AlFall, AlHang, AlRefuse, PowerFault
 from rtcp.virtual.faults.slaves import FaultRefused, begin
-from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, Line, TinyDevice
+from rtcp.virtual.protocol import Command
+from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, STATION, Line, TinyDevice
 
 REFUSED = 0x0042
 
@@ -46,8 +47,8 @@ def test_a_request_downwards_is_not_refused() -> None:
 def test_a_slave_that_hangs_neither_follows_nor_refuses_and_does_it_afterwards() -> None:
     line = in_op()
     end = begin(line.segment, AlHang(2), line.now)
-    assert line.request(1, SAFE_OP) == (OP, 0)
     assert line.request(1, INIT) == (OP, 0)
+    assert line.one(Command.FPWR, STATION + 1, 0x0120, b"\x02\x00").counter == 0, "AL control was not read yet"
     for _ in range(200):
         assert line.exchange()[1] == 6
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rtcp.virtual import sdo_access
+from rtcp.virtual import coe as sdo_access
 from rtcp.virtual.models import CubemarsDrive, create
 
 OP = 8

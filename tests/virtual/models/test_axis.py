@@ -5,8 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.virtual.models.axis import _POSITION_GAIN, _TRACKER, Axis
-from rtcp.virtual.models.mechanics import Mechanics
+from rtcp.virtual.models.mechanics import _POSITION_GAIN, _TRACKER, Axis, Mechanics
 
 SPEEDS = st.floats(-3.0, 3.0)
 STEP_S = 0.0005

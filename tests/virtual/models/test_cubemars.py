@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.virtual.models import MODELS, create
+from rtcp.virtual.device import create, models
 from rtcp.virtual.models.cia402 import State, StateMachine
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import PdoImage
@@ -393,7 +393,7 @@ def test_a_loose_joint_falls_from_upright_and_swings_back_when_it_hangs(
 
 
 def test_every_model_can_be_created_and_stepped_without_a_socket() -> None:
-    for model in MODELS:
+    for model in models():
         device = create(model, serial=7)
         device.step(0.001)
         assert device.identity.serial == 7

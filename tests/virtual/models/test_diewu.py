@@ -2,7 +2,7 @@
 
 import pytest
 
-from rtcp.virtual import sdo_access
+from rtcp.virtual import coe as sdo_access
 from rtcp.virtual.models import DiewuIoBox
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import PdoImage
@@ -24,17 +24,17 @@ def _write(box: DiewuIoBox, index: int, subindex: int, value: int, size: int = 2
     sdo_access.write(box.objects, index, subindex, False, OP, value.to_bytes(size, "little", signed=size == 4))
 
 
-def test_an_idle_box_reads_the_joystick_s_neutral() -> None:
-    assert _inputs(DiewuIoBox()) == 63
+def test_by_default_the_joystick_is_neutral_the_toggle_at_the_arm_and_the_emergency_stop_released() -> None:
+    assert _inputs(DiewuIoBox()) == 0x033F
 
 
 @pytest.mark.parametrize(("line", "value"), [(0, 62), (1, 61), (2, 59), (3, 55), (4, 47), (5, 31)])
 def test_a_line_pulled_low_reads_the_joystick_s_value(line: int, value: int) -> None:
     box = DiewuIoBox()
     box.set_input(line, False)
-    assert _inputs(box) == value
+    assert _inputs(box) & 0x3F == value
     box.set_input(line, True)
-    assert _inputs(box) == 63
+    assert _inputs(box) & 0x3F == 63
 
 
 @pytest.mark.parametrize("levels", [0, 0x033F, 0xFFFF])
@@ -45,14 +45,14 @@ def test_the_levels_at_power_on_are_an_option(levels: int) -> None:
 
 @pytest.mark.parametrize("wrong", [-1, 0x10000, 1.5, True])
 def test_levels_that_are_no_sixteen_bits_are_refused(wrong: object) -> None:
-    with pytest.raises(ValueError, match="must be a whole number from 0 to 65535"):
+    with pytest.raises(ValueError, match="allowed is a whole number from 0 to 65535"):
         DiewuIoBox(inputs=wrong)
 
 
 def test_all_sixteen_inputs_can_be_set() -> None:
     box = DiewuIoBox()
     box.set_input(15, True)
-    assert _inputs(box) == 0x803F
+    assert _inputs(box) == 0x833F
     box.inputs = 0x1234
     assert _inputs(box) == 0x1234
 
@@ -67,14 +67,14 @@ def test_an_input_that_does_not_exist_is_refused() -> None:
 def test_inputs_forced_over_the_bus_hide_the_terminals_until_released() -> None:
     box = DiewuIoBox()
     _write(box, 0x2000, 1, 0x0001)
-    assert _inputs(box) == 62
+    assert _inputs(box) == 0x033E
     _write(box, 0x2000, 2, 0x0001)
-    assert _inputs(box) == 63
+    assert _inputs(box) == 0x033F
     box.set_input(0, False)
-    assert _inputs(box) == 63
+    assert _inputs(box) == 0x033F
     _write(box, 0x2000, 1, 0x0000)
-    assert _inputs(box) == 62
-    assert box.inputs == 62
+    assert _inputs(box) == 0x033E
+    assert box.inputs == 0x033E
 
 
 def test_outputs_reach_the_terminals_only_while_they_are_valid() -> None:
@@ -129,13 +129,13 @@ def test_forced_inputs_are_let_go_when_their_time_has_run_out() -> None:
     box = DiewuIoBox()
     force(box, hold_ms=100)
     box.step(0.06)
-    assert box.objects[0x6000, 1].value == 0x003E
+    assert box.objects[0x6000, 1].value == 0x033E
     force(box, hold_ms=100)
     box.step(0.06)
-    assert box.objects[0x6000, 1].value == 0x003E
+    assert box.objects[0x6000, 1].value == 0x033E
     box.step(0.05)
     box.step(0.001)
-    assert box.objects[0x6000, 1].value == 0x003F
+    assert box.objects[0x6000, 1].value == 0x033F
 
 
 def force(box: DiewuIoBox, hold_ms: int) -> None:

@@ -1,0 +1,137 @@
+"""Writes the generated parts of these pages: `python docs/generate.py`; a test holds pages and code together.
+
+A generated part stands between `<!-- generated: NAME ARGUMENTS -->` and `<!-- end -->`; NAME is one of `PARTS`.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+
+FOLDER = Path(__file__).resolve().parent
+sys.path.insert(0, str(FOLDER.parent))
+
+from rtcp.config import model, segment  # noqa: E402
+from rtcp.config.validation import allowed, bare_type  # noqa: E402
+
+_PART = re.compile(r"(<!-- generated: ([^\n]+) -->\n).*?(<!-- end -->)", re.DOTALL)
+_FILES: dict[str, tuple[type, str]] = {
+    "arm": (model.ArmFile, ""),
+    "device": (model.DeviceDescription, ""),
+    "segment": (segment.SegmentSlave, "slaves[]."),
+}
+
+
+class Key(NamedTuple):
+    """A key of a configuration file; `[]` in its path stands for each entry of a list."""
+
+    path: str
+    allowed: str
+    default: str
+    meaning: str
+
+
+@cache
+def _meanings(kind: type) -> dict[str, str]:
+    """Return the attribute docstrings of a dataclass, those of its bases among them."""
+    found: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        body = ast.parse(inspect.getsource(base)).body[0]
+        assert isinstance(body, ast.ClassDef)
+        for entry, after in zip(body.body, body.body[1:], strict=False):
+            if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name) and isinstance(after, ast.Expr):
+                found[entry.target.id] = inspect.cleandoc(ast.literal_eval(after.value)).replace("\n", " ")
+    return found
+
+
+def keys_of(kind: Any, above: str = "") -> Iterator[Key]:
+    """Yield every key below a dataclass, in the order of its fields."""
+    hints = get_type_hints(kind, include_extras=True)
+    for entry in fields(kind):
+        path, bare = above + entry.name, bare_type(hints[entry.name])
+        inner = bare_type(get_args(bare)[0]) if get_origin(bare) is tuple else None
+        if is_dataclass(inner):
+            yield from keys_of(inner, f"{path}[].")
+        # A gripper's joint has the keys of the others.
+        elif is_dataclass(bare) and not (bare is model.Joint and above):
+            yield from keys_of(bare, f"{path}.")
+        else:
+            default = entry.default if entry.default_factory is MISSING else entry.default_factory()
+            meaning = _meanings(kind).get(entry.name, "")
+            words = "the keys of one of `joints`" if is_dataclass(bare) else allowed(hints[entry.name])
+            yield Key(path, words, _shown(default), meaning)
+
+
+def _shown(default: object) -> str:
+    if default is MISSING:
+        return "required"
+    if default in (None, (), {}, ""):
+        return "none"
+    if isinstance(default, tuple):
+        return f"[{', '.join(f'{value:g}' for value in default)}]"
+    if isinstance(default, bool):
+        return str(default).lower()
+    return f"{default:g}" if isinstance(default, int | float) else str(default)
+
+
+def keys(file: str, *sections: str) -> str:
+    """Return the table of keys of the arm's, a device's or the segment's file, or of these sections of it."""
+    wanted = [key for key in keys_of(*_FILES[file]) if not sections or re.split(r"[.[]", key.path)[0] in sections]
+    return table(
+        ["key", "allowed", "default", "meaning"],
+        [[f"`{key.path}`", key.allowed, key.default, key.meaning] for key in wanted],
+    )
+
+
+def table(head: list[str], rows: list[list[str]]) -> str:
+    """Return a table in Markdown."""
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def machine() -> str:
+    """Return the machine's states and commands."""
+    from docs.machine_page import page
+
+    return page()
+
+
+def stop_reactions() -> str:
+    """Return the stop reactions of the shipped arm."""
+    from docs.stops_page import section
+    from rtcp.config import default_config, load
+
+    return section(load(default_config()))
+
+
+PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine, "stop_reactions": stop_reactions}
+
+
+def generated(text: str) -> str:
+    """Return a page with its generated parts as they have to be."""
+
+    def part(found: re.Match[str]) -> str:
+        name, *arguments = found[2].split()
+        return f"{found[1]}\n{PARTS[name](*arguments).strip()}\n\n{found[3]}"
+
+    return _PART.sub(part, text)
+
+
+def main() -> None:
+    """Rewrite every page that has generated parts."""
+    for page in sorted(FOLDER.glob("*.md")):
+        text = page.read_text()
+        if (new := generated(text)) != text:
+            page.write_text(new)
+            print(f"{page.name}: written")
+
+
+if __name__ == "__main__":
+    main()

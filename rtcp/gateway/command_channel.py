@@ -1,0 +1,334 @@
+"""The way of a command to the loop: lease, ring, answer, outcome. One follower wakes everyone who waits."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import struct
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from rtcp.config.model import ArmConfig
+from rtcp.gateway.status_snapshot import StatusSnapshot
+from rtcp.ipc.commands import Command
+from rtcp.ipc.errors import ErrorKind, RtcpError
+from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn
+from rtcp.ipc.layout import FLAG_SWITCHING
+from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.states import ControlMode, State
+
+T = TypeVar("T")
+Json = dict[str, Any]
+
+IN_MOTION = frozenset({State.MOVING, State.STOPPING})
+"""States that a motion passes through."""
+_POLL_S = 0.002
+_ANSWER_S = 2.0
+_PROGRESS_S = 0.1
+_REST_S = 10.0
+_BROKEN = frozenset({State.FAULT, State.EMERGENCY_STOP})
+
+
+@dataclass(frozen=True)
+class Caller:
+    """Who asks: a name for people, the connection, and how it is told of progress."""
+
+    name: str
+    connection: int
+    report: Callable[[Json], None] = lambda progress: None
+    is_stalled: Callable[[float], bool] = lambda seconds: False
+    """Whether it has not read what was sent to it for so many seconds."""
+
+
+class _Waiter(Generic[T]):
+    def __init__(self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError]) -> None:
+        self._look = look
+        self._until = time.monotonic() + timeout_s
+        self._timed_out = timed_out
+        self.outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
+
+    def update(self) -> None:
+        """Look once; a result or an error ends the wait."""
+        if self.outcome.done():
+            return
+        try:
+            found = self._look()
+            if found is None and time.monotonic() > self._until:
+                raise self._timed_out()
+        except Exception as error:
+            self.outcome.set_exception(error)
+        else:
+            if found is not None:
+                self.outcome.set_result(found)
+
+
+class CommandChannel:
+    """Sends commands to the loop and waits for what comes of them, on behalf of all methods.
+
+    `follow` has to run as a task. All methods raise RtcpError.
+
+    Args:
+        observer: the blackboard.
+        snapshot: whether the loop lives, and why it is in fault.
+        config: the arm.
+    """
+
+    def __init__(self, observer: Observer, snapshot: StatusSnapshot, config: ArmConfig) -> None:
+        self.observer = observer
+        self.snapshot = snapshot
+        self.config = config
+        self.names = snapshot.names
+        self._ring = asyncio.Lock()
+        self._waiters: list[_Waiter[Any]] = []
+        self._has_waiters = asyncio.Event()
+
+    # -- what the loop shows now --------------------------------------------------------------------------------------
+
+    def record(self) -> Any:
+        """Return the latest cycle record, a numpy record."""
+        latest = self.observer.latest()
+        if latest is None:
+            raise RtcpError("fault", "the loop has published no cycle")
+        return latest[0]
+
+    @property
+    def state(self) -> State:
+        """State of the machine in the latest record."""
+        return State(int(self.record()["state"]))
+
+    @property
+    def control_mode(self) -> ControlMode | None:
+        """Control mode in the latest record."""
+        found = int(self.record()["control_mode"])
+        return ControlMode(found) if found in tuple(ControlMode) else None
+
+    def joints(self, name: str) -> list[float]:
+        """Return a field of the latest record, one number a joint."""
+        return [float(value) for value in self.record()[name][: len(self.config.joints)]]
+
+    def progress(self) -> Json:
+        """Return the parameters of a progress report."""
+        record = self.record()
+        moving = int(record["state"]) in IN_MOTION
+        elapsed, duration = float(record["elapsed_s"]), float(record["duration_s"])
+        return {
+            "state": State(int(record["state"])).name.lower(),
+            "fraction": min(elapsed / duration, 1.0) if moving and duration > 0 else 0.0,
+            "remaining_s": max(duration - elapsed, 0.0) if moving else 0.0,
+            "positions": self.joints("actual_position"),
+        }
+
+    def check_loop(self) -> None:
+        """Raise RtcpError where the loop has ended."""
+        if not self.snapshot.loop_lives:
+            raise RtcpError("fault", f"the loop (process {self.observer.loop_pid}) has ended")
+
+    # -- the lease ----------------------------------------------------------------------------------------------------
+
+    @contextlib.asynccontextmanager
+    async def lease(self, caller: Caller) -> AsyncIterator[int]:
+        """Hold the lease, renewed, until the block ends; report progress meanwhile.
+
+        It is not renewed for a caller that does not read its reports: such a client is stopped (SIGSTOP) or hangs.
+        """
+        lease = self.acquire(caller)
+        renewing = asyncio.create_task(self._renew(lease, caller))
+        try:
+            yield lease
+        finally:
+            renewing.cancel()
+            self.observer.release(lease)
+
+    def acquire(self, caller: Caller) -> int:
+        """Take the lease and return its id; the caller has to renew and to release it."""
+        try:
+            return self.observer.acquire(caller.name, self.config.lease_s)
+        except LeaseRefused as refused:
+            raise RtcpError("refused", str(refused), "lease_held", {"holder": refused.holder}) from None
+
+    async def _renew(self, lease: int, caller: Caller) -> None:
+        while not caller.is_stalled(self.config.lease_s) and self.observer.renew(lease):
+            caller.report(self.progress())
+            await asyncio.sleep(min(_PROGRESS_S, self.config.lease_s / 5))
+
+    # -- commands and their outcome -----------------------------------------------------------------------------------
+
+    async def send(self, lease: int, command: Command) -> None:
+        """Send a command; return when it was accepted and a record of a later cycle is there."""
+        await self.run(lease, command, lambda: True, _ANSWER_S, command.name)
+
+    async def run(
+        self, lease: int, command: Command, outcome: Callable[[], T | None], timeout_s: float, what: str
+    ) -> T:
+        """Send a command and wait until `outcome` returns something; it is called from the first record on that knows
+        of the command, and may raise."""
+        async with self._ring:
+            try:
+                number = self.observer.command(lease, command)
+            except BlackboardError as error:
+                raise RtcpError("fault", str(error)) from None
+            except (ValueError, OverflowError, struct.error) as error:
+                raise RtcpError("invalid", f"{command.name}: a field cannot be sent: {error}") from None
+            late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
+            # The answer is a little older than the record of its cycle.
+            head = await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late)
+
+        def look() -> T | None:
+            self.check_loop()
+            return outcome() if self.observer.head > head else None
+
+        def timed_out() -> RtcpError:
+            return RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
+
+        return await self.wait(look, timeout_s, timed_out)
+
+    def _accepted(self, number: int) -> int | None:
+        self.check_loop()
+        answer = self.observer.answer(number)
+        if answer is None:
+            return None
+        if answer.refusal is None:
+            return self.observer.head
+        fault = self.snapshot.fault if self.state in _BROKEN else ""
+        raise self.error("refused", answer.refusal, after=f"; the fault: {fault}" if fault else "")
+
+    async def end_loop(self, command: Command) -> None:
+        """Send the command that ends the loop; the end of its process is the answer."""
+        async with self._ring:
+            self.observer.command(0, command)
+
+    async def wait(self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError]) -> T:
+        """Return what `look` returns, once that is not None; it is called every 2 ms and may raise."""
+        waiter = _Waiter(look, timeout_s, timed_out)
+        self._waiters.append(waiter)
+        self._has_waiters.set()
+        try:
+            return await waiter.outcome
+        finally:
+            self._waiters.remove(waiter)
+
+    async def follow(self) -> None:
+        """Read the blackboard for all who wait; rest while nobody does."""
+        while True:
+            await self._has_waiters.wait()
+            for waiter in list(self._waiters):
+                waiter.update()
+            await asyncio.sleep(_POLL_S)
+            if not self._waiters:
+                self._has_waiters.clear()
+
+    def reaching(self, wanted: State, through: frozenset[State], what: str, since: int) -> Callable[[], State | None]:
+        """Return an outcome: the state `wanted`, reached through the states `through` only.
+
+        Args:
+            wanted: the state; while the drives change their mode it does not count.
+            through: others that are passed; any other fails.
+            what: names the command in messages.
+            since: number of the last event before the command.
+        """
+
+        def look() -> State | None:
+            self.check_loop()
+            record = self.record()
+            state = State(int(record["state"]))
+            if state is wanted:
+                return None if int(record["flags"]) & FLAG_SWITCHING else state
+            if state in _BROKEN:
+                raise self.fault_since(since)
+            if state in through:
+                return None
+            if state is State.STOPPED_BY_LIMIT:
+                raise self.ended(self.early_end(since), f"{what} was stopped by a limit")
+            raise RtcpError("refused", f"{what} was ended by another command: the machine is {state.words}")
+
+        return look
+
+    # -- events -------------------------------------------------------------------------------------------------------
+
+    def events(self, since: int) -> list[EventRecord]:
+        """Return the events after the number `since`."""
+        return self.observer.events_since(since)
+
+    def early_end(self, since: int) -> Event | None:
+        """Return the last event after `since` that ends a motion before its goal."""
+        found = [one.event for one in self.events(since) if _ends_early(one.event)]
+        return found[-1] if found else None
+
+    def fault_since(self, since: int) -> RtcpError:
+        """Return the error for the last fault after `since`."""
+        found = [one.event for one in self.events(since) if one.event.is_fault]
+        if found:
+            return self.error("fault", found[-1])
+        return RtcpError("fault", self.snapshot.last_fault or "the machine went into fault: see `rtcp status`")
+
+    def ended(self, event: Event | None, what: str) -> RtcpError:
+        """Return the error for a motion that `event` ended."""
+        if event is None:
+            return RtcpError("fault", f"{what}: see `rtcp status`")
+        return self.error("fault", event, before=f"{what}: ")
+
+    def error(self, kind: ErrorKind, about: Refusal | Event, before: str = "", after: str = "") -> RtcpError:
+        """Return the error that carries a refusal or an event."""
+        return RtcpError(kind, before + self.names.message(about) + after, about.name, about.as_json())
+
+
+def _ends_early(event: Event) -> bool:
+    return event.is_fault or isinstance(event, MotionEnded | LeaseExpired | PermissionWithdrawn)
+
+
+class StreamingCommands:
+    """Carries commands that last only while more of them follow; each connection keeps one lease from first to last.
+
+    A client that falls silent has three ends: the hold time of its command, its lease, its connection.
+
+    Args:
+        channel: the way to the loop.
+    """
+
+    def __init__(self, channel: CommandChannel) -> None:
+        self._channel = channel
+        self._leases: dict[int, tuple[int, int]] = {}
+        """Lease and last event before it, by connection."""
+
+    async def send(self, caller: Caller, command: Command) -> Json:
+        """Send a command; return state and positions."""
+        channel = self._channel
+        lease, since = self._lease(caller)
+        try:
+            await channel.send(lease, command)
+        except RtcpError as error:
+            ended = channel.early_end(since)
+            if ended is not None and channel.state is not State.HOLDING:
+                raise channel.ended(ended, "the motion has ended") from error
+            raise
+        return {"state": channel.state.name.lower(), "positions": channel.joints("actual_position")}
+
+    async def rest(self, caller: Caller) -> None:
+        """End what this connection moves and wait until the arm rests: another command follows."""
+        if caller.connection not in self._leases:
+            return
+        self.end(caller.connection)
+        channel = self._channel
+
+        def rested() -> bool | None:
+            channel.check_loop()
+            return channel.state not in IN_MOTION or None
+
+        with contextlib.suppress(RtcpError):
+            await channel.wait(rested, _REST_S, lambda: RtcpError("timeout", "the arm does not come to rest"))
+
+    def end(self, connection: int) -> None:
+        """End what a connection moves: its lease goes, and the loop stops the arm."""
+        lease, _ = self._leases.pop(connection, (0, 0))
+        if lease:
+            self._channel.observer.release(lease)
+
+    def _lease(self, caller: Caller) -> tuple[int, int]:
+        held = self._leases.get(caller.connection)
+        if held is None or not self._channel.observer.renew(held[0]):
+            since = self._channel.observer.last_event
+            self._leases[caller.connection] = held = self._channel.acquire(caller), since
+        return held

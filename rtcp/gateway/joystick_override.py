@@ -1,0 +1,158 @@
+"""The joystick of the virtual IO box: forces its inputs through its objects, and releases them by itself.
+
+An input that stays forced when whoever forced it has died is a known accident: every hold is short and has to be
+repeated, a connection that closes releases, and a gateway that starts releases what an earlier one left.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Sequence
+
+from rtcp.config.model import VIRTUAL, ArmConfig, InputConfig
+from rtcp.gateway.command_channel import Caller, Json
+from rtcp.gateway.machine_actions import MachineActions
+from rtcp.ipc.errors import RtcpError
+
+OBJECT, MASK, LEVELS, HOLD = 0x2000, 1, 2, 3
+"""Of the virtual IO box: which inputs are forced, to what, and for how long (`rtcp.virtual.models.diewu`)."""
+_BOX_HOLD_MS, _REPEAT_S = 1500, 0.4
+"""The box releases by itself where this process is killed."""
+DIRECTIONS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
+CHAIR, EMERGENCY_STOP, ENABLING_SWITCH = "chair", "emergency_stop", "enabling_switch"
+LONGEST_HOLD_S = 1.0
+_POLL_S = 0.02
+_BYTE = 0xFF
+
+
+class JoystickOverride:
+    """Forces the inputs of joystick, toggle, emergency stop and enabling switch.
+
+    Args:
+        actions: writes the objects.
+        config: which inputs they are.
+        bus: there is such an object on the virtual bus only.
+    """
+
+    def __init__(self, actions: MachineActions, config: ArmConfig, bus: str) -> None:
+        self._actions = actions
+        self._config = config
+        self._bus = bus
+        boxes = (at for at, slave in enumerate(config.slaves, 1) if slave.device.kind == "io")
+        self._slave = next(boxes, 0)
+        self._owner: Caller | None = None
+        self._until = 0.0
+        self._written: dict[int, int] = {}
+        self._writing = asyncio.Lock()
+        self._repeated = 0.0
+
+    @property
+    def possible(self) -> bool:
+        """Whether there is a virtual IO box."""
+        return self._bus == VIRTUAL and self._slave > 0
+
+    async def force(self, caller: Caller, pressed: Sequence[str] | None, byte: int | None, hold_s: float) -> Json:
+        """Hold the joystick as `pressed` names it, or at `byte`, for `hold_s`; None and None: release it.
+
+        Raises:
+            RtcpError: `refused` where another holds it.
+        """
+        if not self.possible:
+            raise RtcpError("refused", f"inputs are forced on the virtual bus only, not on {self._bus}")
+        if self._owner is not None and self._owner.connection != caller.connection:
+            # What it holds ends by itself within a second.
+            raise RtcpError("refused", f"the joystick is held by {self._owner.name}: wait until it is released")
+        mask, levels = (0, 0) if pressed is None and byte is None else forced(self._config, pressed or (), byte)
+        if mask == 0:
+            await self.release()
+            return {"mask": 0, "levels": 0}
+        self._owner, self._until = caller, time.monotonic() + hold_s
+        await self._write(mask, levels)
+        return {"mask": mask, "levels": levels}
+
+    async def release(self) -> None:
+        """Release everything; what fails is tried again by `watch`."""
+        self._owner = None
+        self._repeated = 0.0
+        if self.possible:
+            with contextlib.suppress(RtcpError):
+                await self._write(0, 0)
+
+    async def end(self, connection: int) -> None:
+        """Release what a connection that has closed was holding."""
+        if self._owner is not None and self._owner.connection == connection:
+            await self.release()
+
+    async def watch(self) -> None:
+        """Release what is not repeated; runs as long as the gateway does."""
+        while True:
+            await asyncio.sleep(_POLL_S)
+            expired = self._owner is not None and time.monotonic() > self._until
+            if expired or (self._owner is None and self._written.get(MASK) != 0):
+                await self.release()
+
+    async def _write(self, mask: int, levels: int) -> None:
+        async with self._writing:
+            if mask and time.monotonic() - self._repeated > _REPEAT_S:
+                await self._write_object(HOLD, _BOX_HOLD_MS)
+                self._repeated = time.monotonic()
+            # Levels first, so that no input takes one that nobody asked for; but none is released late.
+            for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
+                if self._written.get(subindex) != value:
+                    self._written.pop(subindex, None)
+                    await self._write_object(subindex, value)
+                    self._written[subindex] = value
+
+    async def _write_object(self, subindex: int, value: int) -> None:
+        request = {"slave": self._slave, "index": OBJECT, "subindex": subindex}
+        await self._actions.service({"do": "sdo_write", **request, "hex": value.to_bytes(2, "little").hex()})
+
+
+def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> tuple[int, int]:
+    """Return the mask of the inputs that are forced and their levels.
+
+    Args:
+        config: where joystick, toggle, emergency stop and enabling switch are.
+        pressed: of `DIRECTIONS`, and `chair` (the toggle gives the joystick to the wheelchair), `emergency_stop`,
+            `enabling_switch`.
+        byte: the joystick's byte, or None: as `pressed` says.
+
+    Raises:
+        RtcpError: naming what is unknown or not configured.
+    """
+    inputs = config.inputs
+    switches: dict[str, tuple[InputConfig | None, bool]] = {
+        CHAIR: (inputs.arm_toggle, False),
+        EMERGENCY_STOP: (inputs.emergency_stop, True),
+        ENABLING_SWITCH: (inputs.enabling_switch, True),
+    }
+    mask = levels = 0
+    for name in pressed:
+        if name not in DIRECTIONS and name not in switches:
+            allowed = ", ".join((*DIRECTIONS, *switches))
+            raise RtcpError("invalid", f'pressed: found the text "{name}", allowed are {allowed}')
+        if name in switches:
+            switch, active = switches[name]
+            if switch is None:
+                key = "arm_toggle" if name == CHAIR else name
+                raise RtcpError("refused", f"the input inputs.{key} is missing in {config.source}")
+            mask |= 1 << switch.number - 1
+            levels |= ((switch.active == "high") is active) << switch.number - 1
+    joystick = inputs.joystick
+    if joystick is None:
+        if byte is not None or any(name in DIRECTIONS for name in pressed):
+            raise RtcpError("refused", f"there is no joystick: inputs.joystick is missing in {config.source}")
+        return mask, levels
+    bits = {name: 1 << getattr(joystick, name) - 1 for name in DIRECTIONS}
+    place = (min(bits.values()).bit_length() - 1) // 8 * 8
+    others = sum(1 << one.number - 1 for one, _ in switches.values() if one is not None)
+    lines = sum(bits.values())
+    if byte is None:
+        shown = sum(bits[name] for name in DIRECTIONS if name in pressed)
+        return mask | lines, levels | (lines & ~shown if joystick.active == "low" else shown)
+    if not 0 <= byte <= _BYTE:
+        raise RtcpError("invalid", f"byte: found {byte}, allowed is 0 to 255")
+    whole = _BYTE << place & ~others
+    return mask | whole, levels | byte << place & whole

@@ -1,0 +1,369 @@
+"""The methods of the control socket: one function each, whose signature is the form of the parameters.
+
+Every command of the loop that needs no planning (`rtcp.ipc.commands`, and those of packages outside) is a method of
+its own name by itself.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field, make_dataclass
+from enum import IntEnum
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+
+from annotated_types import Ge, Gt, Le
+
+from rtcp.config.model import Point, Stop
+from rtcp.config.validation import Checker
+from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
+from rtcp.gateway.joystick_override import LONGEST_HOLD_S, JoystickOverride
+from rtcp.gateway.limit_settings import LimitSettings
+from rtcp.gateway.machine_actions import MachineActions
+from rtcp.gateway.motion_actions import MotionActions, Planner
+from rtcp.gateway.status_snapshot import StatusSnapshot
+from rtcp.ipc import commands
+from rtcp.ipc.commands import COMMANDS, Command, MotionCommand
+from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.message import Joints
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.session import Session, SessionError, read_json, read_processes
+from rtcp.ipc.states import ControlMode, JogFrame
+from rtcp.motion.limits import Limits
+
+HOLD_S = 0.25
+"""Hold time of a command that gives none."""
+_INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines)
+"""Commands that no client sends by themselves."""
+Numbers = tuple[float, ...]
+Frame = Literal["base", "tool", "joints"]
+F = TypeVar("F", bound=Callable[..., Awaitable[Json]])
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method of the control socket."""
+
+    name: str
+    parameters: Checker[Any]
+    call: Callable[..., Awaitable[Json]]
+    """Takes the caller and the parameters by name."""
+    documentation: str
+    at_once: bool = False
+    """Whether it does not wait for its connection's other requests."""
+    streams: bool = False
+    """Whether it goes on with what its connection moves; else it waits until that has come to rest."""
+
+    async def __call__(self, caller: Caller, given: Json) -> Json:
+        """Check the parameters and carry it out; raises RtcpError."""
+        found, findings = self.parameters.check(given)
+        if findings:
+            raise RtcpError("invalid", "\n".join(_sentence(where, text) for where, text in findings))
+        return await self.call(caller, **vars(found))
+
+
+def _sentence(where: tuple[int | str, ...], text: str) -> str:
+    path = "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in where).removeprefix(".")
+    return f"{path}: {text}" if path else text
+
+
+def method(at_once: bool = False, streams: bool = False) -> Callable[[F], F]:
+    """Mark a function of `Methods` as a method of the control socket."""
+
+    def mark(function: F) -> F:
+        function.method_flags = {"at_once": at_once, "streams": streams}  # type: ignore[attr-defined]
+        return function
+
+    return mark
+
+
+class Methods:
+    """Everything that may be asked of one running platform.
+
+    Args:
+        observer: the blackboard.
+        snapshot: what `status` shows.
+        session: what was started.
+        directory: the runtime directory.
+        end_platform: ends all processes but this one; returns what could not be left in order.
+    """
+
+    def __init__(
+        self,
+        observer: Observer,
+        snapshot: StatusSnapshot,
+        session: Session,
+        directory: Path,
+        end_platform: Callable[[], Awaitable[list[str]]],
+    ) -> None:
+        config, limits = session.config, Limits(session.config)
+        self._config = config
+        self._snapshot = snapshot
+        self._observer = observer
+        self._directory = directory
+        self._end_platform = end_platform
+        self.channel = channel = CommandChannel(observer, snapshot, config)
+        self.machine = MachineActions(channel)
+        self.joystick_override = JoystickOverride(self.machine, config, session.bus)
+        self._streaming = StreamingCommands(channel)
+        self._limits = LimitSettings(channel, limits, directory)
+        self._motion = MotionActions(channel, Planner(config, limits))
+        self.table = self._table()
+
+    def _table(self) -> dict[str, Method]:
+        for point in entry_points(group="rtcp.controllers"):
+            point.load()  # registers the commands that its controller accepts
+        found = (getattr(self, name) for name in dir(type(self)) if hasattr(getattr(type(self), name), "method_flags"))
+        table = {one.name: one for one in map(_method_of, found)}
+        for kind in COMMANDS:
+            if kind.name not in table and kind not in _INTERNAL:
+                table[kind.name] = self._command_method(kind)
+        return dict(sorted(table.items()))
+
+    async def call(self, name: str, caller: Caller, given: Json) -> Json:
+        """Carry out a method by its name; raises RtcpError."""
+        one = self.table[name]
+        if not (one.streams or one.at_once):
+            await self._streaming.rest(caller)
+        return await one(caller, given)
+
+    async def end_connection(self, connection: int) -> None:
+        """End what a connection that has closed was moving or holding."""
+        self._streaming.end(connection)
+        await self.joystick_override.end(connection)
+
+    # -- the platform -------------------------------------------------------------------------------------------------
+
+    @method(at_once=True)
+    async def status(self, caller: Caller) -> Json:
+        """Return the state of machine, joints, bus and slaves: the object that `rtcp status --json` prints."""
+        self._snapshot.follow()
+        return self._snapshot.status(read_processes(self._directory))
+
+    @method(at_once=True)
+    async def events(self, caller: Caller, since: Annotated[int, Ge(0)] = 0) -> Json:
+        """Return `events` after the number `since`, oldest first: number, time, name, fields, message."""
+        return {"events": [self._snapshot.event(record) for record in self._observer.events_since(since)]}
+
+    @method(at_once=True)
+    async def scan(self, caller: Caller) -> Json:
+        """Return `slaves` as the start found them, with their AL states now."""
+        try:
+            slaves = read_json(self._directory / "scan.json", list)
+        except SessionError as error:
+            raise RtcpError("internal", str(error)) from error
+        for slave, now in zip(slaves, (await self.status(caller))["slaves"], strict=False):
+            slave["state"] = now["state"]
+        return {"slaves": slaves}
+
+    @method()
+    async def stop(self, caller: Caller) -> Json:
+        """End the platform. Returns `problems`: what could not be left in order."""
+        return {"problems": await self._end_platform()}
+
+    # -- the machine --------------------------------------------------------------------------------------------------
+
+    @method()
+    async def enable(self, caller: Caller) -> Json:
+        """Enable all drives; returns when the arm holds."""
+        return await self.machine.enable(caller)
+
+    @method(at_once=True)
+    async def disable(self, caller: Caller) -> Json:
+        """Stop and remove the torque; returns when the drives show that it is gone. Needs no lease.
+
+        Returns `unconfirmed`: drives that no cycle record shows, a gripper's in a fault.
+        """
+        return await self.machine.disable()
+
+    @method()
+    async def reset(self, caller: Caller) -> Json:
+        """Leave a fault, an emergency stop or a stop by a limit. Returns `from`: the state that was left."""
+        return await self.machine.reset(caller)
+
+    @method(at_once=True)
+    async def halt(self, caller: Caller) -> Json:
+        """Stop every motion; returns when the arm holds. Needs no lease."""
+        return await self.machine.halt()
+
+    @method()
+    async def mode(self, caller: Caller, name: str) -> Json:
+        """Change the control mode (joint, cartesian, joystick, velocity, torque) or the drive mode (csp, csv, cst)."""
+        return await self.machine.mode(caller, name)
+
+    @method()
+    async def move_gripper(self, caller: Caller, open: bool) -> Json:
+        """Open or close the gripper. One with a drive has come to rest: returns its `position`, rad, and `holds`."""
+        return await self.machine.gripper(caller, open)
+
+    @method()
+    async def zero(self, caller: Caller, joint: str, at: float = 0.0) -> Json:
+        """Define the present position of a joint as `at`, rad. Returns `joint`, `offset`, `before`, `file`."""
+        return await self.machine.zero(caller, joint, at)
+
+    @method()
+    async def home(self, caller: Caller, joint: str) -> Json:
+        """Run the homing of a joint's drive. Returns its `position`, rad."""
+        return await self.machine.home(caller, joint)
+
+    @method(streams=True)
+    async def sdo_read(self, caller: Caller, slave: int, index: int, subindex: int) -> Json:
+        """Read an object of the slave at a position from 1. Returns its bytes as `hex`."""
+        return await self.machine.service({"do": "sdo_read", "slave": slave, "index": index, "subindex": subindex})
+
+    @method()
+    async def sdo_write(self, caller: Caller, slave: int, index: int, subindex: int, hex: str) -> Json:
+        """Write an object of a slave, in state ready only."""
+        return await self.machine.sdo_write(caller, {"slave": slave, "index": index, "subindex": subindex, "hex": hex})
+
+    @method(at_once=True)
+    async def limits(self, caller: Caller) -> Json:
+        """Return the `limits` in force beside those that are `configured`."""
+        return self._limits.show()
+
+    @method()
+    async def set_limits(self, caller: Caller, changes: dict[str, Any]) -> Json:
+        """Narrow limits, all or none; keys as `joint2.max`, `joints.velocity`, `box.min.x`. Returns as `limits`."""
+        return await self._limits.change(caller, changes)
+
+    @method(streams=True)
+    async def joystick(
+        self,
+        caller: Caller,
+        pressed: tuple[str, ...] | None = None,
+        byte: int | None = None,
+        hold_s: Annotated[float, Gt(0), Le(LONGEST_HOLD_S)] = LONGEST_HOLD_S,
+        sent_s: float | None = None,
+    ) -> Json:
+        """Hold the joystick of the virtual IO box as `pressed` names it, or at `byte`; neither: release it.
+
+        `pressed`: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.
+        """
+        _check_age(hold_s, sent_s)
+        return await self.joystick_override.force(caller, pressed, byte, hold_s)
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    @method()
+    async def move_joints(
+        self, caller: Caller, q: Numbers, speed: float | None = None, synchronized: bool = True
+    ) -> Json:
+        """Move to joint positions, rad, at most at `speed`, rad/s. Returns `positions` and the largest `error`, rad."""
+        return await self._motion.move_joints(caller, q, speed, synchronized)
+
+    @method()
+    async def move_pose(self, caller: Caller, pose: Numbers, speed: float | None = None, line: bool = False) -> Json:
+        """Move the tool to x y z, m, rx ry rz, rad, by the joints or on a `line`; `speed` in rad/s or m/s."""
+        return await self._motion.move_pose(caller, pose, speed, line)
+
+    @method()
+    async def move_line(self, caller: Caller, poses: tuple[Numbers, ...], speed: float | None = None) -> Json:
+        """Move the tool on straight lines through poses, m and rad, at `speed`, m/s.
+
+        Returns as `move_joints`, and `duration_s`, `length_m`, and `slowed`, the fraction of the speed that the joints
+        allowed.
+        """
+        return await self._motion.run_path(caller, [Stop(pose) for pose in poses], speed, False)
+
+    @method()
+    async def run(self, caller: Caller, file: str, approach: bool = False) -> Json:
+        """Run a motion file (`docs/motion.md`), an absolute path. `approach`: the joints first move to its start."""
+        return await self._motion.run_file(caller, file, approach)
+
+    @method()
+    async def run_trajectory(self, caller: Caller, points: tuple[Point, ...], approach: bool = False) -> Json:
+        """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`."""
+        return await self._motion.run_trajectory(caller, points, approach)
+
+    @method()
+    async def run_path(
+        self, caller: Caller, stops: tuple[Stop, ...], speed: float | None = None, approach: bool = False
+    ) -> Json:
+        """Run straight lines to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s."""
+        return await self._motion.run_path(caller, stops, speed, approach)
+
+    @method(streams=True)
+    async def jog(
+        self,
+        caller: Caller,
+        velocity: Numbers,
+        frame: Frame = "base",
+        hold_s: float = HOLD_S,
+        sent_s: float | None = None,
+    ) -> Json:
+        """Move the tool, m/s and rad/s along and about the axes of `frame`, or the joints, rad/s, for `hold_s`."""
+        _check_age(hold_s, sent_s)
+        self._check_count("velocity", velocity, len(self._config.joints) if frame == "joints" else 6)
+        command: Command = commands.Jog(velocity, JogFrame[frame.upper()], hold_s)
+        if frame == "joints" and self.channel.control_mode is ControlMode.VELOCITY:
+            command = commands.MoveAtVelocity(velocity, hold_s)
+        return await self._streaming.send(caller, command)
+
+    # -- commands without a function of their own ---------------------------------------------------------------------
+
+    def _command_method(self, kind: type[Command]) -> Method:
+        """Return the method of a command: it moves until the arm holds again, streams, or returns when accepted."""
+        streams = issubclass(kind, MotionCommand) and kind.renewed
+        hints = {name: one for name, one in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
+        held = streams and "hold_s" in hints
+
+        async def call(caller: Caller, sent_s: float | None = None, **given: Any) -> Json:
+            for name, hint in hints.items():
+                if isinstance(hint, type) and issubclass(hint, IntEnum):
+                    given[name] = hint[given[name].upper()]
+                elif hint == Joints:
+                    self._check_count(name, given[name], len(self._config.joints))
+            if held:
+                _check_age(given["hold_s"], sent_s)
+            command = kind(**given)
+            if streams:
+                return await self._streaming.send(caller, command)
+            if isinstance(command, MotionCommand):
+                return await self._motion.run_command(caller, command)
+            if not kind.needs_lease:
+                await self.channel.send(0, command)
+                return {}
+            async with self.channel.lease(caller) as lease:
+                await self.channel.send(lease, command)
+            return {}
+
+        fields = [
+            (name, _parameter(hint), field(default=HOLD_S) if held and name == "hold_s" else field())
+            for name, hint in hints.items()
+        ]
+        if held:
+            fields.append(("sent_s", float | None, field(default=None)))
+        checker: Checker[Any] = Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
+        return Method(kind.name, checker, call, inspect.cleandoc(kind.__doc__ or ""), streams=streams)
+
+    @staticmethod
+    def _check_count(name: str, numbers: Numbers, count: int) -> None:
+        if len(numbers) != count:
+            raise RtcpError("invalid", f"{name}: found {len(numbers)} numbers, allowed are {count}")
+
+
+def _method_of(function: Any) -> Method:
+    hints = get_type_hints(function, include_extras=True)
+    fields = [
+        (name, hints[name], field() if one.default is inspect.Parameter.empty else field(default=one.default))
+        for name, one in inspect.signature(function).parameters.items()
+        if name != "caller"
+    ]
+    checker: Checker[Any] = Checker(make_dataclass(function.__name__, fields, frozen=True, kw_only=True))
+    return Method(function.__name__, checker, function, inspect.cleandoc(function.__doc__), **function.method_flags)
+
+
+def _parameter(hint: Any) -> Any:
+    """Return the type of a parameter for a command's field: an enum goes by its names in lower case."""
+    if isinstance(hint, type) and issubclass(hint, IntEnum):
+        return Literal[tuple(one.name.lower() for one in hint)]
+    return hint
+
+
+def _check_age(hold_s: float, sent_s: float | None) -> None:
+    """Raise RtcpError where `hold_s` has passed since `sent_s`, CLOCK_MONOTONIC, at which the command was wanted."""
+    if sent_s is not None and not (late_s := time.monotonic() - sent_s) <= hold_s:
+        raise RtcpError("timeout", f"it came {late_s:.1f} s after it was sent, and lasts for {hold_s:g} s only")

@@ -1,0 +1,268 @@
+"""Motions that have an end: joint moves, poses, straight lines, files. Planned and checked whole before they begin."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from kinematics.forward import frames
+from kinematics.inverse import InverseKinematics
+from kinematics.model import ArmModel, JointLimit
+from kinematics.pose import Pose
+from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
+from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
+from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory
+from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.layout import PlanTooLong
+from rtcp.ipc.states import ControlMode, State
+from rtcp.motion.guards.zones import Zones
+from rtcp.motion.limits import Limits
+from rtcp.motion.planning.lines import plan_lines
+from rtcp.motion.planning.plan import Plan, PlanRefused
+from rtcp.motion.planning.waypoints import plan_trajectory
+
+T = TypeVar("T")
+_COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
+_LARGEST = 100.0
+"""m or rad of a pose: further away is no arm, and the remainder of larger angles would be noise of the number."""
+_SAME_RAD, _SAME_PLANNED_RAD = 1e-9, 1e-4
+"""Distance of the commanded end from the goal: of a move exact, of a plan as the loop's own sums have it."""
+_SETTLED_RAD, _SETTLE_S = 5e-4, 3.0
+_TIMEOUT_S = 20.0
+_UNPLANNED_S = 600.0
+"""Longest motion of a package's own command."""
+
+
+class Planner:
+    """Makes plans for one arm under the limits in force.
+
+    Every method raises RtcpError: `refused` for what this arm cannot do, `invalid` for what no arm could.
+
+    Args:
+        config: the arm.
+        limits: in force now; changed elsewhere.
+    """
+
+    def __init__(self, config: ArmConfig, limits: Limits) -> None:
+        self._config = config
+        self.limits = limits
+        self._zones = None if config.arm is None else Zones(config.arm, limits)
+
+    def _model(self) -> ArmModel:
+        """Return the geometry with the limits in force."""
+        arm = self._config.arm
+        if arm is None:
+            file = self._config.source
+            raise RtcpError("refused", f"the geometry of the arm is unknown: the key kinematics is missing in {file}")
+        limits = zip(self.limits.low, self.limits.high, self.limits.velocity, strict=True)
+        return dataclasses.replace(arm, limits=tuple(JointLimit(*three) for three in limits))
+
+    def _zone_at(self, q: Sequence[float]) -> str | None:
+        if self._zones is None or self._config.arm is None:
+            return None
+        distance, box = self._zones.distance(frames(self._config.arm, q))
+        if distance >= 0.0:
+            return None
+        boxes = self._config.cartesian.keep_out
+        return f"the keep-out box {boxes[box].name}" if 0 <= box < len(boxes) else "the space outside the Cartesian box"
+
+    def joints_at(self, pose: Sequence[float], q_now: Sequence[float]) -> list[float]:
+        """Return the joint positions, rad, nearest to `q_now` that bring the tool to `pose` (m, rad)."""
+        _require_pose(pose, "pose")
+        found = InverseKinematics(self._model()).solve_near(Pose.from_xyzrpy(*pose), q_now)
+        if found.q is None:
+            raise RtcpError("refused", f"the pose cannot be reached: {found.reason}")
+        if box := self._zone_at(found.q):
+            raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
+        return list(found.q)
+
+    def lines(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
+        """Return the plan of straight lines from `q_now` to each stop in turn, at most at `speed`, m/s."""
+        for at, stop in enumerate(stops):
+            if stop.pose is not None:
+                _require_pose(stop.pose, f"poses[{at}]")
+        model, cartesian = self._model(), self._config.cartesian
+        try:
+            return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+        except PlanRefused as refused:
+            raise RtcpError("refused", str(refused)) from None
+
+    def trajectory(self, points: Sequence[Point], q_now: Sequence[float]) -> Plan:
+        """Return the plan of a trajectory that begins at `q_now`."""
+        names = [joint.name for joint in self._config.joints]
+        try:
+            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
+        except PlanRefused as refused:
+            raise RtcpError("refused", str(refused)) from None
+
+    @staticmethod
+    def read(path: str) -> tuple[tuple[Point, ...], tuple[Stop, ...], float | None]:
+        """Return trajectory, path and speed of a motion file."""
+        from rtcp.config.motion_file import read_motion
+
+        if not Path(path).is_absolute():
+            raise RtcpError("invalid", f'file: found the text "{path}", allowed is an absolute path')
+        try:
+            motion = read_motion(Path(path))
+        except ConfigError as error:
+            raise RtcpError("invalid", str(error)) from None
+        return motion.trajectory, motion.path, motion.speed
+
+
+class MotionActions:
+    """Moves the arm on behalf of the clients; every method raises RtcpError.
+
+    Args:
+        channel: the way to the loop.
+        planner: makes the plans.
+    """
+
+    def __init__(self, channel: CommandChannel, planner: Planner) -> None:
+        self._channel = channel
+        self._planner = planner
+        self._count = len(channel.config.joints)
+
+    async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
+        """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
+        if len(q) != self._count:
+            raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+        async with self._channel.lease(caller) as lease:
+            return await self._move(lease, q, speed, synchronized)
+
+    async def move_pose(self, caller: Caller, pose: Sequence[float], speed: float | None, line: bool) -> Json:
+        """Move the tool to a pose (m, rad): on a straight line where `line` or the control mode says so, else by the
+        joints."""
+        if line or self._channel.control_mode is ControlMode.CARTESIAN:
+            return await self.run_path(caller, [Stop(tuple(pose))], speed, False)
+        async with self._channel.lease(caller) as lease:
+            q = await asyncio.to_thread(self._planner.joints_at, pose, self._start())
+            return await self._move(lease, q, speed, True)
+
+    async def run_file(self, caller: Caller, file: str, approach: bool) -> Json:
+        """Run a motion file."""
+        # In a thread, as all planning: leases are renewed meanwhile.
+        points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if stops:
+            return await self.run_path(caller, stops, speed, approach)
+        return await self.run_trajectory(caller, points, approach)
+
+    async def run_trajectory(self, caller: Caller, points: Sequence[Point], approach: bool) -> Json:
+        """Run a trajectory; with `approach` the joints first move to its first point."""
+        async with self._channel.lease(caller) as lease:
+            if approach and points:
+                await self._move(lease, self._joints(points[0].q), None, True)
+            plan = await asyncio.to_thread(self._planner.trajectory, points, self._start())
+            return await self._run_plan(lease, RunTrajectory, plan, "the trajectory")
+
+    async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
+        """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
+        async with self._channel.lease(caller) as lease:
+            if approach and stops:
+                first = stops[0]
+                q = (
+                    self._joints(first.q)
+                    if first.q is not None
+                    else await asyncio.to_thread(self._planner.joints_at, first.pose or (), self._start())
+                )
+                arrival = await self._move(lease, q, None, True)
+                stops = stops[1:]
+                if not stops:
+                    return arrival
+            plan = await asyncio.to_thread(self._planner.lines, stops, self._start(), speed)
+            return await self._run_plan(lease, RunLines, plan, "the path")
+
+    async def run_command(self, caller: Caller, command: MotionCommand) -> Json:
+        """Send a motion command that needs no planning here; return when the arm holds again."""
+
+        def position() -> Json:
+            return {"positions": self._channel.joints("actual_position")}
+
+        async with self._channel.lease(caller) as lease:
+            return await self._run(lease, command, _UNPLANNED_S, command.name, position)
+
+    def _joints(self, q: Sequence[float]) -> Sequence[float]:
+        if len(q) != self._count:
+            raise RtcpError("invalid", f"the first point has {len(q)} joint positions, the arm has {self._count}")
+        return q
+
+    def _start(self) -> list[float]:
+        """Return where a plan begins."""
+        # What is refused anyway is refused by the loop: then the plan only has to begin somewhere.
+        is_commanded = self._channel.state is State.HOLDING
+        return self._channel.joints("commanded_position" if is_commanded else "actual_position")
+
+    async def _move(self, lease: int, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
+        velocities = self._planner.limits.velocity
+        slowest = min(velocities)
+        if speed is not None and speed > 0.0:
+            slowest = min(slowest, speed)
+        command = MoveJoints(tuple(q), max(velocities) if speed is None else speed, synchronized)
+        # Twice round at that speed and some more: only a machine that hangs takes longer.
+        timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
+        return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"))
+
+    async def _run_plan(self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, what: str) -> Json:
+        try:
+            slot = self._channel.observer.write_plan(plan.rows)
+        except PlanTooLong as error:
+            raise RtcpError("refused", str(error)) from None
+        arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
+        timeout_s = _TIMEOUT_S + 2 * plan.duration_s
+        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival)
+        return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
+
+    async def _run(
+        self, lease: int, command: Command, timeout_s: float, what: str, arrived: Callable[[], T | None]
+    ) -> T:
+        """Send a command and return what `arrived` finds when the arm holds again."""
+        channel = self._channel
+        since = channel.observer.last_event
+        at_rest = channel.reaching(State.HOLDING, IN_MOTION, what, since)
+        rested = False
+
+        def outcome() -> T | None:
+            nonlocal rested
+            if not rested:
+                if at_rest() is None:
+                    return None
+                if ended := channel.early_end(since):
+                    raise channel.ended(ended, f"{what} ended before it arrived")
+                rested = True
+            return arrived()
+
+        return await channel.run(lease, command, outcome, timeout_s, what)
+
+    def _arrival(self, q: Sequence[float], same_rad: float, what: str) -> Callable[[], Json | None]:
+        """Return an outcome: where the arm is, once the following error has died away."""
+        channel, until = self._channel, 0.0
+
+        def look() -> Json | None:
+            nonlocal until
+            if not until:
+                until = time.monotonic() + _SETTLE_S
+                commanded = channel.joints("commanded_position")
+                if max(abs(a - b) for a, b in zip(commanded, q, strict=True)) > same_rad:
+                    last = channel.events(channel.observer.last_event - 1)
+                    raise channel.ended(last[-1].event if last else None, f"{what} ended before it arrived")
+            positions = channel.joints("actual_position")
+            error = max(abs(a - b) for a, b in zip(positions, q, strict=True))
+            if error > _SETTLED_RAD and time.monotonic() < until:
+                return None
+            return {"positions": positions, "error": error}
+
+        return look
+
+
+def _require_pose(pose: Sequence[float], key: str) -> None:
+    if len(pose) != len(_COORDINATES):
+        raise RtcpError("invalid", f"{key}: found {len(pose)} numbers, allowed are 6: X Y Z (m) RX RY RZ (rad)")
+    for name, number in zip(_COORDINATES, pose, strict=True):
+        if not abs(number) <= _LARGEST:
+            unit = "rad" if name.startswith("r") else "m"
+            allowed = f"{-_LARGEST:g} to {_LARGEST:g} {unit}"
+            raise RtcpError("invalid", f"{key}.{name}: found {number:g} {unit}, allowed is {allowed}")

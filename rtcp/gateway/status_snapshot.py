@@ -1,0 +1,282 @@
+"""What `rtcp status` shows of the running platform, made from the blackboard."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from datetime import datetime
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.ipc.events import JOYSTICK_MODES, ProcessDataLost, ResetDone
+from rtcp.ipc.layout import (
+    FLAG_ARM_HAS_JOYSTICK,
+    FLAG_DC_LOCKED,
+    FLAG_EMERGENCY_STOP,
+    FLAG_ENABLED,
+    FLAG_MOTION_ALLOWED,
+    FLAG_SWITCHING,
+    PER_JOINT,
+)
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import EventRecord, Observer
+from rtcp.ipc.session import Processes, Session, is_running
+from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.realtime.statistics import SlidingPercentiles
+
+AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
+_MESSAGES = 50
+_SHOWN = 10
+"""The last so many of them are shown."""
+_SILENT_S = 1.0
+_NO_ERROR = "sent emergency 0x0000:"
+"""An emergency that takes an earlier one back (CiA 301, error code 0)."""
+_UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
+_FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "compute_ns", "offset": "dc_offset_ns",
+            "filtered": "dc_filtered_ns"}  # fmt: skip
+
+_IN_ERROR = frozenset({State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING})
+_IN_MOTION = frozenset({State.MOVING, State.STOPPING, State.HOMING})
+_MOTION_POSSIBLE = frozenset({State.HOLDING, State.MOVING})
+
+
+def al_name(status: int) -> str:
+    """Return the AL state in words (ETG.1000.6, table 9); `no answer` for 0."""
+    if status == 0:
+        return "no answer"
+    return AL_NAMES.get(status & 0x0F, f"0x{status:02X}") + (" + ERROR" if status & 0x10 else "")
+
+
+def robot_status(state: State, control_mode: int, flags: int, fault: int, limit: int) -> dict[str, Any]:
+    """Return the fields of ROS-Industrial's RobotStatus (industrial_msgs), from the machine's state and nothing else.
+
+    Args:
+        state: of the machine.
+        control_mode: under the joystick the arm is in manual mode (ISO 10218-1), otherwise in auto.
+        flags: of the cycle record.
+        fault: number of the event that began the fault, 0: none.
+        limit: number of the event that led to the stop by a limit, 0: none.
+    """
+    in_error = state in _IN_ERROR
+    return {
+        "mode": "manual" if control_mode == ControlMode.JOYSTICK else "auto",
+        "e_stopped": state is State.EMERGENCY_STOP or bool(flags & FLAG_EMERGENCY_STOP),
+        "drives_powered": bool(flags & FLAG_ENABLED),
+        "motion_possible": state in _MOTION_POSSIBLE
+        and bool(flags & FLAG_MOTION_ALLOWED)
+        and not flags & (FLAG_SWITCHING | FLAG_EMERGENCY_STOP),
+        "in_motion": state in _IN_MOTION,
+        "in_error": in_error,
+        "error_code": (fault or limit) if in_error else 0,
+    }
+
+
+class StatusSnapshot:
+    """Follows the blackboard: statistics of the cycle, the last messages, the fault.
+
+    Args:
+        observer: the blackboard.
+        session: what was started.
+        started: facts of the start that the loop reported (realtime, start to OP).
+    """
+
+    def __init__(self, observer: Observer, session: Session, started: dict[str, Any]) -> None:
+        self._observer = observer
+        self._session = session
+        self._started = started
+        self.names = Names(session.config)
+        self._at = max(observer.head - 1, 0)
+        self._event = 0
+        self._text = 0
+        self._figures = {name: SlidingPercentiles() for name in _FIGURES}
+        self._enables = 0
+        self.fault = ""
+        """Message of the present fault: why the machine is in it."""
+        self.last_fault = ""
+        self.message = ""
+        """The last message on what has become of the arm."""
+        self._message_ns = 0
+        """Its instant, CLOCK_REALTIME."""
+        self._moves = 0
+        self._moving = False
+        self._began_ns = 0
+        """When the last motion began, CLOCK_MONOTONIC."""
+        self.messages: deque[tuple[int, str]] = deque(maxlen=_MESSAGES)
+        self.loop_lives = True
+
+    # -- following ----------------------------------------------------------------------------------------------------
+
+    def follow(self) -> list[str]:
+        """Read what is new; return the messages that came since the last call."""
+        records, _ = self._observer.since(self._at)
+        if len(records):
+            self._at = int(records[-1]["number"])
+            self._count(records)
+            self._note_motion(records)
+        return self._read_messages()
+
+    def note(self, message: str) -> None:
+        """Add a message of the gateway's own."""
+        self.messages.append((time.time_ns(), message))
+
+    def _count(self, records: npt.NDArray[np.void]) -> None:
+        now = time.monotonic()
+        if int(records[-1]["enables"]) != self._enables:
+            self._enables = int(records[-1]["enables"])
+            for figure in self._figures.values():
+                figure.reset()
+            records = records[records["enables"] == self._enables]
+        for name, field in _FIGURES.items():
+            self._figures[name].add(now, np.abs(records[field]) / 1e3 if "dc" in field else records[field] / 1e3)
+
+    def _note_motion(self, records: npt.NDArray[np.void]) -> None:
+        """Find the last cycle in which a motion began: from rest, or one that took another's place."""
+        moving, moves = np.isin(records["state"], _UNDER_WAY), records["moves"].astype(np.int64)
+        rested = ~np.concatenate([[self._moving], moving[:-1]])
+        other = moves != np.concatenate([[self._moves], moves[:-1]])
+        begun = np.flatnonzero(moving & (rested | other))
+        if len(begun):
+            self._began_ns = int(records["time_ns"][begun[-1]])
+        self._moving, self._moves = bool(moving[-1]), int(moves[-1])
+
+    def _read_messages(self) -> list[str]:
+        new: list[tuple[int, str]] = []
+        for record in self._observer.events_since(self._event):
+            self._event, event = record.number, record.event
+            message = self.names.message(event)
+            new.append((record.time_ns, message))
+            if event.is_fault:
+                # An emergency stop out of a fault is what has to be ended first.
+                self.fault = message if event.is_emergency else self.fault or message
+                self.last_fault = message
+            elif isinstance(event, ResetDone):
+                self.fault = ""
+        for text in self._observer.texts_since(self._text):
+            self._text = text.number
+            new.append((text.time_ns, text.sentence))
+        new.sort()
+        self.messages.extend(new)
+        for at_ns, message in new:
+            if _NO_ERROR not in message:
+                self.message, self._message_ns = message, at_ns
+        return [message for _, message in new]
+
+    # -- showing ------------------------------------------------------------------------------------------------------
+
+    def event(self, record: EventRecord) -> dict[str, Any]:
+        """Return an event as JSON."""
+        return {
+            "number": record.number,
+            "time": _iso(record.time_ns),
+            "name": record.event.name,
+            "fields": record.event.as_json(),
+            "message": self.names.message(record.event),
+        }
+
+    def _headline(self, state: State) -> str:
+        """Return why the machine is in fault, else the last message; while a motion lasts none of an earlier one."""
+        if self.fault or int(state) not in _UNDER_WAY:
+            return self.fault or self.message
+        began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
+        return self.message if self._message_ns > began_ns else state.words
+
+    def _loop_problem(self, silent_s: float) -> str:
+        """Return what is wrong with the loop's process; empty: it publishes."""
+        loop = f"the loop (process {self._observer.loop_pid})"
+        way_out = "the drives' watchdog stops them: `rtcp stop`, then `rtcp start`"
+        if not self.loop_lives:
+            return f"{loop} ended unexpectedly; {way_out}"
+        if silent_s > _SILENT_S:
+            return f"{loop} has published nothing for {silent_s:.1f} s; {way_out}, if it stays so"
+        return ""
+
+    def _slaves(self) -> list[dict[str, Any]]:
+        slaves = self._session.config.slaves
+        found = zip(slaves, self._observer.slaves(len(slaves)), self._observer.health(len(slaves)), strict=True)
+        return [
+            {
+                "position": position,
+                "name": slave.name,
+                "state": al_name(al) if self.loop_lives else "unknown",
+                "al_status_code": code,
+                "lost": health.lost,
+                "recovered": health.recovered,
+                "errors": {"rx": health.rx, "forwarded": health.forwarded, "links": health.links},
+            }
+            for position, (slave, (al, code), health) in enumerate(found, 1)
+        ]
+
+    def status(self, processes: Processes) -> dict[str, Any]:
+        """Return everything, as `rtcp status --json` prints it."""
+        latest = self._observer.latest()
+        if latest is None:
+            raise RuntimeError("the loop has published no cycle yet")
+        record = latest[0]
+        state, control_mode, flags = State(int(record["state"])), int(record["control_mode"]), int(record["flags"])
+        problem = self._loop_problem((time.monotonic_ns() - int(record["time_ns"])) * 1e-9)
+        numbers = (int(record["fault"]), int(record["limit"]))
+        # Where nobody commands the drives any more, their watchdog has stopped them.
+        robot = (
+            robot_status(State.FAULT, control_mode, 0, ProcessDataLost.number, 0)
+            if problem
+            else robot_status(state, control_mode, flags, *numbers)
+        )
+        figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
+        shown = list(self.messages)[-_SHOWN:]
+        return {
+            "state": "fault" if problem else state.name.lower(),
+            "message": problem or self._headline(state),
+            "drive_mode": _name(DriveMode, int(record["drive_mode"])),
+            "control_mode": _name(ControlMode, control_mode),
+            "joystick": {
+                "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
+                "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),
+            },
+            "robot": robot,
+            "bus": self._session.bus,
+            "cycle_ns": self._observer.period_ns,
+            "cycles": int(record["cycle"]),
+            "time_ns": int(record["time_ns"]),
+            "missed": int(record["missed"]),
+            "lost_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
+            "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else int(record["wkc"])},
+            "slaves": self._slaves(),
+            "joint_names": [joint.name for joint in self._session.config.joints],
+            "joints": {
+                name: [round(float(value), 7) for value in record[name]] for name, code in PER_JOINT if code == "d"
+            },
+            "statuswords": [int(word) for word in record["statusword"]],
+            "inputs": int(record["inputs"]),
+            "outputs": int(record["outputs"]),
+            "counter": int(record["counter"]),
+            "wakeup_us": figures["wakeup"],
+            "exchange_us": figures["exchange"],
+            "compute_us": figures["compute"],
+            "dc": {
+                "locked": not problem and bool(flags & FLAG_DC_LOCKED),
+                "offset_ns": int(record["dc_offset_ns"]),
+                "filtered_ns": int(record["dc_filtered_ns"]),
+                "offset_us": figures["offset"],
+                "filtered_us": figures["filtered"],
+            },
+            "realtime": self._started.get("realtime", {}),
+            "start_to_op_s": self._started.get("start_to_op_s"),
+            "lease": {"holder": self._observer.holder()},
+            "pids": {
+                "loop": processes.loop if self.loop_lives else 0,
+                "gateway": processes.gateway,
+                "segment": processes.segment if is_running(processes.segment) else 0,
+            },
+            "messages": [message for _, message in shown],
+            "message_times": [_iso(at) for at, _ in shown],
+        }
+
+
+def _name(kind: type[ControlMode] | type[DriveMode], number: int) -> str:
+    return next((one.name.lower() for one in kind if one == number), str(number))
+
+
+def _iso(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns * 1e-9).astimezone().isoformat(timespec="milliseconds")

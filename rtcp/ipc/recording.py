@@ -1,0 +1,380 @@
+"""Cycle records on disk: one MCAP file a fault, written whole or not at all, and read with distrust.
+
+Foxglove, PlotJuggler and `ros2 bag` open them. Topic `/cycle` has a message a cycle (schema `rtcp_msgs/msg/Cycle`, the
+fields of `rtcp.ipc.layout`, in CDR), `/log` the messages of the loop (schema `foxglove.Log`); the metadata `rtcp/about`
+says what happened, when, to which arm.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import math
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import numpy.typing as npt
+import zstandard
+from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.writer import CompressionType, Writer
+
+from rtcp.config.zero import state_directory
+from rtcp.ipc.layout import PER_JOINT, SCALARS
+
+FORMAT = 2
+KEPT = 100
+"""Files: more than anyone reads, of about 2 MB each (20 000 cycles of six joints)."""
+_ABOUT = "rtcp/about"
+_CYCLE, _LOG = "/cycle", "/log"
+_LAST = "last"
+"""File with the last number that was given: none is given twice, also where its file was removed."""
+_NAME = re.compile(r"fault-(\d{1,12})-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap")
+_LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
+"""Bytes of one record of the file, and of all messages, unpacked: three times a whole ring of ten joints."""
+_JOINTS_MAX = 10
+_ENCAPSULATION = b"\x00\x01\x00\x00"
+"""CDR, little endian (OMG DDSI-RTPS, 10.5)."""
+_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
+          "h": ("int16", "<i2"), "I": ("uint32", "<u4"), "i": ("int32", "<i4"), "f": ("float32", "<f4"),
+          "d": ("float64", "<f8")}  # fmt: skip
+"""Struct code to the types of ROS 2 messages and of numpy."""
+_LOG_SCHEMA = {
+    "type": "object",
+    "title": "foxglove.Log",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "level": {"type": "integer"},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+    },
+}
+_INFO = 2
+
+Records = dict[str, npt.NDArray[Any]]
+
+
+class RecordingError(Exception):
+    """A recording cannot be written or read; the message names file and defect."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A message of the loop and its instant, CLOCK_REALTIME ns."""
+
+    time_ns: int
+    message: str
+
+
+@dataclass(frozen=True)
+class About:
+    """What a recording is of."""
+
+    number: int
+    """0 until it is written."""
+    time_ns: int
+    """Of the fault, CLOCK_REALTIME."""
+    what: str
+    """The message of the fault."""
+    before: str
+    """The machine's state in the cycle before."""
+    arm: str
+    bus: str
+    period_ns: int
+    joints: tuple[str, ...]
+    versions: dict[str, str]
+    began_ns: int
+    """When the platform was started, CLOCK_MONOTONIC; together with `event` it says which fault this is."""
+    event: int
+    """Number of the event that began the fault; 0: the loop's process died or hung."""
+    at: int
+    """Index of the fault's cycle in the arrays; -1: there are no records."""
+    notes: tuple[str, ...]
+    """What is missing, a sentence each."""
+    timeline: tuple[Moment, ...]
+
+    @property
+    def when(self) -> datetime:
+        """The fault's instant in local time."""
+        return datetime.fromtimestamp(self.time_ns * 1e-9).astimezone()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A fault: what it is, and the cycle records around it, oldest first, by field."""
+
+    about: About
+    records: Records
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A file of the directory: what it is of, or why that cannot be read."""
+
+    number: int
+    path: Path
+    about: About | None
+    trouble: str
+    seconds: float = 0.0
+    """From its first cycle to its last."""
+
+
+def faults_directory(state: Path | None = None) -> Path:
+    """Return where the recordings are, without making it; None: in this process' state directory."""
+    return (state or state_directory()) / "faults"
+
+
+# -- writing --------------------------------------------------------------------------------------------------------
+
+
+def write(directory: Path, recording: Recording) -> tuple[int, Path]:
+    """Write a recording under the next number, remove the oldest beyond `KEPT`, and return number and file.
+
+    Raises:
+        RecordingError: the disk refuses; nothing of the file is left.
+    """
+    try:
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
+        descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            # Instances of the service share the directory.
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            number = _next_number(directory)
+            about = replace(recording.about, number=number)
+            path = directory / f"fault-{number:06d}-{about.when:%Y-%m-%dT%H-%M-%S}.mcap"
+            new = directory / f".{path.name}.new"
+            try:
+                _fill(new, replace(recording, about=about))
+                os.replace(new, path)
+            finally:
+                new.unlink(missing_ok=True)
+            os.fsync(descriptor)
+            _thin_out(directory)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        raise RecordingError(f"{directory}: no recording can be written there: {error.strerror or error}") from error
+    return number, path
+
+
+def _next_number(directory: Path) -> int:
+    last = directory / _LAST
+    given = [number for number, _ in files(directory)]
+    with contextlib.suppress(OSError, ValueError):
+        given.append(int(last.read_bytes()[:12]))
+    number = max(given, default=0) + 1
+    new = directory / f".{_LAST}.new"
+    new.write_text(f"{number}\n")
+    os.replace(new, last)
+    return number
+
+
+def _fill(path: Path, recording: Recording) -> None:
+    about = recording.about
+    with open(path, "xb") as file:
+        writer = Writer(file, compression=CompressionType.ZSTD)
+        writer.start("ros2", f"rtcp {about.versions.get('rtcp', '')}")
+        told = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
+        writer.add_metadata(_ABOUT, {"json": json.dumps(told)})
+        _write_cycles(writer, recording)
+        schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(_LOG_SCHEMA).encode())
+        channel = writer.register_channel(_LOG, "json", schema)
+        for moment in about.timeline:
+            sec, nsec = divmod(moment.time_ns, 1_000_000_000)
+            log = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": moment.message, "name": "rtcp"}
+            writer.add_message(channel, moment.time_ns, json.dumps(log).encode(), moment.time_ns)
+        writer.finish()
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _write_cycles(writer: Writer, recording: Recording) -> None:
+    about, records = recording.about, recording.records
+    kind = _message_type(len(about.joints))
+    rows = np.zeros(len(records["number"]), dtype=kind)
+    for name in rows.dtype.names or ():
+        rows[name] = records[name]
+    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", _definition(len(about.joints)))
+    channel = writer.register_channel(_CYCLE, "cdr", schema)
+    # The record's clock is CLOCK_MONOTONIC; the file's is that of the fault's instant, CLOCK_REALTIME.
+    offset_ns = about.time_ns - int(records["time_ns"][about.at]) if len(rows) else 0
+    packed, size = rows.tobytes(), kind.itemsize
+    for at, (number, time_ns) in enumerate(zip(records["number"], records["time_ns"], strict=True)):
+        data = _ENCAPSULATION + packed[at * size : (at + 1) * size]
+        when = max(int(time_ns) + offset_ns, 0)
+        writer.add_message(channel, when, data, when, int(number) & 0xFFFF_FFFF)
+
+
+def _message_type(joints: int) -> np.dtype[np.void]:
+    """Return a cycle's message: CDR aligns each number to its size, as numpy's aligned types do."""
+    fields: list[Any] = [(name, _TYPES[code][1]) for name, code in SCALARS]
+    fields += [(name, _TYPES[code][1], (joints,)) for name, code in PER_JOINT]
+    return np.dtype(fields, align=True)
+
+
+def _definition(joints: int) -> bytes:
+    """Return the same as a ROS 2 message definition."""
+    lines = [f"{_TYPES[code][0]} {name}" for name, code in SCALARS]
+    lines += [f"{_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT]
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _seconds(records: Records) -> float:
+    instants = records["time_ns"]
+    return (int(instants[-1]) - int(instants[0])) * 1e-9 if len(instants) else 0.0
+
+
+def _thin_out(directory: Path) -> None:
+    for _, path in files(directory)[:-KEPT]:
+        path.unlink(missing_ok=True)
+        path.with_suffix(".png").unlink(missing_ok=True)  # its picture (`rtcp faults show`)
+    # What an interrupted writer left: whoever holds the lock is the only one.
+    for left in directory.glob(".fault-*.new"):
+        left.unlink(missing_ok=True)
+
+
+# -- reading --------------------------------------------------------------------------------------------------------
+
+
+def listed(directory: Path) -> list[Listed]:
+    """Return the recordings of a directory, the oldest first; none where there is no directory.
+
+    Raises:
+        RecordingError: the directory cannot be read.
+    """
+    found = []
+    for number, path in files(directory):
+        try:
+            with _opened(path) as file:
+                about, seconds = next(_abouts(file), (None, 0.0))
+                file.seek(-8, os.SEEK_END)
+                whole = file.read() == b"\x89MCAP0\r\n"
+            if about is None or not whole:
+                raise RecordingError(f"{path}: the file is cut off, damaged or no recording")
+        except RecordingError as error:
+            found.append(Listed(number, path, None, str(error)))
+        else:
+            found.append(Listed(number, path, about, "", seconds))
+    return found
+
+
+def read(path: Path) -> Recording:
+    """Read a recording.
+
+    Raises:
+        RecordingError: it is cut off, is none, or was written by another version.
+    """
+    with _opened(path) as file:
+        about, _ = next(_abouts(file), (None, 0.0))
+        if about is None:
+            raise RecordingError(f"{path}: the metadata {_ABOUT} is missing: it is no recording")
+        file.seek(0)
+        rows = _cycles(file, len(about.joints))
+    if not (0 <= about.at < len(rows) or (about.at == -1 and not len(rows))):
+        raise RecordingError(f"{path}: it gives {about.at} as the cycle of the fault, and has {len(rows)} cycles")
+    return Recording(about, {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()})
+
+
+def files(directory: Path) -> list[tuple[int, Path]]:
+    """Return number and file of each recording, the oldest first, without a look into them.
+
+    Raises:
+        RecordingError: the directory cannot be read.
+    """
+    try:
+        names = os.listdir(directory)
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise RecordingError(f"{directory}: the directory cannot be read: {error.strerror}") from error
+    found = [(int(match[1]), directory / match[0]) for match in map(_NAME.fullmatch, names) if match]
+    return sorted(found)
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes]]:
+    try:
+        with open(path, "rb") as file:
+            yield file
+    except OSError as error:
+        raise RecordingError(f"{path}: the file cannot be read: {error.strerror or error}") from error
+    except RecordingError:
+        raise
+    except Exception as error:
+        # The reader lets through whatever its parts, zstandard and json raise about bytes that are not theirs.
+        defect = f"{type(error).__name__} {error}".rstrip()
+        raise RecordingError(f"{path}: the file is cut off, damaged or no recording: {defect}") from error
+
+
+def _records(file: IO[bytes]) -> Iterator[McapRecord]:
+    """Return the records of a file, chunks unpacked and checked."""
+    left = _LARGEST
+    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD).records:
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        left -= record.uncompressed_size
+        size = zstandard.frame_content_size(record.data) if record.compression == "zstd" else len(record.data)
+        if size != record.uncompressed_size or left < 0 or record.compression not in ("zstd", ""):
+            raise ValueError(f"a chunk of {size} bytes, {record.uncompressed_size} announced, {left} allowed after it")
+        yield from breakup_chunk(record, validate_crc=True)
+
+
+def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
+    """Return what a file says about itself, and the seconds from its first cycle to its last."""
+    for record in _records(file):
+        if isinstance(record, Metadata) and record.name == _ABOUT:
+            told = json.loads(record.metadata["json"])
+            if not isinstance(told, dict) or told.get("format") != FORMAT:
+                raise ValueError(f"allowed is format {FORMAT}")
+            yield _checked(told), float(_of(told, "seconds", float))
+
+
+def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
+    """Return the cycles of a file, oldest first."""
+    kind, channel, schema, found = _message_type(joints), 0, 0, []
+    for record in _records(file):
+        if isinstance(record, Schema) and record.data == _definition(joints):
+            schema = record.id
+        elif isinstance(record, Channel) and record.topic == _CYCLE and record.schema_id == schema:
+            channel = record.id
+        elif isinstance(record, Message) and record.channel_id == channel:
+            if len(record.data) != len(_ENCAPSULATION) + kind.itemsize:
+                raise ValueError(f"a cycle of {len(record.data)} bytes")
+            found.append(record.data[len(_ENCAPSULATION) :])
+    if not channel:
+        raise ValueError(f"no cycles of this version and {joints} joints")
+    return np.frombuffer(b"".join(found), dtype=kind)
+
+
+def _checked(told: Mapping[str, Any]) -> About:
+    numbers = {key: _of(told, key, int) for key in ("number", "time_ns", "period_ns", "began_ns", "event", "at")}
+    texts = {key: _of(told, key, str) for key in ("what", "before", "arm", "bus")}
+    moments = [Moment(_of(one, "time_ns", int), _of(one, "message", str)) for one in _of(told, "timeline", list)]
+    about = About(
+        **numbers,
+        **texts,
+        joints=tuple(str(name) for name in _of(told, "joints", list)[:_JOINTS_MAX]),
+        versions={str(name): str(version) for name, version in _of(told, "versions", dict).items()},
+        notes=tuple(str(note) for note in _of(told, "notes", list)),
+        timeline=tuple(moments),
+    )
+    if about.period_ns <= 0 or not math.isfinite(about.when.timestamp()):
+        raise ValueError("its cycle or its time is impossible")
+    return about
+
+
+def _of(told: Mapping[str, Any], key: str, kind: type) -> Any:
+    if type(found := told[key]) is not kind:
+        raise TypeError(f"{key} is {type(found).__name__}, allowed is {kind.__name__}")
+    return found

@@ -1,0 +1,261 @@
+"""The EtherCAT state machine as tables, and the supervision of SYNC0.
+
+States and transitions: ETG.1000.6, 6.4.1; AL status codes: ETG.1020, table 11; sync error counter: ETG.1020, 21.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+from itertools import pairwise
+
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.esc import MEMORY_SIZE, Esc, SyncManager
+from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
+from rtcp.virtual.protocol import REGISTER_SPACE, Register, State
+
+MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(4)
+"""Sync managers of a slave with mailbox, by their use (ETG.1000.6, 5.6.7.4)."""
+MINIMUM_MAILBOX = 34
+"""Smallest mailbox of a CoE slave, in bytes: SDO information needs it (ETG.1020, 8.1)."""
+BUFFERS = 3
+MINIMUM_CYCLE = (0x1C32, 5)
+
+
+class AlStatusCode(IntEnum):
+    """AL status codes that these slaves report."""
+
+    NO_ERROR = 0x0000
+    INVALID_STATE_CHANGE = 0x0011
+    UNKNOWN_STATE = 0x0012
+    BOOTSTRAP_NOT_SUPPORTED = 0x0013
+    INVALID_MAILBOX_PREOP = 0x0016
+    INVALID_SYNC_MANAGERS = 0x0017
+    SYNC_ERROR = 0x001A
+    SYNC_MANAGER_WATCHDOG = 0x001B
+    INVALID_OUTPUTS = 0x001D
+    INVALID_INPUTS = 0x001E
+    INVALID_WATCHDOG = 0x001F
+    INVALID_INPUT_MAPPING = 0x0024
+    INVALID_OUTPUT_MAPPING = 0x0025
+    FATAL_SYNC_ERROR = 0x002C
+    NO_SYNC = 0x002D
+    INVALID_DC_SYNC = 0x0030
+    INVALID_SYNC0_CYCLE = 0x0035
+
+
+Check = Callable[[Esc, DeviceModel], AlStatusCode]
+
+
+def _in_ram(manager: SyncManager, size: int) -> bool:
+    return manager.start >= REGISTER_SPACE and manager.start + size <= MEMORY_SIZE
+
+
+def check_mailboxes(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """SM0 and SM1 must be mailboxes, out and in, long enough and apart."""
+    out, in_ = esc.sync_managers[MAILBOX_OUT], esc.sync_managers[MAILBOX_IN]
+    good = (
+        all(m.enabled and m.mailbox and m.length >= MINIMUM_MAILBOX and _in_ram(m, m.length) for m in (out, in_))
+        and out.master_writes
+        and not in_.master_writes
+        and (out.end <= in_.start or in_.end <= out.start)
+    )
+    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_MAILBOX_PREOP
+
+
+def mapped_image(device: DeviceModel, assignment: int) -> PdoImage | None:
+    """The process image that `assignment` (0x1C12, 0x1C13) gives; None where it maps what does not exist."""
+    try:
+        return PdoImage.from_assignment(device.objects, assignment)
+    except (SdoAbort, ValueError):
+        return None
+
+
+def check_output_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """All that 0x1C12 maps must exist."""
+    found = mapped_image(device, RX_ASSIGN)
+    return AlStatusCode.INVALID_OUTPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
+
+
+def check_input_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """All that 0x1C13 maps must exist."""
+    found = mapped_image(device, TX_ASSIGN)
+    return AlStatusCode.INVALID_INPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
+
+
+def _fits(manager: SyncManager, length: int, master_writes: bool) -> bool:
+    """Whether the sync manager is right for an image of `length` bytes; none at all needs none."""
+    if not length:
+        return not manager.enabled
+    return (
+        manager.enabled
+        and not manager.mailbox
+        and manager.master_writes == master_writes
+        and manager.length == length
+        and _in_ram(manager, BUFFERS * length)
+    )
+
+
+def check_outputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """SM2 must be a buffer that the master writes, as long as the RxPDOs."""
+    image = mapped_image(device, RX_ASSIGN)
+    good = image is not None and _fits(esc.sync_managers[OUTPUTS], image.byte_length, True)
+    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_OUTPUTS
+
+
+def check_inputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """SM3 must be a buffer that the master reads, as long as the TxPDOs."""
+    image = mapped_image(device, TX_ASSIGN)
+    good = image is not None and _fits(esc.sync_managers[INPUTS], image.byte_length, False)
+    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_INPUTS
+
+
+def check_areas(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """No two sync managers may share memory; a buffer takes its length three times."""
+    areas = sorted(
+        (m.start, m.start + m.length * (1 if m.mailbox else BUFFERS)) for m in esc.sync_managers if m.enabled
+    )
+    apart = all(first[1] <= second[0] for first, second in pairwise(areas))
+    return AlStatusCode.NO_ERROR if apart else AlStatusCode.INVALID_SYNC_MANAGERS
+
+
+def check_watchdog(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """A watchdog that SM2 triggers and that has a time must have a divider to count it with."""
+    wanted = esc.sync_managers[OUTPUTS].watchdog_trigger and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
+    if wanted and not esc.get(Register.WATCHDOG_DIVIDER, 2):
+        return AlStatusCode.INVALID_WATCHDOG
+    return AlStatusCode.NO_ERROR
+
+
+def check_sync(esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """Where SYNC pulses are on there must be SYNC0, with a cycle that the device can keep, and it must still come."""
+    dc = esc.dc
+    if dc is None or not dc.cyclic:
+        return AlStatusCode.NO_ERROR
+    if not dc.sync0_active or not dc.sync0.cycle:
+        return AlStatusCode.INVALID_DC_SYNC
+    objects = device.objects
+    minimum = objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in objects else 0
+    if isinstance(minimum, int) and dc.sync0.cycle < minimum:
+        return AlStatusCode.INVALID_SYNC0_CYCLE
+    # Pulses left on by the last master whose time base was set anew since: they came and come no more (SOEM#60).
+    if dc.sync0.lost and dc.sync0.pulses:
+        return AlStatusCode.FATAL_SYNC_ERROR
+    return AlStatusCode.NO_ERROR
+
+
+_PROCESS_DATA: tuple[Check, ...] = (
+    check_output_mapping, check_input_mapping, check_outputs, check_inputs, check_areas, check_watchdog, check_sync,
+)  # fmt: skip
+
+# Steps up, and what must hold for them. A step down is always allowed; any other pair is 0x0011.
+UPWARD: dict[tuple[State, State], tuple[Check, ...]] = {
+    (State.INIT, State.PRE_OP): (check_mailboxes,),
+    (State.PRE_OP, State.SAFE_OP): (check_mailboxes, *_PROCESS_DATA),
+    (State.SAFE_OP, State.OP): (check_sync,),
+}
+
+# What must go on to hold in a state when sync managers are written, and where the slave falls to otherwise.
+HELD: dict[State, tuple[tuple[tuple[Check, ...], State], ...]] = {
+    State.INIT: (),
+    State.PRE_OP: (((check_mailboxes,), State.INIT),),
+    State.SAFE_OP: (((check_mailboxes,), State.INIT), ((check_outputs, check_inputs, check_areas), State.PRE_OP)),
+    State.OP: (((check_mailboxes,), State.INIT), ((check_outputs, check_inputs, check_areas), State.PRE_OP)),
+}
+
+
+def first_failure(checks: tuple[Check, ...], esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """The code of the first check that fails, or NO_ERROR."""
+    for check in checks:
+        code = check(esc, device)
+        if code:
+            return code
+    return AlStatusCode.NO_ERROR
+
+
+def judge(state: State, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:
+    """Whether a slave in `state` may go to `wanted`, the value of AL control's low four bits."""
+    if wanted not in State.__members__.values():
+        return AlStatusCode.UNKNOWN_STATE
+    if wanted == State.BOOTSTRAP:
+        return AlStatusCode.BOOTSTRAP_NOT_SUPPORTED if state == State.INIT else AlStatusCode.INVALID_STATE_CHANGE
+    if wanted <= state:
+        return AlStatusCode.NO_ERROR
+    checks = UPWARD.get((state, State(wanted)))
+    return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, esc, device)
+
+
+MISSED, MET = 3, 1
+"""A SYNC0 window without outputs adds MISSED to the sync error counter, one with outputs subtracts MET."""
+SYNC_TYPE, CYCLE_TIME, MISSED_COUNTER, SYNC_ERROR = 1, 2, 11, 32
+TYPE_SM_EVENT, TYPE_SYNC0 = 1, 2
+OUTPUT_PARAMETERS, INPUT_PARAMETERS = 0x1C32, 0x1C33
+
+
+class SyncMonitor:
+    """Supervises SYNC0: counts the windows between two pulses that bring no outputs (ETG.1020, 21.2)."""
+
+    def __init__(self, esc: Esc, device: DeviceModel) -> None:
+        self._dc = esc.dc
+        self._device = device
+        self._came = 0
+        self._counter = 0
+        self._limit = 0
+        self._missed = 0
+        self.active = False
+        """Whether SYNC0 steps the device."""
+
+    @property
+    def running(self) -> bool:
+        """Whether SYNC0 pulses have come and will continue."""
+        return self._dc is not None and self._dc.sync0.pulses > 0 and self._dc.sync0.due is not None
+
+    def configure(self) -> None:
+        """Read from the DC activation register whether SYNC0 is used; show it in 0x1C32 and 0x1C33."""
+        sync0 = None if self._dc is None or not self._dc.sync0_active else self._dc.sync0
+        self.active = sync0 is not None and self._device.uses_sync0
+        cycle = 0 if sync0 is None or not self.active else sync0.cycle
+        for index in (OUTPUT_PARAMETERS, INPUT_PARAMETERS):
+            self._show(index, SYNC_TYPE, TYPE_SYNC0 if self.active else TYPE_SM_EVENT)
+            self._show(index, CYCLE_TIME, cycle)
+
+    def start(self) -> None:
+        """The slave enters OP: count from zero, with the limit of now (0: no limit)."""
+        self._limit = self._device.sync_error_limit
+        self._counter = 0
+        self._came = 1
+        self._show(OUTPUT_PARAMETERS, SYNC_ERROR, 0)
+
+    def stop(self) -> None:
+        """The slave left SAFE-OP."""
+        self.active = False
+
+    def outputs_came(self) -> None:
+        """A complete buffer of outputs arrived."""
+        self._came += 1
+
+    def pulse(self, on_time: bool) -> bool:
+        """SYNC0 has come; return whether the error counter is above its limit.
+
+        A pulse noticed late (the process was stopped) consumes one of the buffers that came meanwhile and is no miss.
+        """
+        if not on_time:
+            self._came = max(0, self._came - 1)
+            return False
+        if self._came:
+            self._came = 0
+            self._counter = max(0, self._counter - MET)
+            return False
+        self._counter += MISSED
+        self._missed = (self._missed + 1) & 0xFFFF
+        self._show(OUTPUT_PARAMETERS, MISSED_COUNTER, self._missed)
+        exceeded = 0 < self._limit < self._counter
+        if exceeded:
+            self._show(OUTPUT_PARAMETERS, SYNC_ERROR, 1)
+        return exceeded
+
+    def _show(self, index: int, subindex: int, value: int) -> None:
+        objects = self._device.objects
+        if (index, subindex) in objects:
+            objects[index, subindex].value = value

@@ -1,0 +1,243 @@
+"""The cyclic synchronous modes and the stop that may take over from any mode (CiA 402-2, ETG.6010).
+
+A mode is entered, then updated once a step: `count` sub-steps of `h` seconds each. `bits` are the bits of the
+statusword that the mode owns.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from rtcp.virtual.device import number
+from rtcp.virtual.models.cia402 import Status
+from rtcp.virtual.models.drive_objects import UNIT
+from rtcp.virtual.models.mechanics import Axis
+from rtcp.virtual.models.profile_modes import ramp
+from rtcp.virtual.objects import ObjectDictionary
+
+# Plain ints: flag arithmetic is too slow for every step.
+_REACHED = int(Status.TARGET_REACHED)
+_LIMIT = int(Status.INTERNAL_LIMIT)
+_FOLLOWS = int(Status.MODE_SPECIFIC)
+_CATCHING_UP = 1.02
+_CREEP = 0.005
+"""What the position loop may add to the speed limit to make good what it lags behind: a factor, and rad/s."""
+_STANDSTILL = 0.005
+"""Speed, rad/s, below which a stopped joint counts as standing."""
+_STOP_PATIENCE = 0.5
+"""A joint that still moves so long (s) after its ramp has ended is moved by something else: the stop is over."""
+
+
+class Motion(Protocol):
+    """What moves the axis while the power stage is on."""
+
+    bits: int
+    closed: bool
+    """Whether the position loop is closed: only then is the following error watched."""
+
+    def enter(self) -> None:
+        """Begin anew: nothing is left of an earlier target."""
+
+    def resume(self) -> None:
+        """Go on after a halt."""
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Let `count` times `h` seconds pass."""
+
+
+class Hold:
+    """No mode chosen yet (0x6061 = 0): the joint is held where it is."""
+
+    closed = True
+
+    def __init__(self, axis: Axis) -> None:
+        self.bits = 0
+        self._axis = axis
+
+    def enter(self) -> None:
+        """Hold here."""
+        self._axis.synchronise()
+        self._axis.reference_velocity = 0.0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Stay."""
+        for _ in range(count):
+            self._axis.follow(h)
+
+
+class CyclicPosition:
+    """CSP (8): interpolates from set-point to set-point over 0x60C2; 0x60FF limits its speed, 0 means no motion."""
+
+    closed = True
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._target = number(objects, 0x607A)
+        self._offset = number(objects, 0x60B0)
+        self._speed = number(objects, 0x60FF)
+        self._top = number(objects, 0x607F)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+        self._period = number(objects, 0x60C2, 1)
+        self._exponent = number(objects, 0x60C2, 2)
+        self._period_told = self._exponent_told = 0
+        self._period_s = 0.0
+        self._set_point: int | None = None
+        self._limit = 0
+        self._goal = 0.0
+        self._slope = 0.0
+        self._fastest = _CREEP
+        self._clamped = self._held_back = False
+
+    def enter(self) -> None:
+        """Start from where the joint is; after a halt, on to the set-point again."""
+        self._set_point = None
+        self.bits = 0
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Move the demand along the line to the set-point, and the joint after it."""
+        axis = self._axis
+        counts = self._target.value + self._offset.value
+        limit = self._speed.value
+        if counts != self._set_point or limit != self._limit:
+            self._take(counts, limit, h * count)
+        self._slope = axis.glide(self._goal, self._slope, self._fastest, h, count)
+        bits = _FOLLOWS
+        if self._clamped or (self._held_back and axis.demand != self._goal):
+            bits |= _LIMIT
+        self.bits = bits
+
+    def _take(self, counts: int, limit: int, step: float) -> None:
+        # Every cycle in a motion: comparisons are quicker than min and max.
+        self._set_point, self._limit = counts, limit
+        high, low = self._high.value, self._low.value
+        allowed = high if counts > high else counts
+        if allowed < low:  # noqa: PLR1730
+            allowed = low
+        self._clamped = allowed != counts
+        self._goal = allowed * UNIT
+        value, exponent = self._period.value, self._exponent.value
+        if value != self._period_told or exponent != self._exponent_told:
+            self._period_told, self._exponent_told = value, exponent
+            self._period_s = value * 10.0**exponent
+        highest = self._top.value
+        size = -limit if limit < 0 else limit
+        top = (highest if highest < size else size) * UNIT
+        slope = (self._goal - self._axis.demand) / (self._period_s or step)
+        self._slope = top if slope > top else -top if slope < -top else slope
+        self._held_back = self._slope != slope
+        self._fastest = top * _CATCHING_UP + _CREEP
+
+
+class _WithoutPosition:
+    """What CSV and CST share: a target, an offset added to it, and the software position limits that stop the joint."""
+
+    closed = False
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary, target: int, offset: int) -> None:
+        self.bits = 0
+        self._axis = axis
+        self._target = number(objects, target)
+        self._offset = number(objects, offset)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+        self._deceleration = number(objects, 0x6085)
+
+    def enter(self) -> None:
+        """Begin with the next target."""
+        self.bits = 0
+
+    resume = enter
+
+    def _wanted(self) -> float:
+        return (self._target.value + self._offset.value) * UNIT
+
+    def _limits(self) -> tuple[float, float, float]:
+        """Return the lowest and the highest position and the deceleration before them."""
+        return self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+
+
+class CyclicVelocity(_WithoutPosition):
+    """CSV (9): the velocity loop follows 0x60FF + 0x60B1 within 0x607F, and stops at the software position limits."""
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        super().__init__(axis, objects, 0x60FF, 0x60B1)
+        self._top = number(objects, 0x607F)
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Run at the velocity commanded."""
+        axis = self._axis
+        allowed = wanted = self._wanted()
+        top = self._top.value * UNIT
+        low, high, deceleration = self._limits()
+        for _ in range(count):
+            slowest, fastest = axis.velocity_range(low, high, deceleration)
+            allowed = max(slowest, -top, min(fastest, top, wanted))
+            axis.run(allowed, h)
+        axis.synchronise()
+        axis.reference_velocity = allowed
+        self.bits = _FOLLOWS if allowed == wanted else _FOLLOWS | _LIMIT
+
+
+class CyclicTorque(_WithoutPosition):
+    """CST (10): applies 0x6071 + 0x60B2 within 0x6072, and stops at the software position limits."""
+
+    def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
+        super().__init__(axis, objects, 0x6071, 0x60B2)
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Apply the torque commanded."""
+        axis = self._axis
+        wanted = self._wanted()
+        low, high, deceleration = self._limits()
+        for _ in range(count):
+            slowest, fastest = axis.velocity_range(low, high, deceleration)
+            axis.push(wanted, slowest, fastest, h)
+        axis.synchronise()
+        self.bits = _FOLLOWS | _LIMIT if axis.saturated else _FOLLOWS
+
+
+class Stop:
+    """A ramp to rest, then the joint is held: halt, quick stop, disabling and fault reaction, in every mode alike.
+
+    `deceleration` (rad/s^2) is set before `enter`; `done` tells that the joint stands.
+    """
+
+    closed = True
+
+    def __init__(self, axis: Axis) -> None:
+        self.bits = 0
+        self.done = False
+        self.deceleration = 1.0
+        self._axis = axis
+        self._waited = 0.0
+
+    def enter(self) -> None:
+        """Begin to slow down from the joint's own position and velocity."""
+        self.bits = 0
+        self.done = False
+        self._waited = 0.0
+        self._axis.synchronise()
+
+    resume = enter
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Slow down, then hold."""
+        axis = self._axis
+        deceleration = self.deceleration
+        for _ in range(count):
+            velocity = axis.reference_velocity
+            if velocity:
+                velocity = ramp(velocity, 0.0, deceleration, deceleration, h)
+                axis.reference_velocity = velocity
+                axis.demand = axis.reference = axis.reference + velocity * h
+            axis.follow(h)
+        if not self.done and axis.reference_velocity == 0.0:
+            self._waited += h * count
+            self.done = abs(axis.mechanics.velocity) < _STANDSTILL or self._waited > _STOP_PATIENCE
+        self.bits = _REACHED if self.done else 0

@@ -1,0 +1,55 @@
+"""The pages in docs/ against the code that their generated parts are made of."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from docs.generate import FOLDER, generated, keys_of
+from rtcp.config.model import ArmFile, DeviceDescription
+from rtcp.config.segment import SegmentSlave
+
+PAGES = sorted(FOLDER.glob("*.md"))
+OWN = ["configuration.md", "operation.md", "terminals.md", "devices.md", "segment.md"]
+KEYS = {
+    "arm": list(keys_of(ArmFile)),
+    "device": list(keys_of(DeviceDescription)),
+    "segment": list(keys_of(SegmentSlave, "slaves[].")),
+}
+UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million"
+WITHOUT_UNIT = r"[Ff]raction|[Mm]ultiple|Factor|per count|Value to write"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
+    # `python docs/generate.py` writes them.
+    assert generated(page.read_text()) == page.read_text()
+
+
+@pytest.mark.parametrize("file", KEYS)
+def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
+    arm = "".join((FOLDER / name).read_text() for name in OWN[:3])
+    text = {"arm": arm, "device": (FOLDER / "devices.md").read_text(), "segment": (FOLDER / "segment.md").read_text()}
+    written = re.findall(r"^\| `([\w.\[\]]+)` \|.*\|.*\|.*\|$", text[file], re.MULTILINE)
+    assert sorted(set(written) & {key.path for key in KEYS[file]}) == sorted(key.path for key in KEYS[file])
+    assert len(set(written)) == len(written)
+
+
+def test_every_key_has_a_meaning_and_every_number_its_unit() -> None:
+    found = [key for keys in KEYS.values() for key in keys]
+    numbers = [key for key in found if key.allowed.startswith(("a number", "a list of 3 numbers"))]
+    assert [key.path for key in found if not key.meaning] == []
+    assert [key.path for key in numbers if not re.search(f"{UNITS}|{WITHOUT_UNIT}", key.meaning)] == []
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_a_page_is_short_and_its_links_lead_somewhere(name: str) -> None:
+    text = (FOLDER / name).read_text()
+    assert len(text) <= 8000
+    for link, anchor in re.findall(r"\]\(([^)#:]+)(?:#([\w-]+))?\)", text):
+        target = FOLDER / link
+        assert target.exists(), link
+        titles = re.findall(r"^#+ (.*)$", target.read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]

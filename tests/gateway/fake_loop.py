@@ -1,0 +1,147 @@
+"""The loop's side of a blackboard, faked: it accepts every command, and is at once where a motion leads."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits
+from rtcp.ipc.events import Event
+from rtcp.ipc.layout import PER_JOINT, PLAN_COLUMNS, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
+from rtcp.ipc.refusals import Malformed, Refusal
+from rtcp.ipc.states import ControlMode, State
+
+C = TypeVar("C", bound=Command)
+JOINTS = 6
+_SCALAR_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
+_JOINTS_AT = {name: len(SCALARS) - 1 + at * JOINTS for at, (name, _) in enumerate(PER_JOINT)}
+_FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
+_MOVES_FOR = 40
+"""A motion that ends by itself lasts so many turns of about a millisecond."""
+_FOR_EVER = 1_000_000_000
+
+
+class FakeLoop:
+    """Publishes a record a millisecond, answers commands and requests for the service thread.
+
+    What came: `commands`, `plans`, `requests`. What a test may set: `state`, `control_mode`, `q`; by kind of command
+    `refusals`, `ends` (where it leads) and `reports` (events that it leads to at once); `event_at_the_end` of a motion
+    that ends by itself, and `ends_in`, the state then.
+    """
+
+    def __init__(self, path: Path, q: Sequence[float] = (0.0,) * JOINTS, state: State = State.READY) -> None:
+        self.board = Blackboard(path, JOINTS, 500_000)
+        self.commands: list[Command] = []
+        self.plans: list[list[list[float]]] = []
+        self.requests: list[dict[str, Any]] = []
+        self._lease = 0
+        self._ended = threading.Event()
+        self._set_up(q, state)
+        self._publish()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _set_up(self, q: Sequence[float], state: State) -> None:
+        self.refusals: dict[type[Command], Refusal] = {}
+        self.ends: dict[type[Command], Sequence[float]] = {}
+        self.reports: dict[type[Command], Sequence[Event]] = {}
+        self.event_at_the_end: Event | None = None
+        self.ends_in = State.HOLDING
+        self._left = 0
+        self.control_mode = ControlMode.JOINT
+        self.state = state
+        self.q = list(q)
+
+    def clear(self) -> None:
+        """Forget what came and what was set."""
+        for came in (self.commands, self.plans, self.requests):
+            came.clear()
+        self._set_up((0.0,) * JOINTS, State.READY)
+
+    def end(self) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.board.close()
+
+    def received(self, kind: type[C]) -> list[C]:
+        """Return all commands of a kind."""
+        return [command for command in self.commands if isinstance(command, kind)]
+
+    @property
+    def kinds(self) -> list[type[Command]]:
+        return [type(command) for command in self.commands]
+
+    @property
+    def written(self) -> list[tuple[int, int, str]]:
+        """The objects that were written: index, subindex, bytes in hexadecimal."""
+        return [(one["index"], one["subindex"], one["hex"]) for one in self.requests if one["do"] == "sdo_write"]
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.001):
+            if self.board.command_waits():
+                self._handle()
+            self._serve()
+            self._move()
+            self._publish()
+
+    def _move(self) -> None:
+        if not self._left:
+            return
+        self._left -= 1
+        held, renewed, duration = self.board.lease()
+        if held != self._lease or time.monotonic_ns() - renewed > duration:
+            self._left = 0
+            self.state = State.HOLDING
+        elif self._left == 0:
+            if self.event_at_the_end is not None:
+                self.board.event(self.event_at_the_end)
+            self.state = self.ends_in
+
+    def _publish(self) -> None:
+        record: list[float] = [0] * _FIELDS
+        record[_SCALAR_AT["time_ns"]] = time.monotonic_ns()
+        record[_SCALAR_AT["state"]] = self.state
+        record[_SCALAR_AT["control_mode"]] = self.control_mode
+        for name in ("actual_position", "commanded_position", "sent_position"):
+            record[_JOINTS_AT[name] : _JOINTS_AT[name] + JOINTS] = self.q
+        self.board.publish(record)
+
+    def _handle(self) -> None:
+        number, lease, command = self.board.take_command()
+        assert not isinstance(command, Malformed)
+        self.commands.append(command)
+        if isinstance(command, RunLines | RunTrajectory | SetLimits):
+            rows = list(self.board.plan(command.slot))
+            self.plans.append([rows[at * PLAN_COLUMNS : (at + 1) * PLAN_COLUMNS] for at in range(command.rows)])
+        refusal = self.refusals.get(type(command))
+        if refusal is None:
+            for event in self.reports.get(type(command), ()):
+                self.board.event(event)
+            if isinstance(command, MotionCommand):
+                self._begin(command, lease)
+        self.board.answer(number, refusal)
+
+    def _begin(self, command: MotionCommand, lease: int) -> None:
+        leads: Sequence[float] = self.q
+        if isinstance(command, MoveJoints):
+            leads = command.q
+        elif isinstance(command, RunTrajectory):
+            leads = self.plans[-1][-1][1 : 1 + JOINTS]
+        self.q = list(self.ends.get(type(command), leads))
+        self.state, self._lease = State.MOVING, lease
+        self._left = _FOR_EVER if command.renewed else _MOVES_FOR
+
+    def _serve(self) -> None:
+        words, memory = self.board.words, self.board.memory
+        if words[SERVICE_STATE_AT] != 1:
+            return
+        self.requests.append(json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + words[SERVICE_LENGTH_AT]])))
+        answer = b'{"hex": "2a"}'
+        memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + len(answer)] = answer
+        words[SERVICE_LENGTH_AT] = len(answer)
+        words[SERVICE_STATE_AT] = 2

@@ -1,0 +1,640 @@
+"""The black box: what of a blackboard it writes, and when; the loop's part is played, or it runs in simulated time."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rtcp.gateway.blackbox import BlackBox
+from rtcp.gateway.blackbox_file import Recording, listed, read
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig
+from rtcp.gateway import blackbox, fault_events
+from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.codes import Code, Command
+from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
+from rtcp.ipc.machine import State
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.runtime_directory import stop_marker
+from rtcp.ipc.session import Pid, Processes, Session, identify
+from rtcp.launch import launcher
+from rtcp.launch.simulation import Simulation
+
+JOINTS = 6
+AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
+BEGAN_NS = 77
+
+
+@pytest.fixture(scope="module")
+def config() -> ArmConfig:
+    return load(default_config())
+
+
+class Played:
+    """A blackboard whose last cycle is now, and a black box that watches it."""
+
+    def __init__(self, path: Path, directory: Path, config: ArmConfig, period_ns: int = 500_000) -> None:
+        self.period_ns = period_ns
+        self.directory = directory
+        self.session = Session(config, "virtual", "ecat0", 0, BEGAN_NS)
+        self.board = Blackboard(path, JOINTS, period_ns)
+        self.observer = Observer(path)
+        self.told: list[str] = []
+
+    def fill(self, cycles: int, *, fault_at: int = 0, code: int = Code.BUS_LOST, ends_ns: int = 0) -> int:
+        """Publish so many cycles, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
+        ends_ns = ends_ns or time.monotonic_ns()
+        for cycle in range(1, cycles + 1):
+            values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
+            values[AT["cycle"]] = cycle
+            values[AT["time_ns"]] = ends_ns - (cycles - cycle) * self.period_ns
+            broken = 0 < fault_at <= cycle
+            values[AT["state"]] = State.FAULT if broken else State.MOVING
+            values[AT["fault"]] = code if broken else 0
+            values[len(SCALARS) - 1] = cycle * 1e-4
+            self.board.publish(values)
+        return ends_ns
+
+    def watched(self) -> BlackBox:
+        return BlackBox(self.observer, self.session, self.directory, self.told.append)
+
+    def lost(self, box: BlackBox) -> Recording:
+        """Let frames be lost; return the one recording that there is once the box has finished."""
+        self.board.event(Code.BUS_LOST, value=5)
+        box.finish()
+        (recording,) = self.recordings
+        return recording
+
+    @property
+    def recordings(self) -> list[Recording]:
+        return [read(one.path) for one in listed(self.directory)]
+
+    def close(self) -> None:
+        self.observer.close()
+        self.board.close()
+
+
+@pytest.fixture
+def play(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[Callable[..., Played]]:
+    made: list[Played] = []
+
+    def make(period_ns: int = 500_000) -> Played:
+        made.append(Played(path, tmp_path / "faults", config, period_ns))
+        return made[-1]
+
+    yield make
+    for each in made:
+        each.close()
+
+
+def sentences(recording: Recording) -> list[str]:
+    return [moment.sentence for moment in recording.about.timeline]
+
+
+def test_a_fault_is_written_with_the_ten_seconds_before_it(play: Callable[..., Played], config: ArmConfig) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(24_000, fault_at=23_990)
+    played.board.event(Code.BUS_LOST, value=5)
+    played.board.text("the drive's error code is 0x8611")
+    box.look()
+    box.finish()
+    (recording,) = played.recordings
+    about, records = recording.about, recording.records
+    assert (about.number, about.before, about.arm, about.bus) == (1, "moving", config.name, "virtual")
+    assert about.joints == tuple(joint.name for joint in config.joints)
+    assert "process data lost: 5 cycles" in about.what
+    assert int(records["cycle"][about.at]) == 23_990
+    assert int(records["cycle"][0]) == 23_990 - 20_000
+    assert int(records["cycle"][-1]) == 24_000
+    assert np.array_equal(records["position"][:, 0], records["cycle"] * 1e-4)
+    assert [about.what, "the drive's error code is 0x8611"] == sentences(recording)
+    assert any("number 1 (`rtcp faults show 1`)" in sentence for sentence in played.told)
+
+
+def test_further_fault_events_are_in_the_same_file_until_a_reset(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    box.look()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    first, second = played.recordings
+    assert len(sentences(first)) == 4
+    assert "process data lost" in first.about.what
+    assert "emergency stop" in second.about.what.lower()
+
+
+class Clock:
+    """The black box's clock, and the events' of a blackboard: an hour of faults in an instant."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.s = 0.0
+        self.set_s = 0.0
+        """By how much the wall clock was set meanwhile."""
+        self._began_ns, self._wall_ns = time.monotonic_ns(), time.time_ns()
+        monkeypatch.setattr(time, "monotonic_ns", self.now_ns)
+        monkeypatch.setattr(time, "time_ns", self.wall_ns)
+        monkeypatch.setattr(blackbox, "AFTER_S", 0.1)
+        monkeypatch.setattr(fault_events, "AFTER_S", 0.1)
+        monkeypatch.setattr(blackbox, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
+
+    def now_ns(self) -> int:
+        return self._began_ns + round(self.s * 1e9)
+
+    def wall_ns(self) -> int:
+        return self._wall_ns + round((self.s + self.set_s) * 1e9)
+
+
+def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_ten_seconds(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    happens = {
+        0.0: Code.BUS_LOST, 0.05: Code.DRIVE_FAULT, 3.0: Code.DRIVE_FAULT, 5.0: Code.PRESSED, 130.0: Code.RESET_STUCK,
+        131.5: Code.RESET_MOVING, 131.6: Code.RESET, 131.7: Code.PRESSED,
+    }  # fmt: skip
+    for at_s in sorted({*happens, 9.9, 10.0, 20.0, 140.0}):
+        clock.s = at_s
+        if at_s in happens:
+            played.board.event(happens[at_s])
+        box.look()
+        # What was written when: the file of 5.0 s not before 10 s, that of 131.5 s at the reset.
+        seen = {9.9: [1], 10.0: [1, 4], 131.5: [1, 4, 5]}.get(at_s)
+        if seen:
+            box._writer.submit(int).result()
+            assert [recording.about.event for recording in played.recordings] == seen
+    box.finish()
+    assert [recording.about.event for recording in played.recordings] == [1, 4, 5, 6, 8]
+    second = played.recordings[1]
+    assert len(sentences(second)) == 4, "the events of the ten seconds before are in it"
+    # A new gateway divides them in the same way, and finds each of them written.
+    played.watched().finish()
+    assert len(played.recordings) == 5
+
+
+@pytest.mark.parametrize("set_s", [-3600.0, 3600.0])
+def test_a_wall_clock_that_is_set_neither_puts_a_recording_off_nor_brings_it_forward(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch, set_s: float
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+
+    def recorded_at(at_s: float, code: int = 0) -> list[int]:
+        clock.s = at_s
+        if code:
+            played.board.event(code)
+        box.look()
+        box._writer.submit(int).result()
+        return [recording.about.event for recording in played.recordings]
+
+    assert recorded_at(0.0, Code.BUS_LOST) == [1]
+    clock.set_s = set_s
+    assert recorded_at(9.0, Code.DRIVE_FAULT) == [1]
+    assert recorded_at(10.0) == [1, 2]
+    # The emergency stop half a minute into a fault, while its ten seconds are in the ring.
+    assert recorded_at(30.0, Code.PRESSED) == [1, 2, 3]
+    box.finish()
+    first, _, third = played.recordings
+    assert third.about.time_ns == first.about.time_ns + round((30.0 + set_s) * 1e9), "people are shown the wall clock"
+
+
+def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_set_forward(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    clock = Clock(monkeypatch)
+    played.fill(2000, fault_at=1000, ends_ns=clock.now_ns() + 500_000_000)
+    played.board.event(Code.BUS_LOST, value=5)
+    clock.s, clock.set_s = 0.25, 3600.0
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    clock.s = 2.0
+    played.watched().finish()
+    first, second = played.recordings
+    assert int(first.records["cycle"][first.about.at]) == 1000
+    assert first.about.time_ns == clock.wall_ns() - round((2.0 + 3600.0) * 1e9)
+    # No cycle shows the second fault's code: its own is the one of its instant, 0.25 s before the last.
+    assert int(second.records["cycle"][second.about.at]) == 1500
+
+
+def test_what_is_said_while_the_wall_clock_is_set_stands_where_it_was_said(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    played.board.event(Code.ARRIVED)
+    clock.s, clock.set_s = 5.0, -3600.0
+    played.board.event(Code.BUS_LOST, value=5)
+    clock.s, clock.set_s = 5.05, 3600.0
+    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    clock.s = 6.0
+    box.look()
+    box.finish()
+    (recording,) = played.recordings
+    about = recording.about
+    away_s = [(moment.time_ns - about.time_ns) * 1e-9 for moment in about.timeline]
+    assert away_s == pytest.approx([-5.0, 0.0, 0.05])
+
+
+def test_what_was_put_off_is_written_when_the_gateway_ends(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    clock = Clock(monkeypatch)
+    box = played.watched()
+    played.board.event(Code.BUS_LOST)
+    box.look()
+    clock.s = 4.0
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert [recording.about.event for recording in played.recordings] == [1, 2]
+
+
+def test_what_follows_a_fault_is_waited_for(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blackbox, "AFTER_S", 2.0)  # time enough for this test, also on a busy host
+    played = play()
+    box = played.watched()
+    began = played.fill(100, fault_at=100)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    assert played.recordings == []
+    played.fill(1000, fault_at=1, ends_ns=began + 500_000_000)
+    while not played.told:
+        time.sleep(0.01)
+    assert time.monotonic_ns() - began >= 2_000_000_000
+    (recording,) = played.recordings
+    assert len(recording.records["cycle"]) == 1100
+    box.finish()
+
+
+def test_the_shortest_cycle_has_its_ten_seconds_too(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play(100_000)
+    taken, since = threading.Event(), played.observer.since
+
+    def told(number: int) -> Any:
+        found = since(number)
+        taken.set()
+        return found
+
+    box = played.watched()
+    cycles = played.observer.records + 1000
+    played.fill(cycles, fault_at=cycles)
+    played.board.event(Code.BUS_LOST, value=5)
+    monkeypatch.setattr(played.observer, "since", told)
+    box.look()
+    # Read at once: what the ring takes in the second that follows does not push out what was before.
+    assert taken.wait(20)
+    played.fill(40_000, fault_at=1)
+    box.finish()
+    (one,) = listed(played.directory)
+    assert one.about is not None
+    assert one.seconds >= 10.0
+    assert not any("before the fault" in note for note in one.about.notes)
+
+
+def test_cycles_that_were_overwritten_before_they_were_read_are_told(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(16_410, fault_at=16_410)
+    for number in range(1, 11):
+        played.observer._ring[number]["number_again"] = 0
+    recording = played.lost(box)
+    note = "8.2 s before the fault instead of 10 s: older cycles had been overwritten"
+    assert note in recording.about.notes
+
+
+def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    now = time.monotonic_ns()
+    played.fill(1000, ends_ns=now - 13_000_000_000)
+    played.fill(600, fault_at=600, ends_ns=now)
+    recording = played.lost(box)
+    note = "0.3 s before the fault instead of 10 s: the loop had published nothing for 12.7 s before them"
+    assert note in recording.about.notes
+
+
+def test_torn_records_are_told_and_not_taken(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(1000, fault_at=900)
+    for number in (10, 11, 500):
+        slot = played.observer._ring[number % played.observer.records]
+        slot["number_again"] = 0
+    recording = played.lost(box)
+    assert "3 cycles were overwritten before they were read, or torn" in recording.about.notes
+    assert len(recording.records["cycle"]) == 997
+    assert int(recording.records["cycle"][recording.about.at]) == 900
+
+
+def test_events_that_the_ring_no_longer_holds_are_told(play: Callable[..., Played]) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100, fault_at=90)
+    for _ in range(EVENTS):
+        played.board.event(Code.ARRIVED)
+    recording = played.lost(box)
+    assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
+
+
+def test_a_loop_that_has_died_is_a_fault_of_its_own_and_one_that_was_told_to_end_is_none(
+    play: Callable[..., Played],
+) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(100)
+    box.loop_has_ended()
+    box.loop_has_ended()
+    box.finish()
+    (recording,) = played.recordings
+    assert "ended unexpectedly" in recording.about.what
+    assert (recording.about.before, recording.about.at, recording.about.event) == ("moving", 99, 0)
+    assert sentences(recording) == [recording.about.what]
+    told_to_end = played.watched()
+    told_to_end.end_is_wanted()
+    told_to_end.loop_has_ended()
+    told_to_end.finish()
+    assert len(played.recordings) == 1
+
+
+def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(100)
+    box = played.watched()
+    until = time.monotonic() + 0.5
+    while time.monotonic() < until:
+        played.fill(1)
+        box.look()
+        time.sleep(0.02)
+    assert played.told == []
+    last = time.monotonic()
+    while not played.told:
+        box.look()
+        time.sleep(0.01)
+    assert time.monotonic() - last >= 0.9
+    played.fill(1)
+    box.look()
+    assert any("publishes again" in sentence for sentence in played.told)
+    box.finish()
+    (recording,) = played.recordings
+    assert "has published nothing for 1 s" in recording.about.what
+    assert int(recording.records["cycle"][recording.about.at]) == 1
+
+
+def test_a_loop_that_hangs_and_goes_on_into_a_fault_makes_one_recording_until_the_reset(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    monkeypatch.setattr(blackbox, "SILENT_S", 1.0)
+    monkeypatch.setattr(time, "monotonic", lambda: clock.s)
+    played = play()
+    played.fill(100)
+    box = played.watched()
+
+    def recorded_at(at_s: float) -> int:
+        clock.s = at_s
+        box.look()
+        box._writer.submit(int).result()
+        return len(played.recordings)
+
+    assert [recorded_at(at_s) for at_s in (0.5, 1.5, 2.5, 3.0)] == [0, 1, 1, 1]
+    played.fill(1, fault_at=1)
+    assert recorded_at(3.1) == 1
+    played.board.event(Code.SLAVE_NOT_OP)
+    assert recorded_at(3.2) == 1
+    assert "has published nothing" in played.recordings[0].about.what
+    # What the file does not hold is written at the reset, and a silence after that is a new fault.
+    played.board.event(Code.RESET)
+    assert recorded_at(3.3) == 2
+    assert recorded_at(5.0) == 3
+    box.finish()
+
+
+def test_a_fault_that_no_gateway_saw_is_written_by_the_next_one_and_only_once(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(2000, fault_at=1000)
+    played.board.event(Code.BUS_LOST, value=5)
+    for _ in range(3):
+        played.watched().finish()
+    (recording,) = played.recordings
+    assert int(recording.records["cycle"][recording.about.at]) == 1000
+
+
+def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_only_once(
+    play: Callable[..., Played], tmp_path: Path, config: ArmConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(500)
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
+    monkeypatch.setattr(launcher, "blackboard_file", lambda directory: played.board.path)
+    told: list[str] = []
+    # The processes: this one made the blackboard, so it was the loop; another one of its number lives now.
+    for processes in (Processes(), Processes(loop=identify(os.getpid())), Processes(loop=Pid(os.getpid(), 1))):
+        assert played.recordings == []
+        processes.write(tmp_path)
+        launcher._record_unseen_end(tmp_path, told.append)
+        played.session.write(tmp_path)
+    launcher._record_unseen_end(tmp_path, told.append)
+    (recording,) = played.recordings
+    assert "ended unexpectedly" in recording.about.what
+    assert (recording.about.before, recording.about.at) == ("moving", 499)
+    stop_marker(tmp_path).touch()
+    recording_file = listed(played.directory)[0].path
+    recording_file.unlink()
+    launcher._record_unseen_end(tmp_path, told.append)
+    assert played.recordings == []
+
+
+def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_that_are_written(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    for _ in range(5):
+        played.board.event(Code.BUS_LOST, value=5)
+        played.board.event(Code.RESET)
+    played.watched().finish()
+    assert len(played.recordings) == 5
+    asked: list[str] = []
+
+    def heard(name: str, answer: Callable[..., Any]) -> Callable[..., Any]:
+        def ask(given: Any) -> Any:
+            asked.append(name)
+            return answer(given)
+
+        return ask
+
+    monkeypatch.setattr(blackbox, "listed", heard("list", listed))
+    monkeypatch.setattr(played.observer, "since", heard("ring", played.observer.since))
+    played.watched().finish()
+    assert asked == ["list"]
+    assert len(played.recordings) == 5
+
+
+def test_a_list_that_cannot_be_made_is_told_and_the_next_fault_is_recorded(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+
+    def broken(directory: Path) -> object:
+        raise TypeError("odd")
+
+    monkeypatch.setattr(blackbox, "listed", broken)
+    box = played.watched()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert any("by a defect: TypeError odd" in sentence for sentence in played.told)
+    assert [recording.about.event for recording in played.recordings] == [3]
+
+
+def test_a_fault_before_the_first_cycle_is_recorded_with_the_cycles_that_follow(
+    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played = play()
+    box = played.watched()
+    read_once, since = threading.Event(), played.observer.since
+
+    def followed(number: int) -> object:
+        found = since(number)
+        read_once.set()
+        return found
+
+    monkeypatch.setattr(played.observer, "since", followed)
+    box._process_fault(time.monotonic_ns(), "has published nothing")
+    assert read_once.wait(60)
+    played.fill(100)
+    box.finish()
+    (recording,) = played.recordings
+    assert (recording.about.at, len(recording.records["cycle"])) == (0, 100)
+
+
+def test_a_fault_that_has_left_the_ring_is_not_made_up(play: Callable[..., Played]) -> None:
+    played = play()
+    played.board.event(Code.BUS_LOST, value=5)
+    time.sleep(0.1)
+    played.fill(100, fault_at=1)
+    played.watched().finish()
+    assert played.recordings == []
+
+
+def test_a_fault_of_another_start_is_not_taken_for_this_ones(play: Callable[..., Played]) -> None:
+    played = play()
+    played.fill(200, fault_at=100)
+    played.board.event(Code.BUS_LOST, value=5)
+    played.watched().finish()
+    played.session = replace(played.session, began_ns=BEGAN_NS + 1)
+    played.watched().finish()
+    assert len(played.recordings) == 2
+
+
+def test_a_disk_that_refuses_is_a_sentence_and_the_next_fault_is_tried_again(play: Callable[..., Played]) -> None:
+    played = play()
+    played.directory.write_text("no directory")
+    box = played.watched()
+    played.fill(100, fault_at=50)
+    played.board.event(Code.BUS_LOST, value=5)
+    while not played.told:
+        played.fill(1)
+        box.look()
+        time.sleep(0.01)
+    assert str(played.directory) in played.told[0]
+    assert "no recording can be written" in played.told[0]
+    played.directory.unlink()
+    played.board.event(Code.RESET)
+    played.board.event(Code.PRESSED)
+    box.look()
+    box.finish()
+    assert len(played.recordings) == 1
+
+
+def test_a_look_does_not_wait_for_the_disk(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
+    played = play()
+    box = played.watched()
+    played.fill(20_000, fault_at=19_000)
+    written, asked, gate = blackbox.write, threading.Event(), threading.Event()
+
+    def slow(*given: object) -> object:
+        asked.set()
+        assert gate.wait(60)
+        return written(*given)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(blackbox, "write", slow)
+    monkeypatch.setattr(blackbox, "AFTER_S", 0.0)
+    played.board.event(Code.BUS_LOST, value=5)
+    box.look()
+    assert asked.wait(20)
+    box.look()
+    assert played.told == []
+    gate.set()
+    box.finish()
+    assert len(played.recordings) == 1
+
+
+@pytest.mark.parametrize("break_it", ["drive", "frames"])
+def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_path: Path, break_it: str) -> None:
+    quick = replace(config, cycle=replace(config.cycle, period_us=2000.0))
+    with Simulation(quick, follow_clock=False) as simulation:
+        told: list[str] = []
+        session = Session(quick, "inprocess", "", 0, BEGAN_NS)
+        box = BlackBox(simulation.observer, session, tmp_path, told.append)
+        assert simulation.until(lambda: simulation.state is State.READY, 3.0)
+        simulation.acquire()
+        simulation.order(Command.ENABLE)
+        assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
+        simulation.order(Command.MOVE, _move((0.5,) * 6, 0.3))
+        simulation.run(0.8)
+        first = simulation.observer.head
+        if break_it == "drive":
+            simulation.models[2].inject_fault(0x8611)
+        else:
+            simulation.data.lose(200)
+        assert simulation.until(lambda: simulation.state is State.FAULT, 2.0)
+        box.look()
+        simulation.run(0.3)
+        box.finish()
+        (one,) = listed(tmp_path)
+        recording = read(one.path)
+        about, records = recording.about, recording.records
+        assert about.before == "moving"
+        ring, _ = simulation.observer.since(0)
+        whole = ring[np.isin(ring["number"], records["number"])]
+        for name, array in records.items():
+            assert np.array_equal(array, whole[name]), name
+        assert int(records["number"][about.at]) > first
+        assert int(records["state"][about.at]) == State.FAULT
+        assert int(records["state"][about.at - 1]) == State.MOVING
+        assert about.what in sentences(recording)
+        assert told
+
+
+def _move(q: Sequence[float], speed: float) -> list[float]:
+    return [*q, *([0.0] * 5), speed]

@@ -1,0 +1,141 @@
+"""Keys and numbers of limits: what is wrong is one sentence each, with the key, what was found and what is allowed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf, nan
+
+import pytest
+from rtcp.gateway.carrier import CommandFailed
+from rtcp.gateway.limit_keeper import changed
+
+from rtcp.config import default_config, load
+from rtcp.motion.limits import Values
+
+CONFIG = load(default_config())
+WIDEST = Values.configured(CONFIG)
+ONLY_NARROWED = "limits are only narrowed while running)"
+KEYS = (
+    "allowed are joint1.KEY or joints.KEY (KEY: min, max, velocity, acceleration, jerk, torque) and chair.min.x "
+    "(boxes: box, user, chair)"
+)
+
+
+def sentences(changes: dict[str, float], values: Values = WIDEST) -> list[str]:
+    with pytest.raises(CommandFailed) as raised:
+        changed(CONFIG, values, changes)
+    assert raised.value.kind == "invalid"
+    return str(raised.value).split("\n")
+
+
+def test_every_key_that_there_is_changes_what_it_names_and_nothing_else() -> None:
+    joint = {"min": "low", "max": "high", **{name: name for name in ("velocity", "acceleration", "jerk", "torque")}}
+    for key, name in joint.items():
+        before = getattr(WIDEST, name)
+        number = 0.9 * before[2]
+        after = (*before[:2], number, *before[3:])
+        assert changed(CONFIG, WIDEST, {f"joint3.{key}": number}) == replace(WIDEST, **{name: after})
+    assert WIDEST.box is not None
+    for side, end in (("min", "x"), ("min", "z"), ("max", "y")):
+        at = 3 * (side == "max") + "xyz".index(end)
+        number = 0.9 * WIDEST.box[at]
+        narrower = (*WIDEST.box[:at], number, *WIDEST.box[at + 1 :])
+        assert changed(CONFIG, WIDEST, {f"box.{side}.{end}": number}) == replace(WIDEST, box=narrower)
+    user, chair = WIDEST.keep_out
+    larger = (*chair[:4], 0.7, chair[5])
+    assert changed(CONFIG, WIDEST, {"chair.max.y": 0.7}) == replace(WIDEST, keep_out=(user, larger))
+
+
+def test_joints_stands_for_all_of_them() -> None:
+    assert changed(CONFIG, WIDEST, {"joints.velocity": 0.1}).velocity == (0.1,) * 6
+
+
+def test_what_was_narrowed_may_become_as_wide_as_configured_again() -> None:
+    narrowed = changed(CONFIG, WIDEST, {"joint2.max": 1.0, "user.max.z": 1.2})
+    assert changed(CONFIG, narrowed, {"joint2.max": 2.0, "user.max.z": 0.85}) == WIDEST
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"joint2.max": 2.5}, f"joint2.max: found 2.5, allowed is -2 to 2 (joints[1] in {{file}}: {ONLY_NARROWED}"),
+        ({"joint1.min": -4}, f"joint1.min: found -4, allowed is -3.1 to 3.1 (joints[0] in {{file}}: {ONLY_NARROWED}"),
+        (
+            {"joint3.velocity": 0.6},
+            f"joint3.velocity: found 0.6, allowed is 0.0005 to 0.5 (joints[2] in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"joint6.torque": 0.001},
+            f"joint6.torque: found 0.001, allowed is 0.0077 to 7.7 (joints[5] in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"joint4.jerk": -1},
+            f"joint4.jerk: found -1, allowed is 0.02 to 20 (joints[3] in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"box.min.x": -1.3},
+            f"box.min.x: found -1.3, allowed is at least -1.2 (cartesian.box in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"box.max.z": 1.5},
+            f"box.max.z: found 1.5, allowed is at most 1.4 (cartesian.box in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"user.max.z": 0.8},
+            f"user.max.z: found 0.8, allowed is at least 0.85 (cartesian.keep_out in {{file}}: {ONLY_NARROWED}",
+        ),
+        (
+            {"chair.min.x": 0.3},
+            f"chair.min.x: found 0.3, allowed is at most 0.22 (cartesian.keep_out in {{file}}: {ONLY_NARROWED}",
+        ),
+        ({"joint1.min": 1, "joint1.max": 0.5}, "joint1.min: found 1, allowed is less than joint1.max, which is 0.5"),
+        ({"box.min.y": 0.5, "box.max.y": 0.5}, "box.min.y: found 0.5, allowed is less than box.max.y, which is 0.5"),
+        ({"box.max.x": -1.5}, "box.min.x: found -1.2, allowed is less than box.max.x, which is -1.5"),
+        ({"joint1.max": nan}, "joint1.max: found nan, allowed is a finite number"),
+        ({"user.min.x": -inf}, "user.min.x: found -inf, allowed is a finite number"),
+        ({"joint9.max": 1}, f"joint9.max: there is no such limit; {KEYS}"),
+        ({"joint1.speed": 1}, f"joint1.speed: there is no such limit; {KEYS}"),
+        ({"box.min": 1}, f"box.min: there is no such limit; {KEYS}"),
+        ({"box.min.w": 1}, f"box.min.w: there is no such limit; {KEYS}"),
+        ({"box.mid.x": 1}, f"box.mid.x: there is no such limit; {KEYS}"),
+        ({"joints.min.x": 1}, f"joints.min.x: there is no such limit; {KEYS}"),
+        ({"max": 1}, f"max: there is no such limit; {KEYS}"),
+        ({"": 1}, f": there is no such limit; {KEYS}"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
+)
+def test_a_wrong_limit_is_named_by_its_key(changes: dict[str, float], sentence: str) -> None:
+    assert sentences(changes) == [sentence.replace("{file}", CONFIG.source.name)]
+
+
+def test_each_joint_that_joints_makes_wrong_is_named() -> None:
+    assert [one.split(",")[0] for one in sentences({"joints.torque": 30.0})] == [
+        "joint5.torque: found 30", "joint6.torque: found 30"
+    ]  # fmt: skip
+
+
+def test_all_that_is_wrong_is_said_at_once() -> None:
+    changes = {"joint1.max": 9.0, "user.max.z": 0.1, "joint2.velocity": nan, "elbow.max": 1.0, "joint3.max": 1.0}
+    assert [one.split(":")[0] for one in sentences(changes)] == [
+        "joint1.max", "user.max.z", "joint2.velocity", "elbow.max"
+    ]  # fmt: skip
+
+
+def test_a_range_that_becomes_empty_with_a_limit_that_is_in_force_is_named() -> None:
+    narrowed = changed(CONFIG, WIDEST, {"joint2.max": 0.5})
+    (sentence,) = sentences({"joint2.min": 0.6}, narrowed)
+    assert sentence == "joint2.min: found 0.6, allowed is less than joint2.max, which is 0.5"
+
+
+def test_nothing_is_no_change() -> None:
+    (sentence,) = sentences({})
+    assert sentence.startswith("no limit was named: give a key and a number, as joint1.KEY")
+
+
+def test_an_arm_without_boxes_has_no_keys_for_them() -> None:
+    bare = replace(CONFIG, cartesian=replace(CONFIG.cartesian, box=None, keep_out=()))
+    values = Values.configured(bare)
+    assert changed(bare, values, {"joint1.max": 1.0}).box is None
+    with pytest.raises(CommandFailed) as raised:
+        changed(bare, values, {"box.min.x": 0.0})
+    assert str(raised.value) == f"box.min.x: there is no such limit; {KEYS.split(' and ', maxsplit=1)[0]}"
