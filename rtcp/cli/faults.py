@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import AsJson, check_picture
+from rtcp.cli.arguments import AsJson, check_picture, option
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit_json, facts, report, show, table
 
@@ -22,12 +22,8 @@ if TYPE_CHECKING:
 
 SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
 """Recordings of the service and of root; StateDirectory= of the unit."""
-JOINT_COLUMNS = (
-    ("actual_position", "rad"),
-    ("sent_position", "rad"),
-    ("actual_velocity", "rad/s"),
-    ("actual_torque", "Nm"),
-)
+JOINT_COLUMNS = {"position rad": "actual_position", "target rad": "sent_position", "velocity rad/s": "actual_velocity",
+                 "torque Nm": "actual_torque"}  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:
@@ -58,9 +54,7 @@ def _show(
     number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
     plot: Annotated[
         Path | None,
-        typer.Option(
-            "--plot", metavar="FILE", help="Picture: .png, .svg or .pdf. Default: a .png beside the recording."
-        ),
+        option("--plot", "FILE", "Picture: .png, .svg or .pdf. Default: a .png beside the recording."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -183,14 +177,12 @@ def _fault_tables(fault: dict[str, Any]) -> list[RenderableType]:
     head.append(f"\nbefore: {fault['before']}; {versions}")
     timeline = table(("s", "what happened"), expand=True, fill="what happened")
     for entry in fault["timeline"]:
-        timeline.add_row(f"{entry['t_s']:+.3f}", Text(entry["sentence"]))
+        timeline.add_row(f"{entry['t_s']:+.3f}", Text(entry["message"]))
     parts: list[RenderableType] = [Panel(head, box=box.ROUNDED, title="rtcp", title_align="left"), timeline]
     if "joints" in fault:
-        joints = table(
-            ("at the fault", *(f"{name} {unit}" for name, unit in JOINT_COLUMNS)), ("at the fault",), expand=True
-        )
+        joints = table(("at the fault", *JOINT_COLUMNS), ("at the fault",), expand=True)
         for at, name in enumerate(fault["joint_names"]):
-            joints.add_row(name, *(f"{fault['joints'][column][at]:+.4f}" for column, _ in JOINT_COLUMNS))
+            joints.add_row(name, *(f"{fault['joints'][column][at]:+.4f}" for column in JOINT_COLUMNS.values()))
         parts += [Text(), joints, Text(), _facts(fault)]
     return [*parts, *(Text(note, "yellow") for note in fault["notes"])]
 

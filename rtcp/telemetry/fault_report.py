@@ -28,14 +28,14 @@ _DETAIL_S = (-0.1, 0.4)
 """Time around the fault in the enlarged column, s."""
 _LINE_INCH, _LINE_LETTERS = 0.155, 150
 """Height and length of a line of the legend."""
-_STATES = {int(state): state.words for state in State}
+_STATES = {int(state): state.name.lower().replace("_", " ") for state in State}
 
 
 class Entry(NamedTuple):
     """An entry of the timeline: when, s after the fault, and what."""
 
     at_s: float
-    sentence: str
+    message: str
 
 
 def seconds(recording: Recording) -> npt.NDArray[np.float64]:
@@ -72,7 +72,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "cycle_ns": about.period_ns,
         "versions": about.versions,
         "notes": list(about.notes),
-        "timeline": [{"t_s": round(entry.at_s, 4), "sentence": entry.sentence} for entry in timeline(recording)],
+        "timeline": [{"t_s": round(entry.at_s, 4), "message": entry.message} for entry in timeline(recording)],
         "joint_names": list(about.joints),
     }
     if about.at < 0:
@@ -122,7 +122,7 @@ def draw(recording: Recording, out: Path) -> None:
     nearest = sorted(timeline(recording), key=lambda entry: abs(entry.at_s))[:_EVENTS]
     events = sorted(nearest, key=lambda entry: entry.at_s)
     legend = "\n".join(
-        textwrap.fill(f"{i}  {event.at_s:+.3f} s  {event.sentence}", _LINE_LETTERS, subsequent_indent=" " * 8)
+        textwrap.fill(f"{i}  {event.at_s:+.3f} s  {event.message}", _LINE_LETTERS, subsequent_indent=" " * 8)
         for i, event in enumerate(events, 1)
     )
     legend_inch = _LINE_INCH * (legend.count("\n") + 1)

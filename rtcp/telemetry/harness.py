@@ -11,14 +11,12 @@ from typing import Any
 
 import numpy as np
 
+from rtcp.api import Robot, RtcpError, State
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
-from rtcp.ipc.states import State
 from rtcp.telemetry.recording import target_steps
 from rtcp.virtual.faults.client import SegmentClient
 
@@ -54,7 +52,7 @@ class Harness:
     def __init__(self, directory: Path, config: ArmConfig) -> None:
         self.directory = directory
         self.config = config
-        self.client = ControlClient(CLIENT_NAME, control_socket(directory))
+        self.robot = Robot(CLIENT_NAME, control_socket(directory))
         # The session knows the socket: another segment may have the usual one.
         self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
         self.observer = Observer(blackboard_file(directory))
@@ -80,7 +78,7 @@ class Harness:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:  # fmt: skip
-        self.client.close()
+        self.robot.close()
         self.segment.close()
         self.observer.close()
 
@@ -102,11 +100,11 @@ class Harness:
             allowed = self._speeds * self.observer.period_ns * 1e-9
             self.largest_step = max(self.largest_step, float((steps / allowed).max()))
 
-    def state(self) -> str:
-        """Return the machine's state as `rtcp status` names it."""
+    def state(self) -> State:
+        """Return the machine's state."""
         self.read_cycles()
         latest = self.observer.latest()
-        return "off" if latest is None else State(int(latest[0]["state"])).name.lower()
+        return State.OFF if latest is None else State(int(latest[0]["state"]))
 
     def speed(self) -> float:
         """Return the measured speed of the fastest joint, rad/s."""
@@ -115,8 +113,8 @@ class Harness:
 
     def moment(self) -> Moment:
         """Return this moment, for `messages_since`."""
-        texts = self.observer.texts_since(0)
-        return Moment(self.observer.last_event, texts[-1].number if texts else 0)
+        events, texts = self.observer.events_since(0), self.observer.texts_since(0)
+        return Moment(events[-1].number if events else 0, texts[-1].number if texts else 0)
 
     def messages_since(self, moment: Moment) -> list[str]:
         """Return the platform's messages since a moment, in their order."""
@@ -172,10 +170,6 @@ class Harness:
         self.segment.fault(fault)
         self.injected += 1
 
-    def call(self, method: str, /, **params: Any) -> dict[str, Any]:
-        """Send a command to the platform; raises RtcpError."""
-        return self.client.call(method, params, timeout_s=60.0)
-
     def enable(self) -> tuple[int, str]:
         """Reset and enable until the arm holds.
 
@@ -185,10 +179,10 @@ class Harness:
         refusal = ""
         for attempt in range(1, _RESETS + 1):
             try:
-                if self.state() in ("fault", "emergency_stop", "stopped_by_limit"):
-                    self.call("reset")
-                if self.state() != "holding":
-                    self.call("enable")
+                if self.state() in (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT):
+                    self.robot.reset()
+                if self.state() is not State.HOLDING:
+                    self.robot.enable()
             except RtcpError as error:
                 refusal = error.message
                 self.wait(_RESET_PAUSE_S)
@@ -207,8 +201,8 @@ class Harness:
             if refusal:
                 break
             try:
-                self.call("mode", name="joint")
-                self.call("move_joints", q=list(q), speed=_SPEED)
+                self.robot.mode("joint")
+                self.robot.move_joints(q, _SPEED)
             except RtcpError as error:
                 refusal = error.message
                 continue
