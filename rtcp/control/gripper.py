@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from rtcp.config.model import ArmConfig, Joint
-from rtcp.config.model import SupervisionConfig
+from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed

@@ -24,7 +24,7 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Plan, PlanRefused
-from rtcp.motion.planning.waypoints import plan_trajectory
+from rtcp.motion.planning.trajectories import plan_trajectory
 
 T = TypeVar("T")
 _COORDINATES = ("x", "y", "z", "rx", "ry", "rz")

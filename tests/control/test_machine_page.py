@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from rtcp.telemetry.machine_drawing import diagram, page
+
 from rtcp.control.machine import STATES
 from rtcp.control.states import ReadyState, StoppedByLimitState
 from rtcp.ipc.commands import Enable, Reset
 from rtcp.ipc.layout import FLAG_ENABLED, FLAG_MOTION_ALLOWED
 from rtcp.ipc.states import State
-from rtcp.telemetry.machine_drawing import diagram, page
 
 ROOT = Path(__file__).parents[2]
 ALLOWED_TO_MOVE = FLAG_ENABLED | FLAG_MOTION_ALLOWED
