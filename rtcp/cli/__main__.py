@@ -11,11 +11,11 @@ from typing import Annotated
 import typer
 
 import rtcp
+from rtcp.api import RtcpError
 from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, motion, platform, segment, service, soak, status
 from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
 from rtcp.cli.output import complain, emit, mute
 from rtcp.config.model import ConfigError
-from rtcp.ipc.errors import RtcpError
 
 app = typer.Typer(
     name="rtcp",

@@ -7,31 +7,30 @@ import math
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from rtcp.cli.errors import CommandError
-from rtcp.config.numbers import plain_number
+from rtcp.config.numbers import angle, plain_number
+
+
+def option(name: str, metavar_or_help: str = "", help: str = "") -> Any:
+    """Declare an option: its name, for all but switches and plain numbers its metavar, and its help."""
+    if not help:
+        return typer.Option(name, help=metavar_or_help)
+    return typer.Option(name, metavar=metavar_or_help or None, help=help)
+
 
 ConfigFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", metavar="FILE", help="File of the arm. Default: $RTCP_CONFIG, /etc/rtcp, the packaged one."
-    ),
+    Path | None, option("--config", "FILE", "File of the arm. Default: $RTCP_CONFIG, /etc/rtcp, the packaged one.")
 ]
 BusName = Annotated[
     str | None,
-    typer.Option(
-        "--bus",
-        metavar="virtual|NAME",
-        help="virtual or a network interface, as eth0. Default: the running platform's, else the configured one.",
-    ),
+    option("--bus", "virtual|NAME", "virtual, or a network interface. Default: the running one's, the configured one."),
 ]
-Poll = Annotated[
-    bool, typer.Option("--poll", help="The virtual segment polls: it answers faster and keeps one CPU busy.")
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON, SI units.")]
+Poll = Annotated[bool, option("--poll", "The virtual segment polls: it answers faster and keeps one CPU busy.")]
+AsJson = Annotated[bool, option("--json", "Print JSON, SI units.")]
 
 NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
 """Passes `-0.5` through to the arguments; `refuse_options` then finds misspelt options among them."""
@@ -105,7 +104,7 @@ def _numbers(values: Sequence[str], names: Sequence[tuple[str, str]]) -> list[fl
     numbers, wrong = [], []
     for value, (name, unit) in zip(values, names, strict=True):
         try:
-            found = plain_number(_angle(value) if unit == "rad" else value)
+            found = plain_number(angle(value) if unit == "rad" else value)
         except ValueError:
             wrong.append(f"{name}: {value!r} is not a number" + (f" ({unit})" if unit else ""))
             continue
@@ -117,15 +116,13 @@ def _numbers(values: Sequence[str], names: Sequence[tuple[str, str]]) -> list[fl
     return numbers
 
 
-def _angle(value: str) -> object:
-    if "pi" not in value:
-        return value
-    from rtcp.config.numbers import angle  # imports the validator, which loads slowly
-
-    return angle(value)
+def finite(name: str, value: float, unit: str) -> None:
+    """Refuse a value of an option that is not finite; raises CommandError."""
+    if not math.isfinite(value):
+        raise CommandError(f"{name} {value} is not allowed: a finite number of {unit}")
 
 
-def positive(option: str, value: float | None, unit: str, most: float = math.inf) -> None:
+def positive(name: str, value: float | None, unit: str, most: float = math.inf) -> None:
     """Refuse a value that is not above 0, not finite, or above `most`; None is allowed.
 
     Raises:
@@ -133,7 +130,7 @@ def positive(option: str, value: float | None, unit: str, most: float = math.inf
     """
     if value is not None and not (math.isfinite(value) and 0 < value <= most):
         bound = "" if most == math.inf else f", at most {most:g}"
-        raise CommandError(f"{option} {value:g} is not allowed: a finite number of {unit} above 0{bound}")
+        raise CommandError(f"{name} {value:g} is not allowed: a finite number of {unit} above 0{bound}")
 
 
 def check_picture(option: str, file: Path) -> None:

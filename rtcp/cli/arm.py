@@ -15,6 +15,7 @@ from rtcp.cli.arguments import (
     AsJson,
     check_picture,
     joint_values,
+    option,
     pose_values,
     refuse_options,
 )
@@ -32,7 +33,7 @@ SINGULAR = 1e-9
 
 ArmFile = Annotated[
     str | None,
-    typer.Option("--arm", metavar="FILE", help="File of an arm, or name of a packaged one. Default: the platform's."),
+    option("--arm", "FILE", "File of an arm, or name of a packaged one. Default: the platform's."),
 ]
 Positions = Annotated[
     list[str], typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool.")
@@ -72,7 +73,7 @@ def _ik(
     ],
     near: Annotated[
         tuple[str, str, str, str, str, str] | None,
-        typer.Option("--near", metavar="Q1..Q6", help="Joint positions, rad, for joints that a singularity frees."),
+        option("--near", "Q1..Q6", "Joint positions, rad, for joints that a singularity frees."),
     ] = None,
     arm: ArmFile = None,
     as_json: AsJson = False,
@@ -100,9 +101,7 @@ def _ik(
 
 def _plot(
     positions: Positions,
-    out: Annotated[Path, typer.Option("--out", metavar="FILE", help=f"Picture: {', '.join(PICTURES)}.")] = (
-        Path("arm.png")
-    ),
+    out: Annotated[Path, option("--out", "FILE", f"Picture: {', '.join(PICTURES)}.")] = (Path("arm.png")),
     arm: ArmFile = None,
 ) -> None:
     """Draw the arm and its frames."""
@@ -115,9 +114,7 @@ def _plot(
 
 
 def _urdf(
-    out: Annotated[
-        Path | None, typer.Option("--out", metavar="FILE", help="File to write. Default: standard output.")
-    ] = None,
+    out: Annotated[Path | None, option("--out", "FILE", "File to write. Default: standard output.")] = None,
     arm: ArmFile = None,
 ) -> None:
     """Export the arm as URDF, for viewers, simulators and planners."""

@@ -8,19 +8,18 @@ import struct
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, refuse_options
+from rtcp.api import NotRunning, Robot
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
 from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, interruption_code, signals_raise
+from rtcp.cli.errors import CommandError, code_of, interruption_code, signals_raise
 from rtcp.cli.output import emit, emit_json, facts, report, show, table
 from rtcp.cli.platform import refuse_second_platform
 from rtcp.config.model import VIRTUAL
 from rtcp.config.numbers import plain_number
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
 from rtcp.launch import offline
 
 if TYPE_CHECKING:
@@ -52,26 +51,26 @@ def register(app: typer.Typer) -> None:
 
 def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
     """Show the slaves: identity, state, PDO map, clocks and delays."""
-    with _bus("scan", bus, config) as access:
-        slaves = access.scan()
+    with _bus("scan", bus, config) as asked:
+        slaves = asked.access.scan()
     if as_json:
         emit_json(slaves)
     else:
-        show(*_scan_tables(access.name, slaves))
+        show(*_scan_tables(asked.name, slaves))
 
 
 def _sdo_read(
     slave: SlaveName,
     where: ObjectIndex,
-    type_name: Annotated[str | None, typer.Option("--type", metavar="TYPE", help=f"{', '.join(TYPES)}.")] = None,
+    type_name: Annotated[str | None, option("--type", "TYPE", f"{', '.join(TYPES)}.")] = None,
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Read an object; without --type its bytes in hex and as each type of that size."""
     index, subindex = parse_object(where)
     known = None if type_name is None else _checked_type(type_name)
-    with _bus("sdo read", bus, config) as access:
-        data = access.sdo_read(_position(slave, access), index, subindex)
+    with _bus("sdo read", bus, config) as asked:
+        data = asked.access.sdo_read(asked.position(slave), index, subindex)
     emit(interpretations(data) if known is None else decode(data, known))
 
 
@@ -79,7 +78,7 @@ def _sdo_write(
     slave: SlaveName,
     where: ObjectIndex,
     value: Annotated[list[str], typer.Argument(metavar="VALUE")],
-    type_name: Annotated[str, typer.Option("--type", metavar="TYPE", help=f"{', '.join(TYPES)}.")],
+    type_name: Annotated[str, option("--type", "TYPE", f"{', '.join(TYPES)}.")],
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
@@ -89,92 +88,54 @@ def _sdo_write(
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)
     data = encode(value[0], _checked_type(type_name))
-    with _bus("sdo write", bus, config) as access:
-        position = _position(slave, access)
-        access.sdo_write(position, index, subindex, data)
+    with _bus("sdo write", bus, config) as asked:
+        position = asked.position(slave)
+        asked.access.sdo_write(position, index, subindex, data)
     report(f"slave {position}, 0x{index:04X}:{subindex}: {data.hex(' ') or '(empty)'} written")
 
 
 # -- access ---------------------------------------------------------------------------------------------------------
 
 
-class BusAccess(Protocol):
-    """What `scan` and `sdo` need of a bus; every method may raise `RtcpError`."""
+class OfflineBus:
+    """A bus that is opened for each request and closed again; methods as those of `rtcp.api.Robot`."""
+
+    def __init__(self, bus: str, config: Path | None) -> None:
+        self._bus = bus
+        self._config = config
+
+    def scan(self) -> list[dict[str, Any]]:
+        """Return what each slave reports."""
+        return offline.scan(self._bus, self._config)
+
+    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
+        """Return the bytes of an object."""
+        return offline.sdo_read(self._bus, self._config, slave, index, subindex)
+
+    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
+        """Write the bytes of an object."""
+        offline.sdo_write(self._bus, self._config, slave, index, subindex, data)
+
+
+class Bus(NamedTuple):
+    """A bus that can be asked: its name, the position of each slave by configured name, and who asks it."""
 
     name: str
-    """`virtual` or the network interface."""
+    positions: dict[str, int]
+    access: Robot | OfflineBus
 
-    def positions(self) -> dict[str, int]:
-        """Return the position of each slave by its configured name."""
-
-    def scan(self) -> list[dict[str, Any]]:
-        """Return what each slave reports, as `rtcp.fieldbus.bus.SlaveInfo`, bytes as hex."""
-
-    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """Return the bytes of an object."""
-
-    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
-        """Write the bytes of an object."""
-
-
-class RunningBus:
-    """The bus of the running platform, over its control socket."""
-
-    def __init__(self, client: ControlClient, status: Mapping[str, Any]) -> None:
-        self._client = client
-        self._status = status
-        self.name = str(status.get("bus", "-"))
-
-    def positions(self) -> dict[str, int]:
-        """See `BusAccess`."""
-        return {str(slave["name"]): int(slave["position"]) for slave in self._status.get("slaves", [])}
-
-    def scan(self) -> list[dict[str, Any]]:
-        """Return what the slaves reported when they were scanned."""
-        return list(self._client.call("scan").get("slaves", []))
-
-    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """See `BusAccess`."""
-        answer = self._client.call("sdo_read", {"slave": position, "index": index, "subindex": subindex})
-        return bytes.fromhex(str(answer.get("hex", "")))
-
-    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
-        """See `BusAccess`."""
-        arguments = {"slave": position, "index": index, "subindex": subindex, "hex": data.hex()}
-        self._client.call("sdo_write", arguments)
-
-
-class OfflineBus:
-    """A bus that is opened for each request and closed again."""
-
-    def __init__(self, bus: str | None, config: Path | None) -> None:
-        self._config = config
-        self.name = offline.configuration(config).bus.interface if bus is None else bus
-        if self.name == VIRTUAL:
-            from rtcp.config.loader import segment_path
-            from rtcp.virtual.segment import check_segment
-
-            check_segment(segment_path(offline.configuration(config)))
-
-    def positions(self) -> dict[str, int]:
-        """See `BusAccess`."""
-        return {slave.name: place for place, slave in enumerate(offline.configuration(self._config).slaves, 1)}
-
-    def scan(self) -> list[dict[str, Any]]:
-        """See `BusAccess`."""
-        return offline.scan(self.name, self._config)
-
-    def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """See `BusAccess`."""
-        return offline.sdo_read(self.name, self._config, position, index, subindex)
-
-    def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
-        """See `BusAccess`."""
-        offline.sdo_write(self.name, self._config, position, index, subindex, data)
+    def position(self, slave: str) -> int:
+        """Return the position of a slave given by position or configured name; raises CommandError."""
+        if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
+            return int(slave)
+        if slave not in self.positions:
+            known = ", ".join(self.positions) or "none"
+            raise CommandError(f"no slave is called {slave!r}: a position from 1, or one of {known}")
+        return self.positions[slave]
 
 
 @contextmanager
-def _bus(command: str, bus: str | None, config: Path | None) -> Iterator[BusAccess]:
+def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
     """Yield the running platform's bus where it is the requested one, else open the requested or configured one.
 
     Raises:
@@ -185,28 +146,33 @@ def _bus(command: str, bus: str | None, config: Path | None) -> Iterator[BusAcce
     try:
         with signals_raise():
             try:
-                client = connect(command)
-            except RtcpError as error:
-                if error.kind != "not running":
-                    raise
+                robot = connect(command)
+            except NotRunning:
                 refuse_second_platform()
-                yield OfflineBus(bus, config)
+                yield _offline(name, config)
                 return
-            with client:
-                status = client.call("status")
-                yield RunningBus(client, status) if bus in (None, status.get("bus")) else OfflineBus(bus, config)
+            with robot:
+                status = robot.status().raw
+                if name in (None, status["bus"]):
+                    positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
+                    yield Bus(status["bus"], positions, robot)
+                else:
+                    yield _offline(name, config)
+    except offline.OfflineError as error:
+        raise CommandError(str(error), code_of(error.kind)) from error
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
 
 
-def _position(slave: str, access: BusAccess) -> int:
-    """Return the position of a slave given by position or configured name; raises CommandError with the names."""
-    if slave.isdecimal() and len(slave) < 6 and int(slave) > 0:
-        return int(slave)
-    named = access.positions()
-    if slave not in named:
-        raise CommandError(f"no slave is called {slave!r}: a position from 1, or one of {', '.join(named) or 'none'}")
-    return named[slave]
+def _offline(name: str | None, config: Path | None) -> Bus:
+    from rtcp.config.loader import segment_path
+    from rtcp.virtual.segment import check_segment
+
+    arm = offline.configuration(config)
+    name = arm.bus.interface if name is None else name
+    if name == VIRTUAL:
+        check_segment(segment_path(arm))
+    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, OfflineBus(name, config))
 
 
 # -- objects as text (little endian on the wire) --------------------------------------------------------------------

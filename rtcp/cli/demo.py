@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import BusName, ConfigFile, check_picture, positive
+from rtcp.api import Robot
+from rtcp.cli.arguments import BusName, ConfigFile, check_picture, option, positive
 from rtcp.cli.connection import connect
 from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, signals_raise
-from rtcp.cli.motion import MOVE_TIMEOUT_S, arrival, move_joints
-from rtcp.cli.output import ABSENT, report, show, table
+from rtcp.cli.motion import arrival
+from rtcp.cli.output import report, show, table
 from rtcp.cli.platform import launch, refuse_second_platform
-from rtcp.cli.status import CYCLE_TIMES, quantiles, realtime_line
-from rtcp.ipc.client import ControlClient
+from rtcp.cli.status import CYCLE_TIMES, clock_state, quantiles, realtime_line
 from rtcp.launch import offline
 
 if TYPE_CHECKING:
@@ -48,13 +48,11 @@ def register(app: typer.Typer) -> None:
 def _demo(
     config: ConfigFile = None,
     bus: BusName = None,
-    seconds: Annotated[float, typer.Option("--seconds", metavar="N", help="Duration of the motion, s.")] = 6.0,
+    seconds: Annotated[float, option("--seconds", "N", "Duration of the motion, s.")] = 6.0,
     square: Annotated[
-        str | None, typer.Option("--square", metavar="xy|yz|xz", help="Drive a square of 200 mm in this plane instead.")
+        str | None, option("--square", "xy|yz|xz", "Drive a square of 200 mm in this plane instead.")
     ] = None,
-    picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="Picture of the square: PNG, SVG or PDF.")
-    ] = None,
+    picture: Annotated[Path | None, option("--picture", "FILE", "Picture of the square: PNG, SVG or PDF.")] = None,
 ) -> None:
     """Start, enable, move, return, stop, and show how well the cycle held.
 
@@ -71,11 +69,11 @@ def _demo(
 
     options = StartOptions(config=config, bus=bus, mode="csp")
     try:
-        with signals_raise(*SUSPENDING), _platform(options) as started_s, connect("demo") as client:
-            status, mean_ns = _run(client, arm.joints, seconds, drive)
+        with signals_raise(*SUSPENDING), _platform(options) as started_s, connect("demo") as robot:
+            status, mean_ns = _run(robot, arm.joints, seconds, drive)
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: the platform has been stopped", interruption_code(interruption)) from None
-    show(figures(status, status.get("start_to_op_s", started_s), mean_ns))
+    show(figures(status, started_s, mean_ns))
     if drive is not None:
         drive.report()
 
@@ -99,33 +97,30 @@ def _platform(options: StartOptions) -> Iterator[float]:
 
 
 def _run(
-    client: ControlClient, joints: Sequence[Joint], seconds: float, drive: SquareDrive | None
-) -> tuple[dict[str, Any], float | None]:
+    robot: Robot, joints: Sequence[Joint], seconds: float, drive: SquareDrive | None
+) -> tuple[Mapping[str, Any], float]:
     """Enable, move, return; give the last status with the drives enabled and the mean cycle, ns."""
-    _wait_for_clocks(client)
-    client.call("enable")
+    _wait_for_clocks(robot)
+    robot.enable()
     report("enabled: the drives hold the arm where it is")
-    before, since_ns = client.call("status"), time.monotonic_ns()
+    before = robot.status().raw
     home = [
         min(joint.position.max, max(joint.position.min, float(position)))
-        for joint, position in zip(joints, before["joints"]["position"], strict=True)
+        for joint, position in zip(joints, before["joints"]["actual_position"], strict=True)
     ]
     if drive is not None:
-        drive.run(client)
+        drive.run(robot)
     else:
         until, number = time.monotonic() + seconds, 0
         while number == 0 or time.monotonic() < until:
             target = pose(home, joints, POSES[number % len(POSES)])
             number += 1
-            report(f"pose {number}: {arrival(move_joints(client, target))}")
-    report(f"back: {arrival(move_joints(client, home))}")
-    after, passed_ns = client.call("status"), time.monotonic_ns() - since_ns
-    client.call("disable")
+            report(f"pose {number}: {arrival(robot.move_joints(target))}")
+    report(f"back: {arrival(robot.move_joints(home))}")
+    after = robot.status().raw
+    robot.disable()
     report("disabled")
-    cycles = int(after["cycles"]) - int(before["cycles"])
-    if isinstance(before.get("time_ns"), int) and isinstance(after.get("time_ns"), int):
-        passed_ns = after["time_ns"] - before["time_ns"]  # of the cycles themselves, where they are reported
-    return after, passed_ns / cycles if cycles > 0 else None
+    return after, (after["time_ns"] - before["time_ns"]) / max(1, after["cycles"] - before["cycles"])
 
 
 def pose(home: Sequence[float], joints: Sequence[Joint], directions: Sequence[int]) -> list[float]:
@@ -138,15 +133,11 @@ def pose(home: Sequence[float], joints: Sequence[Joint], directions: Sequence[in
     return target
 
 
-def _wait_for_clocks(client: ControlClient) -> None:
-    """Return when the master is locked to the reference clock, or at once on a bus without distributed clocks."""
+def _wait_for_clocks(robot: Robot) -> None:
+    """Return when the master is locked to the reference clock; raises CommandError."""
     deadline = time.monotonic() + LOCK_TIMEOUT_S
     while True:
-        clocks = client.call("status").get("dc") or {}
-        if clocks.get("locked") is None:
-            report("no distributed clocks on this bus")
-            return
-        if clocks["locked"]:
+        if robot.status().raw["dc"]["locked"]:
             report("clocks locked")
             return
         if time.monotonic() > deadline:
@@ -154,32 +145,26 @@ def _wait_for_clocks(client: ControlClient) -> None:
         time.sleep(0.05)
 
 
-def figures(status: Mapping[str, Any], start_to_op_s: float | None, mean_ns: float | None) -> Table:
-    """Return the figures of a run; an unknown one is a dash.
+def figures(status: Mapping[str, Any], started_s: float, mean_ns: float) -> Table:
+    """Return the figures of a run.
 
     Args:
         status: the platform's last status with the drives enabled.
-        start_to_op_s: from the command to all slaves in OP, s.
+        started_s: duration of the start, s, where the platform does not report it.
         mean_ns: mean cycle, ns.
     """
     rows = table(("figure", "value"), ("figure", "value"), title="rtcp demo", fill="value")
-    target = status.get("cycle_ns")
-    deviation = f" ({(mean_ns / target - 1) * 100:+.4f} %)" if mean_ns and target else ""
-    rows.add_row("state", str(status.get("state", ABSENT)))
-    rows.add_row("cycle, target", f"{target / 1000:.3f} us" if target else ABSENT)
-    rows.add_row("cycle, mean", f"{mean_ns / 1000:.3f} us{deviation}" if mean_ns else ABSENT)
-    rows.add_row("cycles, missed", f"{status.get('cycles', ABSENT)}, {status.get('missed', ABSENT)}")
+    target, clocks = status["cycle_ns"], status["dc"]
+    rows.add_row("state", status["state"])
+    rows.add_row("cycle, target", f"{target / 1000:.3f} us")
+    rows.add_row("cycle, mean", f"{mean_ns / 1000:.3f} us ({(mean_ns / target - 1) * 100:+.4f} %)")
+    rows.add_row("cycles, missed", f"{status['cycles']}, {status['missed']}")
     for label, key in CYCLE_TIMES:
-        rows.add_row(f"{label} p50 / p99 / max", f"{' / '.join(quantiles(status, key))} us")
-    clocks = status.get("dc") or {}
-    offsets = [
-        f"{label} p99 {quantiles(clocks, key)[1]} us"
-        for key, label in (("filtered_us", "filtered"), ("offset_us", "raw"))
-        if key in clocks
-    ]
-    rows.add_row("clock offset", ", ".join(["locked" if clocks.get("locked") else "not locked", *offsets]))
-    rows.add_row("start to OP", ABSENT if start_to_op_s is None else f"{start_to_op_s:.2f} s")
-    rows.add_row("real time", realtime_line(status.get("realtime") or {}))
+        rows.add_row(f"{label} p50 / p99 / max", f"{' / '.join(quantiles(status[key]))} us")
+    filtered, raw = (quantiles(clocks[key])[1] for key in ("filtered_us", "offset_us"))
+    rows.add_row("clock offset", f"{clock_state(clocks)}, filtered p99 {filtered} us, raw p99 {raw} us")
+    rows.add_row("start to OP", f"{status['start_to_op_s'] or started_s:.2f} s")
+    rows.add_row("real time", realtime_line(status["realtime"]))
     return rows
 
 
@@ -217,11 +202,11 @@ class SquareDrive:
         self._out = out
         self._driven: Driven | None = None
 
-    def run(self, client: ControlClient) -> None:
+    def run(self, robot: Robot) -> None:
         """Move to the first corner, then along the four sides, while every cycle is recorded.
 
         Raises:
-            RtcpError: as the platform ended a motion.
+            RtcpError: the platform ended a motion.
             CommandError: nothing moved.
         """
         from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
@@ -229,11 +214,10 @@ class SquareDrive:
         from rtcp.telemetry.square import SPEED_M_S, NoSquare, judge
 
         square, model = self._square, self._config.arm
-        report(f"first corner: {arrival(move_joints(client, square.start))}")
+        report(f"first corner: {arrival(robot.move_joints(square.start))}")
         with recording(blackboard_file(runtime_directory())) as recorded:
-            arguments = {"poses": square.poses, "speed": SPEED_M_S}
-            result = client.call("line", arguments, timeout_s=MOVE_TIMEOUT_S)
-        report(f"square in {square.plane}: {arrival(result)}")
+            arrived = robot.move_line(square.poses, SPEED_M_S)
+        report(f"square in {square.plane}: {arrival(arrived)}")
         if model is None:
             raise CommandError("the arm has no geometry (key kinematics)")
         try:

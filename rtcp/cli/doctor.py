@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import AsJson, ConfigFile
+from rtcp.cli.arguments import AsJson, ConfigFile, option
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, show, table
 from rtcp.config.model import VIRTUAL
@@ -28,7 +28,7 @@ RESULTS = {
 
 Bus = Annotated[
     str | None,
-    typer.Option("--bus", metavar="virtual|NAME", help="virtual, or a network interface. Default: the configured one."),
+    option("--bus", "virtual|NAME", "virtual, or a network interface. Default: the configured one."),
 ]
 
 

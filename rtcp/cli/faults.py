@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rtcp.cli.arguments import AsJson, check_picture
+from rtcp.cli.arguments import AsJson, check_picture, option
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit_json, facts, report, show, table
 
@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-    from rtcp.gateway.blackbox_file import Listed
+    from rtcp.ipc.recording import Listed
 
 SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
 """Recordings of the service and of root; StateDirectory= of the unit."""
-JOINT_COLUMNS = (("position", "rad"), ("target", "rad"), ("velocity", "rad/s"), ("torque", "Nm"))
+JOINT_COLUMNS = {"position rad": "actual_position", "target rad": "sent_position", "velocity rad/s": "actual_velocity",
+                 "torque Nm": "actual_torque"}  # fmt: skip
 
 
 def register(app: typer.Typer) -> None:
@@ -37,7 +38,7 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
     """List the recorded faults, the newest last."""
     if context.invoked_subcommand is not None:
         return
-    from rtcp.gateway.blackbox_file import faults_directory, listed
+    from rtcp.ipc.recording import faults_directory, listed
 
     with _readable():
         found = listed(faults_directory())
@@ -53,9 +54,7 @@ def _show(
     number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
     plot: Annotated[
         Path | None,
-        typer.Option(
-            "--plot", metavar="FILE", help="Picture: .png, .svg or .pdf. Default: a .png beside the recording."
-        ),
+        option("--plot", "FILE", "Picture: .png, .svg or .pdf. Default: a .png beside the recording."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -63,7 +62,7 @@ def _show(
     if plot is not None:
         check_picture("--plot", plot)
     path = _recording(number)
-    from rtcp.gateway.blackbox_file import read
+    from rtcp.ipc.recording import read
     from rtcp.telemetry.fault_report import draw, summary
 
     with _readable():
@@ -86,7 +85,7 @@ def _show(
 
 @contextmanager
 def _readable() -> Iterator[None]:
-    from rtcp.gateway.blackbox_file import RecordingError
+    from rtcp.ipc.recording import RecordingError
 
     try:
         yield
@@ -96,7 +95,7 @@ def _readable() -> Iterator[None]:
 
 def _recording(number: int) -> Path:
     """Return the recording of this number; raises CommandError with the numbers that exist."""
-    from rtcp.gateway.blackbox_file import faults_directory, files
+    from rtcp.ipc.recording import faults_directory, files
 
     with _readable():
         recorded = dict(files(faults_directory()))
@@ -108,7 +107,7 @@ def _recording(number: int) -> Path:
 
 def _service_hint() -> str:
     """Return where the service records, for a user whose own list is empty."""
-    from rtcp.gateway.blackbox_file import faults_directory
+    from rtcp.ipc.recording import faults_directory
 
     if faults_directory() == SERVICE_FAULTS or not os.path.isdir(SERVICE_FAULTS):
         return ""
@@ -178,14 +177,12 @@ def _fault_tables(fault: dict[str, Any]) -> list[RenderableType]:
     head.append(f"\nbefore: {fault['before']}; {versions}")
     timeline = table(("s", "what happened"), expand=True, fill="what happened")
     for entry in fault["timeline"]:
-        timeline.add_row(f"{entry['t_s']:+.3f}", Text(entry["sentence"]))
+        timeline.add_row(f"{entry['t_s']:+.3f}", Text(entry["message"]))
     parts: list[RenderableType] = [Panel(head, box=box.ROUNDED, title="rtcp", title_align="left"), timeline]
     if "joints" in fault:
-        joints = table(
-            ("at the fault", *(f"{name} {unit}" for name, unit in JOINT_COLUMNS)), ("at the fault",), expand=True
-        )
+        joints = table(("at the fault", *JOINT_COLUMNS), ("at the fault",), expand=True)
         for at, name in enumerate(fault["joint_names"]):
-            joints.add_row(name, *(f"{fault['joints'][column][at]:+.4f}" for column, _ in JOINT_COLUMNS))
+            joints.add_row(name, *(f"{fault['joints'][column][at]:+.4f}" for column in JOINT_COLUMNS.values()))
         parts += [Text(), joints, Text(), _facts(fault)]
     return [*parts, *(Text(note, "yellow") for note in fault["notes"])]
 

@@ -6,16 +6,16 @@ import re
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, number, positive, refuse_old_name, refuse_options
-from rtcp.cli.connection import connect, stopping
+from rtcp.api import Robot, Status
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, number, option, positive, refuse_old_name, refuse_options
+from rtcp.cli.connection import connect, stoppable
 from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.keyboard import QUIT, HeldKey, Keyboard, RenewalCheck
 from rtcp.cli.output import emit, report
-from rtcp.ipc.client import ControlClient
 
 JOG_INTERVAL_S, JOG_HOLD_S = 0.05, 0.25
 """Interval of jog commands, and how long one is valid: a client that stalls moves the arm no longer than that."""
@@ -60,10 +60,8 @@ def register(app: typer.Typer) -> None:
 def _jog(
     axis: Annotated[str, typer.Argument(metavar="AXIS", help="x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
     speed: Annotated[str, typer.Argument(metavar="SPEED", help="m/s; rad/s of rotations and joints; may be negative.")],
-    frame: Annotated[str, typer.Option("--frame", metavar="base|tool", help="Frame of x, y, z.")] = "base",
-    seconds: Annotated[
-        float | None, typer.Option("--seconds", metavar="N", help="Move for N seconds, without keys.")
-    ] = None,
+    frame: Annotated[str, option("--frame", "base|tool", "Frame of x, y, z.")] = "base",
+    seconds: Annotated[float | None, option("--seconds", "N", "Move for N seconds, without keys.")] = None,
 ) -> None:
     """Move while a key is held (down, left and - move backward, q ends); Ctrl-C stops the arm."""
     refuse_options([axis, speed], ("--frame", "--seconds"))
@@ -76,24 +74,23 @@ def _jog(
     positive("--seconds", seconds, "s", LONGEST_JOG_S)
     if seconds is None and not sys.stdin.isatty():
         raise CommandError("standard input is not a terminal, so no key can be held: give --seconds N")
-    with stopping(client := connect("jog")):
-        count = len(client.call("status").get("joint_names") or POSE) if of_joint else len(POSE)
+    with stoppable("jog") as robot:
+        count = len(robot.status().joint_names) if of_joint else len(POSE)
         if at >= count:
             raise CommandError(f"{axis} does not exist: joint1 to joint{count}")
 
         def jog(direction: float, now: float) -> None:
             speeds = [0.0] * count
             speeds[at] = direction * wanted
-            arguments = {"v": speeds, "frame": "joints" if of_joint else frame, "hold_s": JOG_HOLD_S, "t": now}
-            client.call("jog", arguments)
+            robot.jog(speeds, "joints" if of_joint else frame, JOG_HOLD_S, now)
 
         if seconds is not None:
-            _jog_for(client, jog, seconds)
+            _jog_for(robot, jog, seconds)
         else:
             report(f"hold a key to move {axis} at {wanted:g} (down, left or -: backward), q ends")
-            _jog_by_keys(client, jog)
-        joints = client.call("status").get("joints") or {}
-    report(f"stopped at {' '.join(f'{value:.4f}' for value in joints.get('position') or ())} rad")
+            _jog_by_keys(robot, jog)
+        stopped = robot.status().positions
+    report(f"stopped at {' '.join(f'{position:.4f}' for position in stopped)} rad")
 
 
 def _axis(axis: str) -> tuple[int, bool]:
@@ -107,13 +104,13 @@ def _axis(axis: str) -> tuple[int, bool]:
     return int(found[1]) - 1, True
 
 
-def _jog_for(client: ControlClient, jog: Jog, seconds: float) -> None:
+def _jog_for(robot: Robot, jog: Jog, seconds: float) -> None:
     until = time.monotonic() + seconds
     renewal = RenewalCheck(JOG_HOLD_S)
     while True:
         now = time.monotonic()
         if late_s := renewal.overdue(now):
-            client.call("halt")
+            robot.halt()
             raise CommandError(
                 f"the jog was not renewed for {late_s:.1f} s: the arm had stopped and stays stopped", ExitCode.FAULT
             )
@@ -121,10 +118,10 @@ def _jog_for(client: ControlClient, jog: Jog, seconds: float) -> None:
             break
         jog(1.0, now)
         time.sleep(max(0.0, min(JOG_INTERVAL_S, until - now)))
-    client.call("halt")
+    robot.halt()
 
 
-def _jog_by_keys(client: ControlClient, jog: Jog) -> None:
+def _jog_by_keys(robot: Robot, jog: Jog) -> None:
     key, renewal = HeldKey(), RenewalCheck(JOG_HOLD_S)
     moving = False
     due = time.monotonic()
@@ -148,7 +145,7 @@ def _jog_by_keys(client: ControlClient, jog: Jog) -> None:
                 moving = True
                 continue
             if moving:
-                client.call("halt")
+                robot.halt()
                 moving = False
                 renewal.overdue(time.monotonic())  # the halt's wait is not a stall
             elif not late_s:
@@ -157,7 +154,7 @@ def _jog_by_keys(client: ControlClient, jog: Jog) -> None:
             if not keyboard.drain().isdisjoint(QUIT):
                 break
     if moving:
-        client.call("halt")
+        robot.halt()
 
 
 # -- joystick -------------------------------------------------------------------------------------------------------
@@ -171,7 +168,7 @@ def _joystick(
             help=f"{', '.join(INPUTS)} (one or more), byte N, or release. Default: by keys.",
         ),
     ] = None,
-    seconds: Annotated[float, typer.Option("--seconds", metavar="N", help="Release after N seconds.")] = 1.0,
+    seconds: Annotated[float, option("--seconds", "N", "Release after N seconds.")] = 1.0,
 ) -> None:
     """Operate the joystick of the virtual arm: arrows, + - (paddles), t (toggle), e (emergency stop), q (quit)."""
     positive("--seconds", seconds, "s", LONGEST_JOYSTICK_S)
@@ -180,16 +177,16 @@ def _joystick(
             raise CommandError(
                 f"standard input is not a terminal: give a position, as {', '.join(INPUTS)}, byte N or release"
             )
-        with connect("joystick") as client:
-            _force_by_keys(client)
+        with connect("joystick") as robot:
+            _force_by_keys(robot)
         return
     pressed, byte = _position(words)
     try:
-        with signals_raise(*SUSPENDING), connect("joystick") as client:
+        with signals_raise(*SUSPENDING), connect("joystick") as robot:
             if words == ["release"]:
-                _force(client, [], None, time.monotonic())
+                robot.joystick()
             else:
-                _force_for(client, pressed, byte, seconds)
+                _force_for(robot, pressed, byte, seconds)
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: the joystick is released", interruption_code(interruption)) from None
     report("the joystick is released")
@@ -208,11 +205,11 @@ def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
     return [INPUTS[word] for word in words], None
 
 
-def _force(client: ControlClient, pressed: Sequence[str], byte: int | None, now: float) -> None:
-    client.call("stick", {"pressed": list(pressed), "byte": byte, "hold_s": JOYSTICK_HOLD_S, "t": now})
+def _force(robot: Robot, pressed: Sequence[str], byte: int | None, now: float) -> None:
+    robot.joystick(*pressed, byte=byte, hold_s=JOYSTICK_HOLD_S, sent_s=now)
 
 
-def _force_for(client: ControlClient, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
+def _force_for(robot: Robot, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
     until = time.monotonic() + seconds
     renewal = RenewalCheck(JOYSTICK_HOLD_S)
     while (now := time.monotonic()) < until:
@@ -220,11 +217,11 @@ def _force_for(client: ControlClient, pressed: Sequence[str], byte: int | None, 
             raise CommandError(
                 f"the joystick was not renewed for {late_s:.1f} s: it was released and stays released", ExitCode.FAULT
             )
-        _force(client, pressed, byte, now)
+        _force(robot, pressed, byte, now)
         time.sleep(max(0.0, min(JOYSTICK_INTERVAL_S, until - now)))
 
 
-def _force_by_keys(client: ControlClient) -> None:
+def _force_by_keys(robot: Robot) -> None:
     report("arrows: the joystick, while held; +, -: mode paddles; t: arm or wheelchair; e: emergency stop; q: quit")
     key, renewal = HeldKey(), RenewalCheck(JOYSTICK_HOLD_S)
     switched: set[str] = set()
@@ -255,15 +252,15 @@ def _force_by_keys(client: ControlClient) -> None:
             due = now + JOYSTICK_INTERVAL_S
             held = key.held(now)
             inputs = [*([paddle] if now < paddle_until else [ARROWS[held]] if held else []), *sorted(switched)]
-            _force(client, inputs, None, now)
+            _force(robot, inputs, None, now)
             if now - shown_at > SHOW_INTERVAL_S:
                 shown_at = now
-                _show(client.call("status"), inputs)
+                _show(robot.status(), inputs)
     emit("")
 
 
-def _show(status: dict[str, Any], inputs: Sequence[str]) -> None:
-    mode = (status.get("stick") or {}).get("mode", "-")
-    line = f"{status.get('state', '-')}, {status.get('motion', '-')}, {mode}: {' '.join(inputs) or 'neutral'}"
+def _show(status: Status, inputs: Sequence[str]) -> None:
+    modes = f"{status.raw['control_mode']}, {status.raw['joystick']['mode']}"
+    line = f"{status.raw['state']}, {modes}: {' '.join(inputs) or 'neutral'}"
     sys.stdout.write(f"\r{line[:79]:79}")
     sys.stdout.flush()

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, number, refuse_options
-from rtcp.cli.connection import ask
+from rtcp.cli.connection import connect
 from rtcp.cli.errors import CommandError
 from rtcp.cli.output import emit_json, report, show, table
 
@@ -30,7 +30,8 @@ def register(app: typer.Typer) -> None:
 
 def _show(as_json: AsJson = False) -> None:
     """Show the limits of joints, tool and boxes; a star marks a changed value."""
-    found = ask("limits show", "limits")
+    with connect("limits show") as robot:
+        found = robot.limits()
     if as_json:
         emit_json(found)
     else:
@@ -50,7 +51,8 @@ def _set(
     """Change limits within the configured ones; refused as a whole where the arm would be outside."""
     refuse_options(pairs, ("--json",))
     changes = _changes(pairs)
-    found = ask("limits set", "limits", {"set": changes})
+    with connect("limits set") as robot:
+        found = robot.set_limits(changes)
     if as_json:
         emit_json(found)
     else:

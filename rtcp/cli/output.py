@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +15,13 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.table import Table
 
+    from rtcp.api import Progress
+
+    ShowProgress = Callable[[Progress], None]
+
 PIPED_WIDTH = 80
 """Columns of a table that goes to a file or a pipe."""
 ABSENT = "-"
-
-Progress = Callable[[Mapping[str, Any]], None]
 
 
 def emit(text: str) -> None:
@@ -123,38 +125,29 @@ def facts() -> Table:
 
 
 @contextmanager
-def progress() -> Iterator[Progress]:
+def progress() -> Iterator[ShowProgress]:
     """Yield a function that shows the progress of a motion: a bar on a terminal, else a line every 10 %."""
     if not sys.stdout.isatty():
         yield _line_reporter()
         return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+    from rich.progress import BarColumn, TaskProgressColumn, TextColumn
+    from rich.progress import Progress as Bar
 
     columns = (TextColumn("moving"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
-    with Progress(*columns, console=console()) as bar:
+    with Bar(*columns, console=console()) as bar:
         task = bar.add_task("move", total=1.0, left="")
-        yield lambda update: bar.update(task, completed=_fraction(update), left=_remaining(update))
+        yield lambda update: bar.update(task, completed=update.fraction, left=f"{update.remaining_s:.1f} s left")
         bar.update(task, completed=1.0, left="")
 
 
-def _line_reporter() -> Progress:
+def _line_reporter() -> ShowProgress:
     shown = -1
 
-    def line(update: Mapping[str, Any]) -> None:
+    def line(update: Progress) -> None:
         nonlocal shown
-        tenth = int(_fraction(update) * 10)
+        tenth = int(update.fraction * 10)
         if tenth > shown:
             shown = tenth
-            report(f"moving: {_fraction(update):4.0%} {_remaining(update)}".rstrip())
+            report(f"moving: {update.fraction:4.0%} {update.remaining_s:.1f} s left")
 
     return line
-
-
-def _fraction(update: Mapping[str, Any]) -> float:
-    value = update.get("fraction")
-    return min(1.0, max(0.0, float(value))) if isinstance(value, int | float) else 0.0
-
-
-def _remaining(update: Mapping[str, Any]) -> str:
-    value = update.get("remaining_s")
-    return f"{value:.1f} s left" if isinstance(value, int | float) else ""

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.arguments import BusName, ConfigFile, Poll, positive
+from rtcp.api import RtcpError, State
+from rtcp.cli.arguments import BusName, ConfigFile, Poll, option, positive
 from rtcp.cli.connection import connect, loop_process
 from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.output import report
-from rtcp.ipc.errors import RtcpError
 
 if TYPE_CHECKING:
     from rtcp.launch.launcher import StartOptions
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 READY_TIMEOUT_S = 5.0
 """Time for the machine to leave `starting`: its frames must return first, or be missing for long enough."""
-_NOT_READY = frozenset({"starting", "fault", "emergency_stop"})
+_NOT_READY = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP})
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
 
 
@@ -33,14 +33,10 @@ def register(app: typer.Typer) -> None:
 def _start(
     config: ConfigFile = None,
     bus: BusName = None,
-    mode: Annotated[str | None, typer.Option("--mode", metavar="NAME", help=f"Initial mode: {', '.join(MODES)}.")] = (
-        None
-    ),
-    cycle_us: Annotated[
-        float | None, typer.Option("--cycle-us", metavar="N", help="Cycle, us. Default: the configured one.")
-    ] = None,
+    mode: Annotated[str | None, option("--mode", "NAME", f"Initial mode: {', '.join(MODES)}.")] = None,
+    cycle_us: Annotated[float | None, option("--cycle-us", "N", "Cycle, us. Default: the configured one.")] = None,
     poll: Poll = False,
-    detach: Annotated[bool, typer.Option("--detach", help="Return when it runs; `rtcp stop` ends it.")] = False,
+    detach: Annotated[bool, option("--detach", "Return when it runs; `rtcp stop` ends it.")] = False,
 ) -> None:
     """Start the platform: bring the slaves to OP and wait for commands."""
     mode = None if mode is None else mode.lower()
@@ -69,19 +65,19 @@ def _wait_ready(hint: str) -> tuple[str, bool]:
     """
     until = time.monotonic() + READY_TIMEOUT_S
     try:
-        with connect("start") as client:
-            while (status := client.call("status"))["state"] == "starting" and time.monotonic() < until:
+        with connect("start") as robot:
+            while (status := robot.status()).state is State.STARTING and time.monotonic() < until:
                 time.sleep(0.02)
     except RtcpError as error:
         return f"started, but: {error.message}", False
-    state, message = str(status["state"]), str(status["message"])
-    if state == "ready":
+    state, message = status.state, status.message
+    if state is State.READY:
         return f"ready: {hint} ends it", True
-    if state == "starting":
+    if state is State.STARTING:
         message = f"not ready within {READY_TIMEOUT_S:g} s (`rtcp status`): {message}"
     if state in _NOT_READY:
         return f"started, but: {message}", False
-    return f"{state.replace('_', ' ')}: {message}", True
+    return f"{state.name.lower().replace('_', ' ')}: {message}", True
 
 
 def _stop() -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from rtcp.cli.arguments import AsJson, Poll, refuse_old_name
+from rtcp.cli.arguments import AsJson, Poll, option, refuse_old_name
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit, emit_json, report
 from rtcp.ipc.runtime_directory import (
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 ControlPath = Annotated[
     Path | None,
-    typer.Option("--segment", metavar="PATH", help="Control socket of the segment. Default: in the runtime directory."),
+    option("--segment", "PATH", "Control socket of the segment. Default: in the runtime directory."),
 ]
 _IN_HEX = ("code", "index")
 
@@ -52,20 +52,14 @@ def register(app: typer.Typer) -> None:
 
 def _segment(
     context: typer.Context,
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="The slaves in the order of the cable.")
-    ] = None,
+    config: Annotated[Path | None, option("--config", "FILE", "The slaves in the order of the cable.")] = None,
     interface: Annotated[
         str | None,
-        typer.Option(
-            "--interface", metavar="NAME", help="Name of the master's interface, here. Default: in a network namespace."
-        ),
+        option("--interface", "NAME", "Name of the master's interface, here. Default: in a network namespace."),
     ] = None,
     poll: Poll = False,
-    cpu: Annotated[int | None, typer.Option("--cpu", metavar="N", help="CPU of the segment.")] = None,
-    script: Annotated[
-        Path | None, typer.Option("--faults", metavar="SCRIPT", help="Faults with their times, s after the start.")
-    ] = None,
+    cpu: Annotated[int | None, option("--cpu", "N", "CPU of the segment.")] = None,
+    script: Annotated[Path | None, option("--faults", "SCRIPT", "Faults with their times, s after the start.")] = None,
 ) -> None:
     """Run a segment of software slaves until stopped, or inject faults into a running one."""
     given = {"--config": config, "--interface": interface, "--poll": poll or None, "--cpu": cpu, "--faults": script}
@@ -127,9 +121,7 @@ def _user_namespace() -> str:
 def _fault(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Kind of the fault: `rtcp segment kinds` lists them.")],
     pairs: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE..", help="As after=3, code=0x1A.")] = None,
-    lasts: Annotated[
-        float | None, typer.Option("--lasts", metavar="S", help="Duration, s. Default: until it is cleared.")
-    ] = None,
+    lasts: Annotated[float | None, option("--lasts", "S", "Duration, s. Default: until it is cleared.")] = None,
     segment: ControlPath = None,
 ) -> None:
     """Inject a fault into the running segment."""

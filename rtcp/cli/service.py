@@ -16,6 +16,7 @@ from typing import Annotated
 
 import typer
 
+from rtcp.cli.arguments import option
 from rtcp.cli.errors import CommandError, ExitCode
 from rtcp.cli.output import emit
 
@@ -37,8 +38,8 @@ nothing has been started. Next, as root:
   systemctl daemon-reload
   systemctl start rtcp@eth0    (or rtcp@virtual; `enable` instead of `start`: at every boot, drives disabled)"""
 
-Root = Annotated[Path, typer.Option("--root", metavar="DIR", help="Root of the file system: for packages and images.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Show what would be done; change nothing.")]
+Root = Annotated[Path, option("--root", "DIR", "Root of the file system: for packages and images.")]
+DryRun = Annotated[bool, option("--dry-run", "Show what would be done; change nothing.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -108,9 +109,7 @@ def service_files(root: Path, program: Path) -> list[ServiceFile]:
 
 def _install(
     root: Root = Path("/"),
-    program: Annotated[
-        Path | None, typer.Option("--program", metavar="FILE", help="The rtcp to start. Default: the running one.")
-    ] = None,
+    program: Annotated[Path | None, option("--program", "FILE", "The rtcp to start. Default: the running one.")] = None,
     dry_run: DryRun = False,
 ) -> None:
     """Write the unit rtcp@.service and its sysusers, tmpfiles and sysctl files; start and enable nothing."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.arguments import AsJson, ConfigFile, positive
+from rtcp.cli.arguments import AsJson, ConfigFile, option, positive
 from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.output import emit, report, show, table
 from rtcp.cli.platform import launch, refuse_second_platform
@@ -28,8 +28,8 @@ def register(app: typer.Typer) -> None:
 
 
 def _soak(
-    minutes: Annotated[float, typer.Option("--minutes", metavar="N", help="Duration.")] = 60.0,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of all random choices.")] = 1,
+    minutes: Annotated[float, option("--minutes", "N", "Duration.")] = 60.0,
+    seed: Annotated[int, option("--seed", "N", "Seed of all random choices.")] = 1,
     config: ConfigFile = None,
     as_json: AsJson = False,
 ) -> None:

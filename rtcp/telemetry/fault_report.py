@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from rtcp.gateway.blackbox_file import Recording
-from rtcp.ipc.machine import TABLE
+from rtcp.ipc.recording import Recording
+from rtcp.ipc.states import State
 from rtcp.telemetry.recording import target_steps
 
 COLOURS = ("#1c6dd0", "#e07a1f", "#2f9e44", "#d1322d", "#7b4fb3", "#8a5a33", "#d264a6", "#6b7280", "#a39b1e", "#1fa5b5")
@@ -28,14 +28,14 @@ _DETAIL_S = (-0.1, 0.4)
 """Time around the fault in the enlarged column, s."""
 _LINE_INCH, _LINE_LETTERS = 0.155, 150
 """Height and length of a line of the legend."""
-_STATES = {int(state): row.words for state, row in TABLE.items()}
+_STATES = {int(state): state.name.lower().replace("_", " ") for state in State}
 
 
 class Entry(NamedTuple):
     """An entry of the timeline: when, s after the fault, and what."""
 
     at_s: float
-    sentence: str
+    message: str
 
 
 def seconds(recording: Recording) -> npt.NDArray[np.float64]:
@@ -48,7 +48,7 @@ def seconds(recording: Recording) -> npt.NDArray[np.float64]:
 def timeline(recording: Recording) -> list[Entry]:
     """Return the messages and each change of the machine's state, ordered by time."""
     about = recording.about
-    found = [Entry((moment.time_ns - about.time_ns) * 1e-9, moment.sentence) for moment in about.timeline]
+    found = [Entry((moment.time_ns - about.time_ns) * 1e-9, moment.message) for moment in about.timeline]
     if about.at >= 0:
         states, times = recording.records["state"], seconds(recording)
         names = [_STATES.get(int(state), str(state)) for state in states]
@@ -72,7 +72,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "cycle_ns": about.period_ns,
         "versions": about.versions,
         "notes": list(about.notes),
-        "timeline": [{"t_s": round(entry.at_s, 4), "sentence": entry.sentence} for entry in timeline(recording)],
+        "timeline": [{"t_s": round(entry.at_s, 4), "message": entry.message} for entry in timeline(recording)],
         "joint_names": list(about.joints),
     }
     if about.at < 0:
@@ -84,7 +84,7 @@ def summary(recording: Recording) -> dict[str, Any]:
         "cycles": len(times),
         "joints": {
             name: [round(float(value), 7) for value in records[name][at]]
-            for name in ("position", "target", "velocity", "torque")
+            for name in ("actual_position", "sent_position", "actual_velocity", "actual_torque")
         },
         "largest_step": _largest_step(recording),
         "missed": int(records["missed"][-1]) - int(records["missed"][0]),
@@ -122,7 +122,7 @@ def draw(recording: Recording, out: Path) -> None:
     nearest = sorted(timeline(recording), key=lambda entry: abs(entry.at_s))[:_EVENTS]
     events = sorted(nearest, key=lambda entry: entry.at_s)
     legend = "\n".join(
-        textwrap.fill(f"{i}  {event.at_s:+.3f} s  {event.sentence}", _LINE_LETTERS, subsequent_indent=" " * 8)
+        textwrap.fill(f"{i}  {event.at_s:+.3f} s  {event.message}", _LINE_LETTERS, subsequent_indent=" " * 8)
         for i, event in enumerate(events, 1)
     )
     legend_inch = _LINE_INCH * (legend.count("\n") + 1)
@@ -178,9 +178,9 @@ def _curves(axes: Sequence[Any], recording: Recording, begin: float, end: float)
     # Drive data is valid only with the expected working counter: otherwise the last value would be drawn on.
     valid = records["lost"] == 0
     for at, name in enumerate(recording.about.joints):
-        actual, speed = (np.where(valid, records[key][:, at], np.nan) for key in ("position", "velocity"))
+        actual, speed = (np.where(valid, records[key][:, at], np.nan) for key in ("actual_position", "actual_velocity"))
         positions.plot(times, actual, color=COLOURS[at], lw=1.3, label=name)
-        positions.plot(times, records["target"][:, at], color=COLOURS[at], lw=1.1, ls=(0, (4, 3)))
+        positions.plot(times, records["sent_position"][:, at], color=COLOURS[at], lw=1.1, ls=(0, (4, 3)))
         velocities.plot(times, speed, color=COLOURS[at], lw=1.0)
     counter.plot(times, records["wkc"], color=COLOURS[0], lw=1.1, drawstyle="steps-post", label="found")
     counter.plot(times, records["wkc_expected"], color="black", lw=0.9, ls=":", label="expected")

@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from rtcp.api import Robot, RtcpError, State
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.machine import State
-from rtcp.ipc.messages import Sentences
+from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
@@ -54,12 +52,12 @@ class Harness:
     def __init__(self, directory: Path, config: ArmConfig) -> None:
         self.directory = directory
         self.config = config
-        self.client = ControlClient(CLIENT_NAME, control_socket(directory))
+        self.robot = Robot(CLIENT_NAME, control_socket(directory))
         # The session knows the socket: another segment may have the usual one.
         self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
         self.observer = Observer(blackboard_file(directory))
         self.segment.clear_peaks()  # from the first request on the segment observes its joints
-        self._sentences = Sentences(config)
+        self._names = Names(config)
         self._speeds = np.array([joint.velocity for joint in config.joints])
         self._seen = self.observer.head
         self._last: Any = None
@@ -80,7 +78,7 @@ class Harness:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:  # fmt: skip
-        self.client.close()
+        self.robot.close()
         self.segment.close()
         self.observer.close()
 
@@ -102,16 +100,16 @@ class Harness:
             allowed = self._speeds * self.observer.period_ns * 1e-9
             self.largest_step = max(self.largest_step, float((steps / allowed).max()))
 
-    def state(self) -> str:
-        """Return the machine's state as `rtcp status` names it."""
+    def state(self) -> State:
+        """Return the machine's state."""
         self.read_cycles()
         latest = self.observer.latest()
-        return "off" if latest is None else State(int(latest[0]["state"])).name.lower()
+        return State.OFF if latest is None else State(int(latest[0]["state"]))
 
     def speed(self) -> float:
         """Return the measured speed of the fastest joint, rad/s."""
         latest = self.observer.latest()
-        return 0.0 if latest is None else float(np.abs(latest[0]["velocity"]).max())
+        return 0.0 if latest is None else float(np.abs(latest[0]["actual_velocity"]).max())
 
     def moment(self) -> Moment:
         """Return this moment, for `messages_since`."""
@@ -121,8 +119,7 @@ class Harness:
     def messages_since(self, moment: Moment) -> list[str]:
         """Return the platform's messages since a moment, in their order."""
         found = [
-            (event.time_ns, self._sentences.event(event.code, event.axis, event.value, event.limit))
-            for event in self.observer.events_since(moment.event)
+            (record.time_ns, self._names.message(record.event)) for record in self.observer.events_since(moment.event)
         ]
         found += [(text.time_ns, text.sentence) for text in self.observer.texts_since(moment.text)]
         return [sentence for _, sentence in sorted(found)]
@@ -173,10 +170,6 @@ class Harness:
         self.segment.fault(fault)
         self.injected += 1
 
-    def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
-        """Send a command to the platform; raises RtcpError."""
-        return self.client.call(verb, arguments, timeout_s=60.0)
-
     def enable(self) -> tuple[int, str]:
         """Reset and enable until the arm holds.
 
@@ -186,10 +179,10 @@ class Harness:
         refusal = ""
         for attempt in range(1, _RESETS + 1):
             try:
-                if self.state() in ("fault", "emergency_stop", "stopped_by_limit"):
-                    self.call("reset")
-                if self.state() != "holding":
-                    self.call("enable")
+                if self.state() in (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT):
+                    self.robot.reset()
+                if self.state() is not State.HOLDING:
+                    self.robot.enable()
             except RtcpError as error:
                 refusal = error.message
                 self.wait(_RESET_PAUSE_S)
@@ -208,8 +201,8 @@ class Harness:
             if refusal:
                 break
             try:
-                self.call("motion", name="joint")
-                self.call("move", q=list(q), speed=_SPEED)
+                self.robot.mode("joint")
+                self.robot.move_joints(q, _SPEED)
             except RtcpError as error:
                 refusal = error.message
                 continue

@@ -90,5 +90,5 @@ def target_steps(
     numbers = records["number"].astype(np.int64)
     enabled = (records["flags"] & FLAG_ENABLED) != 0
     pairs = np.flatnonzero((np.diff(numbers) == 1) & enabled[1:] & enabled[:-1])
-    targets = records["target"]
+    targets = records["sent_position"]
     return pairs + 1, np.abs(targets[pairs + 1] - targets[pairs])

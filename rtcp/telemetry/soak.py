@@ -11,7 +11,7 @@ from typing import Any
 
 import psutil
 
-from rtcp.ipc.errors import RtcpError
+from rtcp.api import RtcpError
 from rtcp.telemetry.harness import Harness, TrialFailed
 from rtcp.telemetry.trial import WORKLOADS, named, run_trial
 from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
@@ -213,7 +213,7 @@ class Soak:
         counts.recovered += result.recovered
         summary.largest_step = max(summary.largest_step, result.largest_step)
         summary.failures += [f"{trial}: {violation}" for violation in result.violations]
-        self._log(f"{trial}: {result.state.replace('_', ' ')}; {result.message or 'no message'}")
+        self._log(f"{trial}: {result.state.name.lower().replace('_', ' ')}; {result.message or 'no message'}")
 
     def _resources(self) -> dict[str, Resources]:
         found = {name: resources(pid) for name, pid in self._pids.items()}

@@ -139,12 +139,12 @@ def judge(model: ArmModel, square: Square, recorded: Recording) -> Driven:
     Raises:
         NoSquare: nothing moved in the recording.
     """
-    target = recorded.column("target")
+    target = recorded.column("sent_position")
     moving = np.flatnonzero(np.abs(np.diff(target, axis=0)).max(axis=1) > 0) if len(target) > 1 else np.empty(0, int)
     if not len(moving):
         raise NoSquare("nothing moved while the square was recorded")
     span = slice(int(moving[0]), int(moving[-1]) + 2)
-    position = recorded.column("position")[span]
+    position = recorded.column("actual_position")[span]
     commanded = forward_batch(model, target[span])[0]
     actual = forward_batch(model, position)[0]
     seconds = recorded.seconds[span]
@@ -156,8 +156,8 @@ def judge(model: ArmModel, square: Square, recorded: Recording) -> Driven:
         distance_from(square.corners, commanded),
         distance_from(square.corners, actual),
         position,
-        recorded.column("velocity")[span],
-        recorded.column("torque")[span],
+        recorded.column("actual_velocity")[span],
+        recorded.column("actual_torque")[span],
         recorded.lost,
     )
 

@@ -9,14 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from rtcp.api import Robot, RtcpError, State
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket
-from rtcp.ipc.stops import Rung, bounds, unheard
+from rtcp.ipc.stop_reactions import StopReaction, bounds, unheard
 from rtcp.telemetry.harness import CLIENT_NAME, Harness, TrialFailed
 
-CONTINUES = frozenset({"holding", "moving", "stopping"})
+CONTINUES = frozenset({State.HOLDING, State.MOVING, State.STOPPING})
 """States of a machine without a fault."""
 LARGEST_STEP = 1.0 + 1e-6
 """Largest step of a target, as a fraction of what its speed limit allows in a cycle; the rest is round-off."""
@@ -60,7 +59,7 @@ class Workload:
         harness = self._harness
         if self.mode != "joint":
             try:
-                harness.call("motion", name=self.mode)
+                harness.robot.mode(self.mode)
             except RtcpError as error:
                 raise TrialFailed(f"{self.name} cannot begin: {error.message}") from error
         if not self.moves:
@@ -78,17 +77,17 @@ class Workload:
         if self._thread is not None:
             self._thread.join(timeout=70.0)
 
-    def _connect(self) -> ControlClient:
-        return ControlClient(f"{CLIENT_NAME}, {self.name}", control_socket(self._harness.directory))
+    def _connect(self) -> Robot:
+        return Robot(f"{CLIENT_NAME}, {self.name}", control_socket(self._harness.directory))
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError), self._connect() as client:
+        with contextlib.suppress(OSError), self._connect() as robot:
             try:
-                self._command(client)
+                self._command(robot)
             except RtcpError as error:
                 self.refusal = error.message
 
-    def _command(self, client: ControlClient) -> None:
+    def _command(self, robot: Robot) -> None:
         """Command the arm until `_ended`."""
 
 
@@ -98,18 +97,18 @@ class Moving(Workload):
     name = "moving"
     moves = True
 
-    def _command(self, client: ControlClient) -> None:
+    def _command(self, robot: Robot) -> None:
         sign = 1.0
         while not self._ended.is_set():
             target = [start + sign * by for start, by in zip(START, _SWING, strict=True)]
-            client.call("move", {"q": target, "speed": _SPEED}, timeout_s=60.0)
+            robot.move_joints(target, _SPEED)
             sign = -sign
 
     def end(self) -> None:
         """End the current move too."""
         self._ended.set()
-        with contextlib.suppress(RtcpError, OSError), self._connect() as client:
-            client.call("halt")
+        with contextlib.suppress(RtcpError, OSError), self._connect() as robot:
+            robot.halt()
         super().end()
 
 
@@ -119,12 +118,12 @@ class Jogging(Workload):
     name = "jogging"
     moves = True
 
-    def _command(self, client: ControlClient) -> None:
+    def _command(self, robot: Robot) -> None:
         begun = time.monotonic()
         while not self._ended.is_set():
             sign = 1.0 if (time.monotonic() - begun) % (2 * _REVERSE_S) < _REVERSE_S else -1.0
             speeds = [sign * _JOG_M_S, 0.0, 0.0, 0.0, 0.0, 0.0]
-            client.call("jog", {"v": speeds, "frame": "base", "hold_s": _JOG_HOLD_S})
+            robot.jog(speeds, "base", _JOG_HOLD_S)
             self._ended.wait(_JOG_INTERVAL_S)
 
 
@@ -135,15 +134,14 @@ class Joystick(Workload):
     mode = "joystick"
     moves = True
 
-    def _command(self, client: ControlClient) -> None:
+    def _command(self, robot: Robot) -> None:
         # The arm waits for a neutral joystick before it tracks it.
-        client.call("stick", {"pressed": [], "byte": _NEUTRAL, "hold_s": _JOYSTICK_HOLD_S})
+        robot.joystick(byte=_NEUTRAL, hold_s=_JOYSTICK_HOLD_S)
         self._ended.wait(_JOYSTICK_HOLD_S / 2)
         begun = time.monotonic()
         while not self._ended.is_set():
             forward = (time.monotonic() - begun) % (2 * _REVERSE_S) < _REVERSE_S
-            pressed = ["forward" if forward else "backward"]
-            client.call("stick", {"pressed": pressed, "hold_s": _JOYSTICK_HOLD_S})
+            robot.joystick("forward" if forward else "backward", hold_s=_JOYSTICK_HOLD_S)
             self._ended.wait(_JOYSTICK_HOLD_S / 3)
 
 
@@ -156,7 +154,7 @@ class TrialResult:
 
     fault: str
     workload: str
-    state: str
+    state: State
     """The machine's state after the fault, before it was cleared."""
     standstill_s: float | None
     """Time from the fault until every joint was truly at standstill; None where the arm continued."""
@@ -223,7 +221,10 @@ def stopping_bounds(config: ArmConfig) -> list[float]:
 
     Full speed while lost cycles are held, then the longer of the two stops; or the drive's own watchdog.
     """
-    hold, stop, quick = (bounds(config, rung) for rung in (Rung.HOLD, Rung.CONTROLLED_STOP, Rung.QUICK_STOP))
+    hold, stop, quick = (
+        bounds(config, reaction)
+        for reaction in (StopReaction.HOLD, StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP)
+    )
     watchdog = unheard(config)
     return [
         max(h.way_rad + max(c.way_rad, q.way_rad), w.way_rad)
@@ -270,7 +271,7 @@ def _inject(
     state = harness.state()
     standstill_s, travel = None, 0.0
     # Between two moves an arm holds for a moment only.
-    rests = workload.moves and not harness.wait_for(lambda: harness.state() != "holding", _MESSAGE_S)
+    rests = workload.moves and not harness.wait_for(lambda: harness.state() is not State.HOLDING, _MESSAGE_S)
     if state not in CONTINUES or rests:
         standstill_s = max(0.0, (harness.wait_standstill() - begun_ns) * 1e-9)
         allowed = stopping_bounds(harness.config)
@@ -279,7 +280,7 @@ def _inject(
     early_reset_refusal = ""
     if reset_first and state not in CONTINUES:
         try:
-            harness.call("reset")
+            harness.robot.reset()
         except RtcpError as error:
             early_reset_refusal = error.message
         state = harness.state()
@@ -313,6 +314,6 @@ def _clear(harness: Harness, *, watched: bool) -> str:
             found.append(f"{joint.name} moved by {moved:.4f} rad")
         if now["torque_on"] and not then["torque_on"]:
             found.append(f"{joint.name} got torque")
-    if harness.state() != state:
-        found.append(f"the machine went from {state} to {harness.state()}")
+    if harness.state() is not state:
+        found.append(f"the machine went from {state.name} to {harness.state().name}")
     return "; ".join(found)

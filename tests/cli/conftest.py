@@ -1,7 +1,8 @@
-"""A platform that speaks the control protocol over a real socket, and the command in front of it."""
+"""A platform that speaks the control protocol over a real socket, and the command line as its client."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import shutil
 import socket
@@ -64,46 +65,58 @@ SLAVE = {
 
 def status() -> dict[str, Any]:
     times = {"p50": 24.04, "p99": 61.0, "max": 105.5}
+    position = [0.1, -0.2, 0.3, -0.4, 0.5, -1.23456]
     return {
         "state": "holding",
         "message": "enabled: the arm holds",
-        "mode": "csp",
+        "control_mode": "joint",
+        "drive_mode": "csp",
+        "joystick": {"mode": "X-Y", "controls_arm": True},
+        "robot": {"mode": "auto", "e_stopped": False, "drives_powered": True, "motion_possible": True,
+                  "in_motion": False, "in_error": False, "error_code": 0},
         "bus": "virtual",
         "cycle_ns": 500_000,
         "cycles": 123_456,
+        "time_ns": 61_728_000_000,
         "missed": 2,
-        "unheard_s": 0.0,
+        "lost_s": 0.0,
         "wkc": {"expected": 21, "actual": 21},
-        "slaves": [{"position": 1, "name": "io", "state": "OP"}]
-        + [{"position": n + 1, "name": f"drive{n}", "state": "OP"} for n in range(1, JOINTS + 1)],
+        "slaves": [
+            {"position": at, "name": name, "state": "OP", "lost": 0, "errors": {"rx": 0, "forwarded": 0, "links": 0}}
+            for at, name in enumerate(["io", *(f"drive{n}" for n in range(1, JOINTS + 1))], 1)
+        ],
         "joint_names": [f"joint{n}" for n in range(1, JOINTS + 1)],
         "joints": {
-            "position": [0.1, -0.2, 0.3, -0.4, 0.5, -1.23456],
-            "velocity": [0.0] * JOINTS,
-            "torque": [1.0, -2.0, 3.0, 0.5, 0.25, 0.125],
-            "target": [0.1, -0.2, 0.3, -0.4, 0.5, -1.23456],
+            "actual_position": position,
+            "actual_velocity": [0.0] * JOINTS,
+            "actual_torque": [1.0, -2.0, 3.0, 0.5, 0.25, 0.125],
+            "commanded_position": position,
+            "sent_position": position,
         },
         "inputs": 63,
         "outputs": 0x8001,
         "wakeup_us": times,
         "exchange_us": times,
         "compute_us": times,
-        "dc": {"locked": True, "offset_ns": -3200, "filtered_ns": 410},
+        "dc": {"locked": True, "offset_ns": -3200, "filtered_ns": 410, "offset_us": times, "filtered_us": times},
         "realtime": {"scheduler": "FIFO 80", "memory_locked": True, "cpu": 1, "notes": []},
+        "start_to_op_s": 1.5,
         "pids": {"loop": 11, "gateway": 12, "segment": 13},
-        "lease": {"holder": None},
-    }
+        "lease": {"holder": ""},
+        "messages": [],
+        "message_times": [],
+    }  # fmt: skip
 
 
 class Platform:
-    """Answers requests on `control.sock`; a test sets what it answers and sees what it was asked."""
+    """Answers requests on `control.sock`; a test sets the answers and reads the requests."""
 
     def __init__(self, directory: Path) -> None:
         self.status = status()
         self.refusals: dict[str, tuple[str, str]] = {}
         self.answers: dict[str, dict[str, Any]] = {}
         self.objects: dict[tuple[int, int, int], bytes] = {}
-        self.requests: list[dict[str, Any]] = []
+        self.requests: list[tuple[str, dict[str, Any]]] = []
         self.move_steps = 4
         self.step_s = 0.005
         self.moving = threading.Event()
@@ -112,24 +125,26 @@ class Platform:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._listener.bind(str(self.path))
         self._listener.listen()
-        self._connections: list[socket.socket] = []
+        self.connections: list[socket.socket] = []
         threading.Thread(target=self._accept, daemon=True).start()
 
     def end(self) -> None:
-        """Go away as a process does: nobody listens, open connections end."""
+        """Close the listening socket and all connections, as a process that ends."""
         if self._listener.fileno() < 0:
             return
         self.path.unlink(missing_ok=True)
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
-        for connection in self._connections:
-            try:
+        for connection in self.connections:
+            with contextlib.suppress(OSError):
                 connection.shutdown(socket.SHUT_RDWR)
-            except OSError:
-                pass
 
-    def asked(self, verb: str) -> list[dict[str, Any]]:
-        return [request["args"] for request in self.requests if request["do"] == verb]
+    def asked(self, method: str) -> list[dict[str, Any]]:
+        return [params for name, params in self.requests if name == method]
+
+    @property
+    def methods(self) -> list[str]:
+        return [name for name, _ in self.requests]
 
     def _accept(self) -> None:
         while True:
@@ -137,59 +152,61 @@ class Platform:
                 connection, _ = self._listener.accept()
             except OSError:
                 return
-            self._connections.append(connection)
+            self.connections.append(connection)
             threading.Thread(target=self._converse, args=(connection,), daemon=True).start()
 
     def _converse(self, connection: socket.socket) -> None:
         with connection, connection.makefile("rb") as lines:
             for line in lines:
                 request = json.loads(line)
-                self.requests.append(request)
+                if "id" not in request:
+                    continue  # the notification `identify`
+                method, params = request["method"], request["params"]
+                self.requests.append((method, params))
                 try:
-                    answer = self._answer(request, connection)
-                    _send(connection, {"id": request["id"], **answer})
+                    _send(connection, {"id": request["id"], **self._answer(request["id"], method, params, connection)})
                 except OSError:
                     return
 
-    def _answer(self, request: dict[str, Any], connection: socket.socket) -> dict[str, Any]:
-        verb, args = request["do"], request["args"]
-        if verb in self.refusals:
-            kind, message = self.refusals[verb]
-            return {"ok": False, "error": {"kind": kind, "message": message}}
-        result: dict[str, Any] = {}
-        if verb == "status":
-            result = self.status
-        elif verb == "scan":
-            result = {"slaves": [SLAVE]}
-        elif verb == "sdo_read":
-            result = {"hex": self.objects[args["slave"], args["index"], args["subindex"]].hex()}
-        elif verb == "sdo_write":
-            self.objects[args["slave"], args["index"], args["subindex"]] = bytes.fromhex(args["hex"])
-        elif verb in self.answers:
-            result = self.answers[verb]
-        elif verb in ("move", "move_pose", "run"):
-            self._move(request, connection)
-            result = {"q": args.get("q"), "error": 0.00042}
-        return {"ok": True, "result": result}
+    def _answer(self, number: int, method: str, params: dict[str, Any], connection: socket.socket) -> dict[str, Any]:
+        if method in self.refusals:
+            kind, message = self.refusals[method]
+            return {"error": {"code": -32000, "message": message, "data": {"kind": kind, "reason": "", "fields": {}}}}
+        if method == "status":
+            return {"result": self.status}
+        if method in self.answers:
+            return {"result": self.answers[method]}
+        if method == "scan":
+            return {"result": {"slaves": [SLAVE]}}
+        if method == "sdo_read":
+            return {"result": {"hex": self.objects[params["slave"], params["index"], params["subindex"]].hex()}}
+        if method == "sdo_write":
+            self.objects[params["slave"], params["index"], params["subindex"]] = bytes.fromhex(params["hex"])
+        if method in ("move_joints", "move_pose", "run"):
+            self._move(number, connection)
+            return {"result": {"positions": params.get("q", []), "error": 0.00042}}
+        if method in ("jog", "joystick"):
+            return {"result": {"state": "moving", "positions": []}}
+        return {"result": {"disable": {"unconfirmed": []}, "reset": {"from": "fault"}}.get(method, {})}
 
-    def _move(self, request: dict[str, Any], connection: socket.socket) -> None:
+    def _move(self, number: int, connection: socket.socket) -> None:
         self.moving.set()
         for step in range(self.move_steps):
             connection.settimeout(self.step_s)
             try:
-                if not connection.recv(1, socket.MSG_PEEK):
-                    self.left_while_moving.set()
-                    raise ConnectionError
+                connection.recv(1, socket.MSG_PEEK)  # the notification `cancel`, or the end of the connection
+                self.left_while_moving.set()
+                raise ConnectionError
             except TimeoutError:
                 pass
             finally:
                 connection.settimeout(None)
-            progress = {"fraction": step / self.move_steps, "remaining_s": (self.move_steps - step) * self.step_s}
-            _send(connection, {"id": request["id"], "progress": progress})
+            params = {"fraction": step / self.move_steps, "remaining_s": (self.move_steps - step) * self.step_s}
+            _send(connection, {"method": "progress", "params": {"request": number, **params}})
 
 
-def _send(connection: socket.socket, word: dict[str, Any]) -> None:
-    connection.sendall(json.dumps(word).encode() + b"\n", socket.MSG_NOSIGNAL)
+def _send(connection: socket.socket, message: dict[str, Any]) -> None:
+    connection.sendall(json.dumps({"jsonrpc": "2.0", **message}).encode() + b"\n", socket.MSG_NOSIGNAL)
 
 
 @pytest.fixture(autouse=True)
@@ -212,7 +229,7 @@ def platform(directory: Path) -> Iterator[Platform]:
 
 
 class Ended:
-    """What a command left: exit code, what it printed, and the same without line breaks and boxes."""
+    """Exit code and output of a command; `trouble` is standard error without line breaks and boxes."""
 
     def __init__(self, code: int, out: str, err: str) -> None:
         self.code, self.out, self.err = code, out, err
@@ -252,12 +269,12 @@ def rtcp_process() -> Iterator[Callable[..., subprocess.Popen[str]]]:
 
 @pytest.fixture
 def wait_until() -> Callable[[Callable[[], bool]], None]:
-    """Wait for what another process or thread does; fail when it does not."""
+    """Wait for a condition that another process or thread meets; fail after a timeout."""
 
     def wait(holds: Callable[[], bool], patience_s: float = 20.0) -> None:
         until = time.monotonic() + patience_s
         while not holds():
-            assert time.monotonic() < until, "it did not happen"
+            assert time.monotonic() < until, "the condition was not met in time"
             time.sleep(0.01)
 
     return wait
@@ -265,14 +282,14 @@ def wait_until() -> Callable[[Callable[[], bool]], None]:
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
-    """The default configuration at a place of its own, which the processes that use it carry in their command lines."""
+    """A copy of the default configuration; the processes that use it have its path in their command lines."""
     shutil.copytree(default_config().parent, tmp_path / "config", ignore=shutil.ignore_patterns("*.py"))
     return tmp_path / "config" / "assistive_arm.yaml"
 
 
 @pytest.fixture
 def processes_of() -> Callable[[Path], list[int]]:
-    """Find the processes whose command line names something at a place; a zombie has none."""
+    """Find the processes whose command line contains a path; a zombie has none."""
 
     def find(place: Path) -> list[int]:
         found = []

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from rtcp.cli import faults
-from rtcp.gateway.blackbox_file import About, Moment, Recording, faults_directory, write
 from rtcp.ipc.layout import FLAG_ENABLED, RecordLayout
-from rtcp.ipc.machine import State
 from rtcp.ipc.observer import record_type
+from rtcp.ipc.recording import About, Moment, Recording, faults_directory, write
+from rtcp.ipc.states import State
 
 JOINTS, PERIOD_NS, CYCLES, AT = 3, 1_000_000, 1200, 800
 WHEN_NS = 1_790_000_000_250_000_000
@@ -40,11 +40,11 @@ def recording() -> Recording:
     whole["lost"] = np.where((cycles > AT) & (cycles <= AT + 40), cycles - AT, 0)
     whole["flags"] = FLAG_ENABLED
     whole["missed"] = np.where(cycles < 100, 2, 5)
-    whole["target"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
-    whole["target"][300:, 1] += 0.01
-    whole["position"] = whole["target"] - 0.001
-    whole["velocity"][:AT] = (0.1, 0.2, -0.1)
-    whole["torque"][AT] = (1.0, -2.0, 3.0)
+    whole["sent_position"] = np.minimum(cycles, AT)[:, None] * 1e-4 * np.array([1, 2, -1])
+    whole["sent_position"][300:, 1] += 0.01
+    whole["actual_position"] = whole["sent_position"] - 0.001
+    whole["actual_velocity"][:AT] = (0.1, 0.2, -0.1)
+    whole["actual_torque"][AT] = (1.0, -2.0, 3.0)
     names = [name for name in whole.dtype.names or () if name not in ("number_again", "padding")]
     about = About(
         number=0, time_ns=WHEN_NS, what=WHAT, before="moving", arm="arm", bus="virtual", period_ns=PERIOD_NS,
@@ -126,7 +126,7 @@ def test_the_json_of_a_fault_has_the_same_in_numbers_and_draws_only_when_asked(
     }  # fmt: skip
     assert told["wkc"] == {"expected": 10, "actual": 10, "wrong_cycles": 40, "without_answer": 40}
     assert told["missed"] == 3
-    assert told["joints"]["torque"] == [1.0, -2.0, 3.0]
+    assert told["joints"]["actual_torque"] == [1.0, -2.0, 3.0]
     assert [one["t_s"] for one in told["timeline"]] == [-0.5, 0.0, 0.0, 0.02]
     assert not path.with_suffix(".png").exists()
     out = tmp_path / "mine.svg"

@@ -104,7 +104,7 @@ def suspend(process: Any, seconds: float, meanwhile: Callable[[], None] = lambda
     ("command", "verb", "last", "words"),
     [
         (("jog", "joint1", "0.1"), "jog", "halt", "the arm had stopped and stays stopped"),
-        (("joystick", "forward"), "stick", "stick", "it was released and stays released"),
+        (("joystick", "forward"), "joystick", "joystick", "it was released and stays released"),
     ],
 )
 def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
@@ -125,7 +125,7 @@ def test_a_command_that_was_suspended_ends_and_does_not_move_the_arm_again(
     assert f"the {command[0]} was not renewed for 0." in trouble
     assert words in trouble
     assert len(platform.asked(verb)) == counts[0]
-    assert platform.requests[-1]["do"] == last
+    assert platform.methods[-1] == last
 
 
 def settled(count: Callable[[], int]) -> int:
@@ -137,7 +137,7 @@ def settled(count: Callable[[], int]) -> int:
 def test_a_jog_carries_the_instant_at_which_it_was_requested(platform: Any, rtcp: Callable[..., Any]) -> None:
     before = time.monotonic()
     rtcp("jog", "x", "0.1", "--seconds", "0.1")
-    instants = [one["t"] for one in platform.asked("jog")]
+    instants = [one["sent_s"] for one in platform.asked("jog")]
     assert before < instants[0] < instants[-1] < time.monotonic()
 
 
@@ -167,7 +167,7 @@ def test_keys_typed_while_the_process_was_suspended_move_nothing(
     time.sleep(0.4)
     # One may have been on its way: the platform refuses it by its instant.
     assert len(platform.asked("jog")) <= counts[0] + 1
-    assert all(one["t"] < suspended + 0.1 for one in platform.asked("jog"))
+    assert all(one["sent_s"] < suspended + 0.1 for one in platform.asked("jog"))
     assert "the keyboard was not read for" in keyboard.process.stdout.readline()
     hold_until(keyboard, b" ", lambda: len(platform.asked("jog")) > counts[0])
     assert keyboard.quit() == 0
@@ -177,16 +177,16 @@ def test_arrows_typed_while_the_process_was_suspended_are_ignored(
     platform: Any, terminal: Callable[..., Terminal], wait_until: Callable[..., None]
 ) -> None:
     keyboard = terminal("joystick")
-    wait_until(lambda: bool(platform.asked("stick")))
+    wait_until(lambda: bool(platform.asked("joystick")))
     counts: list[int] = []
 
     def meanwhile() -> None:
-        counts.append(settled(lambda: len(platform.asked("stick"))))
+        counts.append(settled(lambda: len(platform.asked("joystick"))))
         keyboard.press(ARROW_UP * 150 + b"+" + ARROW_UP * 3)
 
     suspend(keyboard.process, 0.8, meanwhile)
-    wait_until(lambda: len(platform.asked("stick")) > counts[0] + 4)
-    assert all(one["pressed"] == [] for one in platform.asked("stick"))
+    wait_until(lambda: len(platform.asked("joystick")) > counts[0] + 4)
+    assert all(one["pressed"] == [] for one in platform.asked("joystick"))
     assert keyboard.quit() == 0
 
 
@@ -209,8 +209,8 @@ def test_a_jog_for_a_time_is_renewed_and_ends_in_a_halt(
     assert ended.out.startswith("stopped at 0.1000 -0.2000")
     asked = platform.asked("jog")
     assert 5 <= len(asked) <= 9
-    assert all(one == {"v": speeds, "frame": frame, "hold_s": 0.25, "t": one["t"]} for one in asked)
-    assert platform.requests[-2]["do"] == "halt"
+    assert all(one == {"velocity": speeds, "frame": frame, "hold_s": 0.25, "sent_s": one["sent_s"]} for one in asked)
+    assert platform.methods[-2] == "halt"
 
 
 WRONG = {
@@ -252,7 +252,7 @@ def test_a_suspended_joystick_is_released_and_ends(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     held = rtcp_process("joystick", "forward", "--seconds", "50")
-    wait_until(lambda: bool(platform.asked("stick")))
+    wait_until(lambda: bool(platform.asked("joystick")))
     held.send_signal(signal.SIGTSTP)
     _, trouble = held.communicate()
     assert (held.returncode, trouble) == (148, "rtcp: interrupted: the joystick is released\n")
@@ -280,7 +280,7 @@ def test_the_arm_moves_while_a_key_is_held_and_stops_when_it_is_released(
     keyboard.hold(ARROW_LEFT, 1.0)
     wait_until(lambda: len(platform.asked("halt")) == 2, 2.0)
     assert keyboard.quit() == 0
-    directions = [one["v"][1] for one in platform.asked("jog")]
+    directions = [one["velocity"][1] for one in platform.asked("jog")]
     assert set(directions[:forward]) == {0.1}
     assert set(directions[forward:]) == {-0.1}
 
@@ -297,7 +297,7 @@ def test_quitting_with_a_held_key_stops_the_arm(platform: Any, terminal: Callabl
     keyboard = terminal("jog", "joint1", "0.1")
     keyboard.hold(b" ", 0.7)
     assert keyboard.quit() == 0
-    assert [request["do"] for request in platform.requests][-2:] == ["halt", "status"]
+    assert platform.methods[-2:] == ["halt", "status"]
 
 
 # -- joystick -------------------------------------------------------------------------------------------------------
@@ -319,9 +319,9 @@ def test_a_position_is_held_for_a_time_by_renewal(
 ) -> None:
     ended = rtcp("joystick", *words, "--seconds", "0.4")
     assert (ended.code, ended.out) == (0, "the joystick is released\n")
-    asked = platform.asked("stick")
+    asked = platform.asked("joystick")
     assert 4 <= len(asked) <= 7
-    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "t": one["t"]} for one in asked)
+    assert all(one == {"pressed": pressed, "byte": byte, "hold_s": 0.4, "sent_s": one["sent_s"]} for one in asked)
 
 
 @pytest.mark.parametrize(
@@ -349,7 +349,7 @@ def test_arrows_are_the_joystick_and_letters_its_switches(
     keyboard = terminal("joystick")
 
     def last() -> list[str]:
-        asked = platform.asked("stick")
+        asked = platform.asked("joystick")
         return asked[-1]["pressed"] if asked else ["none"]
 
     wait_until(lambda: last() == [])
@@ -374,9 +374,9 @@ def test_a_killed_joystick_sends_nothing_more(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     playing = rtcp_process("joystick", "forward", "--seconds", "50")
-    wait_until(lambda: bool(platform.asked("stick")))
+    wait_until(lambda: bool(platform.asked("joystick")))
     playing.kill()
     playing.wait()
-    asked = len(platform.asked("stick"))
+    asked = len(platform.asked("joystick"))
     time.sleep(0.3)
-    assert len(platform.asked("stick")) <= asked + 1
+    assert len(platform.asked("joystick")) <= asked + 1

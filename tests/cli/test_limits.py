@@ -32,7 +32,7 @@ def limits(platform: Any) -> dict[str, Any]:
             "angular_jerk": 10.0, "singularity": {"shoulder": 0.03, "elbow": 0.08, "wrist": 0.07},
         },
     }  # fmt: skip
-    platform.answers["limits"] = made
+    platform.answers |= {"limits": made, "set_limits": made}
     return made
 
 
@@ -63,11 +63,14 @@ def test_an_arm_without_a_box_is_shown_without_one(limits: dict[str, Any], rtcp:
 def test_all_pairs_are_one_transaction(limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("limits", "set", "joint2.max", "1.25", "box.min.x", "-0.5")
     assert (ended.code, ended.out) == (0, "2 limits are changed until `rtcp stop`\n")
-    assert platform.asked("limits") == [{"set": {"joint2.max": 1.25, "box.min.x": -0.5}}]
+    assert platform.asked("set_limits") == [{"changes": {"joint2.max": 1.25, "box.min.x": -0.5}}]
 
 
 def test_a_refused_transaction_is_exit_code_3(limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any]) -> None:
-    platform.refusals["limits"] = ("refused", "joint2 stands at 1.5 rad, outside the new limit: nothing was changed")
+    platform.refusals["set_limits"] = (
+        "refused",
+        "joint2 is at 1.5 rad: nothing was changed",
+    )
     ended = rtcp("limits", "set", "joint2.max", "1.25")
     assert (ended.code, ended.out) == (3, "")
     assert "nothing was changed" in ended.trouble

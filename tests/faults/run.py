@@ -36,7 +36,7 @@ def run_case(harness: Harness, case: Case, workload: str) -> tuple[TrialResult |
 def reaction(result: TrialResult) -> str:
     """Return the reaction in the terms of a case."""
     if not result.continued:
-        return result.state
+        return result.state.name.lower()
     return CONTINUES if result.standstill_s is None else STOPS
 
 

@@ -21,8 +21,6 @@ JOINTS = 6
 _SCALAR_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 _JOINTS_AT = {name: len(SCALARS) - 1 + at * JOINTS for at, (name, _) in enumerate(PER_JOINT)}
 _FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
-_MOVES_FOR = 40
-"""A motion that ends by itself lasts so many turns of about a millisecond."""
 _FOR_EVER = 1_000_000_000
 
 
@@ -31,7 +29,7 @@ class FakeLoop:
 
     What came: `commands`, `plans`, `requests`. What a test may set: `state`, `control_mode`, `q`; by kind of command
     `refusals`, `ends` (where it leads) and `reports` (events that it leads to at once); `event_at_the_end` of a motion
-    that ends by itself, and `ends_in`, the state then.
+    that ends by itself, `ends_in`, the state then, and `moves_for`, its duration in turns of about a millisecond.
     """
 
     def __init__(self, path: Path, q: Sequence[float] = (0.0,) * JOINTS, state: State = State.READY) -> None:
@@ -52,6 +50,7 @@ class FakeLoop:
         self.reports: dict[type[Command], Sequence[Event]] = {}
         self.event_at_the_end: Event | None = None
         self.ends_in = State.HOLDING
+        self.moves_for = 40
         self._left = 0
         self.control_mode = ControlMode.JOINT
         self.state = state
@@ -134,7 +133,7 @@ class FakeLoop:
             leads = self.plans[-1][-1][1 : 1 + JOINTS]
         self.q = list(self.ends.get(type(command), leads))
         self.state, self._lease = State.MOVING, lease
-        self._left = _FOR_EVER if command.renewed else _MOVES_FOR
+        self._left = _FOR_EVER if command.renewed else self.moves_for
 
     def _serve(self) -> None:
         words, memory = self.board.words, self.board.memory

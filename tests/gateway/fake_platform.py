@@ -89,7 +89,7 @@ class FakePlatform:
             try:
                 return await work()
             finally:
-                for connection in (1, 2):
+                for connection in (1, 2) if self.observer.holder() else ():
                     await self.methods.end_connection(connection)
                 for task in following:
                     task.cancel()

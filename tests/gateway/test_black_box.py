@@ -1,36 +1,48 @@
-"""The black box: what of a blackboard it writes, and when; the loop's part is played, or it runs in simulated time."""
+"""The black box: what of a blackboard it writes, and when; the loop's part is written, or it runs in simulated time."""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from rtcp.gateway.blackbox import BlackBox
-from rtcp.gateway.blackbox_file import Recording, listed, read
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.gateway import blackbox, fault_events
+from rtcp.gateway import black_box
+from rtcp.gateway.black_box import BlackBox
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.codes import Code, Command
+from rtcp.ipc.commands import Enable, MoveJoints
+from rtcp.ipc.events import (
+    Arrived,
+    DriveFault,
+    EmergencyStopActivated,
+    Event,
+    ProcessDataLost,
+    ResetDone,
+    ResetTimeout,
+    ResetWhileMoving,
+    SlaveLost,
+)
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
-from rtcp.ipc.machine import State
 from rtcp.ipc.observer import Observer
+from rtcp.ipc.recording import Recording, listed, read
 from rtcp.ipc.runtime_directory import stop_marker
 from rtcp.ipc.session import Pid, Processes, Session, identify
+from rtcp.ipc.states import State
 from rtcp.launch import launcher
 from rtcp.launch.simulation import Simulation
 
 JOINTS = 6
 AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
 BEGAN_NS = 77
+LOST, DRIVE = ProcessDataLost(5, 3), DriveFault(2, 0x21F)
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +50,10 @@ def config() -> ArmConfig:
     return load(default_config())
 
 
-class Played:
+WriteBoard = Callable[..., "Written"]
+
+
+class Written:
     """A blackboard whose last cycle is now, and a black box that watches it."""
 
     def __init__(self, path: Path, directory: Path, config: ArmConfig, period_ns: int = 500_000) -> None:
@@ -47,9 +62,9 @@ class Played:
         self.session = Session(config, "virtual", "ecat0", 0, BEGAN_NS)
         self.board = Blackboard(path, JOINTS, period_ns)
         self.observer = Observer(path)
-        self.told: list[str] = []
+        self.reports: list[str] = []
 
-    def fill(self, cycles: int, *, fault_at: int = 0, code: int = Code.BUS_LOST, ends_ns: int = 0) -> int:
+    def fill(self, cycles: int, *, fault_at: int = 0, event: type[Event] = ProcessDataLost, ends_ns: int = 0) -> int:
         """Publish so many cycles, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
         ends_ns = ends_ns or time.monotonic_ns()
         for cycle in range(1, cycles + 1):
@@ -58,17 +73,17 @@ class Played:
             values[AT["time_ns"]] = ends_ns - (cycles - cycle) * self.period_ns
             broken = 0 < fault_at <= cycle
             values[AT["state"]] = State.FAULT if broken else State.MOVING
-            values[AT["fault"]] = code if broken else 0
+            values[AT["fault"]] = event.number if broken else 0
             values[len(SCALARS) - 1] = cycle * 1e-4
             self.board.publish(values)
         return ends_ns
 
     def watched(self) -> BlackBox:
-        return BlackBox(self.observer, self.session, self.directory, self.told.append)
+        return BlackBox(self.observer, self.session, self.directory, self.reports.append)
 
     def lost(self, box: BlackBox) -> Recording:
         """Let frames be lost; return the one recording that there is once the box has finished."""
-        self.board.event(Code.BUS_LOST, value=5)
+        self.board.event(LOST)
         box.finish()
         (recording,) = self.recordings
         return recording
@@ -83,11 +98,18 @@ class Played:
 
 
 @pytest.fixture
-def play(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[Callable[..., Played]]:
-    made: list[Played] = []
+def path() -> Iterator[Path]:
+    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
+    yield made
+    made.unlink(missing_ok=True)
 
-    def make(period_ns: int = 500_000) -> Played:
-        made.append(Played(path, tmp_path / "faults", config, period_ns))
+
+@pytest.fixture
+def write_board(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[WriteBoard]:
+    made: list[Written] = []
+
+    def make(period_ns: int = 500_000) -> Written:
+        made.append(Written(path, tmp_path / "faults", config, period_ns))
         return made[-1]
 
     yield make
@@ -95,19 +117,19 @@ def play(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[Callable[...
         each.close()
 
 
-def sentences(recording: Recording) -> list[str]:
-    return [moment.sentence for moment in recording.about.timeline]
+def messages(recording: Recording) -> list[str]:
+    return [moment.message for moment in recording.about.timeline]
 
 
-def test_a_fault_is_written_with_the_ten_seconds_before_it(play: Callable[..., Played], config: ArmConfig) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(24_000, fault_at=23_990)
-    played.board.event(Code.BUS_LOST, value=5)
-    played.board.text("the drive's error code is 0x8611")
+def test_a_fault_is_written_with_the_ten_seconds_before_it(write_board: WriteBoard, config: ArmConfig) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(24_000, fault_at=23_990)
+    written.board.event(LOST)
+    written.board.text("the drive's error code is 0x8611")
     box.look()
     box.finish()
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     about, records = recording.about, recording.records
     assert (about.number, about.before, about.arm, about.bus) == (1, "moving", config.name, "virtual")
     assert about.joints == tuple(joint.name for joint in config.joints)
@@ -115,25 +137,25 @@ def test_a_fault_is_written_with_the_ten_seconds_before_it(play: Callable[..., P
     assert int(records["cycle"][about.at]) == 23_990
     assert int(records["cycle"][0]) == 23_990 - 20_000
     assert int(records["cycle"][-1]) == 24_000
-    assert np.array_equal(records["position"][:, 0], records["cycle"] * 1e-4)
-    assert [about.what, "the drive's error code is 0x8611"] == sentences(recording)
-    assert any("number 1 (`rtcp faults show 1`)" in sentence for sentence in played.told)
+    assert np.array_equal(records["actual_position"][:, 0], records["cycle"] * 1e-4)
+    assert [about.what, "the drive's error code is 0x8611"] == messages(recording)
+    assert any("number 1 (`rtcp faults show 1`)" in message for message in written.reports)
 
 
-def test_further_fault_events_are_in_the_same_file_until_a_reset(play: Callable[..., Played]) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(100, fault_at=50)
-    played.board.event(Code.BUS_LOST, value=5)
+def test_further_fault_events_are_in_the_same_file_until_a_reset(write_board: WriteBoard) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(100, fault_at=50)
+    written.board.event(LOST)
     box.look()
-    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    written.board.event(DRIVE)
     box.look()
-    played.board.event(Code.RESET)
-    played.board.event(Code.PRESSED)
+    written.board.event(ResetDone())
+    written.board.event(EmergencyStopActivated())
     box.look()
     box.finish()
-    first, second = played.recordings
-    assert len(sentences(first)) == 4
+    first, second = written.recordings
+    assert len(messages(first)) == 4
     assert "process data lost" in first.about.what
     assert "emergency stop" in second.about.what.lower()
 
@@ -148,9 +170,8 @@ class Clock:
         self._began_ns, self._wall_ns = time.monotonic_ns(), time.time_ns()
         monkeypatch.setattr(time, "monotonic_ns", self.now_ns)
         monkeypatch.setattr(time, "time_ns", self.wall_ns)
-        monkeypatch.setattr(blackbox, "AFTER_S", 0.1)
-        monkeypatch.setattr(fault_events, "AFTER_S", 0.1)
-        monkeypatch.setattr(blackbox, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
+        monkeypatch.setattr(black_box, "AFTER_S", 0.1)
+        monkeypatch.setattr(black_box, "SILENT_S", 1e9)  # on the host's clock, which a busy host lets run on
 
     def now_ns(self) -> int:
         return self._began_ns + round(self.s * 1e9)
@@ -160,76 +181,76 @@ class Clock:
 
 
 def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_ten_seconds(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
+    written = write_board()
+    written.fill(100, fault_at=50)
     clock = Clock(monkeypatch)
-    box = played.watched()
+    box = written.watched()
     happens = {
-        0.0: Code.BUS_LOST, 0.05: Code.DRIVE_FAULT, 3.0: Code.DRIVE_FAULT, 5.0: Code.PRESSED, 130.0: Code.RESET_STUCK,
-        131.5: Code.RESET_MOVING, 131.6: Code.RESET, 131.7: Code.PRESSED,
+        0.0: LOST, 0.05: DRIVE, 3.0: DRIVE, 5.0: EmergencyStopActivated(), 130.0: ResetTimeout(0, 0),
+        131.5: ResetWhileMoving(0, 0.1), 131.6: ResetDone(), 131.7: EmergencyStopActivated(),
     }  # fmt: skip
     for at_s in sorted({*happens, 9.9, 10.0, 20.0, 140.0}):
         clock.s = at_s
         if at_s in happens:
-            played.board.event(happens[at_s])
+            written.board.event(happens[at_s])
         box.look()
         # What was written when: the file of 5.0 s not before 10 s, that of 131.5 s at the reset.
         seen = {9.9: [1], 10.0: [1, 4], 131.5: [1, 4, 5]}.get(at_s)
         if seen:
             box._writer.submit(int).result()
-            assert [recording.about.event for recording in played.recordings] == seen
+            assert [recording.about.event for recording in written.recordings] == seen
     box.finish()
-    assert [recording.about.event for recording in played.recordings] == [1, 4, 5, 6, 8]
-    second = played.recordings[1]
-    assert len(sentences(second)) == 4, "the events of the ten seconds before are in it"
+    assert [recording.about.event for recording in written.recordings] == [1, 4, 5, 6, 8]
+    second = written.recordings[1]
+    assert len(messages(second)) == 4, "the events of the ten seconds before are in it"
     # A new gateway divides them in the same way, and finds each of them written.
-    played.watched().finish()
-    assert len(played.recordings) == 5
+    written.watched().finish()
+    assert len(written.recordings) == 5
 
 
 @pytest.mark.parametrize("set_s", [-3600.0, 3600.0])
 def test_a_wall_clock_that_is_set_neither_puts_a_recording_off_nor_brings_it_forward(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch, set_s: float
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch, set_s: float
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
+    written = write_board()
+    written.fill(100, fault_at=50)
     clock = Clock(monkeypatch)
-    box = played.watched()
+    box = written.watched()
 
-    def recorded_at(at_s: float, code: int = 0) -> list[int]:
+    def recorded_at(at_s: float, event: Event | None = None) -> list[int]:
         clock.s = at_s
-        if code:
-            played.board.event(code)
+        if event is not None:
+            written.board.event(event)
         box.look()
         box._writer.submit(int).result()
-        return [recording.about.event for recording in played.recordings]
+        return [recording.about.event for recording in written.recordings]
 
-    assert recorded_at(0.0, Code.BUS_LOST) == [1]
+    assert recorded_at(0.0, LOST) == [1]
     clock.set_s = set_s
-    assert recorded_at(9.0, Code.DRIVE_FAULT) == [1]
+    assert recorded_at(9.0, DRIVE) == [1]
     assert recorded_at(10.0) == [1, 2]
     # The emergency stop half a minute into a fault, while its ten seconds are in the ring.
-    assert recorded_at(30.0, Code.PRESSED) == [1, 2, 3]
+    assert recorded_at(30.0, EmergencyStopActivated()) == [1, 2, 3]
     box.finish()
-    first, _, third = played.recordings
+    first, _, third = written.recordings
     assert third.about.time_ns == first.about.time_ns + round((30.0 + set_s) * 1e9), "people are shown the wall clock"
 
 
 def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_set_forward(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
+    written = write_board()
     clock = Clock(monkeypatch)
-    played.fill(2000, fault_at=1000, ends_ns=clock.now_ns() + 500_000_000)
-    played.board.event(Code.BUS_LOST, value=5)
+    written.fill(2000, fault_at=1000, ends_ns=clock.now_ns() + 500_000_000)
+    written.board.event(LOST)
     clock.s, clock.set_s = 0.25, 3600.0
-    played.board.event(Code.RESET)
-    played.board.event(Code.PRESSED)
+    written.board.event(ResetDone())
+    written.board.event(EmergencyStopActivated())
     clock.s = 2.0
-    played.watched().finish()
-    first, second = played.recordings
+    written.watched().finish()
+    first, second = written.recordings
     assert int(first.records["cycle"][first.about.at]) == 1000
     assert first.about.time_ns == clock.wall_ns() - round((2.0 + 3600.0) * 1e9)
     # No cycle shows the second fault's code: its own is the one of its instant, 0.25 s before the last.
@@ -237,249 +258,249 @@ def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_
 
 
 def test_what_is_said_while_the_wall_clock_is_set_stands_where_it_was_said(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
+    written = write_board()
+    written.fill(100, fault_at=50)
     clock = Clock(monkeypatch)
-    box = played.watched()
-    played.board.event(Code.ARRIVED)
+    box = written.watched()
+    written.board.event(Arrived())
     clock.s, clock.set_s = 5.0, -3600.0
-    played.board.event(Code.BUS_LOST, value=5)
+    written.board.event(LOST)
     clock.s, clock.set_s = 5.05, 3600.0
-    played.board.event(Code.DRIVE_FAULT, 2, 0x21F)
+    written.board.event(DRIVE)
     clock.s = 6.0
     box.look()
     box.finish()
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     about = recording.about
     away_s = [(moment.time_ns - about.time_ns) * 1e-9 for moment in about.timeline]
     assert away_s == pytest.approx([-5.0, 0.0, 0.05])
 
 
 def test_what_was_put_off_is_written_when_the_gateway_ends(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
+    written = write_board()
+    written.fill(100, fault_at=50)
     clock = Clock(monkeypatch)
-    box = played.watched()
-    played.board.event(Code.BUS_LOST)
+    box = written.watched()
+    written.board.event(LOST)
     box.look()
     clock.s = 4.0
-    played.board.event(Code.PRESSED)
+    written.board.event(EmergencyStopActivated())
     box.look()
     box.finish()
-    assert [recording.about.event for recording in played.recordings] == [1, 2]
+    assert [recording.about.event for recording in written.recordings] == [1, 2]
 
 
-def test_what_follows_a_fault_is_waited_for(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blackbox, "AFTER_S", 2.0)  # time enough for this test, also on a busy host
-    played = play()
-    box = played.watched()
-    began = played.fill(100, fault_at=100)
-    played.board.event(Code.BUS_LOST, value=5)
+def test_what_follows_a_fault_is_waited_for(write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(black_box, "AFTER_S", 2.0)  # time enough for this test, also on a busy host
+    written = write_board()
+    box = written.watched()
+    began = written.fill(100, fault_at=100)
+    written.board.event(LOST)
     box.look()
-    assert played.recordings == []
-    played.fill(1000, fault_at=1, ends_ns=began + 500_000_000)
-    while not played.told:
+    assert written.recordings == []
+    written.fill(1000, fault_at=1, ends_ns=began + 500_000_000)
+    while not written.reports:
         time.sleep(0.01)
     assert time.monotonic_ns() - began >= 2_000_000_000
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     assert len(recording.records["cycle"]) == 1100
     box.finish()
 
 
-def test_the_shortest_cycle_has_its_ten_seconds_too(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played = play(100_000)
-    taken, since = threading.Event(), played.observer.since
+def test_the_shortest_cycle_has_its_ten_seconds_too(write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = write_board(100_000)
+    taken, since = threading.Event(), written.observer.since
 
-    def told(number: int) -> Any:
+    def reports(number: int) -> Any:
         found = since(number)
         taken.set()
         return found
 
-    box = played.watched()
-    cycles = played.observer.records + 1000
-    played.fill(cycles, fault_at=cycles)
-    played.board.event(Code.BUS_LOST, value=5)
-    monkeypatch.setattr(played.observer, "since", told)
+    box = written.watched()
+    cycles = written.observer.records + 1000
+    written.fill(cycles, fault_at=cycles)
+    written.board.event(LOST)
+    monkeypatch.setattr(written.observer, "since", reports)
     box.look()
     # Read at once: what the ring takes in the second that follows does not push out what was before.
     assert taken.wait(20)
-    played.fill(40_000, fault_at=1)
+    written.fill(40_000, fault_at=1)
     box.finish()
-    (one,) = listed(played.directory)
+    (one,) = listed(written.directory)
     assert one.about is not None
     assert one.seconds >= 10.0
     assert not any("before the fault" in note for note in one.about.notes)
 
 
-def test_cycles_that_were_overwritten_before_they_were_read_are_told(play: Callable[..., Played]) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(16_410, fault_at=16_410)
+def test_cycles_that_were_overwritten_before_they_were_read_are_told(write_board: WriteBoard) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(16_410, fault_at=16_410)
     for number in range(1, 11):
-        played.observer._ring[number]["number_again"] = 0
-    recording = played.lost(box)
+        written.observer._ring[number]["number_again"] = 0
+    recording = written.lost(box)
     note = "8.2 s before the fault instead of 10 s: older cycles had been overwritten"
     assert note in recording.about.notes
 
 
-def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(play: Callable[..., Played]) -> None:
-    played = play()
-    box = played.watched()
+def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(write_board: WriteBoard) -> None:
+    written = write_board()
+    box = written.watched()
     now = time.monotonic_ns()
-    played.fill(1000, ends_ns=now - 13_000_000_000)
-    played.fill(600, fault_at=600, ends_ns=now)
-    recording = played.lost(box)
+    written.fill(1000, ends_ns=now - 13_000_000_000)
+    written.fill(600, fault_at=600, ends_ns=now)
+    recording = written.lost(box)
     note = "0.3 s before the fault instead of 10 s: the loop had published nothing for 12.7 s before them"
     assert note in recording.about.notes
 
 
-def test_torn_records_are_told_and_not_taken(play: Callable[..., Played]) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(1000, fault_at=900)
+def test_torn_records_are_told_and_not_taken(write_board: WriteBoard) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(1000, fault_at=900)
     for number in (10, 11, 500):
-        slot = played.observer._ring[number % played.observer.records]
+        slot = written.observer._ring[number % written.observer.records]
         slot["number_again"] = 0
-    recording = played.lost(box)
+    recording = written.lost(box)
     assert "3 cycles were overwritten before they were read, or torn" in recording.about.notes
     assert len(recording.records["cycle"]) == 997
     assert int(recording.records["cycle"][recording.about.at]) == 900
 
 
-def test_events_that_the_ring_no_longer_holds_are_told(play: Callable[..., Played]) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(100, fault_at=90)
+def test_events_that_the_ring_no_longer_holds_are_told(write_board: WriteBoard) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(100, fault_at=90)
     for _ in range(EVENTS):
-        played.board.event(Code.ARRIVED)
-    recording = played.lost(box)
+        written.board.event(Arrived())
+    recording = written.lost(box)
     assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
 
 
 def test_a_loop_that_has_died_is_a_fault_of_its_own_and_one_that_was_told_to_end_is_none(
-    play: Callable[..., Played],
+    write_board: WriteBoard,
 ) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(100)
+    written = write_board()
+    box = written.watched()
+    written.fill(100)
     box.loop_has_ended()
     box.loop_has_ended()
     box.finish()
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     assert "ended unexpectedly" in recording.about.what
     assert (recording.about.before, recording.about.at, recording.about.event) == ("moving", 99, 0)
-    assert sentences(recording) == [recording.about.what]
-    told_to_end = played.watched()
+    assert messages(recording) == [recording.about.what]
+    told_to_end = written.watched()
     told_to_end.end_is_wanted()
     told_to_end.loop_has_ended()
     told_to_end.finish()
-    assert len(played.recordings) == 1
+    assert len(written.recordings) == 1
 
 
-def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(play: Callable[..., Played]) -> None:
-    played = play()
-    played.fill(100)
-    box = played.watched()
+def test_a_loop_that_publishes_nothing_for_a_second_is_a_fault(write_board: WriteBoard) -> None:
+    written = write_board()
+    written.fill(100)
+    box = written.watched()
     until = time.monotonic() + 0.5
     while time.monotonic() < until:
-        played.fill(1)
+        written.fill(1)
         box.look()
         time.sleep(0.02)
-    assert played.told == []
+    assert written.reports == []
     last = time.monotonic()
-    while not played.told:
+    while not written.reports:
         box.look()
         time.sleep(0.01)
     assert time.monotonic() - last >= 0.9
-    played.fill(1)
+    written.fill(1)
     box.look()
-    assert any("publishes again" in sentence for sentence in played.told)
+    assert any("publishes again" in message for message in written.reports)
     box.finish()
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     assert "has published nothing for 1 s" in recording.about.what
     assert int(recording.records["cycle"][recording.about.at]) == 1
 
 
 def test_a_loop_that_hangs_and_goes_on_into_a_fault_makes_one_recording_until_the_reset(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = Clock(monkeypatch)
-    monkeypatch.setattr(blackbox, "SILENT_S", 1.0)
+    monkeypatch.setattr(black_box, "SILENT_S", 1.0)
     monkeypatch.setattr(time, "monotonic", lambda: clock.s)
-    played = play()
-    played.fill(100)
-    box = played.watched()
+    written = write_board()
+    written.fill(100)
+    box = written.watched()
 
     def recorded_at(at_s: float) -> int:
         clock.s = at_s
         box.look()
         box._writer.submit(int).result()
-        return len(played.recordings)
+        return len(written.recordings)
 
     assert [recorded_at(at_s) for at_s in (0.5, 1.5, 2.5, 3.0)] == [0, 1, 1, 1]
-    played.fill(1, fault_at=1)
+    written.fill(1, fault_at=1)
     assert recorded_at(3.1) == 1
-    played.board.event(Code.SLAVE_NOT_OP)
+    written.board.event(SlaveLost(3))
     assert recorded_at(3.2) == 1
-    assert "has published nothing" in played.recordings[0].about.what
+    assert "has published nothing" in written.recordings[0].about.what
     # What the file does not hold is written at the reset, and a silence after that is a new fault.
-    played.board.event(Code.RESET)
+    written.board.event(ResetDone())
     assert recorded_at(3.3) == 2
     assert recorded_at(5.0) == 3
     box.finish()
 
 
-def test_a_fault_that_no_gateway_saw_is_written_by_the_next_one_and_only_once(play: Callable[..., Played]) -> None:
-    played = play()
-    played.fill(2000, fault_at=1000)
-    played.board.event(Code.BUS_LOST, value=5)
+def test_a_fault_that_no_gateway_saw_is_written_by_the_next_one_and_only_once(
+    write_board: WriteBoard,
+) -> None:
+    written = write_board()
+    written.fill(2000, fault_at=1000)
+    written.board.event(LOST)
     for _ in range(3):
-        played.watched().finish()
-    (recording,) = played.recordings
+        written.watched().finish()
+    (recording,) = written.recordings
     assert int(recording.records["cycle"][recording.about.at]) == 1000
 
 
 def test_a_loop_that_died_with_its_gateway_is_recorded_at_the_next_start_and_only_once(
-    play: Callable[..., Played], tmp_path: Path, config: ArmConfig, monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, tmp_path: Path, config: ArmConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(500)
+    written = write_board()
+    written.fill(500)
     monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
-    monkeypatch.setattr(launcher, "blackboard_file", lambda directory: played.board.path)
-    told: list[str] = []
+    monkeypatch.setattr(launcher, "blackboard_file", lambda directory: written.board.path)
+    reports: list[str] = []
     # The processes: this one made the blackboard, so it was the loop; another one of its number lives now.
     for processes in (Processes(), Processes(loop=identify(os.getpid())), Processes(loop=Pid(os.getpid(), 1))):
-        assert played.recordings == []
+        assert written.recordings == []
         processes.write(tmp_path)
-        launcher._record_unseen_end(tmp_path, told.append)
-        played.session.write(tmp_path)
-    launcher._record_unseen_end(tmp_path, told.append)
-    (recording,) = played.recordings
+        launcher._record_unseen_end(tmp_path, reports.append)
+        written.session.write(tmp_path)
+    launcher._record_unseen_end(tmp_path, reports.append)
+    (recording,) = written.recordings
     assert "ended unexpectedly" in recording.about.what
     assert (recording.about.before, recording.about.at) == ("moving", 499)
     stop_marker(tmp_path).touch()
-    recording_file = listed(played.directory)[0].path
+    recording_file = listed(written.directory)[0].path
     recording_file.unlink()
-    launcher._record_unseen_end(tmp_path, told.append)
-    assert played.recordings == []
+    launcher._record_unseen_end(tmp_path, reports.append)
+    assert written.recordings == []
 
 
 def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_that_are_written(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
+    written = write_board()
+    written.fill(100, fault_at=50)
     for _ in range(5):
-        played.board.event(Code.BUS_LOST, value=5)
-        played.board.event(Code.RESET)
-    played.watched().finish()
-    assert len(played.recordings) == 5
+        written.board.event(LOST)
+        written.board.event(ResetDone())
+    written.watched().finish()
+    assert len(written.recordings) == 5
     asked: list[str] = []
 
     def heard(name: str, answer: Callable[..., Any]) -> Callable[..., Any]:
@@ -489,128 +510,130 @@ def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_th
 
         return ask
 
-    monkeypatch.setattr(blackbox, "listed", heard("list", listed))
-    monkeypatch.setattr(played.observer, "since", heard("ring", played.observer.since))
-    played.watched().finish()
+    monkeypatch.setattr(black_box, "listed", heard("list", listed))
+    monkeypatch.setattr(written.observer, "since", heard("ring", written.observer.since))
+    written.watched().finish()
     assert asked == ["list"]
-    assert len(played.recordings) == 5
+    assert len(written.recordings) == 5
 
 
 def test_a_list_that_cannot_be_made_is_told_and_the_next_fault_is_recorded(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    played.fill(100, fault_at=50)
-    played.board.event(Code.BUS_LOST, value=5)
+    written = write_board()
+    written.fill(100, fault_at=50)
+    written.board.event(LOST)
 
     def broken(directory: Path) -> object:
         raise TypeError("odd")
 
-    monkeypatch.setattr(blackbox, "listed", broken)
-    box = played.watched()
-    played.board.event(Code.RESET)
-    played.board.event(Code.PRESSED)
+    monkeypatch.setattr(black_box, "listed", broken)
+    box = written.watched()
+    written.board.event(ResetDone())
+    written.board.event(EmergencyStopActivated())
     box.look()
     box.finish()
-    assert any("by a defect: TypeError odd" in sentence for sentence in played.told)
-    assert [recording.about.event for recording in played.recordings] == [3]
+    assert any("by a defect: TypeError odd" in message for message in written.reports)
+    assert [recording.about.event for recording in written.recordings] == [3]
 
 
 def test_a_fault_before_the_first_cycle_is_recorded_with_the_cycles_that_follow(
-    play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch
+    write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    played = play()
-    box = played.watched()
-    read_once, since = threading.Event(), played.observer.since
+    written = write_board()
+    box = written.watched()
+    read_once, since = threading.Event(), written.observer.since
 
     def followed(number: int) -> object:
         found = since(number)
         read_once.set()
         return found
 
-    monkeypatch.setattr(played.observer, "since", followed)
+    monkeypatch.setattr(written.observer, "since", followed)
     box._process_fault(time.monotonic_ns(), "has published nothing")
     assert read_once.wait(60)
-    played.fill(100)
+    written.fill(100)
     box.finish()
-    (recording,) = played.recordings
+    (recording,) = written.recordings
     assert (recording.about.at, len(recording.records["cycle"])) == (0, 100)
 
 
-def test_a_fault_that_has_left_the_ring_is_not_made_up(play: Callable[..., Played]) -> None:
-    played = play()
-    played.board.event(Code.BUS_LOST, value=5)
+def test_a_fault_that_has_left_the_ring_is_not_made_up(write_board: WriteBoard) -> None:
+    written = write_board()
+    written.board.event(LOST)
     time.sleep(0.1)
-    played.fill(100, fault_at=1)
-    played.watched().finish()
-    assert played.recordings == []
+    written.fill(100, fault_at=1)
+    written.watched().finish()
+    assert written.recordings == []
 
 
-def test_a_fault_of_another_start_is_not_taken_for_this_ones(play: Callable[..., Played]) -> None:
-    played = play()
-    played.fill(200, fault_at=100)
-    played.board.event(Code.BUS_LOST, value=5)
-    played.watched().finish()
-    played.session = replace(played.session, began_ns=BEGAN_NS + 1)
-    played.watched().finish()
-    assert len(played.recordings) == 2
+def test_a_fault_of_another_start_is_not_taken_for_this_ones(write_board: WriteBoard) -> None:
+    written = write_board()
+    written.fill(200, fault_at=100)
+    written.board.event(LOST)
+    written.watched().finish()
+    written.session = replace(written.session, began_ns=BEGAN_NS + 1)
+    written.watched().finish()
+    assert len(written.recordings) == 2
 
 
-def test_a_disk_that_refuses_is_a_sentence_and_the_next_fault_is_tried_again(play: Callable[..., Played]) -> None:
-    played = play()
-    played.directory.write_text("no directory")
-    box = played.watched()
-    played.fill(100, fault_at=50)
-    played.board.event(Code.BUS_LOST, value=5)
-    while not played.told:
-        played.fill(1)
+def test_a_disk_that_refuses_is_a_sentence_and_the_next_fault_is_tried_again(
+    write_board: WriteBoard,
+) -> None:
+    written = write_board()
+    written.directory.write_text("no directory")
+    box = written.watched()
+    written.fill(100, fault_at=50)
+    written.board.event(LOST)
+    while not written.reports:
+        written.fill(1)
         box.look()
         time.sleep(0.01)
-    assert str(played.directory) in played.told[0]
-    assert "no recording can be written" in played.told[0]
-    played.directory.unlink()
-    played.board.event(Code.RESET)
-    played.board.event(Code.PRESSED)
+    assert str(written.directory) in written.reports[0]
+    assert "no recording can be written" in written.reports[0]
+    written.directory.unlink()
+    written.board.event(ResetDone())
+    written.board.event(EmergencyStopActivated())
     box.look()
     box.finish()
-    assert len(played.recordings) == 1
+    assert len(written.recordings) == 1
 
 
-def test_a_look_does_not_wait_for_the_disk(play: Callable[..., Played], monkeypatch: pytest.MonkeyPatch) -> None:
-    played = play()
-    box = played.watched()
-    played.fill(20_000, fault_at=19_000)
-    written, asked, gate = blackbox.write, threading.Event(), threading.Event()
+def test_a_look_does_not_wait_for_the_disk(write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = write_board()
+    box = written.watched()
+    written.fill(20_000, fault_at=19_000)
+    real_write, asked, gate = black_box.write, threading.Event(), threading.Event()
 
     def slow(*given: object) -> object:
         asked.set()
         assert gate.wait(60)
-        return written(*given)  # type: ignore[arg-type]
+        return real_write(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(blackbox, "write", slow)
-    monkeypatch.setattr(blackbox, "AFTER_S", 0.0)
-    played.board.event(Code.BUS_LOST, value=5)
+    monkeypatch.setattr(black_box, "write", slow)
+    monkeypatch.setattr(black_box, "AFTER_S", 0.0)
+    written.board.event(LOST)
     box.look()
     assert asked.wait(20)
     box.look()
-    assert played.told == []
+    assert written.reports == []
     gate.set()
     box.finish()
-    assert len(played.recordings) == 1
+    assert len(written.recordings) == 1
 
 
 @pytest.mark.parametrize("break_it", ["drive", "frames"])
 def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_path: Path, break_it: str) -> None:
     quick = replace(config, cycle=replace(config.cycle, period_us=2000.0))
     with Simulation(quick, follow_clock=False) as simulation:
-        told: list[str] = []
+        reports: list[str] = []
         session = Session(quick, "inprocess", "", 0, BEGAN_NS)
-        box = BlackBox(simulation.observer, session, tmp_path, told.append)
+        box = BlackBox(simulation.observer, session, tmp_path, reports.append)
         assert simulation.until(lambda: simulation.state is State.READY, 3.0)
         simulation.acquire()
-        simulation.order(Command.ENABLE)
+        simulation.send(Enable())
         assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-        simulation.order(Command.MOVE, _move((0.5,) * 6, 0.3))
+        simulation.send(MoveJoints((0.5,) * 6, 0.3, True))
         simulation.run(0.8)
         first = simulation.observer.head
         if break_it == "drive":
@@ -632,9 +655,5 @@ def test_the_loops_own_fault_is_recorded_cycle_by_cycle(config: ArmConfig, tmp_p
         assert int(records["number"][about.at]) > first
         assert int(records["state"][about.at]) == State.FAULT
         assert int(records["state"][about.at - 1]) == State.MOVING
-        assert about.what in sentences(recording)
-        assert told
-
-
-def _move(q: Sequence[float], speed: float) -> list[float]:
-    return [*q, *([0.0] * 5), speed]
+        assert about.what in messages(recording)
+        assert reports

@@ -13,25 +13,27 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rtcp.gateway.blackbox_file import About, listed
-from tests.runtime.played_loop import Loop
 
 from rtcp.config import default_config, load
-from rtcp.gateway import server as gateway
+from rtcp.gateway import server
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.codes import Code
+from rtcp.ipc.events import ProcessDataLost
+from rtcp.ipc.recording import About, listed
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
+from tests.gateway.fake_loop import FakeLoop
+
+LOST = ProcessDataLost(3, 5)
 
 
 class Gateways:
-    """A played loop, and gateways in front of it, one after the other."""
+    """A fake loop, and gateways in front of it, one after the other."""
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
         Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
         (directory / "started.json").write_text("{}")
-        self.loop = Loop(blackboard_file(directory))
+        self.loop = FakeLoop(blackboard_file(directory))
         self._started: list[subprocess.Popen[bytes]] = []
 
     def start(self) -> subprocess.Popen[bytes]:
@@ -72,7 +74,7 @@ def gateways() -> Iterator[Gateways]:
 
 def test_a_fault_followed_at_once_by_a_stop_is_written_before_the_blackboard_goes(gateways: Gateways) -> None:
     gateway = gateways.start()
-    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    gateways.loop.board.event(LOST)
     with ControlClient("a test", control_socket(gateways.directory)) as client:
         client.call("stop", timeout_s=60.0)
         assert [about.what.partition(":")[0] for about in gateways.recorded] == ["process data lost"]
@@ -82,9 +84,9 @@ def test_a_fault_followed_at_once_by_a_stop_is_written_before_the_blackboard_goe
 
 def test_a_fault_in_whose_second_the_gateway_is_killed_is_written_by_the_next_one(gateways: Gateways) -> None:
     gateway = gateways.start()
-    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    gateways.loop.board.event(LOST)
     with ControlClient("a test", control_socket(gateways.directory)) as client:
-        while not any("process data lost" in sentence for sentence in client.call("status")["messages"]):
+        while not any("process data lost" in message for message in client.call("status")["messages"]):
             pass
     gateway.kill()
     gateway.wait()
@@ -97,9 +99,9 @@ def test_a_fault_in_whose_second_the_gateway_is_killed_is_written_by_the_next_on
 def test_the_status_is_answered_while_a_fault_is_written_and_names_its_number(gateways: Gateways) -> None:
     gateways.start()
     with ControlClient("a test", control_socket(gateways.directory)) as client:
-        gateways.loop.board.event(Code.BUS_LOST, value=3)
+        gateways.loop.board.event(LOST)
         answers = 0
-        while not any("black box: this fault is number 1" in said for said in client.call("status")["messages"]):
+        while not any("black box: this fault is number 1" in message for message in client.call("status")["messages"]):
             answers += 1
         assert answers > 3
         assert client.call("status")["message"].startswith("process data lost")
@@ -108,15 +110,15 @@ def test_the_status_is_answered_while_a_fault_is_written_and_names_its_number(ga
 def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
     gateways: Gateways, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(gateway, "_FOLLOW_S", 0.0)
-    made = gateway.Gateway(gateways.directory)
-    turns = {"the picture": 0, "the black box": 0}
+    monkeypatch.setattr(server, "_FOLLOW_S", 0.0)
+    made = server.Gateway(gateways.directory)
+    turns = {"the status snapshot": 0, "the black box": 0}
 
     def broken(what: str) -> None:
         turns[what] += 1
         raise ValueError(what)
 
-    monkeypatch.setattr(made._picture, "follow", lambda: broken("the picture"))
+    monkeypatch.setattr(made._snapshot, "follow", lambda: broken("the status snapshot"))
     monkeypatch.setattr(made._box, "look", lambda: broken("the black box"))
 
     async def followed() -> None:
@@ -130,21 +132,21 @@ def test_a_defect_in_following_the_loop_is_logged_now_and_then_and_ends_nothing(
     made._box.finish()
     made._observer.close()
     assert min(turns.values()) >= 50
-    said = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert said == [f"{what} cannot follow the loop; it is tried again" for what in turns]
+    logged = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert logged == [f"{what} cannot follow the loop; it is tried again" for what in turns]
 
 
 def test_a_new_gateway_knows_what_was_said_before_it_and_logs_only_what_comes(
     gateways: Gateways, caplog: pytest.LogCaptureFixture
 ) -> None:
     gateways.loop.board.text("said before")
-    gateways.loop.board.event(Code.BUS_LOST, value=3)
+    gateways.loop.board.event(LOST)
     caplog.set_level("INFO", "rtcp.gateway")
-    made = gateway.Gateway(gateways.directory)
+    made = server.Gateway(gateways.directory)
     gateways.loop.board.text("said now")
-    made._tell_news()
+    made._log_messages()
     made._box.finish()
     assert [one.getMessage() for one in caplog.records if one.name == "rtcp.gateway"] == ["said now"]
-    messages = [sentence for _, sentence in made._picture.messages]
+    messages = [message for _, message in made._snapshot.messages]
     assert "said before" in messages
-    assert made._picture.fault.startswith("process data lost")
+    assert made._snapshot.fault.startswith("process data lost")

@@ -1,4 +1,4 @@
-"""The joystick without hardware: which inputs of the virtual IO box are forced, when, and until when."""
+"""The joystick of the virtual IO box: which inputs of the virtual IO box are forced, when, and until when."""
 
 from __future__ import annotations
 
@@ -7,24 +7,30 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rtcp.gateway.carrier import CommandFailed
-from rtcp.gateway.stick_forcer import forced
-from tests.runtime.played import Played, played
 
 from rtcp.config import default_config, load
-from rtcp.ipc.machine import State
+from rtcp.gateway.joystick_override import forced
+from rtcp.ipc.errors import Refused, RtcpError
+from rtcp.ipc.states import State
+from tests.gateway.fake_platform import FakePlatform, fake_platform
 
 Q = [0.0] * 6
 MASK, LEVELS = (0x2000, 1), (0x2000, 2)
 
 
-@pytest.fixture
-def arm(tmp_path: Path) -> Iterator[Played]:
-    with played(tmp_path, Q) as made:
+@pytest.fixture(scope="module")
+def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
+    with fake_platform(tmp_path_factory.mktemp("arm"), Q) as made:
         yield made
 
 
-def written(arm: Played) -> list[tuple[int, int]]:
+@pytest.fixture
+def arm(platform: FakePlatform) -> FakePlatform:
+    platform.reset(Q)
+    return platform
+
+
+def written(arm: FakePlatform) -> list[tuple[int, int]]:
     """What was written, subindex and number, but for how long the box holds it (subindex 3)."""
     for index, _, _ in arm.loop.written:
         assert index == 0x2000
@@ -39,7 +45,7 @@ CODES = {
 
 
 @pytest.mark.parametrize(("pressed", "byte"), CODES.values(), ids=CODES.keys())
-def test_what_is_pressed_makes_the_byte_of_the_facts(pressed: list[str], byte: int) -> None:
+def test_each_position_makes_the_byte_of_the_device_description(pressed: list[str], byte: int) -> None:
     config = load(default_config())
     mask, levels = forced(config, pressed, None)
     assert (mask, levels) == (0x3F, byte)
@@ -54,75 +60,77 @@ def test_toggle_and_emergency_stop_are_forced_to_the_level_that_means_them() -> 
 
 
 @pytest.mark.parametrize(
-    ("pressed", "byte", "kind", "sentence"),
+    ("pressed", "byte", "kind", "message"),
     [
-        (["ahead"], None, "invalid", "pressed: found 'ahead', allowed are forward"),
+        (["ahead"], None, "invalid", 'pressed: found the text "ahead", allowed are forward'),
         ([], 256, "invalid", "byte: found 256, allowed is 0 to 255"),
         (["enabling_switch"], None, "refused", "inputs.enabling_switch is missing"),
     ],
 )
-def test_what_cannot_be_pressed_is_one_sentence(pressed: list[str], byte: int | None, kind: str, sentence: str) -> None:
-    with pytest.raises(CommandFailed) as raised:
+def test_what_cannot_be_pressed_is_named(pressed: list[str], byte: int | None, kind: str, message: str) -> None:
+    with pytest.raises(RtcpError) as raised:
         forced(load(default_config()), pressed, byte)
     assert raised.value.kind == kind
-    assert sentence in str(raised.value)
+    assert message in str(raised.value)
 
 
-def test_levels_are_written_before_the_mask_that_lets_them_count(arm: Played) -> None:
+def test_levels_are_written_before_the_mask_and_only_what_changes_is_written(arm: FakePlatform) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61})
-        await arm.call("stick", {"byte": 61})
-        await arm.call("stick", {"byte": 62})
+        await arm.call("joystick", {"byte": 61})
+        await arm.call("joystick", {"byte": 61})
+        await arm.call("joystick", {"byte": 62})
 
     arm.run(force)
     assert written(arm) == [(2, 61), (1, 0xFF), (2, 62)]
+    # Before anything is forced the box is told when to release it by itself.
+    assert arm.loop.written[0] == (0x2000, 3, (1500).to_bytes(2, "little").hex())
 
 
-def test_inputs_are_forced_while_the_arm_moves(arm: Played) -> None:
+def test_inputs_are_forced_while_the_arm_moves(arm: FakePlatform) -> None:
     arm.show(state=State.STOPPING)
-    arm.ask("stick", byte=61)
+    arm.ask("joystick", byte=61)
     assert written(arm) == [(2, 61), (1, 0xFF)]
 
 
-def test_null_lets_go(arm: Played) -> None:
+def test_null_releases(arm: FakePlatform) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61})
-        await arm.call("stick", {"byte": None})
+        await arm.call("joystick", {"byte": 61})
+        await arm.call("joystick", {"byte": None})
 
     arm.run(force)
     assert written(arm)[-1] == (1, 0)
 
 
-def test_nothing_pressed_holds_the_stick_neutral_and_leaves_the_other_inputs_alone(arm: Played) -> None:
-    arm.ask("stick", pressed=[])
+def test_nothing_pressed_holds_the_joystick_neutral_and_leaves_the_other_inputs_alone(arm: FakePlatform) -> None:
+    arm.ask("joystick", pressed=[])
     assert written(arm) == [(2, 63), (1, 0x3F)]
 
 
-def test_only_who_holds_the_stick_can_let_it_go(arm: Played) -> None:
+def test_only_the_holder_can_release(arm: FakePlatform) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
-        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp joystick \(pid 7\)"):
-            await arm.call("stick", {}, "another", connection=2)
+        await arm.call("joystick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
+        with pytest.raises(Refused, match=r"the joystick is held by rtcp joystick \(pid 7\)"):
+            await arm.call("joystick", {}, "another", connection=2)
 
     arm.run(force)
     assert written(arm)[-1] == (1, 0xFF)
 
 
-def test_a_closed_connection_lets_go(arm: Played) -> None:
+def test_a_closed_connection_releases(arm: FakePlatform) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61}, connection=1)
-        await arm.verbs.gone(2)
+        await arm.call("joystick", {"byte": 61}, connection=1)
+        await arm.methods.end_connection(2)
         assert written(arm)[-1] == (1, 0xFF)
-        await arm.verbs.gone(1)
+        await arm.methods.end_connection(1)
 
     arm.run(force)
     assert written(arm)[-1] == (1, 0)
 
 
-def test_what_is_not_said_again_is_let_go_after_its_time(arm: Played) -> None:
+def test_what_is_not_repeated_is_released_after_its_hold_time(arm: FakePlatform) -> None:
     async def force() -> None:
-        watching = asyncio.create_task(arm.verbs.stick.watch())
-        await arm.call("stick", {"byte": 61, "hold_s": 0.2})
+        watching = asyncio.create_task(arm.methods.joystick_override.watch())
+        await arm.call("joystick", {"byte": 61, "hold_s": 0.2})
         await asyncio.sleep(0.1)
         assert written(arm)[-1] == (1, 0xFF)
         await asyncio.sleep(0.3)
@@ -132,25 +140,25 @@ def test_what_is_not_said_again_is_let_go_after_its_time(arm: Played) -> None:
     assert written(arm)[-1] == (1, 0)
 
 
-def test_a_second_client_is_refused_with_the_name_of_who_holds_the_stick(arm: Played) -> None:
+def test_a_second_client_is_refused_with_the_name_of_the_holder(arm: FakePlatform) -> None:
     async def force() -> None:
-        await arm.call("stick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
-        with pytest.raises(CommandFailed, match=r"the stick is held by rtcp joystick \(pid 7\)"):
-            await arm.call("stick", {"byte": 62}, "another", connection=2)
+        await arm.call("joystick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
+        with pytest.raises(Refused, match=r"the joystick is held by rtcp joystick \(pid 7\)"):
+            await arm.call("joystick", {"byte": 62}, "another", connection=2)
 
     arm.run(force)
     assert written(arm) == [(2, 61), (1, 0xFF)]
 
 
 @pytest.mark.parametrize("hold_s", [0, -1, 1.5])
-def test_a_hold_of_more_than_a_second_is_refused(arm: Played, hold_s: float) -> None:
-    assert "allowed is more than 0 and at most 1" in str(arm.refused("stick", byte=61, hold_s=hold_s))
+def test_a_hold_time_beyond_a_second_is_refused(arm: FakePlatform, hold_s: float) -> None:
+    assert "allowed is a number greater than 0 and at most 1" in str(arm.error("joystick", byte=61, hold_s=hold_s))
     assert arm.loop.written == []
 
 
-def test_a_real_bus_has_no_inputs_that_could_be_forced(tmp_path: Path) -> None:
-    with played(tmp_path, Q, bus="eth0") as arm:
-        failed = arm.refused("stick", byte=61)
+def test_inputs_of_a_real_bus_are_not_forced(tmp_path: Path) -> None:
+    with fake_platform(tmp_path, Q, bus="eth0") as arm:
+        failed = arm.error("joystick", byte=61)
         assert failed.kind == "refused"
         assert "inputs are forced on the virtual bus only, not on eth0" in str(failed)
         assert arm.loop.written == []

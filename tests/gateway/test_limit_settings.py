@@ -1,16 +1,20 @@
-"""Keys and numbers of limits: what is wrong is one sentence each, with the key, what was found and what is allowed."""
+"""Keys and numbers of limits: what is wrong is one message each, with the key, what was found and what is allowed."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from math import inf, nan
+from pathlib import Path
 
 import pytest
-from rtcp.gateway.carrier import CommandFailed
-from rtcp.gateway.limit_keeper import changed
 
 from rtcp.config import default_config, load
+from rtcp.gateway.limit_settings import changed
+from rtcp.ipc.commands import SetLimits
+from rtcp.ipc.errors import Invalid
+from rtcp.ipc.refusals import LimitsExcludeJoint
 from rtcp.motion.limits import Values
+from tests.gateway.fake_platform import fake_platform
 
 CONFIG = load(default_config())
 WIDEST = Values.configured(CONFIG)
@@ -21,10 +25,9 @@ KEYS = (
 )
 
 
-def sentences(changes: dict[str, float], values: Values = WIDEST) -> list[str]:
-    with pytest.raises(CommandFailed) as raised:
+def messages(changes: dict[str, float], values: Values = WIDEST) -> list[str]:
+    with pytest.raises(Invalid) as raised:
         changed(CONFIG, values, changes)
-    assert raised.value.kind == "invalid"
     return str(raised.value).split("\n")
 
 
@@ -56,7 +59,7 @@ def test_what_was_narrowed_may_become_as_wide_as_configured_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "sentence"),
+    ("changes", "message"),
     [
         ({"joint2.max": 2.5}, f"joint2.max: found 2.5, allowed is -2 to 2 (joints[1] in {{file}}: {ONLY_NARROWED}"),
         ({"joint1.min": -4}, f"joint1.min: found -4, allowed is -3.1 to 3.1 (joints[0] in {{file}}: {ONLY_NARROWED}"),
@@ -91,8 +94,8 @@ def test_what_was_narrowed_may_become_as_wide_as_configured_again() -> None:
         ({"joint1.min": 1, "joint1.max": 0.5}, "joint1.min: found 1, allowed is less than joint1.max, which is 0.5"),
         ({"box.min.y": 0.5, "box.max.y": 0.5}, "box.min.y: found 0.5, allowed is less than box.max.y, which is 0.5"),
         ({"box.max.x": -1.5}, "box.min.x: found -1.2, allowed is less than box.max.x, which is -1.5"),
-        ({"joint1.max": nan}, "joint1.max: found nan, allowed is a finite number"),
-        ({"user.min.x": -inf}, "user.min.x: found -inf, allowed is a finite number"),
+        ({"joint1.max": nan}, "joint1.max: found NaN, allowed is a finite number"),
+        ({"user.min.x": -inf}, "user.min.x: found -Infinity, allowed is a finite number"),
         ({"joint9.max": 1}, f"joint9.max: there is no such limit; {KEYS}"),
         ({"joint1.speed": 1}, f"joint1.speed: there is no such limit; {KEYS}"),
         ({"box.min": 1}, f"box.min: there is no such limit; {KEYS}"),
@@ -104,38 +107,63 @@ def test_what_was_narrowed_may_become_as_wide_as_configured_again() -> None:
     ],
     ids=lambda value: " ".join(value) if isinstance(value, dict) else "",
 )
-def test_a_wrong_limit_is_named_by_its_key(changes: dict[str, float], sentence: str) -> None:
-    assert sentences(changes) == [sentence.replace("{file}", CONFIG.source.name)]
+def test_a_wrong_limit_is_named_by_its_key(changes: dict[str, float], message: str) -> None:
+    assert messages(changes) == [message.replace("{file}", CONFIG.source.name)]
 
 
 def test_each_joint_that_joints_makes_wrong_is_named() -> None:
-    assert [one.split(",")[0] for one in sentences({"joints.torque": 30.0})] == [
+    assert [one.split(",")[0] for one in messages({"joints.torque": 30.0})] == [
         "joint5.torque: found 30", "joint6.torque: found 30"
     ]  # fmt: skip
 
 
-def test_all_that_is_wrong_is_said_at_once() -> None:
+def test_all_mistakes_are_reported_at_once() -> None:
     changes = {"joint1.max": 9.0, "user.max.z": 0.1, "joint2.velocity": nan, "elbow.max": 1.0, "joint3.max": 1.0}
-    assert [one.split(":")[0] for one in sentences(changes)] == [
+    assert [one.split(":")[0] for one in messages(changes)] == [
         "joint1.max", "user.max.z", "joint2.velocity", "elbow.max"
     ]  # fmt: skip
 
 
 def test_a_range_that_becomes_empty_with_a_limit_that_is_in_force_is_named() -> None:
     narrowed = changed(CONFIG, WIDEST, {"joint2.max": 0.5})
-    (sentence,) = sentences({"joint2.min": 0.6}, narrowed)
-    assert sentence == "joint2.min: found 0.6, allowed is less than joint2.max, which is 0.5"
+    (message,) = messages({"joint2.min": 0.6}, narrowed)
+    assert message == "joint2.min: found 0.6, allowed is less than joint2.max, which is 0.5"
 
 
-def test_nothing_is_no_change() -> None:
-    (sentence,) = sentences({})
-    assert sentence.startswith("no limit was named: give a key and a number, as joint1.KEY")
+def test_an_empty_change_is_refused() -> None:
+    (message,) = messages({})
+    assert message.startswith("changes: found none, give a key and a number, as joint1.KEY")
 
 
 def test_an_arm_without_boxes_has_no_keys_for_them() -> None:
     bare = replace(CONFIG, cartesian=replace(CONFIG.cartesian, box=None, keep_out=()))
     values = Values.configured(bare)
     assert changed(bare, values, {"joint1.max": 1.0}).box is None
-    with pytest.raises(CommandFailed) as raised:
+    with pytest.raises(Invalid) as raised:
         changed(bare, values, {"box.min.x": 0.0})
     assert str(raised.value) == f"box.min.x: there is no such limit; {KEYS.split(' and ', maxsplit=1)[0]}"
+
+
+def test_a_change_is_one_transaction_that_the_next_gateway_finds(tmp_path: Path) -> None:
+    with fake_platform(tmp_path, [0.0] * 6) as arm:
+        before = arm.ask("limits")
+        assert before["limits"] == before["configured"]
+        arm.ask("set_limits", changes={"joint2.max": 1.0, "joints.velocity": 0.4, "user.max.z": 0.9})
+        (rows,) = arm.loop.plans
+        assert arm.loop.commands == [SetLimits(0, len(rows))]
+        joints, boxes = rows[1:7], rows[7:]
+        assert [joint[1] for joint in joints] == [3.1, 1.0, 2.4, 3.1, 2.0, 3.1]
+        assert [joint[2] for joint in joints] == [0.4] * 6
+        assert boxes[1][:6] == [0.42, -0.35, -0.1, 1.1, 0.35, 0.9]
+        # `ask` makes new methods each time, as a gateway that was started again.
+        assert arm.ask("limits")["limits"]["max"][1] == 1.0
+
+
+def test_a_change_that_the_loop_refuses_is_not_in_force(tmp_path: Path) -> None:
+    with fake_platform(tmp_path, [0.0] * 6) as arm:
+        before = arm.ask("limits")
+        arm.loop.refusals[SetLimits] = LimitsExcludeJoint(1, 0.3, 0.1)
+        error = arm.error("set_limits", changes={"joint2.max": 0.1})
+        assert (error.kind, error.reason) == ("refused", "limits_exclude_joint")
+        assert arm.ask("limits") == before
+        assert arm.error("set_limits", changes=[]).message == "changes: found an empty list, allowed is a mapping"

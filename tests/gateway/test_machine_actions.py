@@ -1,162 +1,233 @@
-"""`disable` as a client asks for it: the gateway's verb in front of the real loop and the device models."""
+"""Torque, reset, modes, gripper, zero and homing as clients ask for them; the loop is fake."""
 
 from __future__ import annotations
 
-import asyncio
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
-from rtcp.gateway.carrier import Carrier, CommandFailed
-from rtcp.gateway.commander import Commander
-from rtcp.gateway.picture import Picture
 
-from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
-from rtcp.fieldbus.al_state import AlState
-from rtcp.gateway import commander
-from rtcp.ipc.machine import Code, State
-from rtcp.ipc.session import Session
+from rtcp.config import default_config, load
+from rtcp.config.model import GripperConfig, Joint, Range
+from rtcp.config.zero import read_zeros, state_directory, zero_file
+from rtcp.ipc.commands import (
+    Disable,
+    Enable,
+    Home,
+    MoveGripper,
+    Reset,
+    SetControlMode,
+    SetDriveMode,
+    SetOutput,
+    SetZero,
+)
+from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed
+from rtcp.ipc.refusals import GripperDisabled, TorquePresent, WrongState
+from rtcp.ipc.states import ControlMode, DriveMode, State
+from tests.gateway.fake_platform import FakePlatform, fake_platform
 
-from .bench import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, Bench
-
-FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
-
-
-@pytest.fixture(autouse=True)
-def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What does not come is not waited for longer than the drives need here."""
-    monkeypatch.setattr(commander, "_CONFIRM_S", 0.2)
-
-
-def disable(bench: Bench, config: ArmConfig = CONFIG) -> dict[str, Any]:
-    """Ask for it while the loop's cycles go on."""
-
-    async def both() -> dict[str, Any]:
-        session = Session(config, "eth0", "eth0", 0, bench.now_ns)
-        carrier = Carrier(bench.observer, Picture(bench.observer, session, {}), config)
-        asked = asyncio.ensure_future(Commander(carrier).disable("a test"))
-        while not asked.done():
-            bench.cycle()
-            await asyncio.sleep(PERIOD_S)
-        return await asked
-
-    return asyncio.run(both())
+Q = [0.25, 0.2, 1.0, 0.0, 0.4, 0.0]
+AXIS = 6
+CONFIG = load(default_config())
+FINGER = Joint("finger", "joint6", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
+DRIVEN = replace(CONFIG, gripper=GripperConfig(joint=FINGER, open_position=1.4, closed_position=0.0))
 
 
-def refusal(bench: Bench) -> str:
-    """Ask for what cannot be confirmed; return why."""
-    with pytest.raises(CommandFailed) as failed:
-        disable(bench)
-    assert failed.value.kind == "fault"
-    return str(failed.value)
+@pytest.fixture(scope="module")
+def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
+    with fake_platform(tmp_path_factory.mktemp("arm"), Q) as made:
+        yield made
 
 
-def powered(bench: Bench) -> list[bool]:
-    return [model.powered for model in bench.models]
+@pytest.fixture
+def arm(platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePlatform:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    platform.reset(Q)
+    return platform
 
 
-def press_in_motion(bench: Bench) -> None:
-    bench.set_in_motion()
-    for model in bench.models:
-        model.objects[0x6085, 0].value = 10_000
-    bench.press()
-    assert bench.state is State.EMERGENCY_STOP
+@pytest.fixture(scope="module")
+def driven_platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
+    with fake_platform(tmp_path_factory.mktemp("arm"), Q, config=DRIVEN) as made:
+        yield made
 
 
-def fault_in_motion(bench: Bench) -> None:
-    bench.set_in_motion()
-    bench.service.lost_slave = 3
-    bench.run(0.01)
-    assert bench.state is State.FAULT
+@pytest.fixture
+def driven(driven_platform: FakePlatform) -> FakePlatform:
+    driven_platform.reset(Q)
+    return driven_platform
 
 
-def reset_that_waits(bench: Bench) -> None:
-    bench.bring_to(State.RESETTING)
+# -- commands, and where they need no more than an answer -------------------------------------------------------------
 
 
-@pytest.mark.parametrize("brought", [press_in_motion, fault_in_motion, reset_that_waits, Bench.set_in_motion])
-def test_disabled_is_said_when_no_drive_has_torque_and_not_before(bench: Bench, brought: Any) -> None:
-    brought(bench)
-    assert powered(bench) == [True, True]
-    assert disable(bench) == {"unseen": []}
-    assert powered(bench) == [False, False]
+@pytest.mark.parametrize(
+    ("method", "params", "command"),
+    [
+        ("set_output", {"output": 3, "value": False}, SetOutput(3, False)),
+        ("mode", {"name": "cartesian"}, SetControlMode(ControlMode.CARTESIAN)),
+        ("mode", {"name": "csv"}, SetDriveMode(DriveMode.CSV)),
+        ("set_drive_mode", {"mode": "cst"}, SetDriveMode(DriveMode.CST)),
+        ("move_gripper", {"open": True}, MoveGripper(True)),
+    ],
+)
+def test_a_command_reaches_the_loop_as_it_was_sent(
+    arm: FakePlatform, method: str, params: dict[str, Any], command: object
+) -> None:
+    arm.ask(method, **params)
+    assert arm.loop.commands == [command]
 
 
-def test_a_drive_that_keeps_its_torque_in_a_fault_is_named_with_what_it_shows(bench: Bench) -> None:
-    bench.data.deaf[1, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
-    bench.bring_to(State.FAULT)
-    bench.run(0.5)
-    said = refusal(bench)
-    assert powered(bench) == [False, True]
-    assert said.startswith("told to give up their torque, not confirmed: joint2 (drive2) shows 0x")
-    assert said.endswith(", quick stop active")
-    assert "joint1" not in said
+@pytest.mark.parametrize(
+    ("method", "params", "message"),
+    [
+        ("set_output", {"output": 1.9, "value": True}, "output: found 1.9, allowed is an integer"),
+        ("set_output", {"output": 2**70, "value": True}, "output"),
+        ("set_output", {"output": 1}, "the key value is missing; it must be true or false"),
+        ("mode", {"name": "fast"}, 'name: found the text "fast", allowed is one of joint, cartesian, joystick'),
+        ("set_drive_mode", {"mode": "CSP"}, 'mode: found the text "CSP", allowed is one of csp, csv, cst'),
+        ("zero", {"joint": "joint9"}, 'joint: found the text "joint9", allowed is one of joint1, joint2'),
+        ("home", {"joint": "0"}, 'joint: found the text "0", allowed is one of joint1'),
+        ("sdo_read", {"slave": True, "index": 1, "subindex": 0}, "slave: found true, allowed is an integer"),
+        ("sdo_write", {"slave": 2, "index": 1, "subindex": 0, "hex": 12}, "hex: found 12, allowed is a text"),
+    ],
+)
+def test_a_wrong_parameter_is_named_and_nothing_is_commanded(
+    arm: FakePlatform, method: str, params: dict[str, Any], message: str
+) -> None:
+    arm.show(state=State.READY)
+    error = arm.error(method, **params)
+    assert error.kind == "invalid"
+    assert message in str(error)
+    assert arm.loop.commands == []
+    assert arm.loop.requests == []
 
 
-def test_a_drive_that_keeps_its_torque_in_an_emergency_stop_is_named(bench: Bench) -> None:
-    bench.data.deaf[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
-    press_in_motion(bench)
-    said = refusal(bench)
-    assert "not confirmed: joint1 (drive1) shows 0x" in said
-    assert "joint2" not in said
+def test_objects_are_read_at_any_time_and_written_in_state_ready_only(arm: FakePlatform) -> None:
+    address = {"slave": 2, "index": 0x6065, "subindex": 0}
+    assert arm.ask("sdo_read", **address) == {"hex": "2a"}
+    error = arm.error("sdo_write", **address, hex="0b")
+    assert str(error) == "objects are written in state ready only, not in holding: `rtcp disable` first"
+    arm.show(state=State.READY)
+    arm.ask("sdo_write", **address, hex="0b")
+    assert arm.loop.requests == [{"do": "sdo_read", **address}, {"do": "sdo_write", **address, "hex": "0b"}]
 
 
-def test_a_statusword_that_the_standard_does_not_know_confirms_nothing(bench: Bench) -> None:
-    bench.bring_to(State.FAULT)
-    seen = bench.data.input
-    bench.data.input = lambda index: b"\x01\x00" + seen(index)[2:] if index == 2 else seen(index)  # type: ignore[method-assign]
-    assert "joint2 (drive2) shows 0x0001, a state that the standard does not know" in refusal(bench)
+def test_what_holds_already_is_not_enabled_again_and_what_is_well_not_reset(arm: FakePlatform) -> None:
+    assert arm.ask("enable") == {}
+    assert arm.ask("reset") == {"from": "holding"}
+    assert arm.loop.commands == []
 
 
-def test_where_no_frame_comes_back_nothing_is_known_of_any_joint(bench: Bench) -> None:
-    bench.hold()
-    bench.data.carries = False
-    bench.run(LOST_CYCLES * PERIOD_S)
-    assert "no frame comes back, and nothing is known of joint1 (drive1), joint2 (drive2)" in refusal(bench)
+def test_a_reset_of_a_stop_by_a_limit_waits_for_no_other_state(arm: FakePlatform) -> None:
+    arm.show(state=State.STOPPED_BY_LIMIT)
+    assert arm.ask("reset") == {"from": "stopped_by_limit"}
+    assert arm.loop.commands == [Reset()]
 
 
-def test_where_a_slave_is_missing_nothing_is_known_of_any_joint(bench: Bench) -> None:
-    bench.hold()
-    receive = bench.data.receive
-    bench.data.receive = lambda: receive() - 3  # type: ignore[method-assign]
-    bench.run(LOST_CYCLES * PERIOD_S)
-    said = refusal(bench)
-    assert "slaves are missing (working counter 6 of 9), and nothing is known of joint1 (drive1), joint2" in said
+def test_a_refusal_in_a_fault_ends_with_the_fault(arm: FakePlatform) -> None:
+    arm.loop.board.event(OverSpeed(0, 1.7, 1.5))
+    arm.show(state=State.FAULT)
+    arm.loop.refusals[Enable] = WrongState(Enable.number, State.FAULT)
+    error = arm.error("enable")
+    assert error.reason == "wrong_state"
+    assert "`rtcp reset` first; the fault: joint1: measured speed 1.7 rad/s" in str(error)
 
 
-def test_what_was_shown_before_the_frames_stayed_away_confirms_nothing(bench: Bench) -> None:
-    bench.start()
-    bench.data.carries = False
-    bench.run(LOST_CYCLES * PERIOD_S)
-    assert bench.state is State.FAULT
-    assert "no frame comes back" in refusal(bench)
+def test_disabling_that_another_command_ends_is_no_success(arm: FakePlatform) -> None:
+    arm.show(state=State.RESETTING)
+    arm.loop.refusals[Disable] = WrongState(Disable.number, State.RESETTING)
+    assert arm.error("disable").kind == "refused"
 
 
-def park(bench: Bench) -> None:
-    """Let the emergency stop come to its end: slaves in PRE-OP take part in no frame."""
-    bench.wait(lambda: Code.PARKED in bench.codes)
-    for position in (1, 2, 3):
-        bench.board.slave(position, AlState.PREOP, 0)
-    bench.data.receive = lambda: 0  # type: ignore[method-assign]
-    bench.run(0.1)
+# -- the gripper ------------------------------------------------------------------------------------------------------
+
+HELD, CLOSED = GripperAtRest(AXIS, 0.5, True), GripperAtRest(AXIS, 0.0, False)
 
 
-def test_drives_that_were_parked_without_torque_are_without_it(bench: Bench) -> None:
-    press_in_motion(bench)
-    park(bench)
-    assert disable(bench) == {"unseen": []}
+@pytest.mark.parametrize(
+    ("events", "answer"),
+    [
+        ([GripperCloses(), CLOSED], {"position": 0.0, "holds": False}),
+        ([GripperCloses(), HELD], {"position": 0.5, "holds": True}),
+        ([GripperAtRest(AXIS, 1.4, False), GripperCloses(), CLOSED], {"position": 0.0, "holds": False}),
+    ],
+    ids=["closed", "holds something", "after the end of an earlier motion"],
+)
+def test_a_driven_gripper_returns_where_it_rests(driven: FakePlatform, events: Any, answer: dict[str, Any]) -> None:
+    driven.loop.reports[MoveGripper] = events
+    assert driven.ask("move_gripper", open=False) == answer
+    assert driven.loop.commands == [MoveGripper(False)]
 
 
-def test_drives_that_were_parked_and_showed_torque_last_are_not_confirmed(bench: Bench) -> None:
-    bench.data.deaf[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
-    press_in_motion(bench)
-    park(bench)
-    said = refusal(bench)
-    assert "joint1 (drive1) shows 0x" in said
-    assert said.endswith(", quick stop active; the slaves are in PRE-OP since")
+@pytest.mark.parametrize(
+    ("events", "kind", "message"),
+    [
+        ([GripperCloses(), GripperAtRest(AXIS, 0.71234, False)], "refused", "finger was stopped at 0.7123 rad, before"),
+        ([GripperCloses(), OverSpeed(AXIS, 1.7, 1.5), CLOSED], "fault", "finger: measured speed 1.7 rad/s"),
+        ([GripperCloses(), Disabled()], "refused", "the gripper was stopped by another command"),
+    ],
+)
+def test_a_driven_gripper_that_does_not_arrive_fails(
+    driven: FakePlatform, events: Any, kind: str, message: str
+) -> None:
+    driven.loop.reports[MoveGripper] = events
+    error = driven.error("move_gripper", open=False)
+    assert error.kind == kind
+    assert str(error).startswith(message)
 
 
-def test_the_grippers_drive_which_no_record_shows_is_named_as_not_seen(bench: Bench) -> None:
-    gripper = GripperConfig(joint=FINGER, open_position=1.4, closed_position=0.0)
-    fault_in_motion(bench)
-    assert disable(bench, replace(CONFIG, gripper=gripper)) == {"unseen": ["finger (drive2)"]}
+def test_a_gripper_without_torque_is_refused(driven: FakePlatform) -> None:
+    driven.loop.refusals[MoveGripper] = GripperDisabled()
+    assert driven.error("move_gripper", open=False).reason == "gripper_disabled"
+
+
+# -- zero and homing --------------------------------------------------------------------------------------------------
+
+
+def test_the_present_position_becomes_the_zero_or_what_it_is_said_to_be(arm: FakePlatform) -> None:
+    answer = arm.ask("zero", joint="joint1")
+    assert (answer["joint"], answer["offset"], answer["before"]) == ("joint1", 0.25, 0.0)
+    assert arm.ask("zero", joint="2", at=0.05)["joint"] == "joint2"
+    # The fake loop still shows 0.2: now beyond the offset that is in force.
+    arm.ask("zero", joint="joint2", at=0.1)
+    offsets = [(command.axis, pytest.approx(command.offset)) for command in arm.loop.received(SetZero)]
+    assert offsets == [(0, 0.25), (1, 0.15), (1, 0.25)]
+    assert read_zeros(arm.config) == (0.25, pytest.approx(0.25), 0, 0, 0, 0)
+
+
+def test_a_zero_that_the_loop_refuses_is_in_no_file(arm: FakePlatform) -> None:
+    arm.loop.refusals[SetZero] = TorquePresent()
+    assert arm.error("zero", joint="joint1").reason == "torque_present"
+    assert not zero_file(arm.config.name).exists()
+
+
+def test_a_zero_that_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm: FakePlatform, tmp_path: Path) -> None:
+    (tmp_path / "state").write_text("a file where the folder should be")
+    error = arm.error("zero", joint="joint1")
+    assert error.kind == "refused"
+    assert str(tmp_path / "state") in str(error)
+    assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.25, 0.0])
+
+
+def test_the_zero_of_a_gripper_is_refused_with_the_file_that_holds_it(driven: FakePlatform) -> None:
+    error = driven.error("zero", joint="finger")
+    assert error.kind == "refused"
+    assert str(zero_file(driven.config.name)) in str(error)
+    assert driven.loop.commands == []
+
+
+def test_homing_returns_the_position_or_fails_with_the_drives_answer(arm: FakePlatform) -> None:
+    arm.loop.reports[Home] = [Homed(1, 0.2)]
+    assert arm.ask("home", joint="joint2") == {"joint": "joint2", "position": 0.2}
+    arm.loop.reports[Home] = [HomingFailed(1, 0x2637)]
+    error = arm.error("home", joint="joint2")
+    assert (error.kind, error.reason, error.fields["statusword"]) == ("fault", "homing_failed", 0x2637)
+    arm.loop.reports[Home] = []
+    assert "homing was interrupted" in str(arm.error("home", joint="joint2"))
+
+
+def test_no_test_keeps_offsets_where_the_arm_at_this_host_has_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
+    assert state_directory().is_relative_to(tmp_path_factory.getbasetemp())

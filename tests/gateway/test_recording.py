@@ -1,25 +1,23 @@
-"""The files of the black box: numbers, the oldest that go, disks that refuse, files that are none."""
+"""Recordings on disk: numbers, the oldest that go, disks that refuse, files that are none."""
 
 from __future__ import annotations
 
-import io
 import json
-import os
-import pickle
 import subprocess
 import sys
-import zipfile
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from rtcp.gateway.blackbox_file import About, Moment, Recording, RecordingError, files, listed, read, write
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
-from rtcp.gateway import blackbox_file
+from rtcp.ipc import recording as module
 from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
+from rtcp.ipc.recording import About, Moment, Recording, RecordingError, files, listed, read, write
 
 CYCLES = 50
 
@@ -29,7 +27,7 @@ def recording(cycles: int = CYCLES, joints: int = 2) -> Recording:
     kinds = record_type(RecordLayout(joints))
     whole = np.zeros(cycles, dtype=kinds)
     whole["number"] = whole["time_ns"] = np.arange(cycles) + 1
-    whole["position"] = np.arange(cycles * joints).reshape(cycles, joints) * 0.1
+    whole["actual_position"] = np.arange(cycles * joints).reshape(cycles, joints) * 0.1
     records = {name: whole[name] for name in kinds.names or () if name not in ("number_again", "padding")}
     about = About(
         number=0, time_ns=1_790_000_000_123_456_789, what="process data lost: ü", before="moving", arm="arm",
@@ -47,11 +45,28 @@ def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
     for name, array in recording().records.items():
         assert np.array_equal(found.records[name], array)
     assert [one.about for one in listed(path.parent)] == [found.about]
-    # And by numpy alone.
-    assert np.array_equal(np.load(path, allow_pickle=False)["position"], recording().records["position"])
 
 
-def test_a_recording_without_a_cycle_is_one_too(tmp_path: Path) -> None:
+def test_any_reader_of_mcap_opens_a_recording(tmp_path: Path) -> None:
+    made = recording()
+    _, path = write(tmp_path, made)
+    with open(path, "rb") as file:
+        found = [(schema, channel, message) for schema, channel, message in make_reader(file).iter_messages()]
+    cycles = [(schema, message) for schema, channel, message in found if channel.topic == "/cycle"]
+    schema, first = cycles[0]
+    assert (schema.name, schema.encoding, len(cycles)) == ("rtcp_msgs/msg/Cycle", "ros2msg", CYCLES)
+    assert b"uint64 number\n" in schema.data
+    assert b"float64[2] actual_position\n" in schema.data
+    # By the clock of the fault's instant, its cycle is at that instant.
+    assert cycles[made.about.at][1].log_time == made.about.time_ns
+    # CDR: four bytes of header, then each number at a multiple of its size.
+    assert first.data[:4] == b"\x00\x01\x00\x00"
+    assert int.from_bytes(first.data[4:12], "little") == 1
+    logs = [json.loads(message.data)["message"] for _, channel, message in found if channel.topic == "/log"]
+    assert logs == ["a sentence"]
+
+
+def test_a_recording_may_have_no_cycle(tmp_path: Path) -> None:
     assert read(write(tmp_path, recording(0))[1]).about.at == -1
     assert listed(tmp_path)[0].seconds == 0.0
 
@@ -70,8 +85,8 @@ def test_numbers_rise_and_none_is_given_twice_even_when_files_are_removed(tmp_pa
 
 def test_two_writers_at_once_share_the_numbers(tmp_path: Path) -> None:
     program = (
-        "import sys; from pathlib import Path; from rtcp.gateway.blackbox_file import write\n"
-        "from tests.runtime.test_blackbox_file import recording\n"
+        "import sys; from pathlib import Path; from rtcp.ipc.recording import write\n"
+        "from tests.gateway.test_recording import recording\n"
         "for _ in range(15): print(write(Path(sys.argv[1]), recording())[0])"
     )
     command = [sys.executable, "-c", program, str(tmp_path)]
@@ -81,25 +96,27 @@ def test_two_writers_at_once_share_the_numbers(tmp_path: Path) -> None:
     assert [number for number, _ in files(tmp_path)] == list(range(1, 31))
 
 
-def test_the_oldest_go_and_what_an_interrupted_writer_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blackbox_file, "KEPT", 3)
-    (tmp_path / ".fault-000009-2026-01-01T00-00-00.npz.new").write_text("half")
+def test_the_oldest_files_and_what_an_interrupted_writer_left_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "KEPT", 3)
+    (tmp_path / ".fault-000009-2026-01-01T00-00-00.mcap.new").write_text("half")
     _, first = write(tmp_path, recording())
     first.with_suffix(".png").write_text("its picture")
     (tmp_path / "notes.txt").write_text("somebody's own")
     for _ in range(4):
         write(tmp_path, recording())
     assert [number for number, _ in files(tmp_path)] == [3, 4, 5]
-    assert sorted(path.suffix for path in tmp_path.iterdir()) == ["", ".npz", ".npz", ".npz", ".txt"]
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == ["", ".mcap", ".mcap", ".mcap", ".txt"]
 
 
-def test_a_disk_that_is_full_is_a_sentence_and_leaves_nothing_of_the_file(tmp_path: Path) -> None:
+def test_a_full_disk_is_reported_and_leaves_nothing_of_the_file(tmp_path: Path) -> None:
     program = (
         "import resource, signal, sys; from pathlib import Path\n"
-        "from rtcp.gateway.blackbox_file import RecordingError, write\n"
-        "from tests.runtime.test_blackbox_file import recording\n"
+        "from rtcp.ipc.recording import RecordingError, write\n"
+        "from tests.gateway.test_recording import recording\n"
         "made = recording()\n"
-        "made.records['position'][:] = __import__('numpy').random.default_rng(1).random((50, 2))\n"
+        "made.records['actual_position'][:] = __import__('numpy').random.default_rng(1).random((50, 2))\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))\n"
         "try: write(Path(sys.argv[1]), made)\n"
         "except RecordingError as error: print(error)"
@@ -109,7 +126,7 @@ def test_a_disk_that_is_full_is_a_sentence_and_leaves_nothing_of_the_file(tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 
-def test_a_directory_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
+def test_a_directory_that_cannot_be_made_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(RecordingError, match="no recording can be written there"):
         write(tmp_path / "file" / "faults", recording())
@@ -118,7 +135,7 @@ def test_a_directory_that_cannot_be_made_is_a_sentence(tmp_path: Path) -> None:
     assert listed(tmp_path / "none") == []
 
 
-def test_a_file_cut_off_anywhere_is_a_sentence_in_the_list(tmp_path: Path) -> None:
+def test_a_file_cut_off_anywhere_is_listed_as_damaged(tmp_path: Path) -> None:
     _, path = write(tmp_path, recording())
     whole = path.read_bytes()
     for length in [0, 1, 100, *range(200, len(whole), 997), len(whole) - 1]:
@@ -148,101 +165,63 @@ def test_changed_bytes_are_never_a_traceback(tmp_path: Path) -> None:
     assert refused > 200
 
 
-class Evil:
-    """Makes a file when it is unpickled."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __reduce__(self) -> tuple[object, ...]:
-        return os.mkdir, (str(self._path),)
-
-
-def _changed(path: Path, name: str, content: bytes | None) -> None:
-    with zipfile.ZipFile(path) as archive:
-        members = {member: archive.read(member) for member in archive.namelist()}
-    members.pop(name)
-    if content is not None:
-        members[name] = content
-    with zipfile.ZipFile(path, "w") as archive:
-        for member, bytes_ in members.items():
-            archive.writestr(member, bytes_)
+def _written(path: Path, about: Any = None, **options: Any) -> None:
+    """Write a file of the same form with other contents."""
+    made = recording()
+    told = {"format": module.FORMAT, "seconds": 0.0, **asdict(made.about), **(about or {})}
+    with open(path, "wb") as file:
+        writer = Writer(file, compression=options.get("compression", CompressionType.ZSTD))
+        writer.start()
+        if about is not False:
+            writer.add_metadata(options.get("metadata", "rtcp/about"), {"json": options.get("json", json.dumps(told))})
+        definition = options.get("definition", module._definition(2))
+        channel = writer.register_channel("/cycle", "cdr", writer.register_schema("a", "ros2msg", definition))
+        size = options.get("size", 4 + module._message_type(2).itemsize)
+        for number in range(options.get("cycles", CYCLES)):
+            writer.add_message(channel, number, bytes(size), number)
+        writer.finish()
 
 
-def _npy(array: object) -> bytes:
-    stream = io.BytesIO()
-    np.lib.format.write_array(stream, np.asarray(array), allow_pickle=True)
-    return stream.getvalue()
+FOREIGN: dict[str, dict[str, Any]] = {
+    "no metadata": {"about": False},
+    "metadata of another name": {"metadata": "other"},
+    "metadata that is no JSON": {"json": "{"},
+    "metadata that is no object": {"json": "[]"},
+    "other joints": {"definition": module._definition(3)},
+    "a cycle too short": {"size": 20},
+    "another compression": {"compression": CompressionType.LZ4},
+    "another format": {"about": {"format": 1}},
+    "a text for a number": {"about": {"time_ns": "now"}},
+    "a truth for a number": {"about": {"at": True}},
+    "a fault's cycle beyond the end": {"about": {"at": CYCLES}},
+    "fewer cycles": {"cycles": 3},
+    "an instant that no calendar has": {"about": {"time_ns": 10**40}},
+    "a cycle of nothing": {"about": {"period_ns": 0}},
+    "joints that are a number": {"about": {"joints": 3}},
+    "moments that are none": {"about": {"timeline": [3]}},
+}
 
 
-def _told(**changes: object) -> Callable[[Path], tuple[str, bytes]]:
-    def made(path: Path) -> tuple[str, bytes]:
-        with zipfile.ZipFile(path) as archive, archive.open("about.npy") as stream:
-            told = json.loads(np.lib.format.read_array(stream).tobytes())
-        return "about.npy", _npy(np.frombuffer(json.dumps({**told, **changes}).encode(), dtype=np.uint8))
-
-    return made
-
-
-FOREIGN: dict[str, Callable[[Path], tuple[str, bytes | None]]] = {
-    "a field is missing": lambda path: ("wkc.npy", None),
-    "nothing about itself": lambda path: ("about.npy", None),
-    "another type": lambda path: ("wkc.npy", _npy(np.zeros(CYCLES))),
-    "another length": lambda path: ("wkc.npy", _npy(np.zeros(CYCLES - 1, dtype="<i2"))),
-    "other joints": lambda path: ("position.npy", _npy(np.zeros((CYCLES, 3)))),
-    "a shape beyond memory": lambda path: (
-        "wkc.npy", _npy(np.zeros(3)).replace(b"'shape': (3,), }" + b" " * 15, b"'shape': (99999999999999,), }  "),
-    ),
-    "no JSON": lambda path: ("about.npy", _npy(np.frombuffer(b"{", dtype=np.uint8))),
-    "another format": _told(format=2),
-    "a text for a number": _told(time_ns="now"),
-    "a truth for a number": _told(at=True),
-    "the fault's cycle beyond the end": _told(at=CYCLES),
-    "an instant that no calendar has": _told(time_ns=10**40),
-    "a cycle of nothing": _told(period_ns=0),
-    "joints that are a number": _told(joints=3),
-    "moments that are none": _told(timeline=[3]),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("made", FOREIGN.values(), ids=FOREIGN.keys())
-def test_a_foreign_file_is_a_sentence(tmp_path: Path, made: Callable[[Path], tuple[str, bytes | None]]) -> None:
+@pytest.mark.parametrize("options", FOREIGN.values(), ids=FOREIGN.keys())
+def test_a_foreign_file_is_refused_with_its_name(tmp_path: Path, options: dict[str, Any]) -> None:
     _, path = write(tmp_path, recording())
-    _changed(path, *made(path))
+    _written(path, **options)
     listed(tmp_path)
     with pytest.raises(RecordingError, match=path.name):
         read(path)
 
 
-INSTANTS: dict[str, object] = {
-    "bytes": np.array([b"a", b"b"]),
-    "truths": np.array([True, False]),
-    "several fields": np.zeros(2, dtype=[("a", "<i8"), ("b", "<i8")]),
-    "a table": np.zeros((2, 2), dtype="<i8"),
-    "one number": np.int64(3),
-    "fractions": np.zeros(2),
-}
-
-
-@pytest.mark.parametrize("instants", INSTANTS.values(), ids=INSTANTS.keys())
-def test_one_odd_file_is_a_sentence_in_the_list_and_the_others_are_listed(tmp_path: Path, instants: object) -> None:
+def test_the_form_that_the_foreign_files_vary_is_read(tmp_path: Path) -> None:
     _, path = write(tmp_path, recording())
-    write(tmp_path, recording())
-    _changed(path, "time_ns.npy", _npy(instants))
-    odd, sound = listed(tmp_path)
-    assert odd.about is None
-    assert "time_ns is" in odd.trouble
-    assert sound.about is not None
+    _written(path)
+    assert len(read(path).records["cycle"]) == CYCLES
 
 
-def test_what_is_pickled_in_a_file_is_not_run(tmp_path: Path) -> None:
+def test_a_chunk_that_unpacks_to_more_than_allowed_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _, path = write(tmp_path, recording())
-    trap = tmp_path / "trap"
-    for name in ("about.npy", "time_ns.npy", "wkc.npy"):
-        _changed(path, name, _npy(np.array([Evil(trap)], dtype=object)))
-        listed(tmp_path)
-        with pytest.raises(RecordingError):
-            read(path)
-    path.write_bytes(pickle.dumps(Evil(trap)))
-    assert listed(tmp_path)[0].about is None
-    assert not trap.exists()
+    monkeypatch.setattr(module, "_LARGEST", 1000)
+    monkeypatch.setattr(module, "breakup_chunk", None)
+    with pytest.raises(RecordingError, match="a chunk of"):
+        read(path)

@@ -1,141 +1,265 @@
-"""The gateway's process on a real blackboard; the loop's part is played here."""
+"""The gateway's process on a real blackboard and a real socket: JSON-RPC, connections, and their ends."""
 
 from __future__ import annotations
 
 import json
+import signal
 import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.runtime.played_loop import JOINTS, Loop
 
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.machine import Command
+from rtcp.ipc.commands import Halt, MoveJoints
+from rtcp.ipc.errors import Invalid, Refused
+from rtcp.ipc.events import SlaveLost
+from rtcp.ipc.jsonrpc import LINE_LIMIT
 from rtcp.ipc.runtime_directory import control_socket
-
-LINE_LIMIT = 65536
-
-
-@pytest.fixture
-def directory(gateway_directory: Path) -> Path:
-    return gateway_directory
-
-
-@pytest.fixture
-def loop(gateway_loop: Loop) -> Loop:
-    return gateway_loop
-
-
-@pytest.fixture
-def client(gateway_client: ControlClient) -> ControlClient:
-    return gateway_client
-
+from rtcp.ipc.states import State
+from tests.gateway.fake_loop import JOINTS, FakeLoop
 
 OBJECT = {"slave": 2, "index": 0x6065, "subindex": 0}
-Q = [0.0] * JOINTS
-WRONG = {
-    "an output's number with a fraction": ("output", {"number": 1.9, "value": True}, "number: found 1.9, allowed is"),
-    "an output's number as a truth": ("output", {"number": True, "value": True}, "number: found true, allowed is an"),
-    "an output's number as a text": ("output", {"number": "1", "value": True}, 'number: found "1", allowed is an'),
-    "an output's value as a number": ("output", {"number": 1, "value": 1}, "value: found 1, allowed is true or false"),
-    "an output's value as a text": ("output", {"number": 1, "value": "off"}, 'value: found "off", allowed is true or'),
-    "an output without a value": ("output", {"number": 1}, "value is missing; it must be true or false"),
-    "a slave's position with a fraction": ("sdo_read", {**OBJECT, "slave": 2.5}, "slave: found 2.5, allowed is an"),
-    "a slave's position as a truth": ("sdo_read", {**OBJECT, "slave": True}, "slave: found true, allowed is an"),
-    "an index with a fraction": ("sdo_read", {**OBJECT, "index": 24677.0}, "index: found 24677.0, allowed is an"),
-    "a subindex as a truth": ("sdo_read", {**OBJECT, "subindex": False}, "subindex: found false, allowed is an"),
-    "an index to be written with a fraction": (
-        "sdo_write", {**OBJECT, "index": 24677.5, "hex": "00"}, "index: found 24677.5, allowed is an integer",
-    ),
-    "bytes to be written that are no text": ("sdo_write", {**OBJECT, "hex": 12}, "hex: found 12, allowed is a text"),
-    "positions as truths": ("move", {"q": [True] * JOINTS}, "q: found [true, true, true, true, true, true], allowed"),
-    "positions as a text": ("move", {"q": "000000"}, 'q: found "000000", allowed is a list of numbers'),
-    "a position as a text": ("move", {"q": ["0"] * JOINTS}, "allowed is a list of numbers"),
-    "a position beyond all numbers": ("move", {"q": [10**400] * JOINTS}, "allowed is a list of numbers"),
-    "a speed as a truth": ("move", {"q": Q, "speed": True}, "speed: found true, allowed is a number"),
-    "a pose as a text": ("move_pose", {"pose": "0"}, 'pose: found "0", allowed is a list of numbers'),
-    "a pose of five numbers": ("move_pose", {"pose": [0.0] * 5}, "the pose: found 5 numbers, allowed are 6"),
-    "poses that are none": ("line", {"poses": [1.0]}, "poses: found [1.0], allowed is a list of lists of numbers"),
-    "a line that is a number": ("move_pose", {"pose": Q, "line": 1}, "line: found 1, allowed is true or false"),
-    "a file beside a folder": ("run", {"file": "a.csv"}, "file: found 'a.csv', allowed is an absolute path"),
-    "a file that is not there": ("run", {"file": "/none/a.csv"}, "/none/a.csv"),
-    "a frame that is none": ("jog", {"v": Q, "frame": "world"}, "frame: found 'world', allowed is one of base"),
-    "five speeds": ("jog", {"v": [0.0] * 5, "frame": "base"}, "v: found 5 numbers, allowed are 6"),
-    "torques as a text": ("torque", {"numbers": "0"}, 'numbers: found "0", allowed is a list of numbers'),
-    "a target without a stamp": ("stream", {"q": Q}, "t is missing; it must be a number"),
-    "limits that are a list": ("limits", {"set": []}, "set: found [], allowed is an object of numbers"),
-    "no limits": ("limits", {"set": {}}, "no limit was named"),
-    "a limit of another name": ("limits", {"set": {"joint9.max": 1}}, "joint9.max: there is no such limit"),
-    "a stick's position of another name": ("stick", {"pressed": ["away"]}, "pressed: found 'away', allowed"),
-    "a stick's byte beyond it": ("stick", {"pressed": [], "byte": 256}, "byte: found 256, allowed is 0 to 255"),
-    "a stick held for ever": ("stick", {"pressed": [], "hold_s": 60}, "hold_s: found 60.0, allowed is more than 0"),
-    "a joint that is none": ("zero", {"joint": "joint9"}, "joint: found 'joint9', allowed is one of joint1"),
-    "a gripper as a text": ("gripper", {"open": "yes"}, 'open: found "yes", allowed is true or false'),
-    "a mode of another name": ("mode", {"name": "fast"}, "mode 'fast' is unknown: one of joint, cartesian, joystick"),
-    "a mode that is no text": ("mode", {"name": 8}, "name: found 8, allowed is a text"),
-}  # fmt: skip
+MOVE = {"q": [0.1] * JOINTS}
+LONG = 1_000_000
 
 
-@pytest.mark.parametrize(("verb", "arguments", "sentence"), WRONG.values(), ids=WRONG.keys())
-def test_an_argument_of_another_kind_is_refused_in_a_sentence_and_never_made_into_the_right_one(
-    client: ControlClient, loop: Loop, verb: str, arguments: dict[str, Any], sentence: str
-) -> None:
-    with pytest.raises(RtcpError) as raised:
-        client.call(verb, arguments)
-    assert raised.value.kind == "invalid"
-    assert sentence in raised.value.message
-    assert loop.commands == []
-    assert loop.requests == []
+class Raw:
+    """A connection that sends any bytes."""
+
+    def __init__(self, directory: Path) -> None:
+        self.socket = socket.socket(socket.AF_UNIX)
+        self.socket.settimeout(20)
+        self.socket.connect(str(control_socket(directory)))
+        self.file = self.socket.makefile("rb")
+
+    def send(self, *messages: dict[str, Any] | bytes) -> None:
+        for message in messages:
+            data = message if isinstance(message, bytes) else json.dumps({"jsonrpc": "2.0", **message}).encode()
+            self.socket.sendall(data + b"\n")
+
+    def receive(self) -> dict[str, Any]:
+        """Return the next answer; progress is skipped."""
+        while True:
+            found: dict[str, Any] = json.loads(self.file.readline())
+            if "method" not in found:
+                return found
+
+    def ask(self, message: dict[str, Any] | bytes) -> dict[str, Any]:
+        self.send(message)
+        return self.receive()
+
+    def close(self) -> None:
+        self.file.close()
+        self.socket.close()
 
 
-def test_arguments_of_the_right_kind_reach_the_loop_as_they_are(client: ControlClient, loop: Loop) -> None:
-    client.call("output", {"number": 3, "value": False})
-    assert [command[:3] for command in loop.commands] == [(Command.OUTPUT, 3.0, 0.0)]
+@pytest.fixture
+def raw(directory: Path, loop: FakeLoop) -> Iterator[Raw]:
+    made = Raw(directory)
+    yield made
+    made.close()
+
+
+def wait_until(holds: Callable[[], bool], timeout_s: float = 5.0) -> None:
+    until = time.monotonic() + timeout_s
+    while not holds():
+        assert time.monotonic() < until, "it did not happen"
+        time.sleep(0.01)
+
+
+# -- messages ---------------------------------------------------------------------------------------------------------
+
+
+def test_parameters_reach_the_loop_as_they_are(client: ControlClient, loop: FakeLoop) -> None:
     assert client.call("sdo_read", OBJECT) == {"hex": "2a"}
     client.call("sdo_write", {**OBJECT, "hex": "0b"})
     assert loop.requests == [{"do": "sdo_read", **OBJECT}, {"do": "sdo_write", **OBJECT, "hex": "0b"}]
 
 
+INVALID: dict[str, tuple[dict[str, Any] | bytes, Any, int, str]] = {
+    "no JSON": (b"{", None, -32700, "the request is no JSON"),
+    "NaN": (b'{"jsonrpc":"2.0","id":1,"method":"status","params":{"a":NaN}}', None, -32700, "NaN is no number"),
+    "a batch": (b"[]", None, -32600, "the request must be an object, not list"),
+    "an id with a fraction": ({"id": 1.5, "method": "status"}, None, -32600, "id: found float"),
+    "another version": ({"jsonrpc": "1.0", "id": 7, "method": "status"}, 7, -32600, 'jsonrpc: found "1.0"'),
+    "no method": ({"id": 7}, 7, -32600, "method: found NoneType, allowed is a text"),
+    "an unknown method": ({"id": "x", "method": "fly"}, "x", -32601, 'method: found the text "fly", allowed is one of'),
+    "parameters by position": ({"id": 7, "method": "status", "params": [1]}, 7, -32600, "params: found list, allowed"),
+    "a notification": ({"method": "enable"}, None, -32600, "id: it is missing; only identify and cancel"),
+    "a wrong parameter": (
+        {"id": 7, "method": "run", "params": {"file": 1}},
+        7,
+        -32602,
+        "file: found 1, allowed is a t",
+    ),
+}
+
+
+@pytest.mark.parametrize(("message", "number", "code", "text"), INVALID.values(), ids=INVALID.keys())
+def test_an_invalid_request_is_answered_with_the_code_of_the_specification(
+    raw: Raw, loop: FakeLoop, message: dict[str, Any] | bytes, number: Any, code: int, text: str
+) -> None:
+    answer = raw.ask(message)
+    assert (answer["jsonrpc"], answer["id"], answer["error"]["code"]) == ("2.0", number, code)
+    assert text in answer["error"]["message"]
+    assert answer["error"]["data"]["kind"] == "invalid"
+    assert loop.commands == []
+
+
 @pytest.mark.parametrize("length", [LINE_LIMIT + 1, 4_000_000])
 @pytest.mark.parametrize("newline", [b"", b"\n"], ids=["endless", "whole"])
-def test_a_line_over_64_kib_is_answered_with_a_sentence_and_the_connection_is_closed(
-    directory: Path, loop: Loop, length: int, newline: bytes
-) -> None:
-    with socket.socket(socket.AF_UNIX) as raw:
-        raw.settimeout(20)
-        raw.connect(str(control_socket(directory)))
-        raw.sendall(b" " * length + newline)
-        said = raw.makefile("rb").read()
-    answer = json.loads(said)
-    assert answer["ok"] is False
-    assert answer["error"]["kind"] == "invalid"
+def test_a_line_over_64_kib_is_answered_and_the_connection_closed(raw: Raw, length: int, newline: bytes) -> None:
+    raw.socket.sendall(b" " * length + newline)
+    (answer,) = [json.loads(line) for line in raw.file]
+    assert answer["error"]["data"]["kind"] == "invalid"
     assert f"longer than {LINE_LIMIT} bytes" in answer["error"]["message"]
 
 
-def test_requests_before_a_line_over_64_kib_are_answered_first(directory: Path, loop: Loop) -> None:
-    with socket.socket(socket.AF_UNIX) as raw:
-        raw.settimeout(20)
-        raw.connect(str(control_socket(directory)))
-        request = {"id": 1, "do": "sdo_read", "args": OBJECT}
-        raw.sendall(json.dumps(request).encode() + b"\n" + b" " * 100_000 + b"\n")
-        answers = [json.loads(line) for line in raw.makefile("rb")]
-    assert [answer["ok"] for answer in answers] == [True, False]
+def test_requests_before_a_line_over_64_kib_are_answered_first(raw: Raw) -> None:
+    raw.send({"id": 1, "method": "sdo_read", "params": OBJECT}, b" " * 100_000)
+    assert ["result" in json.loads(line) for line in raw.file] == [True, False]
 
 
-def test_a_client_whose_request_is_too_long_is_told_so(client: ControlClient) -> None:
-    with pytest.raises(RtcpError, match=f"longer than {LINE_LIMIT} bytes") as raised:
+def test_a_client_whose_request_is_too_long_gets_that_answer(client: ControlClient) -> None:
+    with pytest.raises(Invalid, match=f"longer than {LINE_LIMIT} bytes"):
         client.call("sdo_write", {**OBJECT, "hex": "00" * 1_000_000})
-    assert raised.value.kind == "invalid"
 
 
-def test_the_status_tells_each_message_with_its_instant(client: ControlClient, loop: Loop) -> None:
+def test_requests_beyond_256_pending_ones_are_refused(raw: Raw, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    raw.send({"id": 0, "method": "move_joints", "params": MOVE})
+    raw.send(*({"id": number, "method": "sdo_read", "params": OBJECT} for number in range(1, 258)))
+    assert [raw.receive()["error"]["data"]["kind"] for _ in range(2)] == ["refused"] * 2
+
+
+# -- connections ------------------------------------------------------------------------------------------------------
+
+
+def test_the_holder_of_the_lease_has_the_name_it_gave(client: ControlClient, loop: FakeLoop, directory: Path) -> None:
+    loop.state = State.HOLDING
+    with ControlClient("a jogger", control_socket(directory)) as jogger:
+        jogger.call("jog", {"velocity": [0.1, 0, 0, 0, 0, 0], "hold_s": 0.2})
+        assert client.call("status")["lease"]["holder"] == "a jogger"
+        with pytest.raises(Refused, match="the arm is commanded by a jogger"):
+            client.call("move_joints", MOVE)
+    wait_until(lambda: client.call("status")["lease"]["holder"] == "")
+
+
+def test_a_connection_that_closes_during_a_move_ends_the_move(raw: Raw, loop: FakeLoop, client: ControlClient) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    raw.send({"id": 1, "method": "move_joints", "params": MOVE})
+    wait_until(lambda: loop.state is State.MOVING)
+    raw.close()
+    wait_until(lambda: loop.state is State.HOLDING)
+    assert client.call("status")["lease"]["holder"] == ""
+
+
+def test_a_request_that_is_cancelled_ends_its_move_and_is_answered(raw: Raw, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    raw.send({"id": "a", "method": "move_joints", "params": MOVE})
+    wait_until(lambda: loop.state is State.MOVING)
+    answer = raw.ask({"method": "cancel", "params": {"request": "a"}})
+    assert (answer["id"], answer["error"]["message"]) == ("a", "move_joints was cancelled")
+    wait_until(lambda: loop.state is State.HOLDING)
+
+
+def test_a_call_that_an_exception_leaves_ends_its_move(client: ControlClient, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    def interrupt(progress: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        client.call("move_joints", MOVE, interrupt)
+    wait_until(lambda: loop.state is State.HOLDING)
+    assert client.call("status")["lease"]["holder"] == ""
+
+
+def test_halt_does_not_wait_for_the_move_of_its_own_connection_and_other_requests_do(raw: Raw, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    raw.send(
+        {"id": 1, "method": "move_joints", "params": MOVE},
+        {"id": 2, "method": "set_output", "params": {"output": 1, "value": True}},
+    )
+    wait_until(lambda: loop.state is State.MOVING)
+    raw.send({"id": 3, "method": "halt"})
+    wait_until(lambda: loop.kinds == [MoveJoints, Halt])
+    loop.state = State.HOLDING
+    assert sorted(raw.receive()["id"] for _ in range(3)) == [1, 2, 3]
+
+
+def test_a_client_stopped_by_sigstop_during_a_move_loses_its_lease(
+    directory: Path, loop: FakeLoop, client: ControlClient
+) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    program = (
+        "import sys; from pathlib import Path; from rtcp.ipc.client import ControlClient\n"
+        f"ControlClient('stopped', Path(sys.argv[1])).call('move_joints', {MOVE!r}, timeout_s=60)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, str(control_socket(directory))], stderr=subprocess.DEVNULL
+    )
+    try:
+        wait_until(lambda: loop.state is State.MOVING, 20.0)
+        process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: loop.state is State.HOLDING, 10.0)
+        assert client.call("status")["lease"]["holder"] == ""
+    finally:
+        process.kill()
+        process.wait()
+
+
+# -- what is shown ----------------------------------------------------------------------------------------------------
+
+
+def test_the_status_has_each_message_with_its_instant(client: ControlClient, loop: FakeLoop) -> None:
     before = datetime.now().astimezone()
-    loop.board.text("a sentence with a time")
+    loop.board.text("a message with a time")
     status = client.call("status")
-    told = [event for event in status["events"] if event["sentence"] == "a sentence with a time"]
-    assert [event["sentence"] for event in status["events"]] == status["messages"]
-    when = datetime.fromisoformat(told[-1]["time"])
+    at = status["messages"].index("a message with a time")
+    when = datetime.fromisoformat(status["message_times"][at])
     assert before - timedelta(milliseconds=1) <= when <= datetime.now().astimezone()
+
+
+def test_events_have_names_fields_and_messages(client: ControlClient, loop: FakeLoop) -> None:
+    since = client.call("events")["events"]
+    loop.board.event(SlaveLost(3))
+    (event,) = client.call("events", {"since": since[-1]["number"] if since else 0})["events"]
+    assert (event["name"], event["fields"]) == ("slave_lost", {"slave": 3})
+    assert event["message"].startswith("slave 3 (")
+
+
+# -- the last moments of the process ----------------------------------------------------------------------------------
+
+PROGRAM = """
+import asyncio, os, signal
+from asyncio import selector_events
+from pathlib import Path
+from rtcp.gateway import server as gateway
+
+class Served:
+    def __init__(self, directory):
+        pass
+
+    async def serve(self, ready):
+        asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, ready)
+
+def close(loop, sound=selector_events.BaseSelectorEventLoop.close):
+    sound(loop)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+gateway.Gateway = Served
+selector_events.BaseSelectorEventLoop.close = close
+asyncio.run(gateway._run(Path("."), lambda: None))
+"""
+
+
+def test_a_signal_while_the_gateway_ends_is_no_traceback() -> None:
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -1,36 +1,45 @@
-"""The picture of the platform: its headline, and what it says of a bus that does not answer; the loop is played."""
+"""The status: its message, what it says of a silent loop, and RobotStatus; the loop is fake."""
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rtcp.gateway.picture import Picture
 
 from rtcp.config import default_config, load
 from rtcp.fieldbus.emergency import Emergency
-from rtcp.gateway import picture
+from rtcp.gateway import status_snapshot
+from rtcp.gateway.status_snapshot import StatusSnapshot, robot_status
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.codes import Code
-from rtcp.ipc.layout import FLAG_DC_LOCKED, PER_JOINT, SCALARS
-from rtcp.ipc.machine import State
+from rtcp.ipc.events import Arrived, DriveFault, EmergencyStopActivated
+from rtcp.ipc.layout import (
+    FLAG_DC_LOCKED,
+    FLAG_EMERGENCY_STOP,
+    FLAG_ENABLED,
+    FLAG_MOTION_ALLOWED,
+    FLAG_SWITCHING,
+    PER_JOINT,
+    SCALARS,
+)
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Processes, Session
+from rtcp.ipc.states import ControlMode, State
 
 JOINTS = 6
 AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
 
 
-class Bench:
-    """A blackboard that a test writes, and the picture of it."""
+class Written:
+    """A blackboard that a test writes, and the snapshot of it."""
 
     def __init__(self, board: Blackboard, path: Path) -> None:
         self.board = board
         self.observer = Observer(path)
-        self.picture = Picture(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
+        self.snapshot = StatusSnapshot(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
 
     def publish(self, state: State, moves: int = 0, wkc: int = 21) -> None:
         record: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
@@ -41,8 +50,8 @@ class Bench:
 
     @property
     def status(self) -> dict[str, Any]:
-        self.picture.follow()
-        return self.picture.status(Processes())
+        self.snapshot.follow()
+        return self.snapshot.status(Processes())
 
     @property
     def headline(self) -> str:
@@ -50,65 +59,103 @@ class Bench:
 
 
 @pytest.fixture
-def bench(board: Blackboard, path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    monkeypatch.setattr(picture, "_STALE_S", 1e9)  # a busy host must not make the loop a silent one
-    made = Bench(board, path)
+def written(monkeypatch: pytest.MonkeyPatch) -> Iterator[Written]:
+    path = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
+    board = Blackboard(path, JOINTS, 500_000)
+    monkeypatch.setattr(status_snapshot, "_SILENT_S", 1e9)  # a busy host must not make the loop a silent one
+    made = Written(board, path)
     yield made
     made.observer.close()
+    board.close()
+    path.unlink()
 
 
-def test_an_emergency_stop_out_of_a_fault_is_the_headline_and_not_the_fault(bench: Bench) -> None:
-    bench.publish(State.FAULT)
-    bench.board.event(Code.DRIVE_FAULT, 2, 0x0218)
-    assert "joint3" in bench.headline
-    bench.publish(State.EMERGENCY_STOP)
-    bench.board.event(Code.PRESSED)
-    assert bench.headline.startswith("the emergency stop was pressed")
+def test_an_emergency_stop_out_of_a_fault_replaces_the_message_of_the_fault(written: Written) -> None:
+    written.publish(State.FAULT)
+    written.board.event(DriveFault(2, 0x0218))
+    assert "joint3" in written.headline
+    written.publish(State.EMERGENCY_STOP)
+    written.board.event(EmergencyStopActivated())
+    assert written.headline.startswith("the emergency stop is pressed")
 
 
-def test_an_emergency_that_says_no_error_is_a_message_and_never_the_headline(bench: Bench) -> None:
-    bench.publish(State.READY)
-    bench.board.text("something to know")
+def test_an_emergency_with_error_code_0_is_listed_and_never_the_message(written: Written) -> None:
+    written.publish(State.READY)
+    written.board.text("something to know")
     none, over = (Emergency(2, "drive1", code, 0, bytes(5)).sentence() for code in (0x0000, 0x8611))
-    bench.board.text(none)
-    assert bench.headline == "something to know"
-    assert bench.status["messages"] == ["something to know", none]
-    bench.board.text(over)
-    assert bench.headline == over
+    written.board.text(none)
+    assert written.headline == "something to know"
+    assert written.status["messages"] == ["something to know", none]
+    written.board.text(over)
+    assert written.headline == over
 
 
-def test_while_the_arm_moves_the_headline_says_so_and_not_how_the_last_motion_ended(bench: Bench) -> None:
-    bench.publish(State.MOVING, moves=1)
-    bench.board.event(Code.ARRIVED)
-    bench.publish(State.HOLDING, moves=1)
-    arrived = bench.headline
-    assert "arrived" in arrived
+def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(written: Written) -> None:
+    written.publish(State.MOVING, moves=1)
+    written.board.event(Arrived())
+    written.publish(State.HOLDING, moves=1)
+    arrived = written.headline
+    assert arrived == "the motion is complete"
     time.sleep(0.002)
-    bench.publish(State.MOVING, moves=2)
-    assert bench.headline == "moving"
+    written.publish(State.MOVING, moves=2)
+    assert written.headline == "moving"
     time.sleep(0.002)
-    bench.board.text("said meanwhile")
-    bench.publish(State.MOVING, moves=2)
-    assert bench.headline == "said meanwhile"
+    written.board.text("said meanwhile")
+    written.publish(State.MOVING, moves=2)
+    assert written.headline == "said meanwhile"
     time.sleep(0.002)
     # The next motion begins without a cycle of rest between.
-    bench.publish(State.MOVING, moves=3)
-    assert bench.headline == "moving"
-    bench.publish(State.STOPPING, moves=3)
-    assert bench.headline == "stopping"
-    bench.board.event(Code.ARRIVED)
-    bench.publish(State.HOLDING, moves=3)
-    assert bench.headline == arrived
+    written.publish(State.MOVING, moves=3)
+    assert written.headline == "moving"
+    written.publish(State.STOPPING, moves=3)
+    assert written.headline == "stopping"
+    written.board.event(Arrived())
+    written.publish(State.HOLDING, moves=3)
+    assert written.headline == arrived
 
 
-def test_a_loop_that_is_silent_is_said_with_what_to_do_and_nothing_of_it_is_taken_for_the_present(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
+def test_a_silent_loop_is_reported_with_the_way_out_and_its_last_values_do_not_count(
+    written: Written, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench.publish(State.HOLDING)
-    assert (bench.status["wkc"]["actual"], bench.status["dc"]["locked"]) == (21, True)
-    monkeypatch.setattr(picture, "_STALE_S", -1.0)
-    status = bench.status
+    written.publish(State.HOLDING)
+    assert (written.status["wkc"]["actual"], written.status["dc"]["locked"]) == (21, True)
+    monkeypatch.setattr(status_snapshot, "_SILENT_S", -1.0)
+    status = written.status
     assert "has published nothing for " in status["message"]
     assert " s; the drives' watchdog stops them" in status["message"]
     assert "`rtcp stop`, then `rtcp start`, if it stays so" in status["message"]
     assert (status["wkc"]["actual"], status["dc"]["locked"]) == (-1, False)
+
+
+# -- RobotStatus ------------------------------------------------------------------------------------------------------
+
+ALLOWED = FLAG_ENABLED | FLAG_MOTION_ALLOWED
+JOINT = ControlMode.JOINT
+
+
+@pytest.mark.parametrize("state", State)
+def test_robot_status_follows_the_state(state: State) -> None:
+    found = robot_status(state, JOINT, ALLOWED, 0, 0)
+    assert found["motion_possible"] is (state in (State.HOLDING, State.MOVING))
+    assert found["in_motion"] is (state in (State.MOVING, State.STOPPING, State.HOMING))
+    in_error = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
+    assert found["in_error"] is (state in in_error)
+    assert found["e_stopped"] is (state is State.EMERGENCY_STOP)
+    assert found["drives_powered"]
+
+
+@pytest.mark.parametrize("flags", [ALLOWED | FLAG_EMERGENCY_STOP, ALLOWED | FLAG_SWITCHING, FLAG_ENABLED])
+def test_motion_is_not_possible_with_stop_pressed_or_mode_changing_or_without_permission(flags: int) -> None:
+    assert not robot_status(State.HOLDING, JOINT, flags, 0, 0)["motion_possible"]
+
+
+@pytest.mark.parametrize("mode", ControlMode)
+def test_only_the_joystick_makes_the_mode_manual(mode: ControlMode) -> None:
+    manual = robot_status(State.HOLDING, mode, 0, 0, 0)["mode"] == "manual"
+    assert manual is (mode is ControlMode.JOYSTICK)
+
+
+def test_an_error_code_is_the_number_of_the_event() -> None:
+    assert robot_status(State.FAULT, JOINT, 0, 5, 0)["error_code"] == 5
+    assert robot_status(State.STOPPED_BY_LIMIT, JOINT, FLAG_ENABLED, 0, 107)["error_code"] == 107
+    assert robot_status(State.HOLDING, JOINT, FLAG_ENABLED, 0, 0)["error_code"] == 0

@@ -37,7 +37,7 @@ def recorded(square: Square, config: ArmConfig, off_m: float) -> Recording:
         assert found.q is not None
         assert beside.q is not None
         near = found.q
-        records[number]["target"], records[number]["position"] = found.q, beside.q
+        records[number]["sent_position"], records[number]["actual_position"] = found.q, beside.q
         records[number]["cycle"] = number
     return Recording(0.001, [records])
 

@@ -1,0 +1,64 @@
+"""A gateway's process in front of a fake loop, one for the tests of a file."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.ipc.client import ControlClient
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket
+from rtcp.ipc.session import Session
+from tests.gateway.fake_loop import FakeLoop
+
+
+@pytest.fixture(scope="module")
+def directory() -> Iterator[Path]:
+    # Short: a control socket's path has 107 bytes at most.
+    made = Path(tempfile.mkdtemp(prefix="rtcp-gateway-", dir="/tmp"))
+    yield made
+    blackboard_file(made).unlink(missing_ok=True)
+    shutil.rmtree(made)
+
+
+@pytest.fixture(scope="module")
+def served_loop(directory: Path) -> Iterator[FakeLoop]:
+    config = load(default_config())
+    Session(config, "virtual", "ecat0", 0, time.monotonic_ns()).write(directory)
+    (directory / "started.json").write_text("{}")
+    made = FakeLoop(blackboard_file(directory))
+    reading, writing = os.pipe()
+    gateway = subprocess.Popen(
+        [sys.executable, "-m", "rtcp.gateway.server", "--directory", str(directory), "--ready-fd", str(writing)],
+        pass_fds=(writing,),
+        env={**os.environ, "RTCP_STATE_DIR": str(directory / "state")},
+    )
+    os.close(writing)
+    try:
+        with open(reading) as pipe:
+            assert pipe.readline()
+        yield made
+    finally:
+        gateway.terminate()
+        gateway.wait()
+        made.end()
+
+
+@pytest.fixture
+def loop(served_loop: FakeLoop) -> FakeLoop:
+    served_loop.clear()
+    return served_loop
+
+
+@pytest.fixture
+def client(directory: Path, loop: FakeLoop) -> Iterator[ControlClient]:
+    with ControlClient("a test", control_socket(directory)) as made:
+        yield made
