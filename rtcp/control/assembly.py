@@ -14,7 +14,8 @@ from rtcp.control.loop import Loop
 from rtcp.control.operator import Operator
 from rtcp.control.orders import Orders
 from rtcp.control.record import Recorder
-from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.cia402 import Cia402Drive, drive_of
+from rtcp.devices.driver import Driver, make_driver
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.blackboard import Blackboard
@@ -36,17 +37,9 @@ class Parts:
 
 
 def drives_of(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
-    """Return each joint's driver with the index of its slave.
-
-    Raises:
-        DeviceError: a device's description cannot serve.
-    """
-    slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
+    """Return each joint's driver with the index of its slave; raises DeviceError."""
     zeros = config.zero_offsets or (0.0,) * len(config.axes)
-    return [
-        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity, zero=zero))
-        for joint, zero in zip(config.joints, zeros, strict=False)
-    ]
+    return [drive_of(config, joint, zero) for joint, zero in zip(config.joints, zeros, strict=False)]
 
 
 def position_of(config: ArmConfig, joint: Joint) -> int:
@@ -54,16 +47,11 @@ def position_of(config: ArmConfig, joint: Joint) -> int:
     return next(slot for slot, slave in enumerate(config.slaves, 1) if slave.name == joint.slave)
 
 
-def box_of(config: ArmConfig) -> tuple[int, IoBox] | None:
-    """Return the first IO box with the index of its slave, or None.
-
-    Raises:
-        DeviceError: its description cannot serve.
-    """
-    for slot, slave in enumerate(config.slaves):
-        if slave.device.kind == "io":
-            return slot, IoBox(slave)
-    return None
+def others_of(config: ArmConfig) -> list[tuple[int, Driver]]:
+    """Return the drivers of the slaves that are no drives, with the indices of the slaves; raises DeviceError."""
+    period_s = config.cycle.period_us * 1e-6
+    made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
+    return [(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
 
 
 def discipline_of(config: ArmConfig) -> Discipline | None:
@@ -97,7 +85,8 @@ def assemble(
         DeviceError: a device's description cannot serve.
     """
     arm = Arm(config, drives_of(config), gripper_of(config), blackboard.plan)
-    slotted = box_of(config)
+    others = others_of(config)
+    slotted = next(((slot, driver) for slot, driver in others if isinstance(driver, IoBox)), None)
     box = None if slotted is None else slotted[1]
     operator = Operator(config, box)
     behaviour = Behaviour(config, arm, operator, blackboard, service, discipline)
@@ -115,5 +104,6 @@ def assemble(
         blackboard,
         discipline,
         now,
+        [one for one in others if one != slotted],
     )
     return Parts(arm, box, operator, behaviour, orders, recorder, loop)

@@ -6,12 +6,13 @@ wake -> send the outputs of the last cycle -> receive -> decode -> machine state
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rtcp.control.arm import Arm
 from rtcp.control.behaviour import Behaviour
 from rtcp.control.orders import Orders
 from rtcp.control.record import Recorder
+from rtcp.devices.driver import Driver
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.blackboard import Blackboard
@@ -34,6 +35,7 @@ class Loop:
         blackboard: where commands come from.
         discipline: follows the reference clock, or None without distributed clocks.
         now: the clock, ns; another one where time is simulated.
+        others: drivers of slaves that are neither drives nor the IO box, with the indices of the slaves.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class Loop:
         blackboard: Blackboard,
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
+        others: Sequence[tuple[int, Driver]] = (),
     ) -> None:
         self._period_ns = period_ns
         self._spin_ns = spin_ns
@@ -62,6 +65,7 @@ class Loop:
         self._command_waits = blackboard.command_waits
         self._discipline = discipline
         self._now = now
+        self._others = tuple(others)
         self._half_ns = period_ns // 2
         self._expected = data.expected_wkc
         self._shutdown = False
@@ -93,6 +97,8 @@ class Loop:
             arm.decode(data)
             if self._box is not None:
                 self._box.decode(data.input(self._box_slot))
+            for slot, driver in self._others:
+                driver.decode(data.input(slot))
         elif wkc > 0 and self._box is not None and behaviour.box_in_op:
             # Another slave is missing, and which ones were in the frame is not known. SOEM gives what a slave did not
             # fill in back as it was, so that the inputs are the box's, of now or of before.
@@ -106,6 +112,8 @@ class Loop:
         arm.encode(data)
         if self._box is not None:
             data.set_output(self._box_slot, self._box.encode())
+        for slot, driver in self._others:
+            data.set_output(slot, driver.encode())
         recorder.publish(woken, planned, received, wkc)
         discipline = self._discipline
         if discipline is None:

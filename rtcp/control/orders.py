@@ -160,6 +160,8 @@ class Orders:
         motions = self._arm.motions
         if motions.mode in (MotionMode.VELOCITY, MotionMode.TORQUE):
             return Refusal.OTHER_MOTION, int(motions.mode), float(MotionMode.JOINT)
+        if (axis := self._arm.first_without(DriveMode(int(wanted)))) >= 0:
+            return Refusal.MODE, axis, wanted
         motions.drive_mode = DriveMode(int(wanted))
         self._change_mode(motions.drive_mode)
         return DONE
@@ -171,6 +173,8 @@ class Orders:
         motions = self._arm.motions
         if wanted in (MotionMode.CARTESIAN, MotionMode.JOYSTICK) and not motions.has_geometry:
             return (Refusal.NO_GEOMETRY,)
+        if (axis := self._arm.first_without(motions.drive_mode_of(wanted))) >= 0:
+            return Refusal.MODE, axis, float(motions.drive_mode_of(wanted))
         motions.select(wanted)
         self._operator.wait_for_neutral()
         self._blackboard.event(Code.MOTION, int(wanted))

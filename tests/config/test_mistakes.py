@@ -200,8 +200,8 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'rpdo[0].channels[4].type: found the text "int24", allowed is one of bool, int8, uint8, int16, uint16, int32, '
      "uint32, int64, uint64, float32, float64"),
     (BOX, [("kind: io", "kind: cia402")],
-     "rpdo: kind cia402 needs channels named controlword, target_position, target_velocity, target_torque, "
-     "modes_of_operation; its channels are outputs"),
+     "rpdo: kind cia402 needs channels named controlword, target_position, modes_of_operation; "
+     "its channels are outputs"),
     (DRIVE, [("type: uint16, name: controlword", "type: uint32, name: controlword")],
      "rpdo[0].channels[0].type: found uint32 for controlword, allowed is uint16"),
     (DRIVE, [(TORQUE, "{index: 0x6071, sub_index: 0, type: bool, name: target_torque, factor: 0.0001}")],
@@ -399,3 +399,38 @@ def test_any_value_in_any_place_is_accepted_or_named(
             node[where[-1]] = value
             problems = problems_of(load_kinematics if file == IRB else load, IRB if file == IRB else ARM)
             assert all(re.match(r"[\w/.-]+:\d+: ", sentence) for sentence in problems)
+
+
+def without(file: Path, channels: tuple[str, ...]) -> None:
+    """Take the channels of these names out of a device file."""
+    lines = file.read_text().splitlines()
+    file.write_text("".join(f"{line}\n" for line in lines if not any(f"name: {one}," in line for one in channels)))
+
+
+@pytest.mark.parametrize(
+    ("mode", "lacking"),
+    [("csp", ("target_velocity", "target_torque", "velocity", "torque")), ("csv", ("target_torque", "torque"))],
+)
+def test_a_drive_needs_no_channels_of_other_modes(directory: Path, mode: str, lacking: tuple[str, ...]) -> None:
+    without(directory / DRIVE, lacking)
+    arm = directory / ARM
+    arm.write_text(arm.read_text().replace("drive_mode: csp", f"drive_mode: {mode}"))
+    assert len(load(arm).slaves) == 7
+
+
+@pytest.mark.parametrize(
+    ("mode", "lacking"), [("csv", ("target_velocity", "velocity")), ("cst", ("target_torque", "velocity", "torque"))]
+)
+def test_a_drive_needs_the_channels_of_the_mode_in_use(
+    directory: Path, problems_after: Callable[..., list[str]], mode: str, lacking: tuple[str, ...]
+) -> None:
+    without(directory / DRIVE, lacking)
+    problems = problems_after(ARM, ("drive_mode: csp", f"drive_mode: {mode}"))
+    assert len(problems) == 6
+    assert all(f"maps no {', '.join(lacking)}, which drive_mode {mode} needs" in problem for problem in problems)
+
+
+def test_a_box_needs_no_counter(directory: Path) -> None:
+    box = directory / BOX
+    box.write_text("".join(f"{line}\n" for line in box.read_text().splitlines() if "name: counter" not in line))
+    assert load(directory / ARM).slaves[0].device.tpdo[0].channels[0].name == "inputs"
