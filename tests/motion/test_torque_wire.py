@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.runtime.bench import CONFIG, CST, PERIOD_S, Bench
 
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Refusal
 from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.observer import Observer
-from tests.runtime.bench import CONFIG, CST, PERIOD_S, Bench
 
 TORQUE_MODE = 5.0
 

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.runtime.bench import CONFIG, PERIOD_S, Bench
+from tests.runtime.played_loop import Loop
 
 from rtcp.config import default_config, load
 from rtcp.ipc.blackboard import Blackboard
@@ -19,8 +21,6 @@ from rtcp.ipc.client import ControlClient
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
-from tests.runtime.bench import CONFIG, PERIOD_S, Bench
-from tests.runtime.played_loop import Loop
 
 
 @pytest.fixture(scope="module")
