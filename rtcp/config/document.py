@@ -46,6 +46,7 @@ _CONSTANTS = {"": None, "~": None, "null": None, "Null": None, "NULL": None, "tr
               "false": False, "False": False, "FALSE": False}  # fmt: skip
 _OPEN = object()
 """Value of an anchor whose end is not read yet."""
+_SURROGATE = re.compile("[\ud800-\udfff]")
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]*)|0x[0-9a-fA-F]+|0o[0-7]+")
 _FLOAT = re.compile(
     r"[-+]?(?:\.[0-9]+|(?:0|[1-9][0-9]*)(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)"
@@ -281,6 +282,9 @@ class _Builder:
     def _scalar(self, event: ScalarEvent, where: KeyPath) -> object:
         text = str(event.value)
         self._count(text)
+        if lone := _SURROGATE.search(text):
+            self.findings.append((where, f"this text holds U+{ord(lone[0]):04X}, half of a character"))
+            return ""
         if event.tag is not None or not event.implicit[0]:
             return text
         if text in _CONSTANTS:

@@ -36,7 +36,7 @@ RENAMED = {
     "mode": "drive_mode",
     "motion": "control_mode",
     "watch": "supervision",
-    "bus.timeout_scale": "bus.timeout_scale",
+    "bus.virtual_patience": "bus.timeout_scale",
     "stops.watch": "stops.supervision",
 }
 """Keys of the arm's file in version 0.1, and their names now."""

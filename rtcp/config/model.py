@@ -118,8 +118,8 @@ class DeviceDescription:
 
     name: Name
     """Device name, for messages."""
-    kind: Literal["cia402", "io"]
-    """Driver: `cia402` moves a joint, `io` is a box of inputs and outputs."""
+    kind: Name
+    """Driver: `cia402` moves a joint, `io` is a box of inputs and outputs; further ones from installed packages."""
     vendor_id: U32
     """Vendor id (0x1018:01); another one on the bus is refused."""
     product_id: U32

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from importlib.metadata import entry_points
 
 from rtcp.config.document import Finding, KeyPath, dotted
 from rtcp.config.model import (
@@ -58,6 +59,11 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
     },
     "io": {"rpdo": {"outputs": ("uint16",)}, "tpdo": {"inputs": ("uint16",), "counter": ("int32",)}},
 }
+OPTIONAL = {"target_velocity", "target_torque", "velocity", "torque", "counter"}
+"""Channels that only some modes of a drive need (`MODE_CHANNELS`), and only some boxes have."""
+MODE_CHANNELS = {
+    "csp": (), "csv": ("target_velocity", "velocity"), "cst": ("target_torque", "velocity", "torque"),
+}  # fmt: skip
 PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
 """Objects of receive and transmit PDO mappings (ETG.1000.6)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -104,6 +110,14 @@ def _startup_value(sdo: StartupSdo) -> Iterator[Finding]:
         yield ("value",), f"found {sdo.value:g}, allowed is an integer from {low} to {high}, the range of {sdo.type}"
 
 
+@rule(DeviceDescription, "kind")
+def _kind(device: DeviceDescription) -> Iterator[Finding]:
+    # By name alone: a driver is loaded by the loop, which stands above the configuration.
+    kinds = sorted(entry_points(group="rtcp.devices").names)
+    if device.kind not in kinds:
+        yield ("kind",), f'found the text "{device.kind}", allowed is one of {", ".join(kinds)}'
+
+
 @rule(DeviceDescription, "rpdo", "kind")
 def _rpdo(device: DeviceDescription) -> Iterator[Finding]:
     return _pdos("rpdo", device.rpdo, device.kind)
@@ -142,8 +156,8 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
     if bits % 8:
         wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
         yield (direction,), f"found {bits} bits in all, allowed are {wanted}"
-    needed = CHANNELS[kind][direction]
-    if missing := [name for name in needed if name not in names]:
+    needed = CHANNELS.get(kind, {}).get(direction, {})
+    if missing := [name for name in needed if name not in names and name not in OPTIONAL]:
         there = f"its channels are {', '.join(names)}" if names else "it has no channels"
         those = f"{'a channel' if len(missing) == 1 else 'channels'} named {', '.join(missing)}"
         yield (direction,), f"kind {kind} needs {those}; {there}"
@@ -304,17 +318,23 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
         if slave is None:
             told = f'found the text "{joint.slave}", which is no slave; allowed are the names under slaves: '
             yield (*where, "slave"), told + ", ".join(slaves)
-        elif device is not None and device.kind != "cia402":
+        elif device is not None and device.kind == "io":
             told = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
             yield (*where, "slave"), f"{told}{device.kind}; allowed is kind cia402"
         elif device is not None:
+            mapped = {entry.name for pdo in (*device.rpdo, *device.tpdo) for entry in pdo.channels}
+            if missing := [name for name in MODE_CHANNELS[arm.drive_mode] if name not in mapped]:
+                told = (
+                    f"its device {slave.device} maps no {', '.join(missing)}, which drive_mode {arm.drive_mode} needs"
+                )
+                yield (*where, "slave"), told
             yield from _beyond_the_wire(where, joint, device)
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
     """Yield the terminals of an arm that has no IO box; `devices`: the valid ones by name."""
     found = [devices.get(slave.device) for slave in arm.slaves]
-    if any(device is None or device.kind == "io" for device in found):
+    if any(device is None or device.kind != "cia402" for device in found):
         return
     for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
         for where, number in terminals:

@@ -215,6 +215,10 @@ class Arm:
                 return axis
         return -1
 
+    def first_without(self, mode: DriveMode) -> int:
+        """Return the first joint whose drive does not map what `mode` needs, or -1."""
+        return next((axis for axis, drive in enumerate(self.drives) if not drive.supports(mode)), -1)
+
     def first_outside(self) -> int:
         """Return the first joint that stands outside its range, or -1."""
         low, high = self.limits.low, self.limits.high

@@ -36,6 +36,7 @@ from rtcp.ipc.refusals import (
     ClockNotLocked,
     DriveModeChanging,
     DriveModeFixed,
+    DriveModeUnsupported,
     EmergencyStopPressed,
     GripperDisabled,
     JointOutsideRange,
@@ -211,6 +212,8 @@ class CommandHandler:
         arm = self._arm
         if arm.control_mode in _FIXED_DRIVE_MODE:
             return DriveModeFixed(arm.control_mode, command.mode)
+        if (axis := arm.first_without(command.mode)) >= 0:
+            return DriveModeUnsupported(axis, command.mode)
         arm.configured_mode = command.mode
         self._machine.change_drive_mode(command.mode)
         return None
@@ -219,11 +222,13 @@ class CommandHandler:
         arm, mode = self._arm, command.mode
         if mode in (ControlMode.CARTESIAN, ControlMode.JOYSTICK) and arm.jog is None:
             return NoGeometry()
+        drive_mode = arm.drive_mode_of(mode)
+        if (axis := arm.first_without(drive_mode)) >= 0:
+            return DriveModeUnsupported(axis, drive_mode)
         arm.control_mode = mode
         arm.rest()
         self._operator.require_neutral()
         self._blackboard.event(ControlModeChanged(mode))
-        drive_mode = arm.drive_mode_of(mode)
         if drive_mode is not arm.mode or self._machine.state is not State.HOLDING:
             self._machine.change_drive_mode(drive_mode)
         else:

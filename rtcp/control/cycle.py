@@ -16,7 +16,8 @@ from rtcp.control.context import Context
 from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
-from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.cia402 import Cia402Drive, drive_of
+from rtcp.devices.driver import Driver, make_driver
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.blackboard import Blackboard
@@ -65,7 +66,9 @@ class Cycle:
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
     ) -> None:
-        box = find_box(config)
+        others = make_others(config)
+        box = next(((slot, driver) for slot, driver in others if isinstance(driver, IoBox)), None)
+        self._others = [one for one in others if one != box]
         self.arm = Arm(config, make_drives(config), make_gripper(config), blackboard.plan)
         self.box = None if box is None else box[1]
         self.operator = Operator(config, self.box)
@@ -119,6 +122,8 @@ class Cycle:
             arm.decode(data)
             if box is not None:
                 box.decode(data.input(self._box_slot))
+            for slot, driver in self._others:
+                driver.decode(data.input(slot))
         elif wkc > 0 and box is not None and context.box_in_op:
             # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
             # fill in as it was, so these are the inputs of the box, of now or of before.
@@ -132,6 +137,8 @@ class Cycle:
         arm.encode(data)
         if box is not None:
             data.set_output(self._box_slot, box.encode())
+        for slot, driver in self._others:
+            data.set_output(slot, driver.encode())
         self._publish(woken, planned, received, wkc)
         discipline = self._discipline
         if discipline is None:
@@ -226,20 +233,15 @@ class Cycle:
 
 def make_drives(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
     """Return the driver of each joint with the index of its slave; raises DeviceError."""
-    slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
     zeros = config.zero_offsets or (0.0,) * len(config.axes)
-    return [
-        (slots[joint.slave], Cia402Drive(config.slaves[slots[joint.slave]], speed_limit=joint.velocity, zero=zero))
-        for joint, zero in zip(config.joints, zeros, strict=False)
-    ]
+    return [drive_of(config, joint, zero) for joint, zero in zip(config.joints, zeros, strict=False)]
 
 
-def find_box(config: ArmConfig) -> tuple[int, IoBox] | None:
-    """Return the first IO box with the index of its slave, or None; raises DeviceError."""
-    for slot, slave in enumerate(config.slaves):
-        if slave.device.kind == "io":
-            return slot, IoBox(slave)
-    return None
+def make_others(config: ArmConfig) -> list[tuple[int, Driver]]:
+    """Return the drivers of the slaves that are no drives, with the indices of the slaves; raises DeviceError."""
+    period_s = config.cycle.period_us * 1e-6
+    made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
+    return [(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
 
 
 def make_discipline(config: ArmConfig) -> Discipline | None:

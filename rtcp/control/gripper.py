@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
-from rtcp.devices.cia402 import Cia402Drive, DriveState
+from rtcp.devices.cia402 import Cia402Drive, DriveState, drive_of
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed
 from rtcp.motion.controllers.gripper import GripperMotion
@@ -147,9 +147,7 @@ def make_gripper(config: ArmConfig) -> DrivenGripper | None:
     if gripper is None or gripper.joint is None or gripper.open_position is None or gripper.closed_position is None:
         return None
     joint = gripper.joint
-    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
-    zero = config.zero_offsets[-1] if config.zero_offsets else 0.0
-    drive = Cia402Drive(config.slaves[slot], speed_limit=joint.velocity, zero=zero)
+    slot, drive = drive_of(config, joint, config.zero_offsets[-1] if config.zero_offsets else 0.0)
     period_s = config.cycle.period_us * 1e-6
     motion = GripperMotion(joint, gripper.open_position, gripper.closed_position, period_s)
     axis = len(config.joints)

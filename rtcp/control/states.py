@@ -81,8 +81,12 @@ _TARGETS = {
     StopReaction.TORQUE_OFF: TargetState.TORQUE_OFF,
 }
 """Where a stop reaction takes the drives."""
-_FAULTS = {Fault: State.FAULT, Emergency: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
-_TORQUE = {**_FAULTS, Disable: State.DISABLING}
+_FAULTS: dict[type[Message] | Signal, State] = {
+    Fault: State.FAULT,
+    Emergency: State.EMERGENCY_STOP,
+    Shutdown: State.CLOSING,
+}
+_TORQUE: dict[type[Message] | Signal, State] = {**_FAULTS, Disable: State.DISABLING}
 
 
 class MachineState:

@@ -1,7 +1,7 @@
 """One driver a kind of slave: bytes on the wire on one side, SI units and states on the other."""
 
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
-from rtcp.devices.driver import DeviceError
+from rtcp.devices.driver import DeviceError, Driver, make_driver
 from rtcp.devices.io_box import IoBox
 
-__all__ = ["Cia402Drive", "DeviceError", "DriveState", "IoBox", "TargetState"]
+__all__ = ["Cia402Drive", "DeviceError", "DriveState", "Driver", "IoBox", "TargetState", "make_driver"]

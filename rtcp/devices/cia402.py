@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 
-from rtcp.config.model import SlaveConfig
-from rtcp.devices.driver import DeviceError, factors, integer_range, make_codec, slots
-from rtcp.fieldbus.pdo import layout
+from rtcp.config.model import ArmConfig, Joint, SlaveConfig
+from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
+from rtcp.fieldbus.pdo import ImageLayout
 
 
 class DriveState(Enum):
@@ -107,10 +108,24 @@ _RESET_HOLD = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
-CSP, _CSV, _CST = 8, 9, 10
+CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
-_WITH_SPEED = (CSP, _CSV)
+_WITH_SPEED = (CSP, CSV)
+NEEDED: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    CSP: ((), ()),
+    CSV: (("target_velocity",), ("velocity",)),
+    CST: (("target_torque",), ("velocity", "torque")),
+}
+"""Mode -> channels of rpdo and of tpdo that it needs beside the required ones."""
+_WINDOW_S = 0.02
+"""Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
 _ENABLED = DriveState.OPERATION_ENABLED
+
+
+def _slots(image: ImageLayout, names: Sequence[str]) -> tuple[int, ...]:
+    """Return where channels stand in an image; -1: it is not mapped."""
+    found = map(image.find, names)
+    return tuple(-1 if channel is None else image.channels.index(channel) for channel in found)
 
 
 def state_of(statusword: int) -> DriveState:
@@ -118,51 +133,43 @@ def state_of(statusword: int) -> DriveState:
     return _STATE_OF[statusword & _STATE_BITS]
 
 
-class Cia402Drive:
+class Cia402Drive(Driver):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
-    Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm), `statusword`, `mode_display`,
-    `state`, and `error_code` where 0x603F is mapped as `error_code`.
+    Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm; 0 where it is not mapped),
+    `statusword`, `mode_display`, `state`, and `error_code` where 0x603F is mapped as `error_code`. A velocity that is
+    not mapped is the mean one over 20 ms.
     Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
     `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
     `zero` (rad) is what the drive itself shows where the joint is at 0; `position` and `target_position` count from it.
+
+    Args:
+        slave: the slave's name and description.
+        period_s: the cycle, s.
+        speed_limit: what the drive is given as its speed limit in CSP, rad/s.
+        zero: what the drive shows where the joint is at 0, rad.
+
+    Raises:
+        DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
     """
 
-    __slots__ = (
-        "_error_slot", "_fields", "_in", "_in_factors", "_limits", "_out", "_pack", "_reset_calls", "_scales",
-        "_unpack", "_was_enabled", "_zero", "controlword", "error_code", "input_bytes", "mode", "mode_display", "name",
-        "output_bytes", "position", "speed_limit", "state", "statusword", "target_position", "target_torque",
-        "target_velocity", "torque", "velocity",
-    )  # fmt: skip
+    REQUIRED_OUTPUTS = ("controlword", "target_position", "modes_of_operation")
+    REQUIRED_INPUTS = ("statusword", "position", "modes_of_operation_display")
 
-    def __init__(self, slave: SlaveConfig, speed_limit: float = 0.0, zero: float = 0.0) -> None:
-        """Make the driver of `slave`.
-
-        Args:
-            slave: the slave's name and description.
-            speed_limit: rad/s; what the drive is given as its speed limit in CSP.
-            zero: rad; what the drive shows where the joint is at 0.
-
-        Raises:
-            DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
-        """
-        device = slave.device
-        outputs, inputs = layout(device.rpdo), layout(device.tpdo)
-        self._out = slots(device.name, "rpdo", outputs, _OUTPUTS)
-        self._in = slots(device.name, "tpdo", inputs, _INPUTS)
-        self._limits = tuple(integer_range(outputs, place) for place in self._out[1:4])
-        scales = factors(outputs, self._out[1:4])
-        if not all(scales):
-            raise DeviceError(f"{device.name}: a factor of 0 in `rpdo` is not allowed")
-        self._scales = tuple(1.0 / factor for factor in scales)
-        self._in_factors = factors(inputs, self._in[1:4])
-        error = inputs.find("error_code")
-        self._error_slot = -1 if error is None else inputs.channels.index(error)
-        self._unpack = make_codec(inputs).unpack
-        self._pack = make_codec(outputs).pack
-        self._fields: list[int] = [0] * len(outputs.channels)
-        self.name = slave.name
-        self.output_bytes, self.input_bytes = outputs.bytes, inputs.bytes
+    def __init__(
+        self, slave: SlaveConfig, period_s: float = 0.001, *, speed_limit: float = 0.0, zero: float = 0.0
+    ) -> None:
+        super().__init__(slave, period_s)
+        self._out, self._in = _slots(self.rpdo, _OUTPUTS), _slots(self.tpdo, _INPUTS)
+        targets = [None if slot < 0 else self.rpdo.channels[slot] for slot in self._out[1:4]]
+        if any(channel is not None and channel.factor == 0 for channel in targets):
+            raise DeviceError(f"{self.device}: a factor of 0 in `rpdo` is not allowed")
+        self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
+        self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
+        self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
+        (self._error_slot,) = _slots(self.tpdo, ("error_code",))
+        self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
+        self._fields: list[int] = [0] * len(self.rpdo.channels)
         self.position = self.velocity = self.torque = 0.0
         self.statusword = self.mode_display = self.error_code = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
@@ -173,6 +180,13 @@ class Cia402Drive:
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._was_enabled = False
         self._reset_calls = 0
+        self._past: list[float] = []
+        self._past_at = 0
+
+    def supports(self, mode: int) -> bool:
+        """Whether the process data has what a mode (CSP, CSV, CST) needs."""
+        outputs, inputs = NEEDED[mode]
+        return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
 
     @property
     def zero(self) -> float:
@@ -192,15 +206,27 @@ class Cia402Drive:
         status, position, velocity, torque, mode = self._in
         by_position, by_velocity, by_torque = self._in_factors
         self.statusword = word = int(values[status])
-        self.position = values[position] * by_position - self._zero
-        self.velocity = values[velocity] * by_velocity
-        self.torque = values[torque] * by_torque
+        shown = values[position] * by_position
+        self.position = shown - self._zero
+        self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
+        if torque >= 0:
+            self.torque = values[torque] * by_torque
         self.mode_display = int(values[mode])
         self.state = _STATE_OF[word & _STATE_BITS]
         if self._error_slot >= 0:
             self.error_code = int(values[self._error_slot])
         if self.controlword not in _TARGET_STANDS:
             self.target_position = self.position
+
+    def _measured_velocity(self, shown: float) -> float:
+        past = self._past
+        if not past:
+            past += [shown] * max(round(_WINDOW_S / self.period_s), 1)
+        at = self._past_at
+        moved = shown - past[at]
+        past[at] = shown
+        self._past_at = at + 1 if at + 1 < len(past) else 0
+        return moved / (len(past) * self.period_s)
 
     def advance(self, goal: TargetState) -> bool:
         """Choose the controlword of the next step towards `goal` by the state found; return whether it is reached."""
@@ -243,13 +269,15 @@ class Cia402Drive:
         fields[position] = self._counts((self.target_position + self._zero) * by_position, 0, fields[position])
         speed = effort = 0
         if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
-            if commanded == _CST:
+            if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
             elif commanded == self.mode_display and commanded in _WITH_SPEED:
                 wanted = self.speed_limit if commanded == CSP else self.target_velocity
                 speed = self._counts(wanted * by_velocity, 1, fields[velocity])
-        fields[velocity] = speed
-        fields[torque] = effort
+        if velocity >= 0:
+            fields[velocity] = speed
+        if torque >= 0:
+            fields[torque] = effort
         return self._pack(*fields)
 
     def _counts(self, value: float, which: int, last: int) -> int:
@@ -260,3 +288,19 @@ class Cia402Drive:
             # Not a number, or infinite: the last counts that were sent.
             return last
         return low if value < low else high
+
+
+def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Cia402Drive]:
+    """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Cia402Drive`.
+
+    Raises:
+        DeviceError: its device's description cannot serve, or it is no drive.
+    """
+    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
+    slave = config.slaves[slot]
+    drive = make_driver(slave, config.cycle.period_us * 1e-6)
+    if not isinstance(drive, Cia402Drive):
+        raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
+    drive.speed_limit = joint.velocity
+    drive.zero = zero
+    return slot, drive

@@ -1,18 +1,97 @@
-"""Process images as tuples of numbers: one `struct` where every channel fills whole bytes, bit by bit where not."""
+"""The driver of a slave: its base class, how its kind is found, process images as tuples of numbers."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import ClassVar
 
-from rtcp.fieldbus.pdo import TYPES, ImageLayout
+from rtcp.config.model import SlaveConfig
+from rtcp.fieldbus.pdo import TYPES, Channel, ImageLayout, layout
 
 Number = int | float
+GROUP = "rtcp.devices"
+"""Entry point group in which a package registers its drivers: the kind is the name, the class is the object."""
 
 
 class DeviceError(ValueError):
-    """A device description that its driver cannot work with; the message is a sentence."""
+    """A device description that its driver cannot work with."""
+
+
+class Driver:
+    """Bytes of one slave's process image on one side, SI units and states on the other.
+
+    A kind of device is one subclass: it names the channels that it cannot do without, unpacks the inputs in `decode`
+    and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
+    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name.
+
+    Args:
+        slave: the slave's name and description.
+        period_s: the cycle, s.
+
+    Raises:
+        DeviceError: a channel is missing, or has a type that cannot serve.
+    """
+
+    REQUIRED_OUTPUTS: ClassVar[tuple[str, ...]] = ()
+    """Channels of `rpdo` that the driver cannot do without."""
+    REQUIRED_INPUTS: ClassVar[tuple[str, ...]] = ()
+    """Channels of `tpdo` that the driver cannot do without."""
+
+    def __init__(self, slave: SlaveConfig, period_s: float = 0.001) -> None:
+        device = slave.device
+        self.name = slave.name
+        self.device = device.name
+        self.rpdo, self.tpdo = layout(device.rpdo), layout(device.tpdo)
+        self.output_bytes, self.input_bytes = self.rpdo.bytes, self.tpdo.bytes
+        for key, image, required in (
+            ("rpdo", self.rpdo, self.REQUIRED_OUTPUTS),
+            ("tpdo", self.tpdo, self.REQUIRED_INPUTS),
+        ):
+            if missing := [name for name in required if image.find(name) is None]:
+                found = ", ".join(channel.name for channel in image.channels if channel.index)
+                raise DeviceError(
+                    f"{device.name}: key `{key}` maps no {', '.join(missing)}; kind {device.kind} needs "
+                    f"{', '.join(required)}, found are {found or 'none'}"
+                )
+        self.period_s = period_s
+        self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
+        self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if channel.index}
+        self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if channel.index}
+
+    def decode(self, data: bytes) -> None:
+        """Take the inputs of the cycle (`input_bytes` long)."""
+        for channel, counts in zip(self.tpdo.channels, self.codec_in.unpack(data), strict=True):
+            if channel.index:
+                self.values[channel.name] = counts * channel.factor
+
+    def encode(self) -> bytes:
+        """Return the outputs of the cycle (`output_bytes` long)."""
+        return self.codec_out.pack(*(self._counts_of(channel) for channel in self.rpdo.channels))
+
+    def _counts_of(self, channel: Channel) -> Number:
+        counts = self.targets[channel.name] / channel.factor if channel.index else 0
+        return counts if channel.type.startswith("float") else round(counts)
+
+
+def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
+    """Return the driver of a slave, of the class that is registered for the kind of its device.
+
+    Raises:
+        DeviceError: no installed package has a driver for this kind, or the description cannot serve.
+    """
+    kind = slave.device.kind
+    found = entry_points(group=GROUP)
+    for point in found:
+        if point.name == kind:
+            driver: Driver = point.load()(slave, period_s=period_s)
+            return driver
+    raise DeviceError(
+        f"{slave.device.name}: no driver is installed for kind {kind} (key `kind`); installed are "
+        f"{', '.join(sorted(found.names)) or 'none: reinstall rtcp (`make setup`)'}"
+    )
 
 
 @dataclass(frozen=True)
@@ -55,41 +134,8 @@ def _bit_codec(layout: ImageLayout) -> Codec:
     return Codec(unpack, pack)
 
 
-def slots(device: str, key: str, layout: ImageLayout, names: Iterable[str]) -> tuple[int, ...]:
-    """Return where `names` stand among the channels of an image.
-
-    Args:
-        device: name of the device, for the sentence.
-        key: `rpdo` or `tpdo`, for the sentence.
-        layout: the image.
-        names: channels that the driver cannot do without.
-
-    Raises:
-        DeviceError: channels are missing; all of them are named.
-    """
-    wanted = tuple(names)
-    at = {channel.name: i for i, channel in enumerate(layout.channels) if channel.index}
-    missing = [name for name in wanted if name not in at]
-    if missing:
-        raise DeviceError(
-            f"{device}: key `{key}` maps no {', '.join(missing)}; its kind needs {', '.join(wanted)}, "
-            f"found are {', '.join(at) or 'none'}"
-        )
-    return tuple(at[name] for name in wanted)
-
-
-def factors(layout: ImageLayout, places: Sequence[int]) -> tuple[float, ...]:
-    """Return the factors (SI value = counts * factor) of the channels at `places`."""
-    return tuple(layout.channels[place].factor for place in places)
-
-
-def integer_range(layout: ImageLayout, place: int) -> tuple[int, int]:
-    """Return the smallest and the largest counts of a channel.
-
-    Raises:
-        DeviceError: the channel is not of an integer type.
-    """
-    channel = layout.channels[place]
+def integer_range(channel: Channel) -> tuple[int, int]:
+    """Return the smallest and the largest counts of a channel; raises DeviceError where it is of no integer type."""
     if channel.type.startswith("uint"):
         return 0, (1 << channel.bits) - 1
     if channel.type.startswith("int"):

@@ -4,36 +4,30 @@ from __future__ import annotations
 
 import struct
 
-from rtcp.config.model import DeviceDescription, GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
-from rtcp.devices.driver import DeviceError, slots
-from rtcp.fieldbus.pdo import TYPES, ImageLayout, layout
+from rtcp.config.model import GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
+from rtcp.devices.driver import DeviceError, Driver
+from rtcp.fieldbus.pdo import TYPES, ImageLayout
 
 
-class IoBox:
+class IoBox(Driver):
     """Inputs and outputs as bit fields, bit 0 is number 1. `decode` sets `inputs`, `counter`; `encode` takes `outputs`.
 
-    The channels are named `inputs`, `outputs` and `counter` in the device's file, each of an unsigned or a signed type.
+    The channels are named `inputs` and `outputs` in the device's file, and `counter` where the box has one: without it
+    the counter stays 0.
+
+    Raises:
+        DeviceError: the description lacks a channel, or one is not an integer of whole bytes.
     """
 
-    __slots__ = (
-        "_counter", "_image", "_inputs", "_outputs", "counter", "input_bytes", "inputs", "name", "output_bytes",
-        "outputs",
-    )  # fmt: skip
+    REQUIRED_OUTPUTS = ("outputs",)
+    REQUIRED_INPUTS = ("inputs",)
 
-    def __init__(self, slave: SlaveConfig) -> None:
-        """Make the driver of `slave`.
-
-        Raises:
-            DeviceError: the description lacks a channel, or one is not an integer of whole bytes.
-        """
-        device = slave.device
-        outputs, inputs = layout(device.rpdo), layout(device.tpdo)
-        self._outputs, out_at = _field(device, "rpdo", outputs, "outputs")
-        self._inputs = _field(device, "tpdo", inputs, "inputs")
-        self._counter = _field(device, "tpdo", inputs, "counter")
-        self.name = slave.name
-        self.output_bytes, self.input_bytes = outputs.bytes, inputs.bytes
-        self._image = (bytes(out_at), bytes(outputs.bytes - out_at - self._outputs.size))
+    def __init__(self, slave: SlaveConfig, period_s: float = 0.001) -> None:
+        super().__init__(slave, period_s)
+        self._inputs = _field(self, self.tpdo, "inputs")
+        self._outputs, at = _field(self, self.rpdo, "outputs")
+        self._counter = _field(self, self.tpdo, "counter") if self.tpdo.find("counter") else None
+        self._around = (bytes(at), bytes(self.output_bytes - at - self._outputs.size))
         self.inputs = 0
         self.outputs = 0
         self.counter = 0
@@ -42,12 +36,13 @@ class IoBox:
         """Take the inputs of the cycle (`input_bytes` long)."""
         single, at = self._inputs
         self.inputs = single.unpack_from(data, at)[0]
-        single, at = self._counter
-        self.counter = single.unpack_from(data, at)[0]
+        if self._counter is not None:
+            single, at = self._counter
+            self.counter = single.unpack_from(data, at)[0]
 
     def encode(self) -> bytes:
         """Return the outputs of the cycle."""
-        before, after = self._image
+        before, after = self._around
         return before + self._outputs.pack(self.outputs) + after
 
     @property
@@ -67,11 +62,12 @@ class IoBox:
         self.outputs = self.outputs | bit if value else self.outputs & ~bit
 
 
-def _field(device: DeviceDescription, key: str, image: ImageLayout, name: str) -> tuple[struct.Struct, int]:
-    channel = image.channels[slots(device.name, key, image, (name,))[0]]
+def _field(box: Driver, image: ImageLayout, name: str) -> tuple[struct.Struct, int]:
+    channel = image.find(name)
+    assert channel is not None
     if channel.bit_offset % 8 or "int" not in channel.type:
         raise DeviceError(
-            f"{device.name}: channel {name} is {channel.type} at bit {channel.bit_offset}; "
+            f"{box.device}: channel {name} is {channel.type} at bit {channel.bit_offset}; "
             "it must be an integer at a whole byte"
         )
     return struct.Struct("<" + TYPES[channel.type][1]), channel.bit_offset // 8

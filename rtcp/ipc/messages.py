@@ -34,7 +34,11 @@ class Sentences:
                 f"speed {number(m.value)} rad/s is not allowed: more than 0 and at most {number(m.limit)} rad/s "
                 f"(joints[].velocity in {file})"
             ),
-            Refusal.MODE: lambda m: f"mode {number(m.value)} is not one of csp (8), csv (9), cst (10)",
+            Refusal.MODE: lambda m: (
+                f"mode {number(m.value)} is not one of csp (8), csv (9), cst (10)"
+                if m.axis < 0
+                else f"{joint(m.axis)}: its drive does not map what mode {number(m.value)} needs (`rpdo`, `tpdo`)"
+            ),
             Refusal.OUTSIDE_LIMITS: self._outside_limits,
             Refusal.OUTPUT: lambda m: f"output {number(m.value)} does not exist: 1 to {number(m.limit)}",
             Refusal.OUTPUT_VALUE: lambda m: f"output {m.axis}: found {number(m.value)}, allowed is 0 or 1",

@@ -135,6 +135,13 @@ class DriveModeFixed(Refusal):
     wanted: DriveMode
 
 
+class DriveModeUnsupported(Refusal):
+    """the drive of {joint} has no process data for {mode} (rpdo and tpdo in its device file)"""
+
+    axis: int
+    mode: DriveMode
+
+
 class NoGeometry(Refusal):
     """the geometry of the arm is unknown: the key kinematics is missing in {file}"""
 

@@ -1,6 +1,6 @@
-"""Keeps a platform's gateway there: one that has ended is started anew, in turns that never wait.
+"""Supervise a running platform: wait for its end, restart its gateway, notify systemd.
 
-Nothing moves by that: the lease of what the old one carried has run out, and a new one enables nothing.
+A restart of the gateway moves nothing: the lease of the old one has expired, and a new one enables nothing.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from rtcp.launch.platform import SIGNALS, Platform
 
 _POLL_S = 0.1
 STARTS, WINDOW_S = 5, 60.0
-"""At most so many starts in so many seconds: a gateway that cannot live is not started for ever."""
+"""Limit of gateway starts: this many within this time, s."""
 
 
 class GatewaySupervisor:
-    """Looks after the gateway of a platform in the foreground.
+    """Restarts the gateway of a platform in the foreground when it has ended; no call waits for it.
 
     Args:
         platform: the platform.
-        report: is told in a sentence what happened.
+        report: receives in a sentence what happened.
     """
 
     def __init__(self, platform: Platform, report: Callable[[str], None]) -> None:
@@ -36,41 +36,47 @@ class GatewaySupervisor:
         self._report = report
         self._starts: deque[float] = deque()
         self._gave_up = False
-        self._trouble = ""
-        """Why it could not be started, as it was told last."""
+        self._error = ""
+        """Why it could not be started, as reported last."""
         self._ready: int | None = None
-        """Pipe on which the gateway that is being started says that it is ready."""
+        """Pipe on which the gateway that is being started reports that it is ready."""
 
     def look(self) -> None:
-        """Start the gateway anew where it has ended; where that is refused it is told, and tried again in a while."""
+        """Restart the gateway if it has ended; report a failure once, and try again within the limit."""
         now = time.monotonic()
         try:
             self._look(now)
         except (OSError, ValueError) as error:
-            # Nothing of it may end the launcher: the loop would be nobody's.
-            self._failed(now, error)
+            # Must not end the launcher: nobody would supervise the loop.
+            self.close()
+            if not self._starts or self._starts[-1] != now:
+                self._starts.append(now)
+            if str(error) != self._error:
+                self._error = str(error)
+                self._tell(f"the gateway cannot be restarted: {error}")
 
     def _look(self, now: float) -> None:
-        self._hear()
-        if is_running(self._platform.processes.gateway):
+        platform = self._platform
+        if self._ready is not None and select.select([self._ready], [], [], 0.0)[0]:
+            if os.read(self._ready, 4096):
+                self._tell(f"the gateway (process {platform.processes.gateway}) answers again")
+            self.close()
+        if is_running(platform.processes.gateway):
             return
         while self._starts and now - self._starts[0] > WINDOW_S:
             self._starts.popleft()
-        if len(self._starts) >= STARTS:
-            if not self._gave_up:
-                self._gave_up = True
-                where = log_location(self._platform.directory / "gateway.log")
-                again = f"it is left alone for a while; {where} says why"
-                self._tell(f"{self._fate()}, {STARTS} times within {WINDOW_S:g} s: {again}")
-            return
-        try:
-            with exclusive(self._platform.directory):
+        if len(self._starts) < STARTS:
+            # Whoever holds the lock is stopping the platform, or starting a gateway.
+            with contextlib.suppress(LockHeld), exclusive(platform.directory):
                 self._start(now)
-        except LockHeld:
-            pass  # whoever has the lock is stopping the platform, or giving it a gateway
+        elif not self._gave_up:
+            self._gave_up = True
+            where = log_location(platform.directory / "gateway.log")
+            again = f"it is tried again later; {where} has the reason"
+            self._tell(f"{self._fate()}, {STARTS} times within {WINDOW_S:g} s: {again}")
 
     def close(self) -> None:
-        """Let go of the pipe."""
+        """Close the pipe."""
         if self._ready is not None:
             os.close(self._ready)
             self._ready = None
@@ -88,27 +94,12 @@ class GatewaySupervisor:
         fate = self._fate()
         self.close()
         self._ready = platform.begin_gateway()
-        self._trouble = ""
-        self._tell(f"{fate}: it is started anew")
-
-    def _failed(self, now: float, error: Exception) -> None:
-        self.close()
-        if not self._starts or self._starts[-1] != now:
-            self._starts.append(now)
-        if str(error) != self._trouble:
-            self._trouble = str(error)
-            self._tell(f"the gateway cannot be started anew: {error}")
+        self._error = ""
+        self._tell(f"{fate}: it is restarted")
 
     def _tell(self, sentence: str) -> None:
         with contextlib.suppress(OSError):  # the terminal may be gone
             self._report(sentence)
-
-    def _hear(self) -> None:
-        if self._ready is None or not select.select([self._ready], [], [], 0.0)[0]:
-            return
-        if os.read(self._ready, 4096):
-            self._tell(f"the gateway (process {self._platform.processes.gateway}) answers again")
-        self.close()
 
     def _fate(self) -> str:
         gateway = self._platform.processes.gateway

@@ -1,13 +1,12 @@
-"""The master follows the reference clock of the segment.
+"""The master follows the reference clock of the segment: when to wake up.
 
-The reference slave's clock runs free. Each frame brings its system time at the instant the frame passed it; with the
-master's own time just before sending, the difference of the two clocks is known but for the way through the kernel.
-That difference is tracked by a second-order filter (phase and rate), and the next wake-up is computed straight from
-the reference's time, not steered by a controller: wake-up jitter then never enters the clocks, and there is no gain to
-tune against it. Residuals are bounded before they enter, so that one late frame moves the estimate by little, and a
-frame that is late by more than any clock drifts (its sender or its receiver was kept off the CPU) is left out, unless
-for so long so many more are late than in time that it must be the clock. A reference whose time stands although frames
-come back is no clock any more: it is not followed until it moves again.
+The reference slave's clock runs free. Each frame returns its system time at the instant the frame passed it; together
+with the master's time just before sending this gives the difference of the two clocks, apart from the kernel's delay.
+A second-order filter tracks that difference (phase and rate), and the next wake-up is computed straight from the
+reference time: wake-up jitter never enters the clocks, and there is no gain to tune against it. Residuals are bounded:
+one late frame moves the estimate by little. A frame that is later than any clock drifts (its sender or its receiver
+was kept off the CPU) is ignored, until so many more are late than in time that it must be the clock. A reference whose
+time stands although frames return is not followed until it moves again.
 
 Three phases: *measure* (the clocks are compared for `MEASURE_CYCLES`, nothing is moved), *align* (one jump of the
 grid to the configured phase between two SYNC0, before any drive is in OP), *track*.
@@ -26,14 +25,14 @@ _RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
 _SHOWN_GAIN = 1 / 32
 _LATE_BEYOND_NS = 50_000.0
 UNHEARD_CYCLES = 200
-"""So many frames in a row with the same reference time: the rate that was found bridges them, and no more."""
+"""Frames in a row with the same reference time that the holdover bridges at the last rate; then the lock is lost."""
 _LATE_MORE = 150
-"""So many more frames late than in time: beyond it they are the clock's. A host that takes the CPU away in bursts of
-tens of frames, fewer than half of all, does not come to it: with a count of 40 it does."""
+"""Excess of late frames over those in time, above which they are the clock's. A host that takes the CPU away in bursts
+of tens of frames, fewer than half of all, does not reach it; it reaches 40."""
 _LATE_MOST = 200
-"""The count goes further: where most are late all of those are taken in, instead of one left out for each in time."""
+"""Limit of that count: where most frames are late all late ones are used, not one ignored for each in time."""
 _RATE_BOUND = 500e-6
-"""No two oscillators differ by more: a bound that keeps a jump of the reference from winding the rate up."""
+"""No two oscillators differ by more; keeps a jump of the reference from winding up the rate."""
 
 
 class Discipline:
@@ -65,13 +64,13 @@ class Discipline:
         self.aligned = False
         self.locked = False
         self.raw_ns = 0
-        """Reference time of the last frame less the nearest wanted instant: carries the wake-up's jitter."""
+        """Reference time of the last frame minus the nearest wanted instant, ns: includes the wake-up's jitter."""
         self.filtered_ns = 0.0
-        """The same less the wake-up's own latency, low-pass filtered over 32 cycles, without single frames that were
-        late by more than 50 us: how well the clock is followed."""
+        """The same without the wake-up's latency, low-pass filtered over 32 cycles, without single frames that were
+        more than 50 us late: how well the clock is followed."""
 
     def observe(self, sent_ns: int, reference_ns: int) -> None:
-        """Take in one frame: the master's time just before sending and the reference's when it passed."""
+        """Update from one frame: the master's time just before sending and the reference time when it passed, ns."""
         if reference_ns == self._reference:
             # The reference slave did not answer: what came back is what was sent.
             self.holdover()
@@ -111,7 +110,7 @@ class Discipline:
         self._judge()
 
     def holdover(self) -> None:
-        """Let a cycle pass without an observation (no frame came back)."""
+        """Continue for a cycle at the last rate: no frame returned."""
         if self.aligned:
             self._difference += self._rate
 

@@ -1,6 +1,6 @@
-"""What the host grants the cycle: SCHED_FIFO, a CPU, locked memory, shallow idle states, no garbage collection.
+"""Real-time scheduling of the cycle: SCHED_FIFO, a CPU, locked memory, shallow idle states, no garbage collection.
 
-Nothing here is a condition for running: what is refused becomes a note, said once and shown in `rtcp status`.
+The loop runs without any of it: what the host refuses becomes a note in `rtcp status`.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ _STACK_BYTES = 256 << 10
 
 @dataclass
 class Realtime:
-    """What the loop runs with: scheduler ("SCHED_FIFO 80", "SCHED_OTHER"), locked memory, CPU, and what was refused."""
+    """What the loop runs with, and what was refused."""
 
     scheduler: str = "SCHED_OTHER"
+    """SCHED_OTHER, or SCHED_FIFO and its priority."""
     memory_locked: bool = False
     cpu: int = -1
     notes: list[str] = field(default_factory=list)
@@ -43,10 +44,9 @@ def choose_cpu(wanted: int | None) -> int:
 
 
 def prepare(made: Realtime, priority: int, cpu: int | None) -> None:
-    """Make the calling thread the cycle's: pin it, lock and prefault memory, freeze the collector, go SCHED_FIFO.
+    """Prepare the calling thread to run the cycle: pin it, lock and prefault memory, freeze the collector, SCHED_FIFO.
 
-    Call it after everything is imported and built, from the thread that runs the cycle; what was granted goes into
-    `made`.
+    Call it after everything is imported and built; what was granted goes into `made`.
     """
     _pin(made, cpu)
     _lock_memory(made)
@@ -57,14 +57,14 @@ def prepare(made: Realtime, priority: int, cpu: int | None) -> None:
 
 
 def freeze_garbage() -> None:
-    """Collect once, move what lives out of the collector's sight, and switch it off."""
+    """Collect garbage once, exempt what is alive from collection, and switch the collector off."""
     gc.collect()
     gc.freeze()
     gc.disable()
 
 
 def release(made: Realtime) -> None:
-    """Give back what a file descriptor holds (the CPU latency request)."""
+    """Withdraw the CPU latency request."""
     if made._latency_file >= 0:
         os.close(made._latency_file)
         made._latency_file = -1
@@ -133,8 +133,8 @@ def _fifo(made: Realtime, priority: int) -> None:
 def thread_beside(avoid_cpu: int, priority: int) -> None:
     """Keep the calling thread off the cycle's CPU where there is another; SCHED_FIFO `priority` where allowed.
 
-    The thread shares the interpreter's lock with the cycle: taken off its CPU while it holds the lock, an ordinary
-    thread would let the cycle wait for as long as others run there.
+    The thread shares the interpreter's lock with the cycle: an ordinary thread that is preempted while it holds the
+    lock would make the cycle wait for as long as others run there.
     """
     others = set(available_cpus()) - {avoid_cpu}
     if others:
@@ -144,5 +144,5 @@ def thread_beside(avoid_cpu: int, priority: int) -> None:
 
 
 def share_interpreter_quickly() -> None:
-    """Let the cycle have the interpreter back from another thread within 50 us instead of 5 ms."""
+    """Return the interpreter to the cycle from another thread within 50 us instead of 5 ms."""
     sys.setswitchinterval(50e-6)

@@ -48,7 +48,7 @@ class SlidingPercentiles:
     """
 
     def __init__(self) -> None:
-        self._counts = np.zeros((WINDOW_S, _BINS + 1), dtype=np.int64)
+        self._counts = np.zeros((WINDOW_S, _BINS + 1), dtype=np.int32)
         self._largest = np.zeros(WINDOW_S)
         self._second: int | None = None
 

@@ -9,8 +9,9 @@ import ctypes
 import errno
 import os
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,23 +70,35 @@ def _own_namespace() -> None:
         raise _forbidden(error) from error
 
 
-def _prepare(links: Any, name: str) -> None:
-    """Bring one end up, without ARP and IPv6: nothing but EtherCAT frames is to travel."""
-    index = links.link_lookup(ifname=name)[0]
+def _without_ipv6(name: str) -> None:
+    """Switch IPv6 off on an interface: only EtherCAT frames travel on it."""
     # Where the kernel has no IPv6 or /proc is read-only, a stray router solicitation does no harm.
     with suppress(OSError):
         Path(f"/proc/sys/net/ipv6/conf/{name}/disable_ipv6").write_text("1", encoding="ascii")
+
+
+def _bring_up(links: Any, name: str) -> None:
+    """Bring an interface up, without ARP."""
     flags = IFF_UP | IFF_NOARP
-    links.link("set", index=index, flags=flags, change=flags)
+    links.link("set", index=links.link_lookup(ifname=name)[0], flags=flags, change=flags)
+
+
+def _prepare(links: Any, name: str) -> None:
+    _without_ipv6(name)
+    _bring_up(links, name)
 
 
 def _refused(error: Exception) -> NetworkError:
     return NetworkError(f"the virtual cable cannot be made ({error}): {WHAT_TO_ALLOW}")
 
 
+Pair = tuple[str, str, Callable[[], None]]
+"""Names of the master's end and the segment's end, and the function that brings the master's end up."""
+
+
 @contextmanager
-def private_pair() -> Iterator[tuple[str, str]]:
-    """Move this process into a namespace of its own and lay a cable there; yield the master's and the segment's end.
+def private_pair() -> Iterator[Pair]:
+    """Move this process into a namespace of its own and make a veth pair there.
 
     A master reaches its end by joining this process's namespaces (/proc/PID/ns/user and /proc/PID/ns/net). Must be
     called while the process has one thread.
@@ -99,15 +112,15 @@ def private_pair() -> Iterator[tuple[str, str]]:
     with IPRoute() as links:
         try:
             links.link("add", ifname=MASTER_END, kind="veth", peer={"ifname": SEGMENT_END})
-            _prepare(links, MASTER_END)
+            _without_ipv6(MASTER_END)
             _prepare(links, SEGMENT_END)
         except NetlinkError as error:
             raise _refused(error) from error
-    yield MASTER_END, SEGMENT_END
+        yield MASTER_END, SEGMENT_END, partial(_bring_up, links, MASTER_END)
 
 
 @contextmanager
-def public_pair(name: str) -> Iterator[tuple[str, str]]:
+def public_pair(name: str) -> Iterator[Pair]:
     """Leave the master's end in the caller's network as `name`, move this process and the other end out of it.
 
     The pair is removed at the end. Needs the right to administer the network.
@@ -132,9 +145,10 @@ def public_pair(name: str) -> Iterator[tuple[str, str]]:
                 f"--interface {name} needs the right to administer the network ({error}): run as root or with "
                 "CAP_NET_ADMIN, CAP_NET_RAW and CAP_SYS_ADMIN"
             ) from error
-        # Until the other end is away, in a namespace that dies with this process, removing is up to us.
+        # Until the other end is in a namespace that ends with this process, it has to be removed here.
         try:
-            _prepare(outside, name)
+            # In the caller's namespace: the process leaves it below, and its /proc/sys/net with it.
+            _without_ipv6(name)
             index = outside.link_lookup(ifname=temporary)[0]
             _unshare(CLONE_NEWNET)
             with open("/proc/self/ns/net", "rb") as own:
@@ -142,7 +156,7 @@ def public_pair(name: str) -> Iterator[tuple[str, str]]:
             with IPRoute() as inside:
                 inside.link("set", index=inside.link_lookup(ifname=temporary)[0], ifname=SEGMENT_END)
                 _prepare(inside, SEGMENT_END)
-            yield name, SEGMENT_END
+            yield name, SEGMENT_END, partial(_bring_up, outside, name)
         except (OSError, NetlinkError) as error:
             raise _refused(error) from error
         finally:

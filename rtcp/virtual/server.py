@@ -31,7 +31,16 @@ PR_SET_TIMERSLACK = 29
 MCL_CURRENT, MCL_FUTURE = 1, 2
 SO_TIMESTAMPNS = 35
 TIMESPEC = struct.Struct("@qq")
-ANCILLARY = socket.CMSG_SPACE(TIMESPEC.size)
+ETH_P_ALL = 3
+SOL_PACKET = 263
+PACKET_IGNORE_OUTGOING = 23
+PACKET_AUXDATA = 8
+VLAN_AT = 12
+"""Place of a VLAN tag: before the EtherType."""
+AUXDATA = struct.Struct("=IIIHHHH")
+"""`struct tpacket_auxdata`: status, lengths, offsets, VLAN TCI and TPID (packet(7))."""
+TP_STATUS_VLAN_VALID = 0x10
+ANCILLARY = socket.CMSG_SPACE(TIMESPEC.size) + socket.CMSG_SPACE(AUXDATA.size)
 BUFFER = 2048
 OLDEST = 1_000_000_000
 """A receive time stamp more than this many ns old, or from the future, means that the wall clock was set: not used."""
@@ -39,15 +48,17 @@ RECEIVE_BUFFER = 1 << 20
 STALE = 4_000_000
 """A frame that waited this many ns, because the process was stopped, reaches the slaves but does not come back: SOEM
 has 16 frame numbers, would take an answer from the last round for the present one, and stay a round behind for ever."""
-REST_SHARE = 8
-"""Polling sleeps for this part of the time between frames, right after one: a FIFO thread that never sleeps would be
-throttled by the kernel for 50 ms in every second (sched_rt_runtime_us)."""
-LONGEST_REST = 250_000
+REST_WINDOW = 2_000_000
+REST_MARGIN = 1.5
+"""The kernel stops a SCHED_FIFO thread that takes more than `sched_rt_runtime_us` of the CPU for the rest of each
+`sched_rt_period_us`. The server therefore sleeps in each window (ns) for the share that is left, times this margin."""
+RT_LIMITS = Path("/proc/sys/kernel")
 SILENCE = 20_000_000
 """Without frames for this many ns polling stops until the next one comes."""
 LOOK = 1_000_000
 """The control socket is looked at no more often than once in so many ns."""
 
+Ancillary = list[tuple[int, int, bytes]]
 Ready = Callable[[dict[str, int | str | bool]], None]
 
 
@@ -68,11 +79,14 @@ class Server:
     def __init__(self, segment: Segment, interface: str, truth: GroundTruth, script: Sequence[Planned] = ()) -> None:
         self.segment = segment
         self._truth = truth
-        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
+        # A socket for one EtherType gets tagged frames without their tag; this one gets everything.
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETH_P_ALL))
+        self._socket.setsockopt(SOL_PACKET, PACKET_IGNORE_OUTGOING, 1)
         self._socket.setblocking(False)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self._socket.setsockopt(SOL_PACKET, PACKET_AUXDATA, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
-        self._socket.bind((interface, ETHERTYPE))
+        self._socket.bind((interface, ETH_P_ALL))
         self.registry = FaultRegistry(segment, self._send, time.monotonic_ns(), script, _complain)
 
     def close(self) -> None:
@@ -84,8 +98,11 @@ class Server:
         with suppress(BlockingIOError):
             self._socket.send(frame)
 
-    def serve(self, stop: StopRequest, poll: bool, control: Control | None = None) -> None:
-        """Answer frames until `stop` came; with `poll` sleep no longer than it takes not to be throttled."""
+    def serve(self, stop: StopRequest, poll: bool, control: Control | None = None, rest: float = 0.0) -> None:
+        """Answer frames until `stop` came; with `poll` wait for the next frame without sleeping.
+
+        `rest` is the share of the time that the process sleeps at least, see `rest_share`.
+        """
         segment, registry, truth = self.segment, self.registry, self._truth
         frames = registry.frames
         frame = bytearray(BUFFER)
@@ -94,24 +111,27 @@ class Server:
         descriptors = [self._socket.fileno()]
         monotonic, wait = time.monotonic_ns, select.select
         arrived = 0
-        awake_from = 0 if poll else FOR_EVER
         look_at = FOR_EVER if control is None else 0
+        budget = RestBudget(rest, monotonic())
+        window_end = budget.window_end
         while not stop.came:
             try:
-                size, stamps, _, _ = receive([view], ANCILLARY)
+                size, ancillary, _, _ = receive([view], ANCILLARY)
             except BlockingIOError:
                 size = 0
             if size:
-                before, arrived = arrived, _arrival(stamps)
-                if frames.active:
-                    self._answer_disturbed(frame, size, arrived)
+                if frame[12] != ETHERTYPE >> 8 or frame[13] != ETHERTYPE & 0xFF:
+                    continue
+                arrived = _arrival(ancillary)
+                if frames.active or _tagged(ancillary):
+                    self._answer_slowly(frame, size, arrived, ancillary)
                 elif segment.process(frame, size, arrived):
                     if monotonic() - arrived < STALE:
                         with suppress(BlockingIOError):
                             send(view[:size])
                     segment.settle(arrived)
-                if poll:
-                    awake_from = monotonic() + min((arrived - before) // REST_SHARE, LONGEST_REST)
+                if arrived > window_end:
+                    window_end = budget.rest(monotonic())
                 continue
             now = monotonic()
             if registry.due <= now:
@@ -127,37 +147,81 @@ class Server:
                 stepped = segment.step_one()
                 if truth.watching and stepped is not None:
                     truth.look(stepped, now)
-            elif now < awake_from:
-                wait(descriptors, (), (), max(0, min(due, registry.due, awake_from) - now) * 1e-9)
-            elif now - arrived > SILENCE:
+            elif not poll or now - arrived > SILENCE:
                 wait(descriptors, (), (), max(0, min(due, registry.due) - now) * 1e-9)
+                budget.slept += monotonic() - now
+            elif now > window_end:
+                window_end = budget.rest(now)
 
-    def _answer_disturbed(self, frame: bytearray, size: int, arrived: int) -> None:
-        """Answer a frame while a fault does something to those that pass."""
-        if self.registry.frames.arrives() and self.segment.process(frame, size, arrived):
+    def _answer_slowly(self, frame: bytearray, size: int, arrived: int, ancillary: Ancillary) -> None:
+        """Answer a frame that faults act on, or one with a VLAN tag, which the kernel keeps apart from the frame."""
+        content, tag = frame, _tagged(ancillary)
+        if tag:
+            content = frame[:VLAN_AT] + tag + frame[VLAN_AT:size]
+            size = len(content)
+        frames = self.registry.frames
+        if (not frames.active or frames.arrives()) and self.segment.process(content, size, arrived):
             if time.monotonic_ns() - arrived < STALE:
-                self.registry.answers(bytes(frame[:size]), arrived)
+                self.registry.answers(bytes(content[:size]), arrived)
             self.segment.settle(arrived)
+
+
+class RestBudget:
+    """Time that the process must sleep so that the kernel does not throttle it. Instants in ns.
+
+    `slept` counts the time asleep in the window that ends at `window_end`.
+    """
+
+    def __init__(self, share: float, now: int) -> None:
+        self._least = round(share * REST_WINDOW)
+        self.slept = 0
+        self.window_end = now + REST_WINDOW if self._least else FOR_EVER
+
+    def rest(self, now: int) -> int:
+        """Sleep for what is missing at the end of a window; return the end of the next one."""
+        passed = now - self.window_end + REST_WINDOW
+        missing = min(self._least * passed // REST_WINDOW, REST_WINDOW) - self.slept
+        if missing > 0:
+            time.sleep(missing * 1e-9)
+        self.slept = 0
+        self.window_end = time.monotonic_ns() + REST_WINDOW
+        return self.window_end
+
+
+def rest_share() -> float:
+    """Return the share of the time that this process must sleep: 0 without SCHED_FIFO or without throttling."""
+    if os.sched_getscheduler(0) != os.SCHED_FIFO:
+        return 0.0
+    try:
+        runtime, period = (
+            int((RT_LIMITS / name).read_text()) for name in ("sched_rt_runtime_us", "sched_rt_period_us")
+        )
+    except (OSError, ValueError):
+        runtime, period = 950_000, 1_000_000
+    return 0.0 if runtime < 0 else min(0.5, REST_MARGIN * max(0.0, 1.0 - runtime / period))
 
 
 def _complain(sentence: str) -> None:
     print(sentence, file=sys.stderr, flush=True)
 
 
-def _stamp(data: bytes) -> tuple[int, int]:
-    seconds, nanoseconds = TIMESPEC.unpack_from(data)
-    return seconds, nanoseconds
-
-
-def _arrival(stamps: list[tuple[int, int, bytes]]) -> int:
+def _arrival(ancillary: Ancillary) -> int:
     """The instant (CLOCK_MONOTONIC, ns) at which a frame arrived, by the kernel's receive time stamp."""
     now = time.monotonic_ns()
-    if stamps:
-        seconds, nanoseconds = _stamp(stamps[0][2])
-        age = time.time_ns() - seconds * 1_000_000_000 - nanoseconds
+    if ancillary:
+        seconds, nanoseconds = TIMESPEC.unpack_from(ancillary[0][2])
+        age: int = time.time_ns() - seconds * 1_000_000_000 - nanoseconds
         if 0 <= age < OLDEST:
             return now - age
     return now
+
+
+def _tagged(ancillary: Ancillary) -> bytes:
+    """The VLAN tag (IEEE 802.1Q) that the kernel has taken out of a frame; empty where there was none."""
+    if len(ancillary) < 2 or not ancillary[1][2][0] & TP_STATUS_VLAN_VALID:
+        return b""
+    tci: int = AUXDATA.unpack_from(ancillary[1][2])[5]
+    return b"\x81\x00" + tci.to_bytes(2, "big")
 
 
 def _run_on(cpu: int) -> None:
@@ -203,7 +267,7 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
     with ExitStack() as kept:
         listener = None if control_path is None else kept.enter_context(control_socket(control_path))
         pair = private_pair() if interface is None else public_pair(interface)
-        master_end, segment_end = kept.enter_context(pair)
+        master_end, segment_end, bring_up = kept.enter_context(pair)
         truth = GroundTruth(segment, [slave.model for slave in config.slaves])
         server = Server(segment, segment_end, truth, script)
         kept.callback(server.close)
@@ -211,6 +275,8 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         if control is not None:
             kept.callback(control.close)
         _prefer()
+        # A master that finds its interface up finds the slaves answering.
+        bring_up()
         ready({
             "pid": os.getpid(),
             "interface": master_end,
@@ -218,6 +284,6 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
             "slaves": len(segment.slaves),
         })  # fmt: skip
         try:
-            server.serve(stop, poll, control)
+            server.serve(stop, poll, control, rest_share())
         except OSError as error:
             raise NetworkError(f"the cable at {master_end} is gone ({error.strerror}): was it removed?") from error

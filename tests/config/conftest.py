@@ -23,9 +23,9 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def problems_after(directory: Path) -> Callable[..., list[str]]:
-    """Put `new` for the first `old` of a file, load the arm's file and return the sentences."""
+    """Replace the first `old` of a file by `new`, read it (devices by the arm's file) and return the sentences."""
 
-    def spoil(file: str, *changes: tuple[str, str]) -> list[str]:
+    def spoil(file: str, *changes: tuple[str, str], reader: Callable[[Path], object] = load) -> list[str]:
         path = directory / file
         text = path.read_text()
         for old, new in changes:
@@ -33,7 +33,7 @@ def problems_after(directory: Path) -> Callable[..., list[str]]:
             text = text.replace(old, new, 1)
         path.write_text(text)
         with pytest.raises(ConfigError) as caught:
-            load(Path("assistive_arm.yaml"))
+            reader(Path("assistive_arm.yaml" if file.startswith("devices") else file))
         return caught.value.problems
 
     return spoil

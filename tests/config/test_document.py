@@ -58,6 +58,8 @@ UNREADABLE = {
     "an endless number": (b"a: " + b"1" * 5000, "a.yaml:1: a: this number has 5000 digits; the limit is 100"),
     "an alias of itself": (b"a: &x [*x]\n", "a.yaml:1: a[0]: this alias contains itself"),
     "an unknown alias": (b"a: *x\n", "a.yaml:1:4: this is not valid YAML: found undefined alias 'x'"),
+    "half of a character": (b'a: "\\ud800"\n', "a.yaml:1: a: this text holds U+D800, half of a character"),
+    "a second document": (b"a: 1\n---\nb: 1\n", "a.yaml:2:1: this is not valid YAML: found a second document"),
     "nesting without end": (b"a: " + b"[" * 5000, "a.yaml: the lists and mappings are nested too deeply"),
     "more than a megabyte": (
         b"a: 1\n" * 300_000,

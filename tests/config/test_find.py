@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.config import ConfigError, find, find_config
+from rtcp.config import ConfigError, default_config, find, find_arm, find_config
 
 
 @pytest.fixture
@@ -40,7 +40,7 @@ def test_the_environment_comes_before_the_machine(
 
 
 def test_the_machine_comes_before_the_default(system: Path) -> None:
-    assert find_config() == find.default_config()
+    assert find_config() == default_config()
     made(system)
     assert find_config() == system
 
@@ -48,7 +48,7 @@ def test_the_machine_comes_before_the_default(system: Path) -> None:
 @pytest.mark.usefixtures("system")
 def test_an_empty_environment_variable_names_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RTCP_CONFIG", "")
-    assert find_config() == find.default_config()
+    assert find_config() == default_config()
 
 
 def test_a_given_file_that_does_not_exist_is_refused(tmp_path: Path) -> None:
@@ -65,3 +65,35 @@ def test_a_file_of_the_environment_that_does_not_exist_is_refused(
     with pytest.raises(ConfigError) as caught:
         find_config()
     assert caught.value.problems == [f"{tmp_path}, named by RTCP_CONFIG, is a directory; name the arm's file in it"]
+
+
+# -- which arm ---------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_name_the_arm_is_that_of_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("RTCP_CONFIG", str(default_config()))
+    assert find_arm() == default_config()
+
+
+@pytest.mark.parametrize("name", ["abb_irb120", "assistive_arm"])
+def test_a_bare_name_is_a_file_beside_the_default(name: str) -> None:
+    assert find_arm(name) == default_config().parent / f"{name}.yaml"
+
+
+def test_a_path_is_a_path_also_without_an_ending(directory: Path) -> None:
+    Path("mine").write_bytes(Path("abb_irb120.yaml").read_bytes())
+    assert find_arm("mine") == Path("mine")
+    assert find_arm("./abb_irb120.yaml") == Path("abb_irb120.yaml")
+
+
+@pytest.mark.parametrize("given", ["none.yaml", "./none", "none/arm", "/none"])
+def test_a_path_that_leads_nowhere_is_named(directory: Path, given: str) -> None:
+    with pytest.raises(ConfigError, match="named by --arm, does not exist"):
+        find_arm(given)
+
+
+def test_an_unknown_name_is_answered_with_the_known_ones(directory: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        find_arm("abb_irb140")
+    wanted = "there is no such file, and no arm of this name; known are abb_irb120, assistive_arm"
+    assert caught.value.problems == [f"--arm abb_irb140: {wanted}"]

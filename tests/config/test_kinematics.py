@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import math
 import re
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,7 +14,7 @@ import yaml
 from kinematics.forward import forward, frames
 from kinematics.model import DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
-from rtcp.config import ConfigError, default_config, find, find_arm, load, load_kinematics
+from rtcp.config import ConfigError, default_config, load, load_kinematics
 from rtcp.config.model import CartesianConfig
 from rtcp.config.numbers import angle
 
@@ -27,24 +24,6 @@ LIMIT1 = "{min: -11*pi/12, max: 11*pi/12, velocity: 25*pi/18}"
 LINK1 = "{mass: 3.067, centre: [0.0000977, -0.00012, -0.05159]}"
 MECHANICAL = "\n  limits:\n" + "    - {min: -pi, max: pi, velocity: 1.0}\n" * 6
 HALF = math.pi / 2
-
-
-@pytest.fixture
-def problems_of(directory: Path) -> Callable[..., list[str]]:
-    """Put `new` for the first `old` of a file, read its kinematics and return the sentences without their place."""
-
-    def spoil(file: Path, *changes: tuple[str, str]) -> list[str]:
-        text = file.read_text()
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new, 1)
-        file.write_text(text)
-        with pytest.raises(ConfigError) as caught:
-            load_kinematics(file)
-        assert all(re.match(rf"{file}:\d+: ", problem) for problem in caught.value.problems)
-        return [problem.split(": ", 1)[1] for problem in caught.value.problems]
-
-    return spoil
 
 
 def rewritten(file: Path, change: Callable[[dict[str, object]], object]) -> Path:
@@ -147,33 +126,7 @@ def test_an_arm_starts_without_kinematics_too(directory: Path) -> None:
     assert without == dataclasses.replace(whole, arm=None, cartesian=CartesianConfig())
 
 
-def test_kinematics_and_configuration_load_without_numpy() -> None:
-    reading = "rtcp.config.load_kinematics(rtcp.config.default_config())"
-    code = f"import sys, rtcp.config; {reading}; print('numpy' in sys.modules)"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "False\n"
-
-
 # -- angles ------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("written", "number"),
-    [
-        ("pi", math.pi), ("-pi", -math.pi), ("+pi", math.pi), ("pi/2", math.pi / 2), ("-pi/2", -math.pi / 2),
-        ("pi/4", math.pi / 4), ("3*pi/4", 3 * math.pi / 4), ("-11*pi/12", -math.radians(165)), ("2*pi", math.tau),
-    ],
-)  # fmt: skip
-def test_a_fraction_of_pi_is_that_number(written: str, number: float) -> None:
-    assert angle(written) == number
-
-
-@pytest.mark.parametrize(
-    "written",
-    ["", "PI", "Pi", "pi ", " pi", "- pi", "--pi", "pi/0", "pi/-2", "0*pi", "pi*2", "pi/2/2", "pi+1", "2pi", "1.5*pi",
-     "pi/2.0", "9999999*pi", "pi/9999999", "e", "math.pi", "__import__('os')", "pi\n", "π", "1١*pi"],
-)  # fmt: skip
-def test_any_other_text_is_no_angle(written: str) -> None:
-    assert angle(written) == written
 
 
 def test_angles_may_be_written_as_numbers_too(directory: Path) -> None:
@@ -218,156 +171,6 @@ def test_the_tool_is_a_position_and_three_angles(directory: Path, written: str, 
 
 # -- mistakes ----------------------------------------------------------------------------------------------------------
 
-TURN = "a number from -6.28319 to 6.28319, or a fraction of pi, as -pi/2 or 11*pi/12"
-DEGREES = "; angles are in rad: write 90 degrees as pi/2"
-
-MISTAKES = {
-    "an expression for an angle": (
-        IRB,
-        ("alpha: -pi/2", "alpha: pi*2"),
-        f'kinematics.dh[1].alpha: found the text "pi*2", allowed is {TURN}',
-    ),
-    "an angle with its unit": (
-        IRB,
-        ("alpha: -pi/2", "alpha: -90 deg"),
-        f'kinematics.dh[1].alpha: found the text "-90 deg", allowed is {TURN}; '
-        "write the number alone, the key names its unit",
-    ),
-    "an angle in degrees": (
-        IRB,
-        ("alpha: -pi/2", "alpha: -90"),
-        f"kinematics.dh[1].alpha: found -90, allowed is {TURN}{DEGREES}",
-    ),
-    "a tool turned by degrees": (
-        IRB,
-        ("kinematics:\n", "kinematics:\n  tool: {rpy: [0, 180, 0]}\n"),
-        f"kinematics.tool.rpy[1]: found 180, allowed is {TURN}{DEGREES}",
-    ),
-    "no number for an angle": (
-        IRB,
-        ("alpha: -pi/2", "alpha: .nan"),
-        f"kinematics.dh[1].alpha: found nan, allowed is {TURN}{DEGREES}",
-    ),
-    "an infinite length": (
-        IRB,
-        ("d: 0.290", "d: .inf"),
-        "kinematics.dh[0].d: found inf, allowed is a number from -100 to 100",
-    ),
-    "a length in millimetres": (
-        IRB,
-        ("d: 0.290", "d: 290"),
-        "kinematics.dh[0].d: found 290, allowed is a number from -100 to 100",
-    ),
-    "a length in pi": (
-        IRB,
-        ("d: 0.290", "d: pi"),
-        'kinematics.dh[0].d: found the text "pi", allowed is a number from -100 to 100',
-    ),
-    "a row without its length": (
-        IRB,
-        (ROW1, "{alpha: 0, d: 0.290}"),
-        "kinematics.dh[0]: the key a is missing; it must be a number from -100 to 100",
-    ),
-    "a row with a key of another convention": (
-        IRB,
-        (ROW1, "{alpha: 0, a: 0, d: 0.290, theta: 0}"),
-        "kinematics.dh[0].theta: this key does not exist; allowed are alpha, a, d, offset",
-    ),
-    "five rows": (
-        IRB,
-        (f"    - {ROW1}\n", ""),
-        "kinematics.dh: found a list of 5, allowed is a list of 6 entries",
-    ),
-    "seven rows": (
-        ARM,
-        ("    - {alpha: pi/2, a: 0, d: 0.140}\n", "    - {alpha: pi/2, a: 0, d: 0.140}\n" * 2),
-        "kinematics.dh: found a list of 7, allowed is a list of 6 entries",
-    ),
-    "five limits": (
-        IRB,
-        (f"    - {LIMIT1}", "    #"),
-        "kinematics.limits: found a list of 5, allowed is a list of 6 entries",
-    ),
-    "five masses": (
-        IRB,
-        (f"    - {LINK1}", "    #"),
-        "kinematics.links: found a list of 5, allowed is a list of 6 entries",
-    ),
-    "min above max": (
-        IRB,
-        (LIMIT1, "{min: pi/2, max: -pi/2}"),
-        "kinematics.limits[0]: found min 1.5708 and max -1.5708; min must be less than max",
-    ),
-    "a speed of nothing": (
-        IRB,
-        (LIMIT1, "{min: -1, max: 1, velocity: 0}"),
-        "kinematics.limits[0].velocity: found 0, allowed is a number greater than 0, "
-        "or a fraction of pi, as -pi/2 or 11*pi/12",
-    ),
-    "a negative mass": (
-        IRB,
-        ("mass: 3.067", "mass: -3.067"),
-        "kinematics.links[0].mass: found -3.067, allowed is a number of at least 0",
-    ),
-    "a centre in a plane": (
-        IRB,
-        ("[0.0000977, -0.00012, -0.05159]", "[0.0000977, -0.00012]"),
-        "kinematics.links[0].centre: found a list of 2, allowed is a list of 3 numbers",
-    ),
-    "a tool with a quaternion": (
-        IRB,
-        ("kinematics:\n", "kinematics:\n  tool: {rpy: [0, 0, 0, 1]}\n"),
-        "kinematics.tool.rpy: found a list of 4, allowed is a list of 3 numbers",
-    ),
-    "a list for the kinematics": (
-        IRB,
-        ("kinematics:\n", "kinematics: []\nother:\n"),
-        "kinematics: found an empty list, allowed is a mapping with the keys dh, limits, links, tool",
-    ),
-    "an unknown key beside it": (
-        IRB,
-        ("name: abb-irb120", "name: abb-irb120\npayload: 3"),
-        "payload: this key does not exist; allowed are name, kinematics",
-    ),
-    "a joint beyond its mechanics": (
-        ARM,
-        ("kinematics:\n", "kinematics:" + MECHANICAL.replace("max: pi", "max: 3.0", 1)),
-        "joints[0].position.max: found 3.1, allowed is at most 3, the joint's mechanical end in kinematics.limits[0]",
-    ),
-    "a joint beyond the lower end": (
-        ARM,
-        ("kinematics:\n", "kinematics:" + MECHANICAL.replace("min: -pi", "min: -pi/2", 1)),
-        "joints[0].position.min: found -3.1, allowed is at least -1.5708, the joint's mechanical end in "
-        "kinematics.limits[0]",
-    ),
-    "a joint faster than its mechanics": (
-        ARM,
-        ("kinematics:\n", "kinematics:" + MECHANICAL.replace("velocity: 1.0", "velocity: 0.25", 1)),
-        "joints[0].velocity: found 0.5, allowed is at most 0.25, the velocity in kinematics.limits[0]",
-    ),
-}
-
-
-@pytest.mark.parametrize(("file", "change", "sentence"), MISTAKES.values(), ids=MISTAKES.keys())
-def test_a_mistake_in_the_kinematics_is_named(
-    problems_of: Callable[..., list[str]], file: Path, change: tuple[str, str], sentence: str
-) -> None:
-    assert sentence in problems_of(file, change)
-
-
-def test_the_start_of_the_platform_names_them_too(problems_after: Callable[..., list[str]]) -> None:
-    problems = problems_after(str(ARM), ("d: 0.140", "d: 140"), ("period_us: 500", "period_us: 5"))
-    assert [problem.split(": ")[1] for problem in problems] == ["cycle.period_us", "kinematics.dh[5].d"]
-
-
-def test_an_arm_of_another_number_of_joints_has_no_kinematics(directory: Path) -> None:
-    file = rewritten(ARM, lambda data: data["joints"].pop())  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError) as caught:
-        load_kinematics(file)
-    (problem,) = caught.value.problems
-    assert problem.endswith("kinematics: found beside 5 joints, allowed are 6; leave it out for such an arm")
-    assert len(load(rewritten(file, without_kinematics)).joints) == 5
-
 
 def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
@@ -384,73 +187,13 @@ def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: 
     assert caught.value.problems == [f"{ARM}:1: the key kinematics is missing; {wanted}"]
 
 
-def test_a_mistake_elsewhere_in_a_whole_arm_is_named_too(problems_of: Callable[..., list[str]]) -> None:
-    (problem,) = problems_of(ARM, ("drive_mode: csp", "drive_mode: cps"))
-    assert problem == 'drive_mode: found the text "cps", allowed is one of csp, csv, cst'
+def test_a_mistake_elsewhere_in_a_whole_arm_is_named_too(problems_after: Callable[..., list[str]]) -> None:
+    (problem,) = problems_after(str(ARM), ("drive_mode: csp", "drive_mode: cps"), reader=load_kinematics)
+    assert problem.endswith('drive_mode: found the text "cps", allowed is one of csp, csv, cst')
 
 
-def problems_of_reading() -> list[str]:
-    try:
-        load_kinematics(IRB)
-    except ConfigError as error:
-        return error.problems or ["no sentence"]
-    return []
-
-
-def places(node: object, where: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    if where:
-        yield where
-    for key, value in node.items() if isinstance(node, dict) else enumerate(node[:1] if isinstance(node, list) else ()):
-        yield from places(value, (*where, key))
-
-
-@pytest.mark.parametrize("value", [None, -1, 1e300, "x", "pi", [], [1, 2, 3], {"a": 1}, True], ids=repr)
-def test_whatever_stands_in_whatever_place_is_accepted_or_named(directory: Path, value: object) -> None:
-    shipped = yaml.safe_load(IRB.read_text())
-    shipped["kinematics"]["tool"] = {"position": [0, 0, 0.1], "rpy": [0, 0, 0]}
-    for where in places(shipped):
-        spoilt = copy.deepcopy(shipped)
-        node = spoilt
-        for key in where[:-1]:
-            node = node[key]
-        node[where[-1]] = value
-        IRB.write_text(yaml.safe_dump(spoilt))
-        assert all(re.match(rf"{IRB}:\d+: ", sentence) for sentence in problems_of_reading())
-
-
-# -- which arm ---------------------------------------------------------------------------------------------------------
-
-
-def test_without_a_name_the_arm_is_that_of_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("RTCP_CONFIG", str(default_config()))
-    assert find_arm() == default_config()
-
-
-@pytest.mark.parametrize("name", ["abb_irb120", "assistive_arm"])
-def test_a_bare_name_is_a_file_beside_the_default(name: str) -> None:
-    assert find_arm(name) == default_config().parent / f"{name}.yaml"
-
-
-def test_a_path_is_a_path_also_without_an_ending(directory: Path) -> None:
-    Path("mine").write_bytes(IRB.read_bytes())
-    assert find_arm("mine") == Path("mine")
-    assert find_arm("./abb_irb120.yaml") == Path("abb_irb120.yaml")
-
-
-@pytest.mark.parametrize("given", ["none.yaml", "./none", "none/arm", "/none"])
-def test_a_path_that_leads_nowhere_is_named(directory: Path, given: str) -> None:
-    with pytest.raises(ConfigError, match="named by --arm, does not exist"):
-        find_arm(given)
-
-
-def test_an_unknown_name_is_answered_with_the_known_ones(directory: Path) -> None:
-    with pytest.raises(ConfigError) as caught:
-        find_arm("abb_irb140")
-    wanted = "there is no such file, and no arm of this name; known are abb_irb120, assistive_arm"
-    assert caught.value.problems == [f"--arm abb_irb140: {wanted}"]
-
-
-def test_kinematics_beside_it_do_not_disturb_the_search_for_the_arms_file(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("RTCP_CONFIG", raising=False)
-    monkeypatch.setattr(find, "SYSTEM", Path("/nonexistent/assistive_arm.yaml"))
-    assert find.find_config().name == "assistive_arm.yaml"
+def test_the_start_of_the_platform_names_mistakes_in_the_kinematics_too(
+    problems_after: Callable[..., list[str]],
+) -> None:
+    problems = problems_after(str(ARM), ("d: 0.140", "d: 140"), ("period_us: 500", "period_us: 5"))
+    assert [problem.split(": ")[1] for problem in problems] == ["cycle.period_us", "kinematics.dh[5].d"]

@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
-from rtcp.config.operation import InputConfig
 
 from rtcp.config import default_config, load, load_segment, segment_path
-from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
+from rtcp.config.model import ArmConfig, GripperConfig, InputConfig, Joint, Range, SlaveConfig
 from rtcp.config.segment import SegmentSlave
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
 from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped

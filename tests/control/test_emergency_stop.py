@@ -7,8 +7,8 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from rtcp.config.operation import InputConfig
 
+from rtcp.config.model import InputConfig
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
 from rtcp.ipc.events import (

@@ -7,9 +7,8 @@ from dataclasses import fields, replace
 from typing import get_args, get_type_hints
 
 import pytest
-from rtcp.config.operation import InputConfig
-from rtcp.config.stops import StopsConfig
 
+from rtcp.config.model import InputConfig, StopsConfig
 from rtcp.control.machine import STATES
 from rtcp.control.states import Signal
 from rtcp.ipc.blackboard import Blackboard

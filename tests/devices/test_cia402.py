@@ -221,7 +221,42 @@ def test_widths_and_order_are_those_of_the_description():
 
 
 def test_missing_channels_are_all_named_at_the_start():
-    with pytest.raises(DeviceError, match=r"`rpdo` maps no target_torque, modes_of_operation"):
-        Cia402Drive(slave(rpdo=RPDO[:3]))
+    with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position, modes_of_operation"):
+        Cia402Drive(slave(rpdo=RPDO[:1]))
     with pytest.raises(DeviceError, match=r"`tpdo` maps no modes_of_operation_display"):
         Cia402Drive(slave(tpdo=TPDO[:4]))
+
+
+CSP_ONLY = slave((*RPDO[:2], RPDO[4]), (*TPDO[:2], TPDO[4]))
+
+
+def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp():
+    drive = Cia402Drive(CSP_ONLY, speed_limit=0.5)
+    for status in (SWITCHED_ON, ENABLED, ENABLED):
+        drive.decode(struct.pack("<Hib", status, 10000, 8))
+        drive.advance(T.ENABLED)
+    drive.target_position = 1.5
+    assert drive.encode() == struct.pack("<Hib", 0x0F, 15000, 8)
+    assert [drive.supports(mode) for mode in (8, 9, 10)] == [True, False, False]
+
+
+def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms():
+    drive = Cia402Drive(CSP_ONLY, 0.0005)
+    for cycle in range(200):
+        drive.decode(struct.pack("<Hib", ENABLED, 70000 + 3 * cycle, 8))
+        if cycle == 0:
+            assert drive.velocity == 0.0
+    assert drive.velocity == pytest.approx(3 * 1e-4 / 0.0005)
+    for _ in range(41):
+        drive.decode(struct.pack("<Hib", ENABLED, 70597, 8))
+    assert (drive.velocity, drive.torque) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("without", "modes"),
+    [("target_velocity", [8, 10]), ("velocity", [8]), ("target_torque", [8, 9]), ("torque", [8, 9])],
+)
+def test_a_drive_serves_the_modes_whose_entries_it_maps(without, modes):
+    rpdo, tpdo = ([row for row in rows if row[0] != without] for rows in (RPDO, TPDO))
+    drive = Cia402Drive(slave(tuple(rpdo), tuple(tpdo)))
+    assert [mode for mode in (8, 9, 10) if drive.supports(mode)] == modes

@@ -44,9 +44,15 @@ def test_an_output_that_does_not_exist_is_refused_with_the_range(number):
         make_box().set_output(number, True)
 
 
-def test_a_box_without_counter_is_refused():
-    with pytest.raises(DeviceError, match="`tpdo` maps no counter"):
-        make_box(inputs=INPUTS[:1])
+def test_a_box_without_a_counter_counts_nothing():
+    box = make_box(inputs=INPUTS[:1])
+    box.decode(b"\x3e\xff")
+    assert (box.inputs, box.counter) == (0xFF3E, 0)
+
+
+def test_a_box_without_inputs_is_refused():
+    with pytest.raises(DeviceError, match="`tpdo` maps no inputs; kind io needs inputs, found are counter"):
+        make_box(inputs=INPUTS[1:])
 
 
 def test_inputs_as_single_bits_are_refused():

@@ -81,7 +81,7 @@ def test_the_foreground_start_keeps_a_gateway_and_nothing_moves_by_that(platform
     kill(before["loop"])
     said = foreground.communicate()[0]
     assert foreground.returncode == 5
-    assert f"the gateway (process {before['gateway']}) has ended by SIGKILL: it is started anew" in said
+    assert f"the gateway (process {before['gateway']}) has ended by SIGKILL: it is restarted" in said
     assert f"the gateway (process {after['gateway']}) answers again" in said
     assert not any(lives(pid) for pid in after.values())
     (fault,) = recorded(platform)

@@ -1,8 +1,7 @@
-"""The launcher beside others: what an older version left, who waits for whom, what a gateway is handed."""
+"""The launcher beside other launchers: what an unclean end left, who waits for whom, what a new gateway gets."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -25,15 +24,10 @@ from rtcp.ipc.session import (
     Pid,
     Processes,
     Session,
-    SessionError,
-    exit_problems,
     identify,
     is_running,
     read_processes,
-    read_session,
-    remove_exit_report,
     session_file,
-    write_exit_report,
 )
 from rtcp.launch import launcher, platform
 from rtcp.launch.platform import Platform
@@ -77,33 +71,8 @@ def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]
     blackboard_file(directory).unlink(missing_ok=True)
 
 
-@pytest.mark.parametrize("older", [{"version": "0.0.1"}, {"version": None}])
-def test_a_session_of_another_version_is_refused(tmp_path: Path, config: ArmConfig, older: dict[str, None]) -> None:
-    session_of(config).write(tmp_path)
-    assert read_session(tmp_path) == session_of(config)
-    found = json.loads(session_file(tmp_path).read_text())
-    session_file(tmp_path).write_text(json.dumps({**found, **older}))
-    with pytest.raises(SessionError, match=r"session\.json was written by another version of rtcp"):
-        read_session(tmp_path)
-
-
-@pytest.mark.parametrize("wrong", ["without a key", "with a key of another type"])
-def test_a_session_whose_fields_do_not_fit_is_refused_and_the_key_named(
-    tmp_path: Path, config: ArmConfig, wrong: str
-) -> None:
-    session_of(config).write(tmp_path)
-    found = json.loads(session_file(tmp_path).read_text())
-    if wrong == "without a key":
-        del found["session"]["config"]["stops"]
-    else:
-        found["session"]["config"]["stops"] = "none"
-    session_file(tmp_path).write_text(json.dumps(found))
-    with pytest.raises(SessionError, match=r"session\.json is damaged: .*stops"):
-        read_session(tmp_path)
-
-
 @pytest.mark.parametrize("wrong", ["session", "black box"])
-def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
+def test_the_files_of_an_unclean_end_are_removed_even_if_they_are_damaged(
     directory: Path, dead_loop: None, other: subprocess.Popen[bytes], config: ArmConfig,
     monkeypatch: pytest.MonkeyPatch, wrong: str,
 ) -> None:  # fmt: skip
@@ -129,7 +98,7 @@ def test_what_an_unclean_end_left_is_cleared_away_whatever_is_wrong_with_it(
     assert read_processes(directory) == Processes()
 
 
-def test_a_stop_waits_for_whoever_has_the_lock(directory: Path, other: subprocess.Popen[bytes]) -> None:
+def test_a_stop_waits_for_the_lock(directory: Path, other: subprocess.Popen[bytes]) -> None:
     Processes(segment=identify(other.pid)).write(directory)
     told: list[str] = []
     stopper = threading.Thread(target=launcher.stop, args=(told.append,))
@@ -163,7 +132,7 @@ def test_a_stop_does_not_wait_long_for_a_gateway_that_hangs(
     assert ended_by == (-signal.SIGTERM, -signal.SIGTERM)
 
 
-def test_a_stop_that_has_waited_long_enough_says_that_it_has_done_nothing(
+def test_a_stop_that_does_not_get_the_lock_is_refused_and_has_done_nothing(
     directory: Path, other: subprocess.Popen[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(launcher, "STOP_TIMEOUT_S", 0.1)
@@ -224,15 +193,13 @@ def test_the_lock_is_free_while_a_new_gateway_is_waited_for(directory: Path, rep
     assert f"the gateway (process {replacement.gateway}) ended with code -9" in str(replacement.until_ended())
 
 
-def test_a_gateway_that_a_stop_ends_while_it_is_waited_for_is_no_error(
-    directory: Path, replacement: Replacement
-) -> None:
+def test_a_gateway_that_a_stop_ends_while_it_starts_is_no_error(directory: Path, replacement: Replacement) -> None:
     stop_marker(directory).touch()
     os.kill(replacement.gateway, signal.SIGKILL)
     assert replacement.until_ended() == 0
 
 
-def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
+def test_a_new_gateway_gets_the_state_directory_of_the_start(directory: Path, config: ArmConfig) -> None:
     running = Platform(directory, config, Processes(), directory / "of the start")
     os.close(running.begin_gateway())
     (child,) = running._children
@@ -245,7 +212,7 @@ def test_a_new_gateway_is_handed_the_state_directory_of_the_start(directory: Pat
     assert f"RTCP_STATE_DIR={directory}/of the start".encode() in environment.split(b"\0")
 
 
-def test_a_gateway_whose_pipe_closes_before_it_is_dead_is_told_to_have_ended(
+def test_a_gateway_whose_pipe_closes_before_it_exits_is_reported_with_its_exit_code(
     directory: Path, config: ArmConfig
 ) -> None:
     running = Platform(directory, config, Processes())
@@ -265,17 +232,3 @@ def test_a_start_keeps_the_logs_of_the_run_before(directory: Path, config: ArmCo
         launcher._start_all(directory, broken, launcher.StartOptions(), 0, lambda said: None)
     assert (directory / "loop.log.1").read_text() == "what went wrong"
     assert (directory / "gateway.log.1").read_text() == "who asked"
-
-
-@pytest.mark.parametrize("lived", [True, False])
-def test_a_loop_of_another_start_does_not_answer_for_this_one(directory: Path, lived: bool) -> None:
-    this = identify(os.getpid())
-    write_exit_report(directory, this, ["a slave stayed in OP"])
-    assert exit_problems(directory, this, lived) == ("a slave stayed in OP",)
-    gone = Pid(this + 1, this.identity)
-    (sentence,) = exit_problems(directory, gone, lived)
-    assert ("was killed" in sentence) == lived
-    assert "left to their watchdog" in sentence
-    remove_exit_report(directory)
-    assert "left to their watchdog" in exit_problems(directory, gone, lived)[0]
-    assert exit_problems(directory, Pid(0), lived) == ()

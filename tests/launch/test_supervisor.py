@@ -39,7 +39,7 @@ class Kept:
 
     @property
     def starts(self) -> int:
-        return sum("it is started anew" in sentence for sentence in self.told)
+        return sum("it is restarted" in sentence for sentence in self.told)
 
 
 @pytest.fixture
@@ -56,14 +56,14 @@ def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Kept]:
 def test_a_gateway_that_cannot_live_is_started_only_so_often_and_its_log_keeps_every_end(
     kept: Kept, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    kept.look_until(lambda: "left alone" in (kept.told or [""])[-1])
+    kept.look_until(lambda: "tried again" in (kept.told or [""])[-1])
     for _ in range(3):
         kept.supervisor.look()
     assert kept.starts == 2
     assert len(kept.told) == 3
-    assert kept.told[0] == f"the gateway (process {1 << 22}) has ended: it is started anew"
-    assert "has ended with code 1, 2 times within 60 s: it is left alone for a while" in kept.told[2]
-    assert kept.told[2].endswith(f"; {tmp_path / 'gateway.log'} says why")
+    assert kept.told[0] == f"the gateway (process {1 << 22}) has ended: it is restarted"
+    assert "has ended with code 1, 2 times within 60 s: it is tried again later" in kept.told[2]
+    assert kept.told[2].endswith(f"; {tmp_path / 'gateway.log'} has the reason")
     assert (tmp_path / "gateway.log").read_text().count("No such file") == 2
     # The minute has passed.
     monkeypatch.setattr(supervisor, "WINDOW_S", 0.0)
@@ -115,7 +115,7 @@ def test_a_gateway_that_cannot_be_started_is_said_once_and_counts_as_a_start(
     for _ in range(5):
         kept.supervisor.look()
     assert [sentence.partition(":")[0] for sentence in kept.told] == [
-        "the gateway cannot be started anew",
+        "the gateway cannot be restarted",
         f"the gateway (process {1 << 22}) has ended, 2 times within 60 s",
     ]
     assert "Is a directory" in kept.told[0]
@@ -145,4 +145,4 @@ def test_a_signal_without_a_name_is_told_by_its_number(kept: Kept) -> None:
     kept.running.processes.gateway = identify(child.pid)
     child.send_signal(40)
     kept.look_until(lambda: kept.told != [])
-    assert f"the gateway (process {child.pid}) has ended by signal 40: it is started anew" in kept.told[0]
+    assert f"the gateway (process {child.pid}) has ended by signal 40: it is restarted" in kept.told[0]

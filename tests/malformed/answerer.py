@@ -102,7 +102,8 @@ class Answerer:
 
 
 def main() -> None:
-    with private_pair() as (_, own):
+    with private_pair() as (_, own, bring_up):
+        bring_up()
         port = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(ETHERTYPE))
         port.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         port.bind((own, ETHERTYPE))

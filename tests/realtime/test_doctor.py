@@ -174,6 +174,12 @@ def test_every_check_that_can_stand_in_the_way_is_in_the_table() -> None:
     assert {check.key for check in CHECKS} == tested
 
 
+def test_the_page_lists_the_checks_in_their_order() -> None:
+    page = (Path(__file__).parents[2] / "docs/realtime.md").read_text()
+    rows = re.findall(r"^\| ([a-z][a-z-]+(?:, [a-z-]+)*) \|", page.split("| check |")[1].split("\n\n")[0], re.MULTILINE)
+    assert [key for row in rows for key in row.split(", ")] == [check.key for check in CHECKS]
+
+
 @pytest.mark.parametrize(
     ("kind", "warning", "bad"),
     [

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rtcp.gateway.carrier import Carrier, CommandFailed
+from rtcp.gateway.commander import Commander
+from rtcp.gateway.picture import Picture
 
 from rtcp.config import default_config, load
 from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.registers import Steps
-from rtcp.gateway.carrier import Carrier, CommandFailed
-from rtcp.gateway.commander import Commander
-from rtcp.gateway.picture import Picture
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Session

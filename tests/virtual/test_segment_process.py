@@ -20,6 +20,7 @@ pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).parents[2]
 CHILD = Path(__file__).with_name("soem_child.py")
+RAW_CHILD = Path(__file__).with_name("frames_child.py")
 FACTS = [0, 820, 1660, 2500, 3320, 4160, 5020]
 NOBODY = 65534
 needs_root = pytest.mark.skipif(os.getuid() != 0, reason="only root may leave an interface in the caller's network")
@@ -216,7 +217,7 @@ def test_where_namespaces_are_forbidden_one_sentence_says_what_to_allow(config: 
         ("slaves:\n  - {model: toaster}\n", [], "toaster"),
         ("slaves:\n  - {model: diewu-io, options: {colour: 3}}\n", [], "colour"),
         ("slaves:\n  - {model: diewu-io, delay_ns: 900}\n  - {model: diewu-io, delay_ns: 800}\n", [],
-         "slave 2 has delay_ns 800, less than the 900 ns of the slave before it"),
+         "found 800 ns, allowed is at least the 900 ns of the slave before it"),
         ("slaves: []\n", [], "slaves"),
         ("slaves:\n  - {model: diewu-io}\n", ["--interface", "a/b"], "'a/b' is no interface name"),
         ("slaves:\n  - {model: diewu-io}\n", ["--interface", "far-too-long-a-name"], "is no interface name"),
@@ -234,3 +235,55 @@ def test_what_cannot_be_is_refused_in_a_sentence_with_code_2(
     assert expected in said
     assert "Traceback" not in said
     assert said.count("\n") == 1
+
+
+def raw_master(segment: dict[str, Any], frames: int, period_us: int, *more: str) -> dict[str, Any]:
+    command = [sys.executable, str(RAW_CHILD), str(segment["pid"]), str(segment["interface"]), str(frames)]
+    done = subprocess.run([*command, str(period_us), *more], stdout=subprocess.PIPE, text=True, check=True, timeout=200)
+    result: dict[str, Any] = json.loads(done.stdout)
+    return result
+
+
+@pytest.mark.parametrize(("options", "period_us"), [((), 0), (("--poll",), 0), (("--poll",), 1000)])
+def test_under_sched_fifo_the_segment_leaves_the_kernel_its_share_of_the_cpu(
+    config: Path, options: tuple[str, ...], period_us: int
+) -> None:
+    with running(config, *options) as (_, facts):
+        if os.sched_getscheduler(facts["pid"]) != os.SCHED_FIFO:
+            pytest.skip("no right to SCHED_FIFO")
+        told = raw_master(facts, 3000 if period_us else 30_000, period_us)
+    assert told["cpu_share"] < 0.945, "the kernel throttles SCHED_FIFO above 95 % (sched_rt_runtime_us)"
+    assert told["counters"] == [7]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("options", "frames", "period_us"), [((), 100_000, 0), (("--poll",), 20_000, 1000)])
+def test_no_frame_is_lost_back_to_back_nor_while_polling(
+    config: Path, options: tuple[str, ...], frames: int, period_us: int
+) -> None:
+    with running(config, *options) as (_, facts):
+        assert raw_master(facts, frames, period_us)["lost"] == 0
+
+
+def test_a_frame_with_a_vlan_tag_is_answered_with_its_tag(config: Path) -> None:
+    with running(config) as (_, facts):
+        told = raw_master(facts, 5, 2000, "5")
+    assert (told["lost"], told["counters"], told["tags"]) == (0, [7], [5])
+
+
+@needs_root
+def test_an_interface_that_is_up_is_answered(config: Path) -> None:
+    name = f"up{os.getpid()}"[:15]
+    segment = start(config, "--interface", name)
+    try:
+        flags = Path(f"/sys/class/net/{name}/flags")
+        deadline = time.monotonic() + 20
+        while not (flags.exists() and int(flags.read_text(), 16) & 1):
+            assert time.monotonic() < deadline
+        done = subprocess.run(
+            [sys.executable, str(RAW_CHILD), str(os.getpid()), name, "1", "0"], stdout=subprocess.PIPE, check=True
+        )
+        assert json.loads(done.stdout)["lost"] == 0
+    finally:
+        segment.kill()
+        segment.communicate()

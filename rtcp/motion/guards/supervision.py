@@ -2,22 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 from rtcp.config.model import ArmConfig
+from rtcp.ipc.events import Emergency, FollowingError, OverSpeed, OverTorque
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
-
-SPEED, TORQUE, FOLLOWING_ERROR = 0, 1, 2
-
-
-class Found(NamedTuple):
-    """What was beyond its limit for too long: `kind` 0 speed, 1 torque, 2 following error; the joint, value, limit."""
-
-    kind: int
-    axis: int
-    value: float
-    limit: float
 
 
 class Supervision:
@@ -42,8 +30,8 @@ class Supervision:
             for i in self._joints:
                 counts[i] = 0
 
-    def look(self, state: ArmState) -> Found | None:
-        """Look at the cycle's measurements; return what has been beyond its limit for too long, or None."""
+    def check(self, state: ArmState) -> Emergency | None:
+        """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
         limits, error = self._limits, self._error
         speeds, torques, errors = self._counts
         for i in self._joints:
@@ -54,7 +42,7 @@ class Supervision:
             else:
                 speeds[i] += 1
                 if speeds[i] >= self._cycles:
-                    return Found(SPEED, i, value, bound)
+                    return OverSpeed(i, value, bound)
             bound = self._torque * limits.torque[i]
             value = state.actual_torque[i]
             if -bound <= value <= bound:
@@ -62,12 +50,12 @@ class Supervision:
             else:
                 torques[i] += 1
                 if torques[i] >= self._cycles:
-                    return Found(TORQUE, i, value, bound)
+                    return OverTorque(i, value, bound)
             value = state.actual[i] - state.commanded[i]
             if -error <= value <= error:
                 errors[i] = 0
             else:
                 errors[i] += 1
                 if errors[i] >= self._cycles:
-                    return Found(FOLLOWING_ERROR, i, value, error)
+                    return FollowingError(i, value, error)
         return None
