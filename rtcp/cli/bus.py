@@ -15,7 +15,7 @@ import typer
 from rtcp.api import NotRunning, Robot
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
 from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, code_of, interruption_code, signals_raise
+from rtcp.cli.errors import CommandError, interruption_code, signals_raise
 from rtcp.cli.output import emit, emit_json, facts, report, show, table
 from rtcp.cli.platform import refuse_second_platform
 from rtcp.config.model import VIRTUAL
@@ -139,8 +139,8 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
     """Yield the running platform's bus where it is the requested one, else open the requested or configured one.
 
     Raises:
-        CommandError: the offline bus failed, or a signal ended the command; a started segment has ended.
-        RtcpError: as the platform answers.
+        CommandError: a signal ended the command; a started segment has ended.
+        RtcpError: as the platform or the offline bus answers.
         ConfigError: the configuration is wrong.
     """
     try:
@@ -158,8 +158,6 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
                     yield Bus(status["bus"], positions, robot)
                 else:
                     yield _offline(name, config)
-    except offline.OfflineError as error:
-        raise CommandError(str(error), code_of(error.kind)) from error
     except KeyboardInterrupt as interruption:
         raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
 

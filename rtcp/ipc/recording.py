@@ -193,7 +193,7 @@ def _fill(path: Path, recording: Recording) -> None:
             sec, nsec = divmod(moment.time_ns, 1_000_000_000)
             log = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": moment.message, "name": "rtcp"}
             writer.add_message(channel, moment.time_ns, json.dumps(log).encode(), moment.time_ns)
-        writer.finish()
+        writer.finish()  # type: ignore[no-untyped-call]
         file.flush()
         os.fsync(file.fileno())
 

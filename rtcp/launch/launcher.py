@@ -18,11 +18,11 @@ from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, state_directory
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import check_name
-from rtcp.gateway.blackbox import BlackBox
-from rtcp.gateway.blackbox_file import faults_directory
+from rtcp.gateway.black_box import BlackBox
 from rtcp.ipc.client import LONGEST_SOCKET_PATH
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.recording import faults_directory
 from rtcp.ipc.runtime_directory import (
     LockHeld,
     RuntimeDirectoryError,
