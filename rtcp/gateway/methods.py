@@ -332,7 +332,7 @@ class Methods:
             return {}
 
         documentation = inspect.cleandoc(kind.__doc__ or "")
-        return Method(kind.name, _parameters_of_command(kind), call, documentation, streams=streams)
+        return Method(kind.name, _parameters_of_command(kind), call, documentation, streams=streams)  # type: ignore[arg-type]
 
     @staticmethod
     def _check_count(name: str, numbers: Numbers, count: int) -> None:
