@@ -1,4 +1,4 @@
-"""The stop reactions for docs/faults.md, which `python docs/generate.py` writes.
+"""The stop reactions for docs/stops.md, which `python docs/generate.py` writes.
 
 Bounds are those of the shipped arm, from `rtcp.ipc.stops`; the tests measure against the same ones.
 """

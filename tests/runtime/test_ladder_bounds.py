@@ -35,7 +35,7 @@ STANDS_RAD_S = 0.01
 SAFE_OP, AL_WATCHDOG = 4, 0x001B
 OUTPUTS = struct.Struct("<Hiiib")
 ENABLE_OPERATION, QUICK_STOP = 0x0F, 0x02
-FAULTS_PAGE = Path(__file__).parents[2] / "docs" / "faults.md"
+STOPS_PAGE = Path(__file__).parents[2] / "docs" / "stops.md"
 SITUATIONS = ("holding", "moving", "jogging")
 
 
@@ -274,4 +274,4 @@ def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
 
 def test_the_section_in_the_docs_is_printed_from_the_table_and_the_bounds() -> None:
     # `python docs/generate.py` writes it.
-    assert section(load(default_config())) in FAULTS_PAGE.read_text()
+    assert section(load(default_config())) in STOPS_PAGE.read_text()
