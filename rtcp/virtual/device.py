@@ -14,8 +14,7 @@ from math import isfinite
 from types import MappingProxyType
 from typing import ClassVar, Protocol, cast
 
-from rtcp.config.document import Finding
-from rtcp.config.validation import shown
+from rtcp.config.document import Finding, shown
 from rtcp.virtual.objects import DataType, Entry, ObjectDictionary
 
 GROUP = "rtcp.virtual_models"
