@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import astuple
 
 from rtcp.control.arm import Arm
 from rtcp.control.verdict import DONE, Verdict
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.codes import Code, Refusal
 from rtcp.ipc.layout import PLANS
-from rtcp.motion.limits import Wrong, read
+from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeArm, LimitsExcludeJoint, LimitWidened
+from rtcp.motion.limits import read
 
 MOST_ROWS = 64
 """Six joints and more boxes than an arm is configured with: all are looked at in one cycle."""
 _REFUSALS = {
-    Wrong.NO_LIMIT: Refusal.LIMITS_WRONG,
-    Wrong.FASTER: Refusal.LIMITS_WRONG,
-    Wrong.WIDER: Refusal.LIMITS_NARROW,
-    Wrong.OUTSIDE: Refusal.LIMITS_OUTSIDE,
+    ImpossibleLimit: Refusal.LIMITS_WRONG,
+    LimitWidened: Refusal.LIMITS_NARROW,
+    LimitsExcludeJoint: Refusal.LIMITS_OUTSIDE,
 }
 
 
@@ -43,7 +44,10 @@ class LimitOrders:
             return Refusal.LIMITS_WRONG, -1, count, float(MOST_ROWS)
         refused = arm.trajectory_guard.refuses(arm.state, new)
         if refused is not None:
-            return _REFUSALS[refused.wrong], refused.at, refused.value, refused.limit
+            if isinstance(refused, LimitsExcludeArm):
+                return Refusal.LIMITS_OUTSIDE, -1, 0.0, float(refused.box)
+            axis, value, limit = astuple(refused)
+            return _REFUSALS[type(refused)], axis, value, limit
         limits = arm.limits
         if arm.first_with_torque() >= 0:
             for axis, held in enumerate(arm.state.actual_torque):

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from math import isfinite
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 from rtcp.config.model import ArmConfig
+from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeJoint, LimitWidened, Refusal
 from rtcp.motion.planning.plan import COLUMNS, MOST_JOINTS
 
 LEAST_PART = 1e-3
@@ -15,28 +15,6 @@ LEAST_PART = 1e-3
 
 Corners: TypeAlias = tuple[float, float, float, float, float, float]
 """A box along the base's axes, m: x, y, z of its lower corner, then of its upper one."""
-
-
-class Wrong(IntEnum):
-    """Why limits are not taken."""
-
-    NO_LIMIT = 1
-    """A number that is none, or a range that is empty; `at`: joint, or -1 for a box."""
-    WIDER = 2
-    """Beyond what the configuration allows; `at` as above."""
-    OUTSIDE = 3
-    """The arm stands, or would come to rest, outside; `at`: joint, or -1 for a box (`limit`: its number)."""
-    FASTER = 4
-    """The joint is moving faster than its new limit."""
-
-
-class Refused(NamedTuple):
-    """The answer of a transaction that was not carried out: nothing has changed."""
-
-    wrong: Wrong
-    at: int
-    value: float
-    limit: float
 
 
 @dataclass(frozen=True)
@@ -134,61 +112,61 @@ class Limits:
         self.jerk[:], self.torque[:] = new.jerk, new.torque
         self.box, self.keep_out = new.box, new.keep_out
 
-    def check(self, new: Values, position: list[float], velocity: list[float]) -> Refused | None:
+    def check(self, new: Values, position: list[float], velocity: list[float]) -> Refusal | None:
         """Return why `new` cannot come into force for an arm at `position` (rad) with `velocity` (rad/s), or None.
 
         The boxes are compared with the configuration's only; where the arm is in them `TrajectoryGuard.refuses` says.
         """
         if len(new.low) != len(self.low):
-            return Refused(Wrong.NO_LIMIT, -1, float(len(new.low)), float(len(self.low)))
+            return ImpossibleLimit(-1, float(len(new.low)), float(len(self.low)))
         for axis, (q, v) in enumerate(zip(position, velocity, strict=True)):
             refused = self._joint(new, axis, q, v)
             if refused is not None:
                 return refused
         return self._boxes(new)
 
-    def _joint(self, new: Values, axis: int, q: float, v: float) -> Refused | None:
+    def _joint(self, new: Values, axis: int, q: float, v: float) -> Refusal | None:
         low, high = new.low[axis], new.high[axis]
         if not (isfinite(low) and isfinite(high) and low < high):
-            return Refused(Wrong.NO_LIMIT, axis, low if not isfinite(low) else high, low)
+            return ImpossibleLimit(axis, low if not isfinite(low) else high, low)
         widest = self.widest
         if low < widest.low[axis]:
-            return Refused(Wrong.WIDER, axis, low, widest.low[axis])
+            return LimitWidened(axis, low, widest.low[axis])
         if high > widest.high[axis]:
-            return Refused(Wrong.WIDER, axis, high, widest.high[axis])
+            return LimitWidened(axis, high, widest.high[axis])
         for name in ("velocity", "acceleration", "jerk", "torque"):
             found, most = getattr(new, name)[axis], getattr(widest, name)[axis]
             if not (isfinite(found) and found >= LEAST_PART * most):
-                return Refused(Wrong.NO_LIMIT, axis, found, LEAST_PART * most)
+                return ImpossibleLimit(axis, found, LEAST_PART * most)
             if found > most:
-                return Refused(Wrong.WIDER, axis, found, most)
+                return LimitWidened(axis, found, most)
         rest = q + 0.5 * v * abs(v) / new.acceleration[axis]
         if abs(v) > new.velocity[axis] < self.velocity[axis]:
-            return Refused(Wrong.FASTER, axis, new.velocity[axis], abs(v))
+            return ImpossibleLimit(axis, new.velocity[axis], abs(v))
         # What is not narrowed needs no room: the guards see to it, to a rounding.
         if low <= self.low[axis] and high >= self.high[axis] and new.acceleration[axis] >= self.acceleration[axis]:
             return None
         if not low <= min(q, rest) <= max(q, rest) <= high:
-            return Refused(Wrong.OUTSIDE, axis, rest, high if rest > high or q > high else low)
+            return LimitsExcludeJoint(axis, rest, high if rest > high or q > high else low)
         return None
 
-    def _boxes(self, new: Values) -> Refused | None:
+    def _boxes(self, new: Values) -> Refusal | None:
         for box in (*new.keep_out, *(() if new.box is None else (new.box,))):
             for lower, upper in zip(box[:3], box[3:], strict=True):
                 if not (isfinite(lower) and isfinite(upper) and lower < upper):
-                    return Refused(Wrong.NO_LIMIT, -1, lower if not isfinite(lower) else upper, lower)
+                    return ImpossibleLimit(-1, lower if not isfinite(lower) else upper, lower)
         widest = self.widest
         if widest.box is not None:
             if new.box is None:
-                return Refused(Wrong.WIDER, -1, 0.0, 0.0)
+                return LimitWidened(-1, 0.0, 0.0)
             for at in range(6):
                 beyond = new.box[at] < widest.box[at] if at < 3 else new.box[at] > widest.box[at]
                 if beyond:
-                    return Refused(Wrong.WIDER, -1, new.box[at], widest.box[at])
+                    return LimitWidened(-1, new.box[at], widest.box[at])
         if len(new.keep_out) != len(widest.keep_out):
-            return Refused(Wrong.NO_LIMIT, -1, float(len(new.keep_out)), float(len(widest.keep_out)))
+            return ImpossibleLimit(-1, float(len(new.keep_out)), float(len(widest.keep_out)))
         for box, least in zip(new.keep_out, widest.keep_out, strict=True):
             for at in range(6):
                 if box[at] > least[at] if at < 3 else box[at] < least[at]:
-                    return Refused(Wrong.WIDER, -1, box[at], least[at])
+                    return LimitWidened(-1, box[at], least[at])
         return None

@@ -17,9 +17,10 @@ from kinematics.forward import frames
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.events import BoxReached, JointLimitReached, MotionEnded, NotLeavingBox
+from rtcp.ipc.refusals import LimitsExcludeArm, Refusal
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
-from rtcp.motion.limits import Limits, Refused, Values, Wrong
+from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
 
 # So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
@@ -106,11 +107,7 @@ class TrajectoryGuard:
         here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
         return NotLeavingBox(box, -here) if here < 0.0 and nearest == box else BoxReached(box, max(ahead, 0.0))
 
-    def probe(self, state: ArmState, position: Sequence[float], velocity: Sequence[float]) -> bool:
-        """Return whether a target would pass as it is."""
-        return not self._bound(state, position) and self._touches(state, position) is None
-
-    def refuses(self, state: ArmState, new: Values) -> Refused | None:
+    def refuses(self, state: ArmState, new: Values) -> Refusal | None:
         """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
         refused = self._limits.check(new, state.commanded, self._mean)
         if refused is not None or self._model is None:
@@ -127,8 +124,8 @@ class TrajectoryGuard:
             stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
             if stop is None:
                 return None
-            which, distance = stop
-        return Refused(Wrong.OUTSIDE, -1, distance, float(which))
+            which, _ = stop
+        return LimitsExcludeArm(which)
 
     def apply(self, state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:
         """Write what may be commanded of `target` into `state`: position, velocity, acceleration.
