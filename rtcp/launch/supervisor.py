@@ -15,10 +15,10 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from rtcp.ipc.states import State
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, exclusive, log_location, stop_marker
 from rtcp.ipc.session import EXIT_INCOMPLETE, is_running, read_processes
+from rtcp.ipc.states import State
 from rtcp.launch.platform import SIGNALS, Platform
 
 _POLL_S = 0.1

@@ -272,5 +272,3 @@ def test_a_bound_that_rests_on_what_is_not_known_is_refused() -> None:
 
 
 # -- what the docs say ----------------------------------------------------------------------------------------------
-
-
