@@ -334,7 +334,6 @@ class Mailbox:
         return bool(status[0] & _FULL)
 
 
-_SM1_STATUS, _FULL = 0x080D, 0x08
 _MESSAGES_A_POLL = 8
 
 

@@ -204,7 +204,8 @@ class SoemBus:
             raise BusError(*faults)
         for i, config in enumerate(slaves):
             try:
-                self.notes += self._configure_slave(i, config, period_ns)
+                sdo, station = self._mailboxes.sdo(i + 1), station_of(i + 1)
+                self.notes += finish(configure_slave(sdo, self.port, station, config, period_ns))
             except BusError as error:
                 faults += error.sentences
         if faults:
@@ -247,14 +248,8 @@ class SoemBus:
 
     def _to_preop(self) -> tuple[str, ...]:
         stations = self._stations(i + 1 for i, mailbox in enumerate(self._infos) if mailbox is not None)
-        return self._lead(AlState.PREOP, stations) if stations else ()
-
-    def _lead(self, state: AlState, stations: dict[int, str]) -> tuple[str, ...]:
-        al_state.request_state(self.port, stations, state)
-        return al_state.wait_for_state(self.port, stations, state, self._state_timeout_s)
-
-    def _configure_slave(self, i: int, config: SlaveConfig, period_ns: int) -> list[str]:
-        return finish(configure_slave(self._mailboxes.sdo(i + 1), self.port, station_of(i + 1), config, period_ns))
+        al_state.request_state(self.port, stations, AlState.PREOP)
+        return al_state.wait_for_state(self.port, stations, AlState.PREOP, self._state_timeout_s)
 
     def _map(self, slaves: Sequence[SlaveConfig]) -> dict[int, list[str]]:
         """Let SOEM lay out the process image; return sentences for each position whose images have a wrong length.
