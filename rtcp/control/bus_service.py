@@ -14,7 +14,8 @@ from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.supervision import MonitoredSlave, SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.recovery import MonitoredSlave
+from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime.scheduling import thread_beside
 

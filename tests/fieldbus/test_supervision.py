@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rtcp.fieldbus.al_state import AlState
-from rtcp.fieldbus.supervision import Action, action_for
+from rtcp.fieldbus.recovery import Action, action_for
 from tests.fieldbus.conftest import WATCHER, Segment
 
 pytestmark = pytest.mark.alone
