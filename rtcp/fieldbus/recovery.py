@@ -151,12 +151,12 @@ class SlaveRecovery:
         self._op_allowed = True
 
     def take_steps(self, now: float, reached: int, op_allowed: bool) -> None:
-        """Take a step with every slave that is not well.
+        """Advance the recovery of every slave that is not in OP.
 
         Args:
             now: the instant (time.monotonic).
-            reached: so many slaves answer on the cable.
-            op_allowed: whether OP may be asked for; otherwise slaves wait in SAFE-OP.
+            reached: number of slaves that answer.
+            op_allowed: whether OP may be requested; otherwise slaves wait in SAFE-OP.
         """
         self._reached = reached
         self._op_allowed = op_allowed
@@ -202,13 +202,13 @@ class SlaveRecovery:
             self.request(slave, _REQUESTS[action], acknowledge=error)
 
     def request(self, slave: MonitoredSlave, state: AlState, *, acknowledge: bool = False) -> bool:
-        """Request `state` of a slave; return False where it has surely not heard. What comes of it shows later."""
+        """Request `state` of a slave; return False where it certainly did not receive that."""
         word = state | (ERROR_BIT if acknowledge else 0)
         data = word.to_bytes(2, "little")
         return self._port.exchange(Command.FPWR, slave.station, AL_CONTROL, data, tries=1).wkc != 0
 
     def note_fall(self, slave: MonitoredSlave, now: float) -> None:
-        """Note that a slave left OP; one that does so again and again is brought back after pauses, and set up."""
+        """Note that a slave left OP; one that does so repeatedly is brought back after pauses, and set up again."""
         if now - slave.back_at < _WELL_S:
             slave.flaps += 1
             slave.pause_until = now + min(_PAUSE_S * slave.flaps, _LONGEST_PAUSE_S)
@@ -274,7 +274,7 @@ class SlaveRecovery:
             self.report_limited(slave, "; ".join(error.sentences))
 
     def drop(self, slave: MonitoredSlave) -> None:
-        """Give up what is under way with a slave."""
+        """Abandon the pending request or restoration of a slave."""
         slave.asked = None
         if slave.work is not None:
             slave.work.close()

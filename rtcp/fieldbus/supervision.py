@@ -27,15 +27,15 @@ _RARELY_S = 0.1
 def _runs(words: Iterable[tuple[MonitoredSlave, str]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, str]]:
     """Yield the first and the last of each run of neighbours with the same text, and the text."""
     run: list[MonitoredSlave] = []
-    said = ""
+    shared = ""
     for slave, text in words:
-        if run and (text != said or slave.position != run[-1].position + 1):
-            yield run[0], run[-1], said
+        if run and (text != shared or slave.position != run[-1].position + 1):
+            yield run[0], run[-1], shared
             run = []
         run.append(slave)
-        said = text
+        shared = text
     if run:
-        yield run[0], run[-1], said
+        yield run[0], run[-1], shared
 
 
 def _fall_count(falls: int) -> str:
@@ -65,7 +65,7 @@ class SlaveWatcher:
         self.errors = ErrorCounters(port, names, report)
         self._recovery = SlaveRecovery(port, self.slaves, restorer, report)
         self._rarely_at = 0.0
-        self._heard_at = time.monotonic()
+        self._answered_at = time.monotonic()
         self._silent_since: float | None = None
         self._silence_told = False
         self._parked_at: float | None = None
@@ -85,7 +85,7 @@ class SlaveWatcher:
         self.all_op = False
         for slave in self.slaves:
             self._recovery.drop(slave)
-            # A slave that was being brought back has to be set up again: nobody knows how far it got.
+            # A slave in restoration has to be set up again: its progress is unknown.
             slave.kept = slave.kept or slave.was_in_op
             slave.was_in_op = False
             slave.leaving = True
@@ -115,11 +115,11 @@ class SlaveWatcher:
         if wkc < 0:
             self._note_silence(now)
             return 0
-        self._note_sound(now)
-        self._heard_at, heard_before = now, self._heard_at
+        self._note_answer(now)
+        self._answered_at, answered_before = now, self._answered_at
         left = 0
         if self._parked_at is None:
-            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, heard_before)
+            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, answered_before)
             if not self.all_op:
                 self._recovery.take_steps(now, wkc, self.op_allowed)
         if now >= self._rarely_at:
@@ -132,7 +132,7 @@ class SlaveWatcher:
 
     # -- looking --------------------------------------------------------------------------------------------------
 
-    def _look_at_all(self, all_in_op: bool, now: float, heard_before: float) -> int:
+    def _look_at_all(self, all_in_op: bool, now: float, answered_before: float) -> int:
         if all_in_op and self.all_op:
             return 0
         if all_in_op:
@@ -150,7 +150,7 @@ class SlaveWatcher:
             slave.was_in_op = False
             slave.lost += 1
             slave.unreported += 1
-            slave.left_at = heard_before
+            slave.left_at = answered_before
             self._recovery.note_fall(slave, now)
         self._report_left([slave for slave in self.slaves if self._fall_is_due(slave, now)], now)
         self._report_back([slave for slave in self.slaves if slave.well and self._note_return(slave, now)], now)
@@ -175,7 +175,7 @@ class SlaveWatcher:
         return found
 
     def _note_return(self, slave: MonitoredSlave, now: float) -> bool:
-        """Note that a slave is well; return whether that is to be told: it had been lost, and this was told."""
+        """Note that a slave is well; return whether to report that: its fall was reported."""
         if not slave.was_in_op:
             slave.back_at = now
         slave.was_in_op = True
@@ -222,7 +222,7 @@ class SlaveWatcher:
         self._silent_since = self._silent_since or now
         if now - self._silent_since < _SILENCE_S or self._silence_told:
             return
-        # Which slave left OP shows when they are heard again; the cycle counts the lost frames and stops the arm.
+        # Which slave left OP shows when they answer again; the cycle counts the lost frames and stops the arm.
         self._silence_told = True
         self.all_op = False
         for slave in self.slaves:
@@ -231,7 +231,7 @@ class SlaveWatcher:
             f"no slave answers: check the cable between the master and {self.slaves[0].label}, and that slave's supply"
         )
 
-    def _note_sound(self, now: float) -> None:
+    def _note_answer(self, now: float) -> None:
         if self._silence_told and self._silent_since is not None:
             self._report(f"slaves answer again, after {now - self._silent_since:.1f} s without any")
         self._silent_since = None
@@ -255,7 +255,7 @@ class SlaveWatcher:
 
 
 class SupervisedBus(Bus, Protocol):
-    """A bus on a wire: slaves are lost and brought back while the cycle goes on."""
+    """A bus on a wire: slaves are lost and recovered while the cycle runs."""
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""
