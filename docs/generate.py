@@ -96,22 +96,20 @@ def table(head: list[str], rows: list[list[str]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def machine() -> str:
-    """Return the machine's states and commands."""
-    from docs.machine_page import page
-
-    return page()
-
-
-def stop_reactions() -> str:
-    """Return the stop reactions of the shipped arm."""
-    from docs.stops_page import section
+def machine(part: str) -> str:
+    """Return a table of the state machine or of the stop reactions of the shipped arm."""
+    from docs import machine_page
     from rtcp.config import default_config, load
 
-    return section(load(default_config()))
+    if part == "diagram":
+        return f"```mermaid\n{machine_page.diagram()}\n```"
+    if part == "reactions":
+        return machine_page.reactions(load(default_config()))
+    made: str = getattr(machine_page, part)()
+    return made
 
 
-PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine, "stop_reactions": stop_reactions}
+PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine}
 
 
 def generated(text: str) -> str:

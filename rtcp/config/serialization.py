@@ -1,4 +1,4 @@
-"""An `ArmConfig` as JSON values and back, without the validator: how the launcher hands it to the loop.
+"""Frozen dataclasses as JSON values and back, without the validator: how the launcher hands an `ArmConfig` to the loop.
 
 Fields keep their names, tuples become lists, paths and enum members their text. Round trips are exact.
 """
@@ -13,43 +13,30 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from rtcp.config.model import ArmConfig
-
 T = TypeVar("T")
 _hints = cache(get_type_hints)
 
 
-def to_json(config: ArmConfig) -> dict[str, Any]:
-    """Return a configuration as dicts, lists, texts, numbers, booleans and None; floats may be infinite."""
-    form: dict[str, Any] = plain(config)
-    return form
+def to_json(value: object) -> Any:
+    """Return the JSON form of a dataclass, tuple, path, enum member or scalar; floats may be infinite."""
+    if is_dataclass(value):
+        return {field.name: to_json(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, tuple | list):
+        return [to_json(entry) for entry in value]
+    if isinstance(value, Path):
+        return str(value)
+    return value.value if isinstance(value, Enum) else value
 
 
-def from_json(data: object) -> ArmConfig:
-    """Return the configuration that `to_json` wrote.
+def from_json(kind: type[T], data: object) -> T:
+    """Return the object of this type that `to_json` gave this form.
 
     Types are checked, ranges are not: the writer has validated them.
 
     Raises:
         ValueError: a key is missing or unknown, or a value has another type; the message names the key.
     """
-    return typed(ArmConfig, data)
-
-
-def plain(value: object) -> Any:
-    """Return the JSON form of a dataclass, tuple, path, enum member or scalar."""
-    if is_dataclass(value):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, tuple | list):
-        return [plain(entry) for entry in value]
-    if isinstance(value, Path):
-        return str(value)
-    return value.value if isinstance(value, Enum) else value
-
-
-def typed(kind: type[T], data: object, where: str = "") -> T:
-    """Return the object of this type that `plain` gave this form; `where` names it in the message of a ValueError."""
-    made: T = _typed(kind, data, where or kind.__name__)
+    made: T = _typed(kind, data, kind.__name__)
     return made
 
 

@@ -14,15 +14,16 @@ from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.supervision import MonitoredSlave, SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.recovery import MonitoredSlave
+from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime.scheduling import thread_beside
 
-_TELL_S = 0.1
-"""Slave states and counters go to the blackboard, and emergencies are looked for, so often."""
+_PUBLISH_S = 0.1
+"""Interval at which slave states and counters are published and emergencies are read, s."""
 _LOCK_S = 15.0
 _MOST_COMPLAINTS, _MOST_EMERGENCIES = 8, 4
-"""So many different sentences are said in 10 s: of all that failed, and of each slave's emergencies."""
+"""Different messages in 10 s: about failures of the bus, and about the emergencies of one slave."""
 _ERROR_BIT = 0x10
 
 
@@ -44,7 +45,7 @@ class BusService(threading.Thread):
         joint_names: their names.
         op_timeout_s: how long the slaves may take from SAFE-OP to OP.
         cycle_cpu: CPU of the cycle, which this thread keeps off.
-        cycle_priority: the cycle's; this thread's is one below, so that nobody else's work holds it up in mid-turn.
+        cycle_priority: the cycle's; this thread's is one below, above all other work.
         watch_s: how long it rests between two turns.
     """
 
@@ -70,7 +71,7 @@ class BusService(threading.Thread):
         self._cycle_cpu = cycle_cpu
         self._cycle_priority = cycle_priority
         self._watch_s = watch_s
-        self._tell_turns = max(round(_TELL_S / watch_s), 1)
+        self._publish_turns = max(round(_PUBLISH_S / watch_s), 1)
         self._op_wanted = False
         self._asked = 0
         """What the cycle asked last, counted up: odd to park, even to recover."""
@@ -95,7 +96,7 @@ class BusService(threading.Thread):
     # -- what the cycle asks: a plain store each ----------------------------------------------------------------
 
     def want_op(self) -> None:
-        """Ask for OP; may be said every cycle."""
+        """Request OP; may be called every cycle."""
         self._op_wanted = True
 
     def recover(self) -> None:
@@ -121,9 +122,9 @@ class BusService(threading.Thread):
     # -- the thread ---------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Take turns until `finish`. A defect in here ends the loop: nobody would watch the slaves."""
+        """Take turns until `finish`. A defect in here ends the loop, which must not run without supervision."""
         try:
-            self._take_turns()
+            self._run_turns()
         except Exception as error:
             sentence = f"the service thread met a defect ({type(error).__name__}: {error}): the loop ends"
             self._blackboard.text(sentence)
@@ -131,26 +132,26 @@ class BusService(threading.Thread):
             self.on_refused()
             raise
 
-    def _take_turns(self) -> None:
+    def _run_turns(self) -> None:
         thread_beside(self._cycle_cpu, self._cycle_priority - 1)
         turn = 0
         while not self._end.wait(self._watch_s):
             turn += 1
-            # Each part by itself: what one of them meets keeps none of the others from its turn.
+            # Each part by itself: an error in one does not stop the others.
             for part in (self._watch, self._serve_sdo_requests, self._listen):
                 try:
                     part(turn)
                 except BusError as error:
                     self._complain(error)
         try:
-            self._tell_states(self._bus.read_states())
+            self._publish_states(self._bus.read_states())
         except BusError as error:
             self._complain(error)
 
     def _complain(self, error: BusError) -> None:
-        """Say what failed; what fails again in every turn, as where the interface is gone, is said now and then."""
+        """Report what failed; a failure in every turn, as without the interface, is reported at most every 10 s."""
         for sentence in error.sentences:
-            self._complaints.say(sentence)
+            self._complaints.report(sentence)
 
     def _watch(self, turn: int) -> None:
         watcher = self._watcher
@@ -167,7 +168,7 @@ class BusService(threading.Thread):
                 watcher.park()
             else:
                 self.lost_slave = 0
-                # After a reset the next fault is told whole, however soon it comes.
+                # After a reset the next fault is reported in full, however soon it comes.
                 self._emergencies.clear()
                 watcher.resume()
         watcher.op_allowed = self.clock_followed()
@@ -181,14 +182,14 @@ class BusService(threading.Thread):
         if self._asked != asked:
             # The cycle asked meanwhile: what was seen was before that.
             self.all_op = False
-        if turn % self._tell_turns == 0 or not (was_well and watcher.all_op):
-            self._tell_health(watcher)
+        if turn % self._publish_turns == 0 or not (was_well and watcher.all_op):
+            self._publish_health(watcher)
 
     def _start(self, turn: int) -> None:
         if self._op_wanted:
             self._bus.request_state(AlState.OP)
             self.refused = self._bus.wait_for_state(AlState.OP, self._op_timeout_s)
-            self._tell_states(self._bus.read_states())
+            self._publish_states(self._bus.read_states())
             if not self.refused:
                 self._watcher = self._bus.watcher(self._blackboard.text)
                 self.all_op = True
@@ -198,8 +199,8 @@ class BusService(threading.Thread):
                 f"the cycle did not lock onto the reference clock within {_LOCK_S:g} s: the frames come too unevenly "
                 "or do not come back (see `rtcp status`, bus.send_phase)",
             )
-        elif turn % self._tell_turns == 0:
-            self._tell_states(self._bus.read_states())
+        elif turn % self._publish_turns == 0:
+            self._publish_states(self._bus.read_states())
         if self.refused:
             self.on_refused()
 
@@ -211,10 +212,10 @@ class BusService(threading.Thread):
         self._sdo_requests.take_steps()
 
     def _listen(self, turn: int) -> None:
-        if turn % self._tell_turns:
+        if turn % self._publish_turns:
             return
         for throttle in (self._complaints, *self._emergencies.values()):
-            throttle.tell()
+            throttle.report_due()
         if self._watcher is not None and self._watcher.silent:
             return
         for emergency in self._bus.emergencies():
@@ -222,26 +223,26 @@ class BusService(threading.Thread):
             if position not in self._emergencies:
                 what = f"emergency messages of slave {position}"
                 self._emergencies[position] = LogThrottle(self._blackboard.text, _MOST_EMERGENCIES, what)
-            self._emergencies[position].say(emergency.sentence())
+            self._emergencies[position].report(emergency.sentence())
 
-    def _tell_states(self, states: Iterable[SlaveState | MonitoredSlave]) -> None:
+    def _publish_states(self, states: Iterable[SlaveState | MonitoredSlave]) -> None:
         for slave in states:
             self._blackboard.slave(slave.position, slave.state | (_ERROR_BIT if slave.error else 0), slave.code)
 
-    def _tell_health(self, watcher: SlaveWatcher) -> None:
-        self._tell_states(watcher.slaves)
+    def _publish_health(self, watcher: SlaveWatcher) -> None:
+        self._publish_states(watcher.slaves)
         for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
             self._blackboard.health(
                 slave.position, slave.lost, slave.recovered, errors.rx, errors.forwarded, errors.links
             )
 
 
-SAY_AGAIN_S = 10.0
-"""An identical sentence is said at most so often."""
+REPORT_INTERVAL_S = 10.0
+"""Least interval between two reports of the same message, s."""
 
 
 @dataclass
-class _Said:
+class _Repeated:
     at: float
     again: int = 0
 
@@ -250,45 +251,45 @@ class LogThrottle:
     """Says a sentence at once the first time, and at most every 10 s how often it has come again.
 
     Args:
-        say: takes the sentences.
-        most: so many different ones are said in 10 s.
+        report: takes the sentences.
+        most: different messages that are reported in 10 s.
         what: how the sentence on those beyond names them, as `messages of slave 3`.
     """
 
-    def __init__(self, say: Callable[[str], None], most: int, what: str) -> None:
-        self._say = say
+    def __init__(self, report: Callable[[str], None], most: int, what: str) -> None:
+        self._report = report
         self._most = most
         self._what = what
-        self._said: dict[str, _Said] = {}
+        self._recent: dict[str, _Repeated] = {}
         self._beyond = 0
         self._beyond_at = 0.0
 
-    def say(self, sentence: str) -> None:
+    def report(self, sentence: str) -> None:
         """Say `sentence`, or count it."""
         now = time.monotonic()
-        said = self._said.get(sentence)
-        if said is not None:
-            said.again += 1
-        elif len(self._said) < self._most:
-            self._said[sentence] = _Said(now)
-            self._say(sentence)
+        entry = self._recent.get(sentence)
+        if entry is not None:
+            entry.again += 1
+        elif len(self._recent) < self._most:
+            self._recent[sentence] = _Repeated(now)
+            self._report(sentence)
         else:
             self._beyond_at = self._beyond_at if self._beyond else now
             self._beyond += 1
 
-    def tell(self) -> None:
+    def report_due(self) -> None:
         """Say what was counted and is due, and forget what did not come again; to be called now and then."""
         now = time.monotonic()
-        for sentence, said in tuple(self._said.items()):
-            if now - said.at < SAY_AGAIN_S:
+        for sentence, entry in tuple(self._recent.items()):
+            if now - entry.at < REPORT_INTERVAL_S:
                 continue
-            if said.again:
-                self._say(f"{sentence} ({_times(said.again)} again in {now - said.at:.0f} s)")
-                said.at, said.again = now, 0
+            if entry.again:
+                self._report(f"{sentence} ({_times(entry.again)} again in {now - entry.at:.0f} s)")
+                entry.at, entry.again = now, 0
             else:
-                del self._said[sentence]
-        if self._beyond and now - self._beyond_at >= SAY_AGAIN_S:
-            self._say(f"further {self._what} were left out: {self._beyond} in {now - self._beyond_at:.0f} s")
+                del self._recent[sentence]
+        if self._beyond and now - self._beyond_at >= REPORT_INTERVAL_S:
+            self._report(f"further {self._what} were left out: {self._beyond} in {now - self._beyond_at:.0f} s")
             self._beyond = 0
 
 

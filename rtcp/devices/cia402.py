@@ -26,11 +26,11 @@ class DriveState(Enum):
 
 
 class TargetState(Enum):
-    """Where a drive is led."""
+    """State to which a drive is brought."""
 
     DISABLED = "disabled"
     QUICK_STOPPED = "stopped by quick stop"
-    """Ramps down by itself and holds (0x605A = 6) until it is led to DISABLED; a drive without torque stays without."""
+    """Ramps down by itself and holds (0x605A = 6) until DISABLED is requested; a drive without torque stays without."""
     ENABLED = "enabled"
     TORQUE_OFF = "without torque at once"
     """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
@@ -55,41 +55,29 @@ ENABLE_OPERATION, FAULT_RESET = 0x000F, 0x0080
 """Commands of the controlword (CiA 402-2, table 27)."""
 
 _S = DriveState
-# (state, goal) -> controlword of the next step (CiA 402-2, figure 7). A fault is reset on request only.
+# (state, target) -> controlword of the next step (CiA 402-2, figure 7); DISABLE_VOLTAGE where nothing else stands here.
 CONTROLWORDS: dict[tuple[DriveState, TargetState], int] = {
-    (_S.NOT_READY_TO_SWITCH_ON, TargetState.ENABLED): DISABLE_VOLTAGE,
+    **{(state, target): DISABLE_VOLTAGE for state in DriveState for target in TargetState},
     (_S.SWITCH_ON_DISABLED, TargetState.ENABLED): SHUTDOWN,
     (_S.READY_TO_SWITCH_ON, TargetState.ENABLED): SWITCH_ON,
     (_S.SWITCHED_ON, TargetState.ENABLED): ENABLE_OPERATION,
     (_S.OPERATION_ENABLED, TargetState.ENABLED): ENABLE_OPERATION,
     # Transition 16: holds the arm, which `disable voltage` would let fall.
     (_S.QUICK_STOP_ACTIVE, TargetState.ENABLED): ENABLE_OPERATION,
-    (_S.FAULT_REACTION_ACTIVE, TargetState.ENABLED): DISABLE_VOLTAGE,
-    (_S.FAULT, TargetState.ENABLED): DISABLE_VOLTAGE,
-    (_S.UNKNOWN, TargetState.ENABLED): DISABLE_VOLTAGE,
-    (_S.NOT_READY_TO_SWITCH_ON, TargetState.DISABLED): DISABLE_VOLTAGE,
-    (_S.SWITCH_ON_DISABLED, TargetState.DISABLED): DISABLE_VOLTAGE,
-    (_S.READY_TO_SWITCH_ON, TargetState.DISABLED): DISABLE_VOLTAGE,
     (_S.SWITCHED_ON, TargetState.DISABLED): SHUTDOWN,
     (_S.OPERATION_ENABLED, TargetState.DISABLED): SWITCH_ON,
-    (_S.QUICK_STOP_ACTIVE, TargetState.DISABLED): DISABLE_VOLTAGE,
-    (_S.FAULT_REACTION_ACTIVE, TargetState.DISABLED): DISABLE_VOLTAGE,
-    (_S.FAULT, TargetState.DISABLED): DISABLE_VOLTAGE,
-    (_S.UNKNOWN, TargetState.DISABLED): DISABLE_VOLTAGE,
+    (_S.SWITCHED_ON, TargetState.RESET): SHUTDOWN,
+    (_S.OPERATION_ENABLED, TargetState.RESET): SWITCH_ON,
+    # A fault is reset on request only.
+    (_S.FAULT, TargetState.RESET): FAULT_RESET,
+    # From every state: where a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
+    # Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays.
+    **{(state, TargetState.QUICK_STOPPED): QUICK_STOP for state in DriveState},
 }
-CONTROLWORDS |= {
-    (state, TargetState.RESET): FAULT_RESET if state is _S.FAULT else CONTROLWORDS[state, TargetState.DISABLED]
-    for state in DriveState
-}
-
-CONTROLWORDS |= {(state, TargetState.TORQUE_OFF): DISABLE_VOLTAGE for state in DriveState}
-# Whatever state is shown: where a false statusword hides an enabled drive, `disable voltage` would let the arm fall.
-# Without torque a drive comes to, or stays in, `switch on disabled` (transitions 7 and 10); one in fault stays there.
-CONTROLWORDS |= {(state, TargetState.QUICK_STOPPED): QUICK_STOP for state in DriveState}
 
 _WITHOUT_TORQUE = frozenset({_S.SWITCH_ON_DISABLED, _S.NOT_READY_TO_SWITCH_ON, _S.FAULT})
 
-# States in which a goal is reached.
+# States in which a target is reached.
 REACHED: dict[TargetState, frozenset[DriveState]] = {
     TargetState.ENABLED: frozenset({_S.OPERATION_ENABLED}),
     TargetState.DISABLED: _WITHOUT_TORQUE,
@@ -228,10 +216,10 @@ class Cia402Drive(Driver):
         self._past_at = at + 1 if at + 1 < len(past) else 0
         return moved / (len(past) * self.period_s)
 
-    def advance(self, goal: TargetState) -> bool:
-        """Choose the controlword of the next step towards `goal` by the state found; return whether it is reached."""
+    def advance(self, target: TargetState) -> bool:
+        """Choose the controlword of the next step towards `target` by the state found; return whether it is reached."""
         state = self.state
-        word = CONTROLWORDS[state, goal]
+        word = CONTROLWORDS[state, target]
         if word == ENABLE_OPERATION:
             # On the step itself, and again when the drive left the state on its own; never while it is enabled.
             if self.controlword != ENABLE_OPERATION or (self._was_enabled and state is not _ENABLED):
@@ -246,7 +234,7 @@ class Cia402Drive(Driver):
         else:
             self._reset_calls = 0
         self.controlword = word
-        return state in REACHED[goal]
+        return state in REACHED[target]
 
     def latch(self) -> None:
         """Set the target position to the actual one, the other targets to zero: on enabling, on entering CSP."""
@@ -256,7 +244,7 @@ class Cia402Drive(Driver):
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
-        Velocity and torque are sent only to a drive that is enabled and told to be. The velocity (in CSP: the speed
+        Velocity and torque are sent only to a drive that is enabled and has to be. The velocity (in CSP: the speed
         limit) waits until the drive displays the mode that is commanded: on the way from CSV to CSP it would take the
         limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
         A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.

@@ -17,12 +17,12 @@ _COUNTERS, _SIZE = 0x0300, 0x14
 _FORWARDED, _LINKS = 0x08, 0x10
 _PORTS = 4
 _OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + _PORTS), slice(_LINKS, _LINKS + _PORTS)
-"""What is cleared, each with one write; between them are errors of the processing unit, which are nobody's cable."""
+"""Cleared with one write each; the errors of the processing unit between them belong to no cable."""
 _CLEAR_FROM = 128
 """Counters stop at 255; from here on they are set to 0, which a write of any value does."""
-_SAY_AGAIN_S = 10.0
+_REPORT_INTERVAL_S = 10.0
 _CALM_S = 60.0
-"""Without a new error for so long the next one is a new beginning."""
+"""After this time without an error the next one starts a new count, s."""
 
 
 @dataclass
@@ -38,31 +38,31 @@ class PortErrors:
 
 
 @dataclass
-class _Trouble:
-    """What enters at one cable: since when, how often, when it was told."""
+class _CableErrors:
+    """What enters at one cable: since when, how often, when it was reported."""
 
     began: str
-    told_at: float
+    reported_at: float
     last_at: float
     near: int = 0
     """Counted by the slave before the cable."""
     far: int = 0
     """Counted by the slave behind it."""
-    told: int = 0
+    reported: int = 0
 
 
 class ErrorCounters:
     """Reads one slave's counters a call, the slaves in turn."""
 
-    def __init__(self, port: RegisterPort, names: Sequence[str], say: Callable[[str], None]) -> None:
-        """Take the slaves in the order of the cable; `say` is given the sentences."""
+    def __init__(self, port: RegisterPort, names: Sequence[str], report: Callable[[str], None]) -> None:
+        """Take the slaves in the order of the cable; `report` receives the messages."""
         self._port = port
         self._names = names
-        self._say = say
+        self._report = report
         # What was counted before is of no cable that is in use now: plugs were put in.
         self._last = [port.read(station_of(position), _COUNTERS, _SIZE) for position in range(1, len(names) + 1)]
         self._turn = 0
-        self._trouble: dict[tuple[str, int], _Trouble] = {}
+        self._cables: dict[tuple[str, int], _CableErrors] = {}
         self.of = [PortErrors() for _ in names]
         """By slave, in the order of the cable."""
 
@@ -101,24 +101,28 @@ class ErrorCounters:
 
     def _note(self, kind: str, cable: int, count: int, *, far: bool) -> None:
         now = time.monotonic()
-        trouble = self._trouble.get((kind, cable))
-        if trouble is None or now - trouble.last_at > _CALM_S:
-            trouble = self._trouble[kind, cable] = _Trouble(time.strftime("%H:%M:%S"), now - _SAY_AGAIN_S, now)
+        cable_errors = self._cables.get((kind, cable))
+        if cable_errors is None or now - cable_errors.last_at > _CALM_S:
+            cable_errors = self._cables[kind, cable] = _CableErrors(
+                time.strftime("%H:%M:%S"), now - _REPORT_INTERVAL_S, now
+            )
         if far:
-            trouble.far += count
+            cable_errors.far += count
         else:
-            trouble.near += count
-        trouble.last_at = now
+            cable_errors.near += count
+        cable_errors.last_at = now
 
-    def tell(self) -> None:
+    def report_due(self) -> None:
         """Say what enters where: at once when it begins, then at most every 10 s with the number."""
         now = time.monotonic()
-        for (kind, cable), trouble in self._trouble.items():
+        for (kind, cable), cable_errors in self._cables.items():
             # A frame is damaged on its way out or on its way back; a link that is lost is lost for both ends.
-            count = trouble.near + trouble.far if kind == "errors" else max(trouble.near, trouble.far)
-            if count > trouble.told and now - trouble.told_at >= _SAY_AGAIN_S:
-                trouble.told, trouble.told_at = count, now
-                self._say(self._sentence(kind, cable, count, trouble.began))
+            count = (
+                cable_errors.near + cable_errors.far if kind == "errors" else max(cable_errors.near, cable_errors.far)
+            )
+            if count > cable_errors.reported and now - cable_errors.reported_at >= _REPORT_INTERVAL_S:
+                cable_errors.reported, cable_errors.reported_at = count, now
+                self._report(self._sentence(kind, cable, count, cable_errors.began))
 
     def _sentence(self, kind: str, cable: int, count: int, began: str) -> str:
         before = "the master" if cable == 0 else slave_label(cable, self._names[cable - 1])

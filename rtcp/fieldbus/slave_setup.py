@@ -109,7 +109,7 @@ class SlaveRestorer:
             yield from self._identify(position)
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
-            # reference clock by its address, and every other slave follows what it says.
+            # reference clock by its address, and every other slave follows its time.
             port.put_at(position, DC_ACTIVATE, b"\0", label)
             others = [other for other in self._clocks if other != position]
             take_over_time(port, position, label, set_up.delay, others, always=lost_address)
@@ -280,24 +280,30 @@ def write_startup(sdo: SdoClient, startup: StartupSdo) -> Steps[list[str]]:
     packer = struct.Struct("<" + code)
     data = packer.pack(startup.value if code in "fd" else int(startup.value))
     what = f"0x{startup.index:04X}:{startup.sub_index}" + (f" ({startup.name})" if startup.name else "")
-    where = slave_label(sdo.position, sdo.name)
     try:
-        yield from sdo.writing(startup.index, startup.sub_index, data)
-        kept = yield from sdo.reading(startup.index, startup.sub_index)
+        yield from _write_and_verify(sdo, startup.index, startup.sub_index, data, what, packer)
     except SdoAborted as error:
         if startup.optional and error.code in ABSENT:
-            return [f"{where} has no {what}; it is marked optional and was left out"]
+            return [f"{slave_label(sdo.position, sdo.name)} has no {what}; it is marked optional and was left out"]
         raise
-    if kept != data:
-        shown = f"{packer.unpack(kept)[0]}" if len(kept) == packer.size else f"bytes {kept.hex(' ')}"
-        raise BusError(f"{where}: {what} was set to {packer.unpack(data)[0]} and reads back as {shown}")
     return []
 
 
-def interpolation_time(period_ns: int) -> tuple[int, int] | None:
-    """Return (value, exponent) of 0x60C2 with value * 10^exponent s = `period_ns`, None where it cannot be said.
+def _write_and_verify(
+    sdo: SdoClient, index: int, sub_index: int, data: bytes, what: str, packer: struct.Struct
+) -> Steps[None]:
+    yield from sdo.writing(index, sub_index, data)
+    kept = yield from sdo.reading(index, sub_index)
+    if kept != data:
+        shown = f"{packer.unpack(kept)[0]}" if len(kept) == packer.size else f"bytes {kept.hex(' ')}"
+        where = slave_label(sdo.position, sdo.name)
+        raise BusError(f"{where}: {what} was set to {packer.unpack(data)[0]} and reads back as {shown}")
 
-    The value has 8 bits (CiA 402-2, object 0x60C2), so that 500 us is 5, -4 and 333 us cannot be said.
+
+def interpolation_time(period_ns: int) -> tuple[int, int] | None:
+    """Return (value, exponent) of 0x60C2 with value * 10^exponent s = `period_ns`, None where it cannot be expressed.
+
+    The value has 8 bits (CiA 402-2, object 0x60C2): 500 us is 5, -4; 333 us cannot be expressed.
     """
     value, exponent = period_ns, -9
     while value and value % 10 == 0:
@@ -308,18 +314,17 @@ def interpolation_time(period_ns: int) -> tuple[int, int] | None:
 def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]:
     """Set 0x60C2 to the period where the drive has it; return a note where that was not possible."""
     where = slave_label(sdo.position, sdo.name)
-    said = interpolation_time(period_ns)
-    if said is None:
-        return [f"{where}: its interpolation time (0x60C2) cannot say {period_ns / 1000:g} us and was left as it is"]
+    value = interpolation_time(period_ns)
+    if value is None:
+        return [
+            f"{where}: its interpolation time (0x60C2) cannot express {period_ns / 1000:g} us and was left as it is"
+        ]
     try:
-        for subindex, byte in ((1, said[0].to_bytes(1, "little")), (2, said[1].to_bytes(1, "little", signed=True))):
-            yield from sdo.writing(_INTERPOLATION, subindex, byte)
-            kept = yield from sdo.reading(_INTERPOLATION, subindex)
-            if kept != byte:
-                raise BusError(
-                    f"{where}: 0x60C2:{subindex} (interpolation time) was set to {byte.hex()}, "
-                    f"it reads back as {kept.hex()}"
-                )
+        for sub_index, (number, packer) in enumerate(
+            zip(value, (struct.Struct("B"), struct.Struct("b")), strict=True), 1
+        ):
+            what = f"0x60C2:{sub_index} (interpolation time)"
+            yield from _write_and_verify(sdo, _INTERPOLATION, sub_index, packer.pack(number), what, packer)
     except SdoAborted as error:
         if error.code in ABSENT:
             return [f"{where} has no interpolation time (0x60C2)"]

@@ -8,43 +8,41 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Protocol
 
-from rtcp.fieldbus.al_state import AL_CONTROL, AL_STATUS, ERROR_BIT, STATE_NAMES, AlState, refusal
-from rtcp.fieldbus.bus import Bus, SlaveState, slave_label, station_of
-from rtcp.fieldbus.errors import BusError, ForeignSlave
+from rtcp.fieldbus.al_state import AL_STATUS, ERROR_BIT, STATE_NAMES, AlState, refusal
+from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import ErrorCounters
-from rtcp.fieldbus.registers import Command, RegisterPort, Steps
-from rtcp.fieldbus.slave_setup import STATION, SlaveRestorer
+from rtcp.fieldbus.recovery import LONG_AGO, REPORT_INTERVAL_S, MonitoredSlave, SlaveRecovery
+from rtcp.fieldbus.registers import Command, RegisterPort
+from rtcp.fieldbus.slave_setup import SlaveRestorer
 
 _PARK_S = 3.0
 _SILENCE_S = 0.25
 _RARELY_S = 0.1
-"""Error counters, and slaves that are parked, are looked at so often."""
+"""Interval at which error counters and parked slaves are read, s."""
 
 
 def _runs(words: Iterable[tuple[MonitoredSlave, str]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, str]]:
-    """Yield the first and the last of neighbours of whom the same is to be said, and what."""
+    """Yield the first and the last of each run of neighbours with the same text, and the text."""
     run: list[MonitoredSlave] = []
-    said = ""
-    for charge, text in words:
-        if run and (text != said or charge.position != run[-1].position + 1):
-            yield run[0], run[-1], said
+    shared = ""
+    for slave, text in words:
+        if run and (text != shared or slave.position != run[-1].position + 1):
+            yield run[0], run[-1], shared
             run = []
-        run.append(charge)
-        said = text
+        run.append(slave)
+        shared = text
     if run:
-        yield run[0], run[-1], said
+        yield run[0], run[-1], shared
 
 
-def _how_often(falls: int) -> str:
-    return f"; it left OP {falls} times since that was last told" if falls > 1 else ""
+def _fall_count(falls: int) -> str:
+    return f"; it left OP {falls} times since the last report" if falls > 1 else ""
 
 
-def _who(first: MonitoredSlave, last: MonitoredSlave) -> str:
+def _slaves_named(first: MonitoredSlave, last: MonitoredSlave) -> str:
     return first.label if first is last else f"{first.label} to {last.label}"
 
 
@@ -55,19 +53,19 @@ class SlaveWatcher:
         port: the port for registers.
         names: the slaves' names in the order of the cable.
         restorer: sets up a slave again.
-        say: takes the sentences.
+        report: receives the messages.
     """
 
     def __init__(
-        self, port: RegisterPort, names: Sequence[str], restorer: SlaveRestorer, say: Callable[[str], None]
+        self, port: RegisterPort, names: Sequence[str], restorer: SlaveRestorer, report: Callable[[str], None]
     ) -> None:  # fmt: skip
         self._port = port
-        self._say = say
+        self._report = report
         self.slaves = tuple(MonitoredSlave(position, name) for position, name in enumerate(names, 1))
-        self.errors = ErrorCounters(port, names, say)
-        self._care = SlaveRecovery(port, self.slaves, restorer, say)
+        self.errors = ErrorCounters(port, names, report)
+        self._recovery = SlaveRecovery(port, self.slaves, restorer, report)
         self._rarely_at = 0.0
-        self._heard_at = time.monotonic()
+        self._answered_at = time.monotonic()
         self._silent_since: float | None = None
         self._silence_told = False
         self._parked_at: float | None = None
@@ -85,23 +83,23 @@ class SlaveWatcher:
         """Take all slaves to PRE-OP and leave them there until `resume`."""
         self._parked_at = time.monotonic()
         self.all_op = False
-        for charge in self.slaves:
-            self._care.drop(charge)
-            # A slave that was being brought back has to be set up again: nobody knows how far it got.
-            charge.kept = charge.kept or charge.was_in_op
-            charge.was_in_op = False
-            charge.leaving = True
+        for slave in self.slaves:
+            self._recovery.drop(slave)
+            # A slave in restoration has to be set up again: its progress is unknown.
+            slave.kept = slave.kept or slave.was_in_op
+            slave.was_in_op = False
+            slave.leaving = True
         # Noted for all first: the interface may be gone, and back while they are still to be parked.
-        for charge in self.slaves:
-            charge.leaving = self._care.request(charge, AlState.PREOP, acknowledge=charge.error)
+        for slave in self.slaves:
+            slave.leaving = self._recovery.request(slave, AlState.PREOP, acknowledge=slave.error)
 
     def resume(self) -> None:
         """Bring back whatever is not in OP, without the pauses that are left."""
         self._parked_at = None
-        for charge in self.slaves:
-            charge.pause_until = 0.0
-            charge.failed = charge.flaps = 0
-            charge.fall_told_at = LONG_AGO
+        for slave in self.slaves:
+            slave.pause_until = 0.0
+            slave.failed = slave.flaps = 0
+            slave.fall_reported_at = LONG_AGO
 
     def turn(self) -> int:
         """Look at the slaves and take a step with those that need it.
@@ -117,54 +115,54 @@ class SlaveWatcher:
         if wkc < 0:
             self._note_silence(now)
             return 0
-        self._note_sound(now)
-        self._heard_at, heard_before = now, self._heard_at
+        self._note_answer(now)
+        self._answered_at, answered_before = now, self._answered_at
         left = 0
         if self._parked_at is None:
-            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, heard_before)
+            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, answered_before)
             if not self.all_op:
-                self._care.take_steps(now, wkc, self.op_allowed)
+                self._recovery.take_steps(now, wkc, self.op_allowed)
         if now >= self._rarely_at:
             self._rarely_at = now + _RARELY_S
             if self._parked_at is not None:
                 self._keep_parked(now - self._parked_at > _PARK_S)
             self.errors.read_next()
-            self.errors.tell()
+            self.errors.report_due()
         return left
 
     # -- looking --------------------------------------------------------------------------------------------------
 
-    def _look_at_all(self, all_in_op: bool, now: float, heard_before: float) -> int:
+    def _look_at_all(self, all_in_op: bool, now: float, answered_before: float) -> int:
         if all_in_op and self.all_op:
             return 0
         if all_in_op:
             found = [(AlState.OP, False, 0)] * len(self.slaves)
         else:
             # Half a look would be taken for what all of them are in.
-            looks = [self._look(charge) for charge in self.slaves]
+            looks = [self._look(slave) for slave in self.slaves]
             found = [look for look in looks if look is not None]
             if len(found) < len(looks):
                 return 0
-        for charge, (state, error, code) in zip(self.slaves, found, strict=True):
-            charge.take(state, error, code)
-        left = [charge for charge in self.slaves if charge.was_in_op and not charge.well]
-        for charge in left:
-            charge.was_in_op = False
-            charge.lost += 1
-            charge.untold += 1
-            charge.left_at = heard_before
-            self._care.note_fall(charge, now)
-        self._tell_left([charge for charge in self.slaves if self._fall_is_due(charge, now)], now)
-        self._tell_back([charge for charge in self.slaves if charge.well and self._note_return(charge, now)], now)
-        self.all_op = all(charge.well for charge in self.slaves)
+        for slave, (state, error, code) in zip(self.slaves, found, strict=True):
+            slave.update(state, error, code)
+        left = [slave for slave in self.slaves if slave.was_in_op and not slave.well]
+        for slave in left:
+            slave.was_in_op = False
+            slave.lost += 1
+            slave.unreported += 1
+            slave.left_at = answered_before
+            self._recovery.note_fall(slave, now)
+        self._report_left([slave for slave in self.slaves if self._fall_is_due(slave, now)], now)
+        self._report_back([slave for slave in self.slaves if slave.well and self._note_return(slave, now)], now)
+        self.all_op = all(slave.well for slave in self.slaves)
         return left[0].position if left else 0
 
-    def _look(self, charge: MonitoredSlave) -> tuple[AlState, bool, int] | None:
+    def _look(self, slave: MonitoredSlave) -> tuple[AlState, bool, int] | None:
         """Read a slave's state, whether it shows an error, its code; None where the frame did not come back."""
         found = (AlState.NONE, False, 0)
         # A frame that was damaged unnoticed must not stop the arm: who was in OP is asked twice.
-        for _ in range(2 if charge.was_in_op else 1):
-            data, wkc = self._port.exchange(Command.FPRD, charge.station, AL_STATUS, bytes(6), tries=1)
+        for _ in range(2 if slave.was_in_op else 1):
+            data, wkc = self._port.exchange(Command.FPRD, slave.station, AL_STATUS, bytes(6), tries=1)
             if wkc < 0:
                 return None
             status = int.from_bytes(data[:2], "little") if wkc else 0
@@ -176,360 +174,91 @@ class SlaveWatcher:
                 break
         return found
 
-    def _note_return(self, charge: MonitoredSlave, now: float) -> bool:
-        """Note that a slave is well; return whether that is to be told: it had been lost, and this was told."""
-        if not charge.was_in_op:
-            charge.back_at = now
-        charge.was_in_op = True
-        charge.kept = False
-        charge.unfinished = False
-        charge.failed = 0
-        self._care.drop(charge)
-        if charge.left_at is None:
+    def _note_return(self, slave: MonitoredSlave, now: float) -> bool:
+        """Note that a slave is well; return whether to report that: its fall was reported."""
+        if not slave.was_in_op:
+            slave.back_at = now
+        slave.was_in_op = True
+        slave.kept = False
+        slave.unfinished = False
+        slave.failed = 0
+        self._recovery.drop(slave)
+        if slave.left_at is None:
             return False
-        charge.recovered += 1
-        if not charge.return_due:
-            charge.left_at = None
+        slave.recovered += 1
+        if not slave.return_due:
+            slave.left_at = None
             return False
-        charge.return_due = False
+        slave.return_due = False
         return True
 
-    def _fall_is_due(self, charge: MonitoredSlave, now: float) -> bool:
-        return charge.untold > 0 and not charge.well and now - charge.fall_told_at >= SAY_AGAIN_S
+    def _fall_is_due(self, slave: MonitoredSlave, now: float) -> bool:
+        return slave.unreported > 0 and not slave.well and now - slave.fall_reported_at >= REPORT_INTERVAL_S
 
-    def _tell_left(self, left: Sequence[MonitoredSlave], now: float) -> None:
-        for first, last, words in _runs((charge, charge.words() + _how_often(charge.untold)) for charge in left):
+    def _report_left(self, left: Sequence[MonitoredSlave], now: float) -> None:
+        for first, last, words in _runs((slave, slave.words() + _fall_count(slave.unreported)) for slave in left):
             if first.state is not AlState.NONE:
                 where = "it is in" if first is last else "each is in"
-                self._say(f"{_who(first, last)} left OP: {where} {words}")
+                self._report(f"{_slaves_named(first, last)} left OP: {where} {words}")
                 continue
             before = "the master" if first.position == 1 else self.slaves[first.position - 2].label
             what = "it does not answer" if first is last else "none of them answers"
             check = f"check the supply of {first.label} and the cable between {before} and {first.label}"
-            self._say(f"{_who(first, last)} left OP: {what}; {check}{_how_often(first.untold)}")
-        for charge in left:
-            charge.fall_told_at, charge.untold, charge.return_due = now, 0, True
+            self._report(f"{_slaves_named(first, last)} left OP: {what}; {check}{_fall_count(first.unreported)}")
+        for slave in left:
+            slave.fall_reported_at, slave.unreported, slave.return_due = now, 0, True
 
-    def _tell_back(self, back: Sequence[MonitoredSlave], now: float) -> None:
-        for first, last, after in _runs((charge, f"{now - (charge.left_at or now):.1f} s") for charge in back):
+    def _report_back(self, back: Sequence[MonitoredSlave], now: float) -> None:
+        for first, last, after in _runs((slave, f"{now - (slave.left_at or now):.1f} s") for slave in back):
             are = "is" if first is last else "are"
-            self._say(
-                f"{_who(first, last)} {are} back in OP after {after}; the arm does not move before `rtcp reset` and "
-                "`rtcp enable`"
+            self._report(
+                f"{_slaves_named(first, last)} {are} back in OP after {after}; the arm does not move before "
+                "`rtcp reset` and `rtcp enable`"
             )
-        for charge in back:
-            charge.left_at = None
+        for slave in back:
+            slave.left_at = None
 
     def _note_silence(self, now: float) -> None:
         self._silent_since = self._silent_since or now
         if now - self._silent_since < _SILENCE_S or self._silence_told:
             return
-        # Which slave left OP shows when they are heard again; the cycle counts the lost frames and stops the arm.
+        # Which slave left OP shows when they answer again; the cycle counts the lost frames and stops the arm.
         self._silence_told = True
         self.all_op = False
-        for charge in self.slaves:
-            charge.state, charge.error, charge.code = AlState.NONE, False, 0
-        self._say(
+        for slave in self.slaves:
+            slave.state, slave.error, slave.code = AlState.NONE, False, 0
+        self._report(
             f"no slave answers: check the cable between the master and {self.slaves[0].label}, and that slave's supply"
         )
 
-    def _note_sound(self, now: float) -> None:
+    def _note_answer(self, now: float) -> None:
         if self._silence_told and self._silent_since is not None:
-            self._say(f"slaves answer again, after {now - self._silent_since:.1f} s without any")
+            self._report(f"slaves answer again, after {now - self._silent_since:.1f} s without any")
         self._silent_since = None
         self._silence_told = False
 
     def _keep_parked(self, late: bool) -> None:
-        for charge in self.slaves:
-            look = self._look(charge)
+        for slave in self.slaves:
+            look = self._look(slave)
             if look is None:
                 return
-            charge.take(*look)
-            at_home = charge.state in (AlState.PREOP, AlState.SAFEOP, AlState.OP)
+            slave.update(*look)
+            at_home = slave.state in (AlState.PREOP, AlState.SAFEOP, AlState.OP)
             # What lost its supply meanwhile is set up again when it is brought back.
-            charge.kept = charge.kept and at_home
-            if not at_home or (charge.state is AlState.PREOP and not charge.error):
+            slave.kept = slave.kept and at_home
+            if not at_home or (slave.state is AlState.PREOP and not slave.error):
                 continue
-            self._care.request(charge, AlState.PREOP, acknowledge=charge.error)
+            self._recovery.request(slave, AlState.PREOP, acknowledge=slave.error)
             if late:
-                found = charge.state | (ERROR_BIT if charge.error else 0)
-                self._care.tell(charge, refusal(charge.label, AlState.PREOP, found, charge.code))
+                found = slave.state | (ERROR_BIT if slave.error else 0)
+                self._recovery.report_limited(slave, refusal(slave.label, AlState.PREOP, found, slave.code))
 
 
 class SupervisedBus(Bus, Protocol):
-    """A bus on a wire: slaves are lost and brought back while the cycle goes on."""
+    """A bus on a wire: slaves are lost and recovered while the cycle runs."""
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""
 
-    def watcher(self, say: Callable[[str], None]) -> SlaveWatcher:
-        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
-
-
-LONG_AGO = float("-inf")
-SAY_AGAIN_S = 10.0
-"""A slave's trouble is told at once, and then at most so often."""
-
-
-class Action(Enum):
-    """What is done with a slave."""
-
-    NOTHING = "nothing"
-    ACKNOWLEDGE = "acknowledge its error"
-    REQUEST_SAFEOP = "request SAFE-OP"
-    REQUEST_OP = "request OP"
-    REQUEST_PREOP = "request PRE-OP: it was to be parked"
-    RECONFIGURE = "set it up again"
-    MARK_LOST = "mark it lost; when it answers again, recover it"
-
-
-# (state, error) -> what is done; any other state that answers is RECONFIGURE.
-TABLE: dict[tuple[AlState, bool], Action] = {
-    (AlState.OP, False): Action.NOTHING,
-    (AlState.OP, True): Action.ACKNOWLEDGE,
-    (AlState.SAFEOP, True): Action.ACKNOWLEDGE,
-    (AlState.SAFEOP, False): Action.REQUEST_OP,
-    (AlState.NONE, False): Action.MARK_LOST,
-}
-
-
-def action_for(state: AlState, error: bool) -> Action:
-    """Return what is done with a slave that is in `state`."""
-    return TABLE.get((state, error), Action.RECONFIGURE)
-
-
-@dataclass
-class MonitoredSlave:
-    """One slave in the watcher's care."""
-
-    position: int
-    name: str
-    state: AlState = AlState.OP
-    error: bool = False
-    code: int = 0
-    lost: int = 0
-    """How often it left OP."""
-    recovered: int = 0
-    """How often it was back in OP after that."""
-    left_at: float | None = None
-    was_in_op: bool = True
-    back_at: float = LONG_AGO
-    """When it last came to OP."""
-    flaps: int = 0
-    """How often in a row it fell out of OP again at once."""
-    kept: bool = False
-    """Whether it is in PRE-OP because it was sent there, its set-up untouched."""
-    leaving: bool = False
-    """Whether it was sent to PRE-OP and has been seen in nothing but OP since."""
-    unfinished: bool = False
-    """Whether a restoration was begun that did not come to its end."""
-    work: Steps[None] | None = None
-    asked: tuple[Action, AlState, bool, float] | None = None
-    """What was asked, in which state it was then, and until when it may take."""
-    failed: int = 0
-    pause_until: float = 0.0
-    probe_at: float = 0.0
-    told_at: float = LONG_AGO
-    fall_told_at: float = LONG_AGO
-    untold: int = 0
-    """How often it left OP since that was told last."""
-    return_due: bool = False
-    """Whether its return is to be told: its fall was."""
-
-    @property
-    def label(self) -> str:
-        """How sentences name it."""
-        return slave_label(self.position, self.name)
-
-    @property
-    def station(self) -> int:
-        """Its configured station address."""
-        return station_of(self.position)
-
-    @property
-    def well(self) -> bool:
-        """Whether it is in OP, without an error, and not about to leave it as it was told to."""
-        return self.state is AlState.OP and not self.error and not self.leaving
-
-    def take(self, state: AlState, error: bool, code: int) -> None:
-        """Note the state in which it was found."""
-        self.state, self.error, self.code = state, error, code
-        if state not in (AlState.OP, AlState.NONE):
-            self.leaving = False
-
-    def words(self) -> str:
-        """Return its state in words."""
-        return SlaveState(self.position, self.station, self.name, self.state, self.error, self.code).words()
-
-
-_REQUESTS = {
-    Action.REQUEST_OP: AlState.OP,
-    Action.REQUEST_SAFEOP: AlState.SAFEOP,
-    Action.REQUEST_PREOP: AlState.PREOP,
-}
-_TRIES = 3
-"""So often a slave may refuse before it is set up again."""
-_PAUSE_S, _LONGEST_PAUSE_S, _FOREIGN_PAUSE_S = 1.0, 5.0, 10.0
-_PATIENCE_S = 3.0
-_WELL_S = 1.0
-"""A slave that leaves OP sooner than this after it got there has not been well in between."""
-_PROBE_S = 0.05
-_POLL_S = 0.0003
-_STEPS_S = 0.003
-"""So long restorations may go on in a turn; where a slave answers at once, several steps fit."""
-
-
-class SlaveRecovery:
-    """Does with each slave what the table says.
-
-    Args:
-        port: the port for registers.
-        slaves: the slaves in the order of the cable.
-        restorer: sets up a slave again.
-        say: takes the sentences.
-    """
-
-    def __init__(
-        self, port: RegisterPort, slaves: Sequence[MonitoredSlave], restorer: SlaveRestorer, say: Callable[[str], None]
-    ) -> None:  # fmt: skip
-        self._port = port
-        self._slaves = slaves
-        self._restorer = restorer
-        self._say = say
-        self._reached = len(slaves)
-        self._op_allowed = True
-
-    def take_steps(self, now: float, reached: int, op_allowed: bool) -> None:
-        """Take a step with every slave that is not well.
-
-        Args:
-            now: the instant (time.monotonic).
-            reached: so many slaves answer on the cable.
-            op_allowed: whether OP may be asked for; otherwise slaves wait in SAFE-OP.
-        """
-        self._reached = reached
-        self._op_allowed = op_allowed
-        until = now + _STEPS_S
-        for charge in self._slaves:
-            if not charge.well:
-                if charge.work is None:
-                    self._act(charge, now)
-                if charge.work is not None:
-                    self._go_on(charge, until)
-
-    def _act(self, charge: MonitoredSlave, now: float) -> None:
-        state, error = charge.state, charge.error
-        if charge.asked is not None:
-            action, state_then, error_then, until = charge.asked
-            same = (state, error) == (state_then, error_then)
-            if same and now < until:
-                return
-            charge.asked = None
-            if same or (action in _REQUESTS and error):
-                self._fail(charge, now, _REQUESTS.get(action, state))
-                return
-        if now < charge.pause_until:
-            return
-        action = action_for(state, error)
-        if charge.kept and state is AlState.PREOP and not error:
-            action = Action.REQUEST_SAFEOP
-        if (charge.failed >= _TRIES or charge.unfinished) and action is not Action.MARK_LOST:
-            action = Action.RECONFIGURE
-        if charge.leaving and state is AlState.OP:
-            action = Action.REQUEST_PREOP
-        if action is Action.REQUEST_OP and not self._op_allowed:
-            return
-        if action is Action.MARK_LOST:
-            self._probe(charge, now)
-        elif action is Action.RECONFIGURE:
-            self._begin(charge, lost_address=False)
-        elif action is Action.ACKNOWLEDGE:
-            charge.asked = action, state, error, now + _PAUSE_S
-            self.request(charge, state, acknowledge=True)
-        else:
-            charge.asked = action, state, error, now + _PATIENCE_S
-            self.request(charge, _REQUESTS[action], acknowledge=error)
-
-    def request(self, charge: MonitoredSlave, state: AlState, *, acknowledge: bool = False) -> bool:
-        """Request `state` of a slave; return False where it has surely not heard. What comes of it shows later."""
-        word = state | (ERROR_BIT if acknowledge else 0)
-        data = word.to_bytes(2, "little")
-        return self._port.exchange(Command.FPWR, charge.station, AL_CONTROL, data, tries=1).wkc != 0
-
-    def note_fall(self, charge: MonitoredSlave, now: float) -> None:
-        """Note that a slave left OP; one that does so again and again is brought back after pauses, and set up."""
-        if now - charge.back_at < _WELL_S:
-            charge.flaps += 1
-            charge.pause_until = now + min(_PAUSE_S * charge.flaps, _LONGEST_PAUSE_S)
-        else:
-            charge.flaps = 0
-            charge.told_at = LONG_AGO
-        charge.failed = charge.flaps
-
-    def _fail(self, charge: MonitoredSlave, now: float, wanted: AlState) -> None:
-        charge.failed += 1
-        charge.kept = False
-        charge.pause_until = now + _PAUSE_S
-        found = charge.state | (ERROR_BIT if charge.error else 0)
-        self.tell(charge, refusal(charge.label, wanted, found, charge.code) + "; it is asked again every second")
-
-    def _probe(self, charge: MonitoredSlave, now: float) -> None:
-        """Look whether a slave that lost its address has come back to its place."""
-        charge.asked = None
-        charge.kept = False
-        if self._reached < charge.position or now < charge.probe_at:
-            return
-        charge.probe_at = now + _PROBE_S
-        place = 1 - charge.position & 0xFFFF
-        data, wkc = self._port.exchange(Command.APRD, place, STATION, bytes(2), tries=1)
-        if wkc != 1:
-            return
-        station = int.from_bytes(data, "little")
-        other = next((one for one in self._slaves if one.station == station), None)
-        if other is None:
-            self._begin(charge, lost_address=True)
-        elif other is not charge:
-            charge.pause_until = now + _PAUSE_S
-            self.tell(charge, f"{charge.label}: at its place answers {other.label}: put the cables back in their order")
-
-    def _begin(self, charge: MonitoredSlave, *, lost_address: bool) -> None:
-        charge.asked = None
-        charge.kept = False
-        charge.unfinished = True
-        what = "it was without supply" if lost_address else f"it is in {charge.words()}"
-        if charge.failed == 0 and charge.flaps == 0:
-            self._say(f"{charge.label} is set up again: {what}")
-        charge.work = self._restorer.restore(charge.position, lost_address)
-
-    def _go_on(self, charge: MonitoredSlave, until: float) -> None:
-        work = charge.work
-        assert work is not None
-        try:
-            next(work)
-            while time.monotonic() < until:
-                time.sleep(_POLL_S)
-                next(work)
-        except StopIteration:
-            charge.work = None
-            charge.unfinished = False
-            charge.failed = 0
-        except BusError as error:
-            charge.work = None
-            charge.failed += 1
-            pause = min(_PAUSE_S * charge.failed, _LONGEST_PAUSE_S)
-            charge.pause_until = time.monotonic() + (_FOREIGN_PAUSE_S if isinstance(error, ForeignSlave) else pause)
-            self.tell(charge, "; ".join(error.sentences))
-
-    def drop(self, charge: MonitoredSlave) -> None:
-        """Give up what is under way with a slave."""
-        charge.asked = None
-        if charge.work is not None:
-            charge.work.close()
-            charge.work = None
-
-    def tell(self, charge: MonitoredSlave, sentence: str) -> None:
-        """Say something of a slave, at most every 10 s."""
-        now = time.monotonic()
-        if now - charge.told_at >= SAY_AGAIN_S:
-            charge.told_at = now
-            self._say(sentence)
+    def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
+        """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""

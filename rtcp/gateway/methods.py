@@ -6,6 +6,8 @@ its own name by itself.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import inspect
 import time
 from collections.abc import Awaitable, Callable
@@ -307,8 +309,7 @@ class Methods:
     def _command_method(self, kind: type[Command]) -> Method:
         """Return the method of a command: it moves until the arm holds again, streams, or returns when accepted."""
         streams = issubclass(kind, MotionCommand) and kind.renewed
-        hints = {name: one for name, one in get_type_hints(kind).items() if name in kind.__dataclass_fields__}
-        held = streams and "hold_s" in hints
+        hints = _fields_of(kind)
 
         async def call(caller: Caller, sent_s: float | None = None, **given: Any) -> Json:
             for name, hint in hints.items():
@@ -316,7 +317,7 @@ class Methods:
                     given[name] = hint[given[name].upper()]
                 elif hint == Joints:
                     self._check_count(name, given[name], len(self._config.joints))
-            if held:
+            if "hold_s" in hints:
                 _check_age(given["hold_s"], sent_s)
             command = kind(**given)
             if streams:
@@ -330,14 +331,8 @@ class Methods:
                 await self.channel.send(lease, command)
             return {}
 
-        fields = [
-            (name, _parameter(hint), field(default=HOLD_S) if held and name == "hold_s" else field())
-            for name, hint in hints.items()
-        ]
-        if held:
-            fields.append(("sent_s", float | None, field(default=None)))
-        checker: Checker[Any] = Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
-        return Method(kind.name, checker, call, inspect.cleandoc(kind.__doc__ or ""), streams=streams)
+        documentation = inspect.cleandoc(kind.__doc__ or "")
+        return Method(kind.name, _parameters_of_command(kind), call, documentation, streams=streams)  # type: ignore[arg-type]
 
     @staticmethod
     def _check_count(name: str, numbers: Numbers, count: int) -> None:
@@ -346,14 +341,39 @@ class Methods:
 
 
 def _method_of(function: Any) -> Method:
+    documentation = inspect.cleandoc(function.__doc__)
+    return Method(
+        function.__name__, _parameters_of(function.__func__), function, documentation, **function.method_flags
+    )
+
+
+@functools.cache
+def _parameters_of(function: Any) -> Checker[Any]:
+    """Return what checks the parameters of a function: those after `self` and `caller`."""
     hints = get_type_hints(function, include_extras=True)
     fields = [
         (name, hints[name], field() if one.default is inspect.Parameter.empty else field(default=one.default))
-        for name, one in inspect.signature(function).parameters.items()
-        if name != "caller"
+        for name, one in list(inspect.signature(function).parameters.items())[2:]
     ]
-    checker: Checker[Any] = Checker(make_dataclass(function.__name__, fields, frozen=True, kw_only=True))
-    return Method(function.__name__, checker, function, inspect.cleandoc(function.__doc__), **function.method_flags)
+    return Checker(make_dataclass(function.__name__, fields, frozen=True, kw_only=True))
+
+
+@functools.cache
+def _parameters_of_command(kind: Any) -> Checker[Any]:
+    """Return what checks the fields of a command; one with a hold time needs none, and has `sent_s` beside."""
+    hints = _fields_of(kind)
+    held = "hold_s" in hints
+    fields: list[tuple[str, Any, Any]] = [
+        (name, _parameter(hint), field(default=HOLD_S) if name == "hold_s" else field()) for name, hint in hints.items()
+    ]
+    if held:
+        fields.append(("sent_s", float | None, field(default=None)))
+    return Checker(make_dataclass(kind.name, fields, frozen=True, kw_only=True))
+
+
+def _fields_of(kind: Any) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {one.name: hints[one.name] for one in dataclasses.fields(kind)}
 
 
 def _parameter(hint: Any) -> Any:

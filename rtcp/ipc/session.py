@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import rtcp
 from rtcp.config.model import ArmConfig
-from rtcp.config.serialization import plain, typed
+from rtcp.config.serialization import from_json, to_json
 
 if TYPE_CHECKING:
     import psutil
@@ -168,7 +168,7 @@ class Session:
         path.unlink(missing_ok=True)
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         with open(descriptor, "w") as file:
-            json.dump({"version": rtcp.__version__, "session": plain(self)}, file)
+            json.dump({"version": rtcp.__version__, "session": to_json(self)}, file)
 
 
 def session_file(directory: Path) -> Path:
@@ -193,7 +193,7 @@ def read_session(directory: Path) -> Session:
     if found.get("version") != rtcp.__version__:
         raise SessionError(f"{path} was written by another version of rtcp: it is not read by {rtcp.__version__}")
     try:
-        return typed(Session, found.get("session"))
+        return from_json(Session, found.get("session"))
     except ValueError as error:
         raise SessionError(f"{path} is damaged: {error}") from error
 

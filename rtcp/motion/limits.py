@@ -115,7 +115,7 @@ class Limits:
     def check(self, new: Values, position: list[float], velocity: list[float]) -> Refusal | None:
         """Return why `new` cannot come into force for an arm at `position` (rad) with `velocity` (rad/s), or None.
 
-        The boxes are compared with the configuration's only; where the arm is in them `TrajectoryGuard.refusal_of` says.
+        The boxes are compared with those of the configuration only, not with the arm (`TrajectoryGuard.refusal_of`).
         """
         if len(new.low) != len(self.low):
             return ImpossibleLimit(-1, float(len(new.low)), float(len(self.low)))

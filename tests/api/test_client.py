@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 import threading
@@ -12,84 +13,135 @@ from typing import Any
 import pytest
 
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
+from rtcp.ipc.errors import Faulted, Refused, RtcpError
 
 
 @pytest.fixture
-def listener(directory: Path) -> Iterator[socket.socket]:
-    """A socket behind which the test itself speaks."""
+def path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("RTCP_RUNTIME_DIR", str(tmp_path))
+    return tmp_path / "control.sock"
+
+
+@pytest.fixture
+def listener(path: Path) -> Iterator[socket.socket]:
+    """A socket behind which the test itself answers."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as bound:
-        bound.bind(str(directory / "control.sock"))
+        bound.bind(str(path))
         bound.listen()
         yield bound
 
 
-def replies(listener: socket.socket, *chunks: bytes) -> None:
-    """Answer the first request with these bytes, a packet each, and close."""
+class Peer:
+    """Answers the first request with these bytes, a packet each, and closes; `received` is what came.
 
-    def serve() -> None:
+    Of several `requests` each has one packet; without a packet it reads on.
+    """
+
+    def __init__(self, listener: socket.socket, *packets: bytes, requests: int = 1) -> None:
+        self.received: list[dict[str, Any]] = []
+        self._thread = threading.Thread(target=self._serve, args=(listener, packets, requests), daemon=True)
+        self._thread.start()
+
+    def _serve(self, listener: socket.socket, packets: tuple[bytes, ...], requests: int) -> None:
         connection, _ = listener.accept()
-        with connection:
-            connection.recv(65536)
-            for chunk in chunks:
-                connection.sendall(chunk)
+        with connection, connection.makefile("rb") as lines:
+            for number in range(requests):
+                while not self.received or self.received[-1].get("id") != number + 1:
+                    self.received.append(json.loads(lines.readline()))
+                for packet in packets[number : number + 1] if requests > 1 else packets:
+                    connection.sendall(packet)
+            if not packets:
+                self.received += [json.loads(line) for line in lines]
 
-    threading.Thread(target=serve, daemon=True).start()
+    def join(self) -> list[dict[str, Any]]:
+        self._thread.join(10)
+        return self.received
 
 
 def error_of(listener: socket.socket, *chunks: bytes) -> RtcpError:
-    replies(listener, *chunks)
+    Peer(listener, *chunks)
     with ControlClient() as client, pytest.raises(RtcpError) as raised:
         client.call("status")
     return raised.value
 
 
-def test_a_request_carries_the_verb_the_arguments_and_who_asks(platform: Any) -> None:
+OK = b'{"jsonrpc": "2.0", "id": 1, "result": {"cycles": 5}}\n'
+
+
+def test_a_connection_gives_its_name_once_and_numbers_its_requests(listener: socket.socket) -> None:
+    peer = Peer(listener, OK, b'{"jsonrpc": "2.0", "id": 2, "result": {}}\n', requests=2)
     with ControlClient("a test") as client:
-        client.call("mode", {"name": "csv"})
-    assert platform.requests == [{"id": 1, "do": "mode", "args": {"name": "csv"}, "client": "a test"}]
+        assert client.call("mode", {"name": "csv"}) == {"cycles": 5}
+        client.call("status")
+    assert peer.join() == [
+        {"jsonrpc": "2.0", "method": "identify", "params": {"name": "a test"}},
+        {"jsonrpc": "2.0", "id": 1, "method": "mode", "params": {"name": "csv"}},
+        {"jsonrpc": "2.0", "id": 2, "method": "status", "params": {}},
+    ]
 
 
-def test_progress_is_passed_on_before_the_result_comes(platform: Any) -> None:
+def test_progress_of_the_request_is_passed_on_before_the_result(listener: socket.socket) -> None:
+    reports = [(1, 0.0), (9, 0.1), (1, 0.5)]
+    lines = [
+        json.dumps({"method": "progress", "params": {"request": number, "fraction": fraction}}).encode() + b"\n"
+        for number, fraction in reports
+    ]
+    Peer(listener, *lines, OK)
     seen: list[float] = []
     with ControlClient() as client:
-        result = client.call("move", {"q": [0.0] * 6}, lambda progress: seen.append(progress["fraction"]))
-    assert seen == [0.0, 0.25, 0.5, 0.75]
-    assert result["error"] == 0.00042
-
-
-def test_one_connection_carries_many_requests(platform: Any) -> None:
-    with ControlClient() as client:
-        assert [client.call("status")["cycles"] for _ in range(3)] == [123_456] * 3
-    assert [request["id"] for request in platform.requests] == [1, 2, 3]
+        client.call("run", {}, lambda progress: seen.append(progress["fraction"]))
+    assert seen == [0.0, 0.5]
 
 
 def test_an_answer_in_pieces_is_put_together(listener: socket.socket) -> None:
-    replies(listener, b'{"id": 1, "ok": tr', b'ue, "result": {"cycles"', b": 5}}\n")
+    Peer(listener, OK[:20], OK[20:50], OK[50:])
     with ControlClient() as client:
         assert client.call("status") == {"cycles": 5}
 
 
-def test_an_answer_to_another_request_is_passed_over(listener: socket.socket) -> None:
-    replies(listener, b'{"id": 9, "ok": true, "result": {}}\n{"id": 1, "ok": true, "result": {"cycles": 5}}\n')
+def test_an_answer_to_another_request_is_skipped(listener: socket.socket) -> None:
+    Peer(listener, b'{"id": 9, "result": {}}\n' + OK)
     with ControlClient() as client:
         assert client.call("status") == {"cycles": 5}
 
 
-def test_a_refusal_keeps_its_kind_and_its_sentence(platform: Any) -> None:
-    platform.refusals["enable"] = ("refused", "the arm is commanded by a panel")
-    with ControlClient() as client, pytest.raises(RtcpError) as raised:
-        client.call("enable")
-    assert (raised.value.kind, raised.value.message) == ("refused", "the arm is commanded by a panel")
+def test_an_error_has_the_class_of_its_kind_and_carries_reason_and_fields(listener: socket.socket) -> None:
+    data = {"kind": "refused", "reason": "lease_held", "fields": {"holder": "a panel"}}
+    answer = {"id": 1, "error": {"code": -32000, "message": "the arm is commanded by a panel", "data": data}}
+    error = error_of(listener, json.dumps(answer).encode() + b"\n")
+    assert type(error) is Refused
+    assert str(error) == error.message == "the arm is commanded by a panel"
+    assert (error.kind, error.reason, error.fields) == ("refused", "lease_held", {"holder": "a panel"})
 
 
-def test_a_refusal_of_a_kind_that_is_not_known_is_a_fault(listener: socket.socket) -> None:
-    error = error_of(listener, b'{"id": 1, "ok": false, "error": {"kind": "not running", "message": "odd"}}\n')
-    assert (error.kind, error.message) == ("fault", "odd")
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (b'{"id": 1, "error": {"message": "odd", "data": {"kind": "not running"}}}\n', "odd"),
+        (b'{"id": 1, "error": {"data": 3}}\n', "the platform refused 'status' without saying why"),
+        (b'{"id": null, "error": 3}\n', "the platform refused 'status' without saying why"),
+        (b'{"id": 1}\n', "the platform refused 'status' without saying why"),
+    ],
+)
+def test_an_error_of_any_other_form_is_a_fault(listener: socket.socket, answer: bytes, message: str) -> None:
+    error = error_of(listener, answer)
+    assert (type(error), error.message) == (Faulted, message)
 
 
-def test_a_refusal_without_words_is_still_a_sentence(listener: socket.socket) -> None:
-    assert "status" in error_of(listener, b'{"id": 1, "ok": false}\n').message
+def test_a_call_that_an_exception_leaves_is_cancelled(listener: socket.socket) -> None:
+    peer = Peer(listener)
+    with ControlClient() as client, pytest.raises(RtcpError, match=r"'reset' for 0\.05 s") as raised:
+        client.call("reset", timeout_s=0.05)
+    assert raised.value.kind == "timeout"
+    assert f"its gateway (process {os.getpid()})" in raised.value.message
+    assert peer.join()[-1] == {"jsonrpc": "2.0", "method": "cancel", "params": {"request": 1}}
+
+
+@pytest.mark.parametrize("value", [float("nan"), object()])
+def test_what_json_cannot_express_is_not_sent(listener: socket.socket, value: object) -> None:
+    with ControlClient() as client, pytest.raises(RtcpError, match="cannot be sent as JSON") as raised:
+        client.call("run", {"file": value})
+    assert raised.value.kind == "invalid"
 
 
 def test_a_connection_that_ends_before_the_answer_is_lost(listener: socket.socket) -> None:
@@ -104,16 +156,9 @@ def test_an_answer_that_is_no_json_is_shown(listener: socket.socket) -> None:
     assert "hello" in error.message
 
 
-def test_silence_ends_in_a_timeout_that_names_the_verb(listener: socket.socket) -> None:
-    with ControlClient() as client, pytest.raises(RtcpError, match=r"'reset' for 0\.05 s") as raised:
-        client.call("reset", timeout_s=0.05)
-    assert raised.value.kind == "timeout"
-    assert f"its gateway (process {os.getpid()})" in raised.value.message
-
-
-def test_a_socket_that_nobody_serves_is_not_running(listener: socket.socket, directory: Path) -> None:
+def test_a_socket_that_nobody_serves_is_not_running(listener: socket.socket, path: Path) -> None:
     listener.close()
-    assert (directory / "control.sock").exists()
+    assert path.exists()
     with pytest.raises(RtcpError, match="nobody listens") as raised:
         ControlClient()
     assert raised.value.kind == "not running"
@@ -126,8 +171,8 @@ def test_a_path_too_long_for_a_socket_is_named_with_the_limit(tmp_path: Path) ->
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may open any socket")
-def test_the_socket_of_another_user_is_refused(listener: socket.socket, directory: Path) -> None:
-    (directory / "control.sock").chmod(0)
+def test_the_socket_of_another_user_is_refused(listener: socket.socket, path: Path) -> None:
+    path.chmod(0)
     with pytest.raises(RtcpError, match="only its owner") as raised:
         ControlClient()
     assert raised.value.kind == "refused"

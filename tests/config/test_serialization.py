@@ -49,7 +49,7 @@ CONFIGS = st.builds(
 
 
 def through_text(config: ArmConfig) -> ArmConfig:
-    return from_json(json.loads(json.dumps(to_json(config))))
+    return from_json(ArmConfig, json.loads(json.dumps(to_json(config))))
 
 
 @given(CONFIGS)
@@ -88,13 +88,14 @@ def test_a_damaged_form_is_refused_with_its_key(damage: Any, message: str) -> No
     data = to_json(load(default_config()))
     damaged = damage(data)
     with pytest.raises(ValueError, match=message):
-        from_json(damaged if damaged == [] else data)
+        from_json(ArmConfig, damaged if damaged == [] else data)
 
 
 def test_reading_the_form_loads_no_validator() -> None:
     form = json.dumps(to_json(load(default_config())))
     code = (
-        "import sys, json; from rtcp.config.serialization import from_json; from_json(json.load(sys.stdin)); "
+        "import sys, json; from rtcp.config.model import ArmConfig; "
+        "from rtcp.config.serialization import from_json; from_json(ArmConfig, json.load(sys.stdin)); "
         "print({'pydantic', 'yaml', 'ruamel', 'numpy'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], input=form, capture_output=True, text=True, check=True)

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rtcp.ipc.machine import State
 
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import PER_JOINT, SCALARS
-from rtcp.ipc.machine import State
-from rtcp.launch.notifier import Notifier
+from rtcp.launch.supervisor import Notifier
 
 JOINTS = 6
 STATE = [name for name, _ in SCALARS[1:]].index("state")

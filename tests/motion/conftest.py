@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import math
+import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -23,6 +24,8 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 PERIOD = 0.0005
+JOG_PERIOD = 0.0005 if "RTCP_SLOW" in os.environ else 0.002
+SAMPLED = round(0.01 / JOG_PERIOD)
 C = TypeVar("C", bound=Controller)
 
 ARM = load(default_config())
@@ -169,8 +172,8 @@ class Driven:
 
     def __init__(self, q: list[float]) -> None:
         self.limits = Limits(ARM)
-        self.trajectory_guard = TrajectoryGuard(ARM, self.limits, PERIOD)
-        setup = ControllerSetup(ARM, self.limits, self.trajectory_guard, PERIOD, no_plan)
+        self.trajectory_guard = TrajectoryGuard(ARM, self.limits, JOG_PERIOD)
+        setup = ControllerSetup(ARM, self.limits, self.trajectory_guard, JOG_PERIOD, no_plan)
         self.jog = JogController(setup)
         self.state = ArmState(6)
         self.state.commanded[:] = q
@@ -206,20 +209,20 @@ class Driven:
             zip(before, state.commanded, speed, state.commanded_velocity, strict=True)
         ):
             assert abs(w) <= limits.velocity[i] * (1.0 + 1e-6)
-            assert abs(w - v) <= limits.acceleration[i] * PERIOD * (1.0 + 1e-6)
-            assert abs(new - old - w * PERIOD) < 1e-12
+            assert abs(w - v) <= limits.acceleration[i] * JOG_PERIOD * (1.0 + 1e-6)
+            assert abs(new - old - w * JOG_PERIOD) < 1e-12
             assert limits.low[i] <= new <= limits.high[i] or abs(new - old) < 1e-9
         if self.jog.phase is Phase.HOLD:
             assert self.still
-        state.now_ns += ARM.cycle.period_us * 1000
+        state.now_ns += round(JOG_PERIOD * 1e9)
 
     def run(self, twist: list[float], seconds: float, frame: str = "base") -> Driven:
-        for cycle in range(round(seconds / PERIOD)):
+        for cycle in range(round(seconds / JOG_PERIOD)):
             if self.jog.phase is Phase.HOLD and any(twist):
                 self.jog.start()
             self.jog.command(twist, in_tool_frame=frame == "tool")
             self.cycle()
-            if cycle % 20 == 0:
+            if cycle % SAMPLED == 0:
                 self.path.append(self.tool)
                 self.least_distance = min(self.least_distance, self.distance())
         return self

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import isfinite
+from typing import TypeVar
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, Box, KeepOut
@@ -15,7 +17,21 @@ from rtcp.motion.state import ArmState, Setpoint
 from .reference import depth, points
 
 ROUNDING_RAD = 1e-6
+Case = TypeVar("Case")
+SLOW = "RTCP_SLOW" in os.environ
+"""Whether every case runs (`RTCP_SLOW=1`); else a share of the samples."""
 ROUNDING_M = 1e-9
+
+
+def examples(full: int) -> int:
+    """How many examples of a property run."""
+    return full if SLOW else max(full // 6, 5)
+
+
+def some(cases: Iterable[Case], every: int = 3) -> list[Case]:
+    """Every third of the cases, or all."""
+    found = list(cases)
+    return found if SLOW else found[::every]
 
 
 class Judge:
@@ -88,7 +104,7 @@ class Judge:
 
     def change(self, new: Values) -> bool:
         """Change the limits as one transaction, as the loop does."""
-        if self.guard.refuses(self.state, new) is not None:
+        if self.guard.refusal_of(self.state, new) is not None:
             return False
         self.limits.apply(new)
         self._depths = self.depths()

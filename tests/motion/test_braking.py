@@ -13,7 +13,7 @@ from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 
-from .judge import ARM, with_boxes
+from .judge import ARM, examples, with_boxes
 from .reference import Point, depth, points
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
@@ -52,7 +52,7 @@ def test_from_the_fastest_stoppable_speed_the_stop_ends_exactly_at_the_edge(room
 
 
 @given(q=JOINTS, parts=SPEEDS, rates=RATES, dt=st.sampled_from([0.001, 0.004, 0.02]))
-@settings(max_examples=40)
+@settings(max_examples=examples(40))
 def test_no_point_travels_further_than_is_said(
     q: Sequence[float], parts: Sequence[float], rates: Sequence[float], dt: float
 ) -> None:
@@ -74,7 +74,7 @@ def test_no_point_travels_further_than_is_said(
     off=st.tuples(*[st.floats(-1.3, 1.3)] * 3),
     sizes=st.tuples(SIZES, SIZES, SIZES),
 )
-@settings(max_examples=300)
+@settings(max_examples=examples(300))
 def test_a_stop_that_is_said_to_be_free_is_free_in_every_cycle_and_one_with_room_is_said_to_be(
     q: Sequence[float],
     parts: Sequence[float],

@@ -25,6 +25,8 @@ from rtcp.motion.planning.interpolation import (
     value,
 )
 
+from .judge import examples
+
 NUMBER = st.floats(-10.0, 10.0)
 
 
@@ -49,7 +51,7 @@ def test_a_quintic_has_what_is_asked_for_at_both_ends(
     assert [value(rise, 0.0) / t**2, value(rise, 1.0) / t**2] == pytest.approx([a0, a1], abs=1e-4 + 1e-9 / t**2)
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(st.floats(-100.0, 100.0), min_size=6, max_size=6))
 def test_the_extremes_are_those_of_dense_samples(c: list[float]) -> None:
     samples = [value(c, k / 2000) for k in range(2001)]
@@ -63,7 +65,7 @@ def test_the_extremes_are_those_of_dense_samples(c: list[float]) -> None:
     assert value(c, at_largest) == pytest.approx(largest, abs=1e-9 * size)
 
 
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.floats(0.5, 6.0))
 def test_what_lies_beyond_a_bound_is_found_whenever_a_sample_does(c: list[float], bound: float) -> None:
     samples = [value(c, k / 500) for k in range(501)]

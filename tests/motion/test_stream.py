@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from collections.abc import Callable
 from itertools import pairwise
@@ -19,9 +18,10 @@ from rtcp.ipc.refusals import NotFinite, PositionOutOfRange, Refusal, StampNotFi
 from rtcp.motion.controllers.stream import TIMEOUT_S, StreamController
 from rtcp.motion.state import Phase
 
+from .judge import examples
+
 PERIOD = 0.0005
 ZERO = [0.0] * 6
-SLOW = "RTCP_SLOW" in os.environ
 
 
 @pytest.fixture
@@ -195,7 +195,7 @@ def test_a_run_up_that_would_leave_the_range_is_not_made(drive: Any, mode: Strea
     assert drive.state.commanded[0] == pytest.approx(low + 0.01, abs=2e-3)
 
 
-@settings(max_examples=30 if SLOW else 4)
+@settings(max_examples=examples(30))
 @given(st.integers(0, 10**6))
 def test_no_stream_breaks_a_limit(new_drive: Any, seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,12 +23,13 @@ from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase
 
+from .judge import examples
+
 PERIOD = 0.0005
 MASS, ARM_M, G = 3.0, 0.4, 9.80665
 INERTIA = (1.2, 1.5, 0.8, 0.4, 0.2, 0.08)
 """kg m^2, of each joint with what it carries, and the rotor."""
 FREE = [0.0] * 6
-SLOW = "RTCP_SLOW" in os.environ
 
 
 def no_plan(slot: int) -> memoryview[float]:
@@ -209,7 +209,7 @@ def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sig
     plant.check()
 
 
-@settings(max_examples=12 if SLOW else 2)
+@settings(max_examples=examples(12))
 @given(st.integers(0, 10**6))
 def test_no_torques_whatever_break_a_bound(new_plant: Any, seed: int) -> None:
     chance = random.Random(seed)

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rtcp.ipc.codes import Refusal
+from rtcp.ipc.machine import Code, Command, State
 from tests.runtime.bench import CONFIG, CST, PERIOD_S, Bench
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.codes import Refusal
-from rtcp.ipc.machine import Code, Command, State
 from rtcp.ipc.observer import Observer
 
 TORQUE_MODE = 5.0

@@ -20,6 +20,8 @@ from rtcp.motion.planning.plan import COLUMNS, KIND, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import ArmState, Phase
 
+from .judge import examples
+
 PERIOD = 0.0005
 ZERO = (0.0,) * 6
 A, B, C = (0.3, 0.2, 0.5, 0.1, 0.2, -0.3), (0.5, 0.4, 0.9, 0.1, 0.5, -0.3), (0.2, -0.1, 0.4, 0.3, 0.1, 0.1)
@@ -134,7 +136,7 @@ def test_a_stop_uses_what_the_joints_accelerations_allow(drive: Any, mode: Traje
     assert drive.until_rest(mode) < speed / 2.0 + 2.0 * 2.0 / 20.0 + 0.05
 
 
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 @given(st.integers(0, 10**6))
 def test_plans_that_interrupt_each_other_never_jump(new_drive: Any, memory: Callable[..., Any], seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from collections.abc import Sequence
 from itertools import pairwise
@@ -20,8 +19,9 @@ from rtcp.ipc.refusals import HoldTimeOutOfRange, JointSpeedOutOfRange, NotFinit
 from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.state import Phase
 
+from .judge import examples
+
 PERIOD = 0.0005
-SLOW = "RTCP_SLOW" in os.environ
 NONE = [0.0] * 6
 
 
@@ -170,7 +170,7 @@ def test_where_no_way_to_an_edge_is_found_the_joints_ramp_down(drive: Any, mode:
     assert drive.cuts == 0
 
 
-@settings(max_examples=12 if SLOW else 3)
+@settings(max_examples=examples(12))
 @given(st.integers(0, 10**6))
 def test_no_velocities_break_a_limit(new_drive: Any, seed: int) -> None:
     chance, drive = random.Random(seed), new_drive()

@@ -21,7 +21,7 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 from rtcp.motion.limits import Limits
 
-from .judge import ARM, MODEL, Judge, with_boxes
+from .judge import ARM, MODEL, SLOW, Judge, examples, with_boxes
 from .reference import Point, depth, points
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
@@ -70,7 +70,7 @@ def test_the_points_that_are_watched_are_where_the_table_of_the_facts_puts_them(
     dt=CYCLES_S,
     legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40), st.booleans()), min_size=1, max_size=4),
 )
-@settings(max_examples=250)
+@settings(max_examples=examples(250))
 def test_who_began_free_never_enters_a_keep_out_box(
     q: Sequence[float],
     which: int,
@@ -97,7 +97,7 @@ def test_who_began_free_never_enters_a_keep_out_box(
     dt=CYCLES_S,
     legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40), st.booleans()), min_size=1, max_size=4),
 )
-@settings(max_examples=100)
+@settings(max_examples=examples(100))
 def test_who_began_inside_its_box_never_leaves_it(
     q: Sequence[float], gaps: Sequence[float], dt: float, legs: list[tuple[list[float], int, bool]]
 ) -> None:
@@ -115,7 +115,7 @@ def test_who_began_inside_its_box_never_leaves_it(
     dt=CYCLES_S,
     legs=st.lists(st.tuples(DIRECTION, st.integers(1, 40)), min_size=1, max_size=4),
 )
-@settings(max_examples=25)
+@settings(max_examples=examples(25))
 def test_who_began_inside_a_keep_out_box_only_moves_outward(
     q: Sequence[float], which: int, depth_m: float, dt: float, legs: list[tuple[list[float], int]]
 ) -> None:
@@ -155,7 +155,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
 
     monkeypatch.setattr("rtcp.motion.guards.braking.frames", counted)
     chance, most, dt = Random(1), 0, 0.0005
-    for _ in range(3000):
+    for _ in range(3000 if SLOW else 1000):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
@@ -178,7 +178,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
 
 def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
     chance, stops = Random(5), 0
-    for _ in range(60):
+    for _ in range(60 if SLOW else 25):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
@@ -196,7 +196,7 @@ def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
             stops += 1
             assert judge.guard.nearest_box(judge.state.commanded)[0] >= 0.0
             assert judge.guard.ended.distance >= 0.0
-    assert stops > 10
+    assert stops > 5
 
 
 def test_a_stop_before_the_tools_own_box_names_it() -> None:
@@ -210,7 +210,7 @@ def test_a_stop_before_the_tools_own_box_names_it() -> None:
 
 
 @given(shares=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4), direction=DIRECTION, dt=CYCLES_S)
-@settings(max_examples=20)
+@settings(max_examples=examples(20))
 def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction: list[float], dt: float) -> None:
     judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, dt)
     limits = judge.limits
@@ -232,15 +232,41 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
     assert judge.guard.poses == frames(MODEL, judge.state.commanded)
 
 
-def test_to_probe_beside_a_box_changes_nothing() -> None:
-    tool = points(Q)[0]
-    judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
-    guard, poses = judge.guard, judge.guard.poses
-    step = [Q[0] + 1e-6, *Q[1:]]
-    assert guard.probe(judge.state, step, [0.0] * 6)
-    assert guard.poses is poses
-    assert judge.ask(step, tolerates_saturation=False) is GuardResult.PASS
-    assert guard.poses == frames(MODEL, step)
+# -- exactly at a face, and thin plates ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("kept_in", [False, True])
+def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: int, kept_in: bool) -> None:
+    x, y, z = frames(MODEL, Q)[6].position
+    box = (*WIDE[:3], x, *WIDE[4:]) if kept_in else (x, y - 0.1, z - 0.1, x + 0.2, y + 0.1, z + 0.1)
+    judge = Judge(with_boxes(box) if kept_in else with_boxes(WIDE, box), Q, 0.001)
+    for sign in (1.0, -1.0):
+        for _ in range(60):
+            way = [sign * 0.5 * judge.dt if i == axis else 0.0 for i in range(6)]
+            verdict = judge.ask(
+                [q + w for q, w in zip(judge.state.commanded, way, strict=True)], tolerates_saturation=True
+            )
+            if axis == 5:
+                assert verdict <= GuardResult.CLAMPED
+        judge.ask([float("nan")] * 6, tolerates_saturation=False)
+        judge.stop()
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.01, 0.1])
+@pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-5])
+@pytest.mark.parametrize("part", [0.01, 0.3, 0.99])
+def test_a_plate_that_the_first_cycle_would_cross_is_not_crossed(dt: float, gap: float, part: float) -> None:
+    q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
+    x, y, z = frames(MODEL, q)[6].position
+    # Joint 1 moves the tool along y; so far it comes in a cycle from rest.
+    way = abs(x) * ARM.joints[0].acceleration * dt * dt
+    low = y + gap
+    judge = Judge(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
+    speed = ARM.joints[0].velocity if x > 0 else -ARM.joints[0].velocity
+    for _ in range(50):
+        judge.ask([judge.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
+        assert frames(MODEL, judge.state.commanded)[6].position[1] <= low + 1e-9
 
 
 # -- distances ------------------------------------------------------------------------------------------------------
@@ -260,7 +286,7 @@ def test_outside_is_the_distance_to_the_nearest_point_of_the_box_and_inside_the_
 
 
 @given(q=JOINTS)
-@settings(max_examples=50)
+@settings(max_examples=examples(50))
 def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     limits = Limits(ARM)
     zones = Zones(MODEL, limits)
@@ -268,7 +294,6 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     found = zones.clearances(poses, inf)
     assert [one.distance for one in found] == sorted(one.distance for one in found)
     assert len(found) == 6 + 3 * len(limits.keep_out)
-    assert found[0] == zones.clearance(poses)
     assert found[0].distance == zones.distance(poses)[0]
     for one in found:
         moved = tuple(p + 1e-6 * n for p, n in zip(poses[one.point].position, one.normal, strict=True))
@@ -279,7 +304,7 @@ def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
 
 
 @given(q=JOINTS, direction=DIRECTION)
-@settings(max_examples=60)
+@settings(max_examples=examples(60))
 def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[float], direction: list[float]) -> None:
     zones = Zones(MODEL, Limits(ARM))
     step = 1e-4
@@ -294,7 +319,7 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
     # A plate 2 mm thin beside the tool, at each of many distances: a stop from full speed passes it in a cycle.
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
-    for gap, sign in product([0.004 * n for n in range(1, 20)], [1.0, -1.0]):
+    for gap, sign in product([0.004 * n for n in range(1, 20, 1 if SLOW else 3)], [1.0, -1.0]):
         y = tool[1] + sign * (gap + 0.001)
         box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
         judge = Judge(with_boxes(WIDE, box), q, 0.01)

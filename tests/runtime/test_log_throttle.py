@@ -17,7 +17,7 @@ class Bench:
 
     def pass_time(self, seconds: float) -> None:
         self.now += seconds
-        self.throttle.tell()
+        self.throttle.report_due()
 
 
 @pytest.fixture
@@ -27,24 +27,24 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 def test_a_sentence_is_said_at_once_and_then_every_ten_seconds_with_its_count(bench: Bench) -> None:
     for _ in range(25):
-        bench.throttle.say("it is hot")
+        bench.throttle.report("it is hot")
         bench.pass_time(1.0)
     assert bench.said == ["it is hot", "it is hot (9 times again in 10 s)", "it is hot (10 times again in 10 s)"]
 
 
 def test_a_sentence_that_came_once_more_and_then_no_longer_is_not_lost(bench: Bench) -> None:
-    bench.throttle.say("it is hot")
-    bench.throttle.say("it is hot")
+    bench.throttle.report("it is hot")
+    bench.throttle.report("it is hot")
     bench.pass_time(10.0)
     assert bench.said == ["it is hot", "it is hot (once again in 10 s)"]
     bench.pass_time(10.0)
-    bench.throttle.say("it is hot")
+    bench.throttle.report("it is hot")
     assert bench.said[2:] == ["it is hot"]
 
 
 def test_of_many_different_sentences_a_few_are_said_and_the_others_counted(bench: Bench) -> None:
     for second in range(10):
         for number in range(20):
-            bench.throttle.say(f"message {second} {number}")
+            bench.throttle.report(f"message {second} {number}")
         bench.pass_time(1.0)
     assert bench.said == ["message 0 0", "message 0 1", "further messages of slave 3 were left out: 198 in 10 s"]

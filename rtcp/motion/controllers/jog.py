@@ -1,44 +1,46 @@
-"""Jogging: the tool goes where it is told to, for as long as it is told to.
+"""Jogging: the tool moves with the velocity that is commanded, until the command expires.
 
-What is asked for becomes a tool velocity under Cartesian acceleration and jerk (`JogRamp`); what the joint ranges, the
-boxes and the singularities do not allow is taken from it (`JogBounds`); the inverse Jacobian makes it joint speeds
-(`JogInverse`), and what the tool has lost of its line, some 1e-7 m a cycle, comes back with the next ones. All joints
-are scaled together, so that the tool keeps its direction; where they cannot follow, it waits, and the ramp goes on from
-what was reached. Nothing winds up.
+The commanded twist passes through `TwistRamp` (Cartesian acceleration and jerk); `JogBounds` takes from it what joint
+ranges, boxes and singularities do not allow; the inverse Jacobian (`JogInverse`) makes it joint speeds; `ScaledTwist`
+scales all joints together, so that the tool keeps its direction. Where joints cannot follow, the ramp continues from
+what was reached: nothing winds up. The tool's drift off its line, some 1e-7 m a cycle, is corrected in the next cycles.
 
 Beside a singularity the joint that would have to move without bound is locked, and the tool goes where it still can. A
-stretched elbow is bent by its joints (`jog_elbow`).
+stretched elbow is bent by its joints (`jog_inverse.bend`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import sqrt
 
 from kinematics.forward import frames
 from kinematics.jacobian import jacobian_columns
 from kinematics.pose import Pose, Rotation, applied, times
+from rtcp.config.model import CartesianConfig
 from rtcp.ipc.commands import Command, Jog
 from rtcp.ipc.events import OutOfReach
 from rtcp.ipc.refusals import JogSpeedOutOfRange, NoGeometry, Refusal
 from rtcp.ipc.states import JogFrame
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.controllers.jog_bounds import JogBounds
-from rtcp.motion.controllers.jog_elbow import bend
-from rtcp.motion.controllers.jog_inverse import ELBOW, JogInverse
-from rtcp.motion.controllers.jog_ramp import JogRamp
-from rtcp.motion.controllers.jog_speeds import FULL, JogSpeeds
+from rtcp.motion.controllers.jog_bounds import JogBounds, stopping
+from rtcp.motion.controllers.jog_inverse import ELBOW, JogInverse, bend
 from rtcp.motion.controllers.velocity import VelocityController
+from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-FOR_EVER = 1 << 62
+FOREVER_NS = 1 << 62
+_FULL = 0.98
+"""Share of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
+_LAST_RAD = 1e-6
 _BRAKING = 0.7
-"""Part of the Cartesian acceleration with which the tool slows before a box."""
+"""Share of the Cartesian acceleration with which the tool slows before a box."""
 _BACK_1_S = 100.0
 """How fast the tool returns to its line, 1/s."""
 _OFF_LINE_M = 2e-4
-"""Further away from it the line begins anew."""
+"""Further away than this the line begins anew."""
 _AT_REST = 2e-3
-"""m/s, rad/s: what is slower is not taken for a motion that is wanted."""
+"""m/s, rad/s: a slower motion counts as rest."""
 
 
 class JogController(Controller):
@@ -66,13 +68,13 @@ class JogController(Controller):
         nearest = (singularity.shoulder, singularity.elbow, singularity.wrist)
         braking = _BRAKING * cartesian.acceleration
         self._bounds = JogBounds(limits, setup.trajectory_guard, self._inverse, braking, nearest, setup.period_s)
-        self._ramp = JogRamp(cartesian)
+        self._ramp = TwistRamp(cartesian)
         self._speed, self._angular_speed = cartesian.speed, cartesian.angular_speed
         self._asked = [0.0] * 6
         self._wanted = [0.0] * 6
-        self._scaled = JogSpeeds(limits)
+        self._scaled = ScaledTwist(limits)
         self._in_tool = False
-        self._until_ns = FOR_EVER
+        self._until_ns = FOREVER_NS
         self._line: Pose | None = None
         self._fresh = True
         self._last = [0.0] * 6
@@ -106,10 +108,10 @@ class JogController(Controller):
         self.begin()
         self._by_joints = False
         self._asked[:] = self._zero
-        self._until_ns = FOR_EVER
+        self._until_ns = FOREVER_NS
         self._fresh = True
 
-    def command(self, twist: Sequence[float], *, in_tool_frame: bool, until_ns: int = FOR_EVER) -> None:
+    def command(self, twist: Sequence[float], *, in_tool_frame: bool, until_ns: int = FOREVER_NS) -> None:
         """Move the tool at vx, vy, vz (m/s), wx, wy, wz (rad/s) along the axes of its own frame or of the base.
 
         The twist counts until the instant `until_ns`. It is scaled down to the largest speeds of the configuration;
@@ -174,7 +176,7 @@ class JogController(Controller):
         if inverse.locked[ELBOW]:
             bend(inverse, poses, position, wanted, speeds, self.limits, self._wrist)
         self._back(poses[6])
-        if joints.follow(state, dt):
+        if joints.limit(state, dt):
             self._advance(dt, poses[6])
             ramp.held(twist)
         else:
@@ -256,7 +258,7 @@ class JogController(Controller):
         """Each joint brakes as fast as it may: there is no inverse."""
         speeds = self._scaled.speeds
         speeds[:] = self._zero
-        self._scaled.clip(state.commanded_velocity, FULL * self.period_s)
+        self._scaled.clip(state.commanded_velocity, _FULL * self.period_s)
         self._line = None
         self._fresh = True
         self._posed = False
@@ -286,3 +288,175 @@ def _turn(x: float, y: float, z: float) -> Rotation:
         half * x * y + one * z, 1.0 - half * (x * x + z * z), half * y * z - one * x,
         half * x * z - one * y, half * y * z + one * x, 1.0 - half * (x * x + y * y),
     )  # fmt: skip
+
+
+class TwistRamp:
+    """`velocity`: vx, vy, vz (m/s), wx, wy, wz (rad/s) along the base's axes; `step` leads it to what is wanted.
+
+    The six change in one proportion, so that from rest and to rest the tool keeps its direction.
+
+    Args:
+        config: accelerations and jerks.
+    """
+
+    def __init__(self, config: CartesianConfig) -> None:
+        self._linear, self._angular = 1.0 / config.acceleration, 1.0 / config.angular_acceleration
+        self._rise = max(config.acceleration / config.jerk, config.angular_acceleration / config.angular_jerk)
+        self._weight = (self._linear / self._angular) ** 2
+        self.velocity = [0.0] * 6
+        self.acceleration = [0.0] * 6
+
+    def begin(self, velocity: Sequence[float]) -> None:
+        """Begin with a velocity, without acceleration."""
+        self.velocity[:] = velocity
+        for i in range(6):
+            self.acceleration[i] = 0.0
+
+    def step(self, wanted: Sequence[float], dt: float) -> None:
+        """Go one cycle towards `wanted`."""
+        v, acc = self.velocity, self.acceleration
+        if v == wanted:
+            for i in range(6):
+                acc[i] = 0.0
+            return
+        a, b, c = wanted[0] - v[0], wanted[1] - v[1], wanted[2] - v[2]
+        d, e, f = wanted[3] - v[3], wanted[4] - v[4], wanted[5] - v[5]
+        time = max(sqrt(a * a + b * b + c * c) * self._linear, sqrt(d * d + e * e + f * f) * self._angular)
+        rise = dt / self._rise
+        if time <= 2.0 * dt * rise:
+            v[:] = wanted
+            for i in range(6):
+                acc[i] = 0.0
+            return
+        # With constant jerk the acceleration has to fall as the root of what is left.
+        full = sqrt(1.6 * time / self._rise)
+        full = (1.0 if full > 1.0 else full) / time
+        if full * dt > 0.5:
+            full = 0.5 / dt
+        a, b, c = a * full - acc[0], b * full - acc[1], c * full - acc[2]
+        d, e, f = d * full - acc[3], e * full - acc[4], f * full - acc[5]
+        change = max(sqrt(a * a + b * b + c * c) * self._linear, sqrt(d * d + e * e + f * f) * self._angular)
+        part = rise / change if change > rise else 1.0
+        for i, more in enumerate((a, b, c, d, e, f)):
+            acc[i] += part * more
+            v[i] += acc[i] * dt
+
+    def held(self, velocity: Sequence[float]) -> None:
+        """Take what has become of the velocity; an acceleration against what was cut is given up."""
+        v, acc, weight = self.velocity, self.acceleration, self._weight
+        a, b, c = velocity[0] - v[0], velocity[1] - v[1], velocity[2] - v[2]
+        d, e, f = velocity[3] - v[3], velocity[4] - v[4], velocity[5] - v[5]
+        v[:] = velocity
+        size = a * a + b * b + c * c + (d * d + e * e + f * f) / weight
+        if size < 1e-24:
+            return
+        along = a * acc[0] + b * acc[1] + c * acc[2] + (d * acc[3] + e * acc[4] + f * acc[5]) / weight
+        if along < 0.0:
+            part = along / size
+            for i, more in enumerate((a, b, c, d, e, f)):
+                acc[i] -= part * more
+
+
+class ScaledTwist:
+    """A twist (m/s, rad/s; six, along the base's axes) and its joint speeds (rad/s, six), scaled to what joints allow.
+
+    Args:
+        limits: of the joints; read every cycle.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self.twist = [0.0] * 6
+        self.speeds = [0.0] * 6
+
+    def make(self, rows: Sequence[Sequence[float]]) -> None:
+        """Write the joint speeds for the twist, both scaled to what the joints' speeds allow.
+
+        Args:
+            rows: of the inverse Jacobian, shape (6, 6).
+        """
+        a, b, c, d, e, f = self.twist
+        speeds, fastest = self.speeds, self._limits.velocity
+        part = 1.0
+        for i, (g, h, k, m, n, o) in enumerate(rows):
+            speeds[i] = v = a * g + b * h + c * k + d * m + e * n + f * o
+            most = _FULL * fastest[i]
+            if v * part > most or v * part < -most:
+                part = most / (v if v > 0.0 else -v)
+        self.scale(part)
+
+    def scale(self, part: float) -> None:
+        """Multiply both by `part`, where it is less than 1."""
+        if part < 1.0:
+            twist, speeds = self.twist, self.speeds
+            for i in range(6):
+                twist[i] *= part
+                speeds[i] *= part
+
+    def limit(self, state: ArmState, dt: float) -> bool:
+        """Bring the joint speeds, and the twist with them, within what the accelerations allow after `state`.
+
+        Returns:
+            Whether all joints are scaled by one factor, so that the tool keeps its direction. Where there is none, each
+                goes towards its speed as fast as it may; so it does, too, where its limits leave no more.
+        """
+        speeds, last, limits = self.speeds, state.commanded_velocity, self._limits
+        acceleration = limits.acceleration
+        step = _FULL * dt
+        together = True
+        for i in range(6):
+            change, most = speeds[i] - last[i], step * acceleration[i]
+            if change > most or change < -most:
+                together = self._scaled_together(last, step)
+                break
+        q, low, high, fastest = state.commanded, limits.low, limits.high, limits.velocity
+        for i in range(6):
+            v, rate, most = speeds[i], acceleration[i], fastest[i]
+            if v > most or v < -most:
+                least = abs(last[i]) - step * rate
+                most = max(most, least)
+                speeds[i] = v = most if v > most else -most if v < -most else v
+                together = False
+            stopping_distance = high[i] - q[i] if v > 0.0 else q[i] - low[i]
+            if v * v > 1.8 * rate * stopping_distance:
+                most = stopping(stopping_distance - _LAST_RAD, rate, dt)
+                least = abs(last[i]) - step * rate if v * last[i] > 0.0 else 0.0
+                most = max(most, least)
+                if v > most or v < -most:
+                    speeds[i] = most if v > 0.0 else -most
+                    together = False
+        return together
+
+    def _scaled_together(self, last: Sequence[float], step: float) -> bool:
+        speeds, acceleration = self.speeds, self._limits.acceleration
+        low, high = 0.0, 1e9
+        for i in range(6):
+            v, w, most = speeds[i], last[i], step * acceleration[i]
+            if v > 1e-12:
+                least, greatest = (w - most) / v, (w + most) / v
+            elif v < -1e-12:
+                least, greatest = (w + most) / v, (w - most) / v
+            elif -most <= w <= most:
+                continue
+            else:
+                high = -1.0
+                break
+            low, high = max(low, least), min(high, greatest)
+        if low > high:
+            self.clip(last, step)
+            return False
+        # Above 1 it brakes as fast as the joints can.
+        factor = low if low > 1.0 else high if high < 1.0 else 1.0
+        twist = self.twist
+        for i in range(6):
+            speeds[i] *= factor
+            twist[i] *= factor
+        return True
+
+    def clip(self, last: Sequence[float], step: float) -> None:
+        """Bring each joint's speed to within acceleration x `step` (s) of its `last` (rad/s), whatever the twist."""
+        speeds, acceleration = self.speeds, self._limits.acceleration
+        for i in range(6):
+            most = step * acceleration[i]
+            v, w = speeds[i], last[i]
+            speeds[i] = w + most if v > w + most else w - most if v < w - most else v

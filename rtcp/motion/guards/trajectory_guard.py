@@ -107,10 +107,6 @@ class TrajectoryGuard:
         here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
         return NotLeavingBox(box, -here) if here < 0.0 and nearest == box else BoxReached(box, max(ahead, 0.0))
 
-    def probe(self, state: ArmState, position: Sequence[float], velocity: Sequence[float]) -> bool:
-        """Return whether a target would pass as it is."""
-        return not self._bound(state, position) and self._touches(state, position) is None
-
     def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
         """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
         refused = self._limits.check(new, state.commanded, self._mean)
@@ -128,7 +124,7 @@ class TrajectoryGuard:
             stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
             if stop is None:
                 return None
-            which, distance = stop
+            which, _ = stop
         return LimitsExcludeArm(which)
 
     def apply(self, state: ArmState, target: Setpoint, tolerates_saturation: bool) -> GuardResult:

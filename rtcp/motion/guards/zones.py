@@ -53,9 +53,6 @@ class Gap(NamedTuple):
     place: tuple[float, float, float]
 
 
-_FREE = Clearance(1e9, INNER_BOX, TOOL, (0.0, 0.0, 0.0))
-
-
 def outside(x: float, y: float, z: float, box: Corners) -> float:
     """Return how far a point is outside a box; negative: how deep inside."""
     a, b, c, d, e, f = box
@@ -126,11 +123,6 @@ class Zones:
                     found.append(Clearance(distance, number, point, _way_out(x, y, z, box)))
         found.sort(key=lambda clearance: clearance.distance)
         return found
-
-    def clearance(self, poses: Sequence[Pose]) -> Clearance:
-        """Return the nearest boundary."""
-        found = self.clearances(poses, 1e9)
-        return found[0] if found else _FREE
 
     def gaps(self, poses: Sequence[Pose], within: float) -> list[Gap]:
         """Return every pair of a point and a box that are nearer than `within`, m."""

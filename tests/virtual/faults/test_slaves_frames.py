@@ -156,7 +156,7 @@ def test_the_master_names_the_cable_over_which_damaged_frames_come_whichever_way
     assert undo.over
     for _ in range(3):
         counters.read_next()
-    counters.tell()
+    counters.report_due()
     named = ("the master and slave 1 (a)", "slave 1 (a) and slave 2 (b)", "slave 2 (b) and slave 3 (c)")[after]
     if (after, way) == (0, "back"):
         # Nobody but the master's network card gets them.

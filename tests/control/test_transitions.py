@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rtcp.telemetry.machine_drawing import diagram, page
-
+from docs.machine_page import diagram
 from rtcp.control.machine import STATES
 from rtcp.control.states import ReadyState, StoppedByLimitState
 from rtcp.ipc.commands import Enable, Reset
@@ -52,11 +51,6 @@ def test_nothing_leads_from_a_fault_or_an_emergency_stop_to_motion_but_through_r
 
 def test_a_stop_by_a_limit_is_left_by_reset_alone_where_the_arm_stays_enabled() -> None:
     assert [cause for cause, target in StoppedByLimitState.leads_to.items() if target is State.HOLDING] == [Reset]
-
-
-def test_the_page_in_the_docs_is_drawn_from_the_table() -> None:
-    # `python docs/generate.py` draws it anew.
-    assert (ROOT / "docs" / "machine.md").read_text() == page()
 
 
 def test_the_picture_shows_every_state() -> None:

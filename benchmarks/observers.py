@@ -1,10 +1,10 @@
-"""What onlookers cost the cycle: `python benchmarks/watched.py [--seconds N] [--rounds N] [--ratio] [--json FILE]`.
+"""What observers cost the cycle: `python benchmarks/observers.py [--seconds N] [--rounds N] [--ratio] [--json FILE]`.
 
-In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and nobody looking; with
-the watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`; and, as the
-watcher's worst, with the last drive losing its supply for 50 ms every second and being set up again. With the timer
-alone (`spin_us: 0`), whose wake-up p99 is what onlookers could delay, and as shipped; the first two in joint motion.
-Medians over the rounds; the ratio is that of the medians. Ends with 1 where it is above 1.2.
+In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and no reader; with the
+watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`; and, as the
+watcher's worst case, with the last drive losing its supply for 50 ms every second. With the timer alone (`spin_us: 0`),
+whose wake-up p99 observers could delay, and as shipped; the first two in joint motion. Medians over the rounds; the ratio
+is that of the medians. Exit code 1 where it is above 1.2.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory, segment_control
 from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
 
-WATCH_MS = {"alone": 1000, "watched": 10, "setting up": 10}
+WATCH_MS = {"alone": 1000, "observed": 10, "setting up": 10}
 TURN_S = 0.01
 AIM = 1.2
 
@@ -65,12 +65,12 @@ def read_everything() -> None:
 
 
 @contextlib.contextmanager
-def onlookers() -> Iterator[None]:
+def observers() -> Iterator[None]:
     """Let a reader and `rtcp status --watch` look on, once there is something to be seen."""
     script = (
-        "import sys, time; sys.path.insert(0, sys.argv[1]); import watched; from pathlib import Path\n"
-        "while not watched.blackboard_file(watched.runtime_directory()).exists(): time.sleep(0.1)\n"
-        "time.sleep(1.0); watched.read_everything()"
+        "import sys, time; sys.path.insert(0, sys.argv[1]); import observers; from pathlib import Path\n"
+        "while not observers.blackboard_file(observers.runtime_directory()).exists(): time.sleep(0.1)\n"
+        "time.sleep(1.0); observers.read_everything()"
     )
     watch = f"while :; do {sys.executable} -m rtcp.cli status --watch; sleep 0.2; done"
     quiet = subprocess.DEVNULL
@@ -118,8 +118,8 @@ def measure(directory: Path, kind: str, spin_us: int, seconds: float) -> Round:
     config = configured(directory, WATCH_MS[kind], spin_us)
     try:
         with contextlib.ExitStack() as around:
-            if kind == "watched":
-                around.enter_context(onlookers())
+            if kind == "observed":
+                around.enter_context(observers())
             elif kind == "setting up":
                 around.enter_context(losses())
             active = None if kind == "setting up" else "joint"
@@ -145,7 +145,7 @@ def main() -> int:
     found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
-        spins, kinds = ((0,), ("alone", "watched")) if given.ratio else ((0, 40), tuple(WATCH_MS))
+        spins, kinds = ((0,), ("alone", "observed")) if given.ratio else ((0, 40), tuple(WATCH_MS))
         runs: dict[tuple[str, int], list[Round]] = {(kind, spin): [] for spin in spins for kind in kinds}
         for turn in range(given.rounds):
             # To and fro: what the host does to whoever comes first hits each of them as often.
@@ -167,11 +167,11 @@ def main() -> int:
                 )
     console.print(table)
     ratio = (
-        figures([run.wakeup for run in runs["watched", 0]])["p99"]
+        figures([run.wakeup for run in runs["observed", 0]])["p99"]
         / figures([run.wakeup for run in runs["alone", 0]])["p99"]
     )
     found["ratio"] = ratio
-    console.print(f"wake-up p99 with the timer alone, watched / alone: {ratio:.2f}")
+    console.print(f"wake-up p99 with the timer alone, observed / alone: {ratio:.2f}")
     if given.json:
         given.json.write_text(json.dumps(found, indent=2))
     return 0 if ratio <= AIM else 1

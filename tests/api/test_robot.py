@@ -1,0 +1,205 @@
+"""Robot and AsyncRobot at a real control socket, in front of a fake loop."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rtcp
+from rtcp import api
+from rtcp.api import Arrival, AsyncRobot, GripperRest, JogFrame, Progress, Robot, State, Streamed, methods
+from rtcp.ipc.commands import Halt, Jog, MoveGripper, MoveJoints, SetOutput, StreamPosition
+from rtcp.ipc.events import SlaveLost
+from rtcp.ipc.runtime_directory import control_socket
+from tests.gateway.fake_loop import JOINTS, FakeLoop
+
+Q = [0.1] * JOINTS
+LONG = 1_000_000
+METHODS = [name for name, one in vars(methods).items() if inspect.isfunction(one) and one.__module__ == methods.__name__
+           and not name.startswith("_")]  # fmt: skip
+
+
+@pytest.fixture
+def robot(directory: Path, loop: FakeLoop) -> Iterator[Robot]:
+    loop.state = State.HOLDING
+    with rtcp.connect("a test", control_socket(directory)) as made:
+        yield made
+
+
+def run(directory: Path, work: Callable[[AsyncRobot], Coroutine[Any, Any, Any]]) -> Any:
+    async def connected() -> Any:
+        async with rtcp.connect_async("a test", control_socket(directory)) as robot:
+            return await work(robot)
+
+    return asyncio.run(connected())
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_both_robots_have_every_method_with_its_signature_and_its_documentation(name: str) -> None:
+    described, blocking, awaited = (getattr(one, name) for one in (methods, Robot, AsyncRobot))
+    parameters = list(inspect.signature(described).parameters.values())
+    for method in (blocking, awaited):
+        assert list(inspect.signature(method).parameters.values()) == parameters
+        assert not str(inspect.signature(method).return_annotation).startswith("Call")
+        assert method.__doc__ == described.__doc__
+        assert method.__doc__
+    assert inspect.iscoroutinefunction(awaited)
+
+
+def test_the_package_shows_the_names_of_the_api() -> None:
+    assert all(getattr(rtcp, name) is getattr(api, name) for name in rtcp.__all__)
+    assert all(hasattr(api, name) for name in api.__all__)
+    with pytest.raises(AttributeError):
+        _ = rtcp.nothing  # type: ignore[attr-defined]
+
+
+def test_a_motion_returns_its_arrival_and_reports_progress(robot: Robot, loop: FakeLoop) -> None:
+    seen: list[Progress] = []
+    arrival = robot.move_joints(Q, speed=0.2, synchronized=False, progress=seen.append)
+    assert arrival == Arrival(tuple(Q), 0.0)
+    assert loop.commands == [MoveJoints(tuple(Q), 0.2, False)]
+    assert all(len(one.positions) == JOINTS for one in seen)
+    assert seen
+
+
+def test_the_status_is_typed(robot: Robot) -> None:
+    status = robot.status()
+    assert (robot.state, status.state, status.control_mode) == (State.HOLDING, State.HOLDING, api.ControlMode.JOINT)
+    assert status.drive_mode is None, "the fake loop shows none"
+    assert status.positions == status.sent_positions == (0.0,) * JOINTS
+    assert status.joint_names[0] == "joint1"
+    assert status.raw["bus"] == "virtual"
+
+
+def test_events_are_typed(robot: Robot, loop: FakeLoop) -> None:
+    before = robot.events()
+    loop.board.event(SlaveLost(3))
+    (event,) = robot.events(before[-1].number if before else 0)
+    assert (event.name, event.fields) == ("slave_lost", {"slave": 3})
+
+
+@pytest.mark.parametrize(
+    ("call", "result", "command"),
+    [
+        (lambda robot: robot.jog([0.1] * 6, JogFrame.TOOL), Streamed, Jog((0.1,) * 6, JogFrame.TOOL, 0.25)),
+        (lambda robot: robot.jog([0.1] * 6, "base", hold_s=0.1), Streamed, Jog((0.1,) * 6, JogFrame.BASE, 0.1)),
+        (lambda robot: robot.stream(Q, 1.5), Streamed, StreamPosition(tuple(Q), 1.5)),
+        (lambda robot: robot.set_output(3, True), type(None), SetOutput(3, True)),
+        (lambda robot: robot.gripper(open=True), GripperRest, MoveGripper(True)),
+        (lambda robot: robot.command("set_output", output=3, value=True), dict, SetOutput(3, True)),
+        (lambda robot: robot.sdo_read(2, 0x6065), bytes, None),
+    ],
+)
+def test_a_method_sends_its_command_and_returns_its_type(
+    robot: Robot, loop: FakeLoop, call: Callable[[Robot], object], result: type, command: object
+) -> None:
+    assert type(call(robot)) is result
+    assert loop.commands == ([] if command is None else [command])
+
+
+def test_a_command_older_than_its_hold_time_has_no_effect(robot: Robot, loop: FakeLoop) -> None:
+    with pytest.raises(rtcp.TimedOut):
+        robot.jog([0.1] * 6, sent_s=time.monotonic() - 1.0)
+    assert loop.commands == []
+
+
+def test_errors_have_classes_and_fields(robot: Robot, directory: Path) -> None:
+    with pytest.raises(rtcp.Invalid, match="q: found 1 numbers"):
+        robot.move_joints([0.0])
+    robot.jog([0.1] * 6)
+    with rtcp.connect("another", control_socket(directory)) as other, pytest.raises(rtcp.Refused) as raised:
+        other.move_joints(Q)
+    assert (raised.value.reason, raised.value.fields) == ("lease_held", {"holder": "a test"})
+
+
+# -- asyncio ----------------------------------------------------------------------------------------------------------
+
+
+def test_async_calls_return_the_same_and_may_overlap(robot: Robot, directory: Path, loop: FakeLoop) -> None:
+    async def work(other: AsyncRobot) -> tuple[Arrival, State, api.Status]:
+        move = asyncio.create_task(other.move_joints(Q))
+        return await move, await other.state(), await other.status()
+
+    arrival, state, status = run(directory, work)
+    assert (arrival, state) == (Arrival(tuple(Q), 0.0), State.HOLDING)
+    assert status.state is State.HOLDING
+
+
+def test_halt_overtakes_the_move_of_the_same_robot(directory: Path, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    async def work(robot: AsyncRobot) -> None:
+        move = asyncio.create_task(robot.move_joints(Q))
+        while await robot.state() is not State.MOVING:
+            pass
+        halt = asyncio.create_task(robot.halt())
+        while Halt not in loop.kinds:
+            await asyncio.sleep(0.01)
+        loop.state = State.HOLDING
+        await asyncio.gather(move, halt)
+
+    run(directory, work)
+
+
+def test_an_awaited_call_that_is_cancelled_ends_its_move(directory: Path, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    async def work(robot: AsyncRobot) -> None:
+        move = asyncio.create_task(robot.move_joints(Q))
+        while await robot.state() is not State.MOVING:
+            pass
+        move.cancel()
+        while await robot.state() is not State.HOLDING:
+            pass
+        assert (await robot.status()).holder == ""
+
+    run(directory, work)
+
+
+def test_an_error_in_a_progress_callback_ends_its_call_and_not_the_connection(directory: Path, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    def report(progress: Progress) -> None:
+        raise ZeroDivisionError
+
+    async def work(robot: AsyncRobot) -> None:
+        with pytest.raises(ZeroDivisionError):
+            await robot.move_joints(Q, progress=report)
+        while await robot.state() is not State.HOLDING:
+            pass
+
+    run(directory, work)
+
+
+def test_async_errors_are_the_same(directory: Path, loop: FakeLoop, tmp_path: Path) -> None:
+    async def refuse(robot: AsyncRobot) -> None:
+        with pytest.raises(rtcp.Invalid):
+            await robot.move_joints([0.0])
+        await robot.close()
+        with pytest.raises(rtcp.ConnectionLost):
+            await robot.status()
+
+    run(directory, refuse)
+    with pytest.raises(rtcp.NotRunning):
+        run(tmp_path, refuse)
+
+
+def test_a_connection_that_the_platform_closes_fails_every_call_that_waits(tmp_path: Path) -> None:
+    async def work() -> None:
+        async def close(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readline()
+            await reader.readline()
+            writer.close()
+
+        await asyncio.start_unix_server(close, control_socket(tmp_path))
+        async with rtcp.connect_async(path=control_socket(tmp_path)) as robot:
+            with pytest.raises(rtcp.ConnectionLost, match="before it answered 'status'"):
+                await robot.status()
+
+    asyncio.run(work())
