@@ -95,7 +95,8 @@ class Machine:
             "SITE": str(Path(psutil.__file__).parents[1]), "SYSTEMD": str(SYSTEMD),
         }  # fmt: skip
         join = f'echo $$ > "{self._cgroup}/cgroup.procs"; exec "$@"'
-        apart = ["unshare", "--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
+        # Also a test run that is killed leaves nothing running.
+        apart = ["setpriv", "--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
         self._console = base.with_suffix(".log")
         with open(self._console, "wb") as log:
             self._unshare = subprocess.Popen(
