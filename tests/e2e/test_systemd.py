@@ -96,11 +96,12 @@ class Machine:
         }  # fmt: skip
         join = f'echo $$ > "{self._cgroup}/cgroup.procs"; exec "$@"'
         # Also a test run that is killed leaves nothing running.
-        apart = ["setpriv", "--pdeathsig", "KILL", "unshare", "--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
+        supervised = ["setpriv", "--pdeathsig", "KILL", "unshare", "--fork", "--kill-child"]
+        apart = ["--pid", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
         self._console = base.with_suffix(".log")
         with open(self._console, "wb") as log:
             self._unshare = subprocess.Popen(
-                ["sh", "-c", join, "sh", *apart, "sh", "-c", BOOT],
+                ["sh", "-c", join, "sh", *supervised, *apart, "sh", "-c", BOOT],
                 env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
 
