@@ -30,10 +30,9 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
+from rtcp.api import Robot, RtcpError, connect
 from rtcp.config.find import find_config
 from rtcp.config.loader import load
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import Platform, StartOptions, start
@@ -88,51 +87,51 @@ def cyclictest(cpu: int, priority: int, interval_us: int, seconds: float) -> Arr
     return np.repeat([bin_us for bin_us, _ in counts], [count for _, count in counts]).astype(float)
 
 
-def wander(client: ControlClient, turn: int) -> None:
-    """Move the arm to and fro in joint space."""
+def move_back_and_forth(robot: Robot, turn: int) -> None:
+    """Move the arm between two joint positions."""
     poses = ([0.4, -0.3, 0.5, 0.2, -0.4, 0.3], [0.0] * 6)
-    client.call("move", {"q": poses[turn % 2], "speed": None}, timeout_s=60.0)
+    robot.move_joints(poses[turn % 2])
 
 
-def drive_squares(client: ControlClient, turn: int) -> None:
-    """Drive the square of the thesis along straight lines, over and over."""
+def drive_squares(robot: Robot, turn: int) -> None:
+    """Drive the square of the thesis along straight lines, again and again."""
     square = place(load(find_config(None)), "xy")
     if turn == 0:
-        client.call("move", {"q": list(square.start), "speed": None}, timeout_s=60.0)
-    client.call("line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
+        robot.move_joints(square.start)
+    robot.move_line(square.poses, SPEED_M_S)
 
 
-def push_the_stick(client: ControlClient, turn: int) -> None:
+def hold_joystick(robot: Robot, turn: int) -> None:
     """Hold the virtual joystick, forward and left, then backward and right, for a second each."""
     if turn == 0:
-        client.call("move", {"q": list(place(load(find_config(None)), "xy").start), "speed": None}, timeout_s=60.0)
-        client.call("motion", {"name": "joystick"})
-        client.call("stick", {"byte": 63})
+        robot.move_joints(place(load(find_config(None)), "xy").start)
+        robot.mode("joystick")
+        robot.joystick(byte=63)
         time.sleep(0.2)
     pressed = ["forward", "left"] if turn % 2 == 0 else ["backward", "right"]
     end = time.monotonic() + 1.0
     while time.monotonic() < end:
-        client.call("stick", {"pressed": pressed, "hold_s": 0.5})
+        robot.joystick(*pressed, hold_s=0.5)
         time.sleep(0.2)
 
 
-ACTIVE: dict[str, Callable[[ControlClient, int], None]] = {
-    "joint": wander,
+ACTIVE: dict[str, Callable[[Robot, int], None]] = {
+    "joint": move_back_and_forth,
     "cartesian": drive_squares,
-    "joystick": push_the_stick,
+    "joystick": hold_joystick,
 }
-"""What moves the arm while the cycle is measured."""
+"""Motion of the arm while the cycle is measured."""
 
 
 def keep_moving(active: str, stop: threading.Event, moving: threading.Event) -> None:
-    """Move the arm until `stop`; a motion that fails is told, and ends the moving."""
+    """Move the arm until `stop`; a motion that fails is reported and ends it."""
     turn = 0
-    with ControlClient("benchmark") as client:
+    with connect("benchmark") as robot:
         while not stop.is_set():
             if turn == 1 or active == "joint":
                 moving.set()
             try:
-                ACTIVE[active](client, turn)
+                ACTIVE[active](robot, turn)
             except RtcpError as error:
                 sys.stderr.write(f"the arm stopped moving: {error.message}\n")
                 moving.set()
@@ -163,8 +162,8 @@ def platform_round(
     running: Platform = start(options, lambda sentence: None)
     try:
         observer = Observer(blackboard_file(runtime_directory()))
-        with ControlClient("benchmark") as client:
-            client.call("enable")
+        with connect("benchmark") as robot:
+            robot.enable()
         stop, moving = threading.Event(), threading.Event()
         if active is not None:
             mover = threading.Thread(target=keep_moving, args=(active, stop, moving), daemon=True)

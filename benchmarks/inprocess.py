@@ -15,8 +15,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from rtcp.config import default_config, load
 from rtcp.ipc.machine import Command, State
+
+from rtcp.config import default_config, load
 from rtcp.launch.simulation import Simulation
 
 START = [0.3, 0.2, 0.9, 0.2, 0.6, 0.1]

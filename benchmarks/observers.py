@@ -3,8 +3,8 @@
 In one run, alternating: the platform with its slave watcher nearly off (`bus.watch_ms: 1000`) and no reader; with the
 watcher every 10 ms, a reader that copies every record from the blackboard, and `rtcp status --watch`; and, as the
 watcher's worst case, with the last drive losing its supply for 50 ms every second. With the timer alone (`spin_us: 0`),
-whose wake-up p99 observers could delay, and as shipped; the first two in joint motion. Medians over the rounds; the ratio
-is that of the medians. Exit code 1 where it is above 1.2.
+whose wake-up p99 observers could delay, and as shipped; the first two in joint motion. Medians over the rounds;
+the ratio is that of the medians. Exit code 1 where it is above 1.2.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def read_everything() -> None:
 
 @contextlib.contextmanager
 def observers() -> Iterator[None]:
-    """Let a reader and `rtcp status --watch` look on, once there is something to be seen."""
+    """Run a reader and `rtcp status --watch` once the blackboard exists."""
     script = (
         "import sys, time; sys.path.insert(0, sys.argv[1]); import observers; from pathlib import Path\n"
         "while not observers.blackboard_file(observers.runtime_directory()).exists(): time.sleep(0.1)\n"

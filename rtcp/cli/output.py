@@ -136,7 +136,7 @@ def progress() -> Iterator[ShowProgress]:
     columns = (TextColumn("moving"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
     with Bar(*columns, console=console()) as bar:
         task = bar.add_task("move", total=1.0, left="")
-        yield lambda update: bar.update(task, completed=update.fraction, left=f"{update.remaining_s:.1f} s left")
+        yield lambda update: bar.update(task, completed=update.fraction, left=_left(update))
         bar.update(task, completed=1.0, left="")
 
 
@@ -148,6 +148,10 @@ def _line_reporter() -> ShowProgress:
         tenth = int(update.fraction * 10)
         if tenth > shown:
             shown = tenth
-            report(f"moving: {update.fraction:4.0%} {update.remaining_s:.1f} s left")
+            report(f"moving: {update.fraction:4.0%}{_left(update)}")
 
     return line
+
+
+def _left(update: Progress) -> str:
+    return f" {update.remaining_s:.1f} s left" if update.remaining_s > 0 else ""  # 0 while it is planned

@@ -14,15 +14,16 @@ from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.supervision import MonitoredSlave, SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.recovery import MonitoredSlave
+from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime.scheduling import thread_beside
 
 _PUBLISH_S = 0.1
-"""Slave states and counters go to the blackboard, and emergencies are looked for, so often."""
+"""Interval at which slave states and counters are published and emergencies are read, s."""
 _LOCK_S = 15.0
 _MOST_COMPLAINTS, _MOST_EMERGENCIES = 8, 4
-"""So many different sentences are said in 10 s: of all that failed, and of each slave's emergencies."""
+"""Different messages in 10 s: about failures of the bus, and about the emergencies of one slave."""
 _ERROR_BIT = 0x10
 
 
@@ -44,7 +45,7 @@ class BusService(threading.Thread):
         joint_names: their names.
         op_timeout_s: how long the slaves may take from SAFE-OP to OP.
         cycle_cpu: CPU of the cycle, which this thread keeps off.
-        cycle_priority: the cycle's; this thread's is one below, so that nobody else's work holds it up in mid-turn.
+        cycle_priority: the cycle's; this thread's is one below, above all other work.
         watch_s: how long it rests between two turns.
     """
 
@@ -95,7 +96,7 @@ class BusService(threading.Thread):
     # -- what the cycle asks: a plain store each ----------------------------------------------------------------
 
     def want_op(self) -> None:
-        """Ask for OP; may be said every cycle."""
+        """Request OP; may be called every cycle."""
         self._op_wanted = True
 
     def recover(self) -> None:
@@ -121,7 +122,7 @@ class BusService(threading.Thread):
     # -- the thread ---------------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Take turns until `finish`. A defect in here ends the loop: nobody would watch the slaves."""
+        """Take turns until `finish`. A defect in here ends the loop, which must not run without supervision."""
         try:
             self._run_turns()
         except Exception as error:
@@ -136,7 +137,7 @@ class BusService(threading.Thread):
         turn = 0
         while not self._end.wait(self._watch_s):
             turn += 1
-            # Each part by itself: what one of them meets keeps none of the others from its turn.
+            # Each part by itself: an error in one does not stop the others.
             for part in (self._watch, self._serve_sdo_requests, self._listen):
                 try:
                     part(turn)
@@ -148,7 +149,7 @@ class BusService(threading.Thread):
             self._complain(error)
 
     def _complain(self, error: BusError) -> None:
-        """Say what failed; what fails again in every turn, as where the interface is gone, is said now and then."""
+        """Report what failed; a failure in every turn, as without the interface, is reported at most every 10 s."""
         for sentence in error.sentences:
             self._complaints.report(sentence)
 
@@ -167,7 +168,7 @@ class BusService(threading.Thread):
                 watcher.park()
             else:
                 self.lost_slave = 0
-                # After a reset the next fault is told whole, however soon it comes.
+                # After a reset the next fault is reported in full, however soon it comes.
                 self._emergencies.clear()
                 watcher.resume()
         watcher.op_allowed = self.clock_followed()
@@ -237,7 +238,7 @@ class BusService(threading.Thread):
 
 
 REPORT_INTERVAL_S = 10.0
-"""An identical sentence is said at most so often."""
+"""Least interval between two reports of the same message, s."""
 
 
 @dataclass
@@ -251,7 +252,7 @@ class LogThrottle:
 
     Args:
         report: takes the sentences.
-        most: so many different ones are said in 10 s.
+        most: different messages that are reported in 10 s.
         what: how the sentence on those beyond names them, as `messages of slave 3`.
     """
 
@@ -259,18 +260,18 @@ class LogThrottle:
         self._report = report
         self._most = most
         self._what = what
-        self._said: dict[str, _Repeated] = {}
+        self._recent: dict[str, _Repeated] = {}
         self._beyond = 0
         self._beyond_at = 0.0
 
     def report(self, sentence: str) -> None:
         """Say `sentence`, or count it."""
         now = time.monotonic()
-        said = self._said.get(sentence)
-        if said is not None:
-            said.again += 1
-        elif len(self._said) < self._most:
-            self._said[sentence] = _Repeated(now)
+        entry = self._recent.get(sentence)
+        if entry is not None:
+            entry.again += 1
+        elif len(self._recent) < self._most:
+            self._recent[sentence] = _Repeated(now)
             self._report(sentence)
         else:
             self._beyond_at = self._beyond_at if self._beyond else now
@@ -279,14 +280,14 @@ class LogThrottle:
     def report_due(self) -> None:
         """Say what was counted and is due, and forget what did not come again; to be called now and then."""
         now = time.monotonic()
-        for sentence, said in tuple(self._said.items()):
-            if now - said.at < REPORT_INTERVAL_S:
+        for sentence, entry in tuple(self._recent.items()):
+            if now - entry.at < REPORT_INTERVAL_S:
                 continue
-            if said.again:
-                self._report(f"{sentence} ({_times(said.again)} again in {now - said.at:.0f} s)")
-                said.at, said.again = now, 0
+            if entry.again:
+                self._report(f"{sentence} ({_times(entry.again)} again in {now - entry.at:.0f} s)")
+                entry.at, entry.again = now, 0
             else:
-                del self._said[sentence]
+                del self._recent[sentence]
         if self._beyond and now - self._beyond_at >= REPORT_INTERVAL_S:
             self._report(f"further {self._what} were left out: {self._beyond} in {now - self._beyond_at:.0f} s")
             self._beyond = 0

@@ -1,4 +1,4 @@
-"""SDO services that the thread beside the cycle does for others, in steps: a slow slave holds up nobody else."""
+"""SDO services on request, in steps beside the cycle: a slow slave delays no other work."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from rtcp.ipc.layout import SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 _ASKED, _ANSWERED = 1, 2
 _POLL_S = 0.0002
 _BUDGET_S = 0.005
-"""So long an errand may be followed in a turn: most slaves answer within it."""
+"""Time for one request in a turn, s; most slaves answer within it."""
 _LONGEST_S = 4.0
-"""Nobody waits longer for an answer."""
+"""Longest time for an answer, s."""
 _ERROR_CODE = 0x603F
 
 
@@ -44,11 +44,11 @@ class SdoRequests:
         return self._explaining is not None
 
     def explain(self, name: str, position: int) -> None:
-        """Read the error code of the drive at `position` and say it."""
+        """Start to read the error code of the drive at `position`, and report it."""
         self._explaining = self._explanation(name, position)
 
     def take_steps(self) -> None:
-        """Go on with what is under way, and begin with what is asked; raises BusError where nobody waits for it."""
+        """Advance the pending requests and start new ones; raises BusError from an explanation that failed."""
         until = time.monotonic() + _BUDGET_S
         if self._answering is None and self._blackboard.words[SERVICE_STATE_AT] == _ASKED:
             self._answering, self._asked_at = self._answer(), time.monotonic()

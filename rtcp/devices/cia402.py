@@ -30,7 +30,7 @@ class TargetState(Enum):
 
     DISABLED = "disabled"
     QUICK_STOPPED = "stopped by quick stop"
-    """Ramps down by itself and holds (0x605A = 6) until it is led to DISABLED; a drive without torque stays without."""
+    """Ramps down by itself and holds (0x605A = 6) until DISABLED is requested; a drive without torque stays without."""
     ENABLED = "enabled"
     TORQUE_OFF = "without torque at once"
     """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
@@ -244,7 +244,7 @@ class Cia402Drive(Driver):
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
 
-        Velocity and torque are sent only to a drive that is enabled and told to be. The velocity (in CSP: the speed
+        Velocity and torque are sent only to a drive that is enabled and has to be. The velocity (in CSP: the speed
         limit) waits until the drive displays the mode that is commanded: on the way from CSV to CSP it would take the
         limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
         A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.

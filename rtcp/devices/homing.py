@@ -1,4 +1,4 @@
-"""Homing (CiA 402-2, homing mode): one drive finds its home by itself, led there and back to CSP by what it shows.
+"""Homing (CiA 402-2, homing mode): one drive finds its home by itself; its statusword decides each step.
 
 How it homes (method, speeds, acceleration, home offset) is in the drive: 0x6098, 0x6099, 0x609A, 0x607C, written by
 the start-up SDOs of its description. Afterwards it counts from its home; the joint's zero offset counts on from there.
@@ -17,7 +17,7 @@ START = ENABLE_OPERATION | 0x10
 
 
 class Shown(Enum):
-    """What the statusword of a drive in mode 6 says."""
+    """Meaning of the statusword of a drive in mode 6."""
 
     UNDER_WAY = "homing is under way"
     AT_REST = "homing is not started, or was interrupted"
@@ -65,11 +65,11 @@ _REST_S = 3.0
 _LONGEST_S = 60.0
 _STILL_RAD_S = 0.01
 _TOLD_CYCLES = 10
-"""What a drive shows is older than what it was told: for so long it may still show the end of an earlier homing."""
+"""Cycles for which the statusword may still show the end of an earlier homing: it lags behind the controlword."""
 
 
 class Homing:
-    """Leads a drive through a homing: `start` once, then `step` every cycle after `decode`, until it has `ended`.
+    """Controls the homing of a drive: `start` once, then `step` every cycle after `decode`, until it has `ended`.
 
     The drive is enabled, in CSP and at standstill at the start and again at the end. While it homes, nothing but this
     object sets its controlword and its mode, and the joint's set-point is `position`, whatever it reads: at the home
@@ -130,7 +130,7 @@ class Homing:
             self._enter(_P.STOPPING)
 
     def abandon(self) -> None:
-        """Let go of the drive, which is led elsewhere: it has faulted, or is about to be stopped in another way."""
+        """Release the drive: it has faulted, or another stop takes over."""
         if self._drive is not None and not self.ended:
             self._drive.mode = CSP
             self._enter(_P.STOPPED)
@@ -172,7 +172,7 @@ class Homing:
             return
         shown = SHOWN[drive.statusword & _BITS]
         if drive.mode_display != HOMING:
-            # The drive left the mode on its own: what its bits say means something else there.
+            # The drive left the mode on its own: its bits have another meaning there.
             self._fail(drive, _P.STUCK)
         elif shown is Shown.ATTAINED:
             self.shown = drive.statusword

@@ -99,13 +99,13 @@ class Switch:
         return not self._bit or self._stable >= self._debounce
 
     def forget(self) -> None:
-        """Count as not active until a level that says otherwise has lasted."""
+        """Become inactive until an active level has lasted for the debounce."""
         self.active = self._candidate = False
         self._stable = -1
         self._restless = 0
 
     def read_active(self, levels: int) -> None:
-        """Take the levels of a cycle, but not that what is active no longer is."""
+        """Update from the levels of a cycle; never clear an active input."""
         if not self.active or bool(levels & self._bit) is not self._inverted:
             self.read(levels)
 
@@ -139,7 +139,7 @@ class Inputs:
     __slots__ = ("arm_toggle", "emergency_stop", "enabling_switch")
 
     def __init__(self, config: InputsConfig, cycle_s: float) -> None:
-        # Until the box has been heard, a stop that is there counts as pressed and a permission as not given.
+        # Before the first inputs arrive, a configured stop counts as pressed and a permission as not given.
         self.emergency_stop = Switch(config.emergency_stop, config.emergency_stop is not None, cycle_s)
         self.enabling_switch = Switch(config.enabling_switch, config.enabling_switch is None, cycle_s)
         self.arm_toggle = Switch(config.arm_toggle, config.arm_toggle is None, cycle_s)
@@ -169,10 +169,10 @@ class Outputs:
         self._closed = gripper is not None and gripper.closed != "off"
         numbers = (config.state_lamp, config.motion_lamp, config.heartbeat, None if gripper is None else gripper.output)
         self.meant = frozenset(number for number in numbers if number is not None)
-        """Numbers of the outputs that nobody switches by hand."""
+        """Numbers of the outputs that commands may not switch."""
 
     def write(self, outputs: int, powered: bool, moving: bool) -> int:
-        """Return `outputs` with the lamps as they have to be, and the heartbeat the other way round."""
+        """Return `outputs` with the lamps set and the heartbeat inverted."""
         lamps = (self._powered if powered else 0) | (self._moving if moving else 0)
         return (outputs & ~(self._powered | self._moving) | lamps) ^ self._heartbeat
 

@@ -33,7 +33,7 @@ STATE_NAMES = {
     AlState.OP: "OP",
 }
 
-# code: (meaning, what to do about it; empty where nothing better than the meaning can be said)
+# code: (meaning, what to do about it; empty where the meaning says it all)
 AL_STATUS_CODES: dict[int, tuple[str, str]] = {
     0x0000: ("no error", ""),
     0x0001: ("unspecified error", "look at the device's own diagnosis"),
@@ -117,7 +117,7 @@ def code_remedy(code: int) -> str:
 
 
 def refusal(slave: str, requested: int, found: int, code: int) -> str:
-    """Return the sentence for a slave that did not go where it was told to.
+    """Return the message for a slave that did not reach a requested state.
 
     Args:
         slave: the slave as `bus.slave_label` names it.
@@ -126,10 +126,10 @@ def refusal(slave: str, requested: int, found: int, code: int) -> str:
         code: its AL status code; 0 where it gave none.
     """
     if not found & 0x0F:
-        return f"{slave} was to go to {state_name(requested)} but does not answer: check its cable and its supply"
+        return f"{slave} did not reach {state_name(requested)}: it does not answer; check its cable and its supply"
     said = f"AL status code 0x{code:04X}: {code_meaning(code)}" if code else "it gave no reason (AL status code 0)"
     remedy = code_remedy(code)
-    return f"{slave} was to go to {state_name(requested)} and is in {state_name(found)}: {said}" + (
+    return f"{slave} did not reach {state_name(requested)}: it is in {state_name(found)}; {said}" + (
         f"; {remedy}" if remedy else ""
     )
 

@@ -1,4 +1,4 @@
-"""A bus as the platform sees it: what it offers, what it tells of its slaves, and the one error that it raises."""
+"""The bus as the platform sees it: its operations, the process data, and the description of each slave."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from rtcp.fieldbus.emergency import Emergency
 
 @dataclass(frozen=True)
 class PdoEntryInfo:
-    """An entry of a PDO as the slave tells it; index 0 is padding."""
+    """An entry of a PDO as the slave reports it; index 0 is padding."""
 
     index: int
     sub_index: int
     bits: int
     name: str
-    """Name in the slave's object dictionary; empty where it does not tell one."""
+    """Name in the slave's object dictionary; empty where it has none."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PdoInfo:
 
 @dataclass(frozen=True)
 class MailboxInfo:
-    """The mailbox as the SII tells it (ETG.1000.6, 5.4: words 0x18 to 0x1C)."""
+    """The mailbox according to the SII (ETG.1000.6, 5.4: words 0x18 to 0x1C)."""
 
     receive_start: int
     receive_size: int
@@ -104,7 +104,7 @@ class SlaveInfo:
 
 @dataclass(frozen=True)
 class SlaveState:
-    """What a slave's AL status register says; `state` is 0 (`AlState.NONE`) where it does not answer."""
+    """AL status of a slave; `state` is 0 (`AlState.NONE`) where it does not answer."""
 
     position: int
     station: int
@@ -153,13 +153,13 @@ class Bus(Protocol):
     """A segment and its master. Every method raises BusError where the bus or a slave does not do what was asked."""
 
     notes: list[str]
-    """What `configure` met and tolerated, in sentences."""
+    """Deviations that `configure` tolerated, in sentences."""
 
     def open(self) -> None:
         """Open the bus."""
 
     def scan(self) -> tuple[SlaveInfo, ...]:
-        """Find the slaves, bring them to PRE-OP and tell what is known of them."""
+        """Find the slaves, bring them to PRE-OP and return their descriptions."""
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> ProcessData:
         """Compare the slaves with `slaves`, set them up, bring them to SAFE-OP with outputs of zero."""
@@ -176,7 +176,7 @@ class Bus(Protocol):
         """Acknowledge a slave's error: it stays in the state that it is in, without the error indication."""
 
     def read_states(self) -> tuple[SlaveState, ...]:
-        """Return what every slave's AL status register says."""
+        """Return the AL status of every slave."""
 
     def emergencies(self) -> tuple[Emergency, ...]:
         """Return the emergency messages that came since the last call."""

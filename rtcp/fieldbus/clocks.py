@@ -64,7 +64,7 @@ def take_over_time(
         always: set it also where it shows the reference's time already.
 
     Raises:
-        BusError: it stopped answering, or nobody took the broadcast.
+        BusError: it stopped answering, or no slave took the broadcast.
     """
     if not always:
         shown = port.read_at(position, _DC_DIFFERENCE, 4)

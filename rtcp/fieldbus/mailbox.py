@@ -98,7 +98,7 @@ class SdoClient:
     def _call(self, what: str, service: Callable[[Mailbox], Steps[T]]) -> Steps[T]:
         where = slave_label(self.position, self.name)
         if self._mailbox is None:
-            raise BusError(f"{where}: {what} is not possible, its EEPROM tells of no CoE mailbox")
+            raise BusError(f"{where}: {what} is not possible, its EEPROM lists no CoE mailbox")
         deadline = time.monotonic() + _PATIENCE_S
         while not self._lock.acquire(blocking=False):
             if time.monotonic() >= deadline:
@@ -159,7 +159,7 @@ class SdoClient:
         if command & _EXPEDITED:
             return answer[4 : 8 - (command >> 2 & 3) if command & _SIZED else 8]
         if size > _LARGEST_OBJECT:
-            raise BusError(f"it tells of {size} bytes; at most {_LARGEST_OBJECT} are read")
+            raise BusError(f"it announces {size} bytes; at most {_LARGEST_OBJECT} are read")
         data = bytearray(answer[8:])
         toggle = 0
         while len(data) < size:
@@ -169,7 +169,7 @@ class SdoClient:
             if command & _TOGGLE != toggle:
                 raise BusError("it repeated a segment")
             part = answer[1:]
-            # Seven bytes or fewer: the command tells how many of them count.
+            # Seven bytes or fewer: the command holds how many are valid.
             data += part[: _SEGMENT_DATA - (command >> 1 & 7)] if len(part) == _SEGMENT_DATA else part
             toggle ^= _TOGGLE
             if command & _LAST:
@@ -204,7 +204,7 @@ def _check_time(deadline: float, sentence: str) -> None:
 
 
 ABSENT = frozenset((0x06020000, 0x06090011))
-"""The codes that say that an object or a subindex does not exist."""
+"""Abort codes of an object or a subindex that does not exist."""
 
 ABORT_CODES: dict[int, str] = {
     0x05030000: "toggle bit not changed",
@@ -338,10 +338,10 @@ _MESSAGES_A_POLL = 8
 
 
 class Mailboxes:
-    """One lock a slave: what waits for one of them keeps nobody from another."""
+    """The mailboxes of all slaves, each with a lock of its own: a slow slave does not block the others."""
 
     def __init__(self, port: RegisterPort, names: Sequence[str], infos: Sequence[MailboxInfo | None]) -> None:
-        """Take the slaves in the order of the cable: their names, and what their EEPROMs tell of their mailboxes."""
+        """Take the names and the mailboxes of the slaves, in the order of the cable."""
         self._port = port
         self._names = names
         self._infos = infos
@@ -374,7 +374,7 @@ class Mailboxes:
         faults: list[str] = []
         for position, info in enumerate(self._infos, 1):
             lock = self._locks[position - 1]
-            # While an SDO is under way its answer is in the mailbox; whoever waits for it then meets emergencies too.
+            # While an SDO is in progress, its client reads the mailbox and collects emergencies as well.
             if info is None or not lock.acquire(blocking=False):
                 continue
             try:

@@ -17,12 +17,12 @@ _COUNTERS, _SIZE = 0x0300, 0x14
 _FORWARDED, _LINKS = 0x08, 0x10
 _PORTS = 4
 _OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + _PORTS), slice(_LINKS, _LINKS + _PORTS)
-"""What is cleared, each with one write; between them are errors of the processing unit, which are nobody's cable."""
+"""Cleared with one write each; the errors of the processing unit between them belong to no cable."""
 _CLEAR_FROM = 128
 """Counters stop at 255; from here on they are set to 0, which a write of any value does."""
 _REPORT_INTERVAL_S = 10.0
 _CALM_S = 60.0
-"""Without a new error for so long the next one is a new beginning."""
+"""After this time without an error the next one starts a new count, s."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class ErrorCounters:
     """Reads one slave's counters a call, the slaves in turn."""
 
     def __init__(self, port: RegisterPort, names: Sequence[str], report: Callable[[str], None]) -> None:
-        """Take the slaves in the order of the cable; `say` is given the sentences."""
+        """Take the slaves in the order of the cable; `report` receives the messages."""
         self._port = port
         self._names = names
         self._report = report

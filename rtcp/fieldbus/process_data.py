@@ -24,7 +24,7 @@ class SoemProcessData:
 
     After an exchange without an answer the next `send` first lets a fence pass, throws away what came back before it
     and only then sends: the answer that follows can only be the new one. While the fence does not come back, outputs
-    are still sent (a drive that hears the master must get its targets), but no answer is taken.
+    are still sent (a drive that receives frames must get its targets), but no answer is taken.
     """
 
     def __init__(

@@ -96,7 +96,7 @@ def attach_filter(port: socket.socket, first: int, last: int) -> None:
 
 
 def _answers(frame: bytes, sent: bytes, length: int) -> bool:
-    """Whether `frame` is what was sent, come back. Indices are used again soon: the index alone does not tell it."""
+    """Whether `frame` is what was sent, come back. Indices are reused soon, so the index alone is not enough."""
     if len(frame) < _DATA_AT + length + 2 or frame[_COMMAND_AT:_STATION_AT] != sent[_COMMAND_AT:_STATION_AT]:
         return False
     # Each slave counts up the station field of every command that goes by position or to all of them.

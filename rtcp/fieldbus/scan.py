@@ -1,4 +1,4 @@
-"""What a slave tells of itself: registers (ETG.1000.4), EEPROM (ETG.1000.6, 5.4; ETG.2010), object dictionary."""
+"""Description of a slave from its registers (ETG.1000.4), EEPROM (ETG.1000.6, 5.4; ETG.2010), object dictionary."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SYNC_MANAGER = struct.Struct("<HHBBBB")
 
 
 def read_mailbox(slave: Any) -> MailboxInfo | None:
-    """Return what the EEPROM of pysoem's `slave` says about its mailbox, None where it has none that can be."""
+    """Return the mailbox according to the EEPROM of pysoem's `slave`, None where it has no valid one."""
     receive_start, receive_size = struct.unpack("<HH", slave.eeprom_read(_SII_RECEIVE, _EEPROM_US))
     send_start, send_size = struct.unpack("<HH", slave.eeprom_read(_SII_SEND, _EEPROM_US))
     send_size = send_size or receive_size
@@ -129,14 +129,14 @@ def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, .
 def describe(
     slave: Any, sdo: SdoClient, port: RegisterPort, station: int, mailbox: MailboxInfo | None, serial: int
 ) -> SlaveInfo:
-    """Return what can be read of a slave; what it does not tell is empty.
+    """Return the description of a slave; what it does not provide is empty.
 
     Args:
         slave: pysoem's slave, in PRE-OP where it has a mailbox.
         sdo: SDO access to it.
         port: the port for its registers.
         station: its configured address.
-        mailbox: what its EEPROM says about the mailbox.
+        mailbox: its mailbox according to the EEPROM.
         serial: the serial number in its EEPROM.
     """
 

@@ -109,7 +109,7 @@ class SlaveRestorer:
             yield from self._identify(position)
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
-            # reference clock by its address, and every other slave follows what it says.
+            # reference clock by its address, and every other slave follows its time.
             port.put_at(position, DC_ACTIVATE, b"\0", label)
             others = [other for other in self._clocks if other != position]
             take_over_time(port, position, label, set_up.delay, others, always=lost_address)

@@ -139,7 +139,7 @@ class SoemBus:
         return tuple(replace(info, parent=parent) for info, parent in zip(found, before, strict=True))
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> SoemProcessData:
-        """Lead the slaves from INIT to SAFE-OP as the configuration says; outputs are zero.
+        """Bring the slaves from INIT to SAFE-OP as configured, with outputs of zero.
 
         Args:
             slaves: the slaves expected, in the order of the cable.
@@ -180,7 +180,7 @@ class SoemBus:
         return data
 
     def _set_up(self, slaves: Sequence[SlaveConfig], period_ns: int, failures: Sequence[int]) -> None:
-        """Bring the slaves from INIT to PRE-OP, each set up as the configuration says; raises BusError.
+        """Bring the slaves from INIT to PRE-OP, each set up as configured; raises BusError.
 
         SOEM reads a slave's mapping by complete access first, after a failure by single subindices, and so on in turn:
         some slaves answer complete access wrongly; single subindices take many frames, of which one is lost sooner.
@@ -255,7 +255,7 @@ class SoemBus:
         """Let SOEM lay out the process image; return sentences for each position whose images have a wrong length.
 
         The result counts, not the errors that SOEM reports: the mappings were compared entry by entry before, and SOEM
-        makes good many an error by reading again.
+        corrects many errors by reading again.
         """
         reported: dict[int, list[str]] = {}
         try:
@@ -312,7 +312,7 @@ class SoemBus:
         al_state.acknowledge(self.port, station_of(position))
 
     def read_states(self) -> tuple[SlaveState, ...]:
-        """Return what every slave's AL status register says; while all are in OP it takes one frame."""
+        """Return the AL status of every slave; one frame while all are in OP."""
         all_of_them = self.port.read_all(al_state.AL_STATUS, 2)
         in_op = all_of_them.wkc == len(self._names) and all_of_them.data == b"\x08\x00"
         result = []
@@ -338,10 +338,10 @@ class SoemBus:
         """Return SDO access to a slave, also in steps; raises BusError where there is no such slave."""
         return self._mailboxes.sdo(position)
 
-    def watcher(self, say: Callable[[str], None]) -> SlaveWatcher:
-        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
+    def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
+        """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""
         assert self._restorer is not None, "only a configured bus has something to restore"
-        return SlaveWatcher(self.port, self._names, self._restorer, say)
+        return SlaveWatcher(self.port, self._names, self._restorer, report)
 
     def _stations(self, positions: Iterable[int] | None) -> dict[int, str]:
         wanted = range(1, len(self._names) + 1) if positions is None else positions
@@ -394,7 +394,7 @@ def open_master(interface: str) -> tuple[Any, socket.socket]:
     timeouts.safe = timeouts.eeprom = _PATIENCE_US
     master = pysoem.Master()
     master.sdo_read_timeout = master.sdo_write_timeout = _SDO_TIMEOUT_US
-    # The slaves are led through their states by us, so that a refusal is told with its code.
+    # We request the states ourselves, so that a refusal is reported with its code.
     master.manual_state_change = 1
     before = _sockets()
     try:

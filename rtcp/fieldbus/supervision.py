@@ -8,40 +8,38 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from enum import Enum
 from typing import Protocol
 
-from rtcp.fieldbus.al_state import AL_CONTROL, AL_STATUS, ERROR_BIT, STATE_NAMES, AlState, refusal
-from rtcp.fieldbus.bus import Bus, SlaveState, slave_label, station_of
-from rtcp.fieldbus.errors import BusError, ForeignSlave
+from rtcp.fieldbus.al_state import AL_STATUS, ERROR_BIT, STATE_NAMES, AlState, refusal
+from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import ErrorCounters
-from rtcp.fieldbus.registers import Command, RegisterPort, Steps
-from rtcp.fieldbus.slave_setup import STATION, SlaveRestorer
+from rtcp.fieldbus.recovery import LONG_AGO, REPORT_INTERVAL_S, MonitoredSlave, SlaveRecovery
+from rtcp.fieldbus.registers import Command, RegisterPort
+from rtcp.fieldbus.slave_setup import SlaveRestorer
 
 _PARK_S = 3.0
 _SILENCE_S = 0.25
 _RARELY_S = 0.1
-"""Error counters, and slaves that are parked, are looked at so often."""
+"""Interval at which error counters and parked slaves are read, s."""
 
 
 def _runs(words: Iterable[tuple[MonitoredSlave, str]]) -> Iterator[tuple[MonitoredSlave, MonitoredSlave, str]]:
-    """Yield the first and the last of neighbours of whom the same is to be said, and what."""
+    """Yield the first and the last of each run of neighbours with the same text, and the text."""
     run: list[MonitoredSlave] = []
-    said = ""
+    shared = ""
     for slave, text in words:
-        if run and (text != said or slave.position != run[-1].position + 1):
-            yield run[0], run[-1], said
+        if run and (text != shared or slave.position != run[-1].position + 1):
+            yield run[0], run[-1], shared
             run = []
         run.append(slave)
-        said = text
+        shared = text
     if run:
-        yield run[0], run[-1], said
+        yield run[0], run[-1], shared
 
 
 def _fall_count(falls: int) -> str:
-    return f"; it left OP {falls} times since that was last told" if falls > 1 else ""
+    return f"; it left OP {falls} times since the last report" if falls > 1 else ""
 
 
 def _slaves_named(first: MonitoredSlave, last: MonitoredSlave) -> str:
@@ -55,7 +53,7 @@ class SlaveWatcher:
         port: the port for registers.
         names: the slaves' names in the order of the cable.
         restorer: sets up a slave again.
-        report: takes the sentences.
+        report: receives the messages.
     """
 
     def __init__(
@@ -67,7 +65,7 @@ class SlaveWatcher:
         self.errors = ErrorCounters(port, names, report)
         self._recovery = SlaveRecovery(port, self.slaves, restorer, report)
         self._rarely_at = 0.0
-        self._heard_at = time.monotonic()
+        self._answered_at = time.monotonic()
         self._silent_since: float | None = None
         self._silence_told = False
         self._parked_at: float | None = None
@@ -87,7 +85,7 @@ class SlaveWatcher:
         self.all_op = False
         for slave in self.slaves:
             self._recovery.drop(slave)
-            # A slave that was being brought back has to be set up again: nobody knows how far it got.
+            # A slave in restoration has to be set up again: its progress is unknown.
             slave.kept = slave.kept or slave.was_in_op
             slave.was_in_op = False
             slave.leaving = True
@@ -117,11 +115,11 @@ class SlaveWatcher:
         if wkc < 0:
             self._note_silence(now)
             return 0
-        self._note_sound(now)
-        self._heard_at, heard_before = now, self._heard_at
+        self._note_answer(now)
+        self._answered_at, answered_before = now, self._answered_at
         left = 0
         if self._parked_at is None:
-            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, heard_before)
+            left = self._look_at_all(data == b"\x08\0" and wkc >= len(self.slaves), now, answered_before)
             if not self.all_op:
                 self._recovery.take_steps(now, wkc, self.op_allowed)
         if now >= self._rarely_at:
@@ -134,7 +132,7 @@ class SlaveWatcher:
 
     # -- looking --------------------------------------------------------------------------------------------------
 
-    def _look_at_all(self, all_in_op: bool, now: float, heard_before: float) -> int:
+    def _look_at_all(self, all_in_op: bool, now: float, answered_before: float) -> int:
         if all_in_op and self.all_op:
             return 0
         if all_in_op:
@@ -152,7 +150,7 @@ class SlaveWatcher:
             slave.was_in_op = False
             slave.lost += 1
             slave.unreported += 1
-            slave.left_at = heard_before
+            slave.left_at = answered_before
             self._recovery.note_fall(slave, now)
         self._report_left([slave for slave in self.slaves if self._fall_is_due(slave, now)], now)
         self._report_back([slave for slave in self.slaves if slave.well and self._note_return(slave, now)], now)
@@ -177,7 +175,7 @@ class SlaveWatcher:
         return found
 
     def _note_return(self, slave: MonitoredSlave, now: float) -> bool:
-        """Note that a slave is well; return whether that is to be told: it had been lost, and this was told."""
+        """Note that a slave is well; return whether to report that: its fall was reported."""
         if not slave.was_in_op:
             slave.back_at = now
         slave.was_in_op = True
@@ -224,7 +222,7 @@ class SlaveWatcher:
         self._silent_since = self._silent_since or now
         if now - self._silent_since < _SILENCE_S or self._silence_told:
             return
-        # Which slave left OP shows when they are heard again; the cycle counts the lost frames and stops the arm.
+        # Which slave left OP shows when they answer again; the cycle counts the lost frames and stops the arm.
         self._silence_told = True
         self.all_op = False
         for slave in self.slaves:
@@ -233,7 +231,7 @@ class SlaveWatcher:
             f"no slave answers: check the cable between the master and {self.slaves[0].label}, and that slave's supply"
         )
 
-    def _note_sound(self, now: float) -> None:
+    def _note_answer(self, now: float) -> None:
         if self._silence_told and self._silent_since is not None:
             self._report(f"slaves answer again, after {now - self._silent_since:.1f} s without any")
         self._silent_since = None
@@ -257,285 +255,10 @@ class SlaveWatcher:
 
 
 class SupervisedBus(Bus, Protocol):
-    """A bus on a wire: slaves are lost and brought back while the cycle goes on."""
+    """A bus on a wire: slaves are lost and recovered while the cycle runs."""
 
     def sdo(self, position: int) -> SdoClient:
         """Return SDO access to a slave, also in steps."""
 
     def watcher(self, report: Callable[[str], None]) -> SlaveWatcher:
-        """Return the watcher of the configured slaves, all of them in OP; `say` takes its sentences."""
-
-
-LONG_AGO = float("-inf")
-REPORT_INTERVAL_S = 10.0
-"""A slave's trouble is told at once, and then at most so often."""
-
-
-class Action(Enum):
-    """What is done with a slave."""
-
-    NOTHING = "nothing"
-    ACKNOWLEDGE = "acknowledge its error"
-    REQUEST_SAFEOP = "request SAFE-OP"
-    REQUEST_OP = "request OP"
-    REQUEST_PREOP = "request PRE-OP: it was to be parked"
-    RECONFIGURE = "set it up again"
-    MARK_LOST = "mark it lost; when it answers again, recover it"
-
-
-# (state, error) -> what is done; any other state that answers is RECONFIGURE.
-TABLE: dict[tuple[AlState, bool], Action] = {
-    (AlState.OP, False): Action.NOTHING,
-    (AlState.OP, True): Action.ACKNOWLEDGE,
-    (AlState.SAFEOP, True): Action.ACKNOWLEDGE,
-    (AlState.SAFEOP, False): Action.REQUEST_OP,
-    (AlState.NONE, False): Action.MARK_LOST,
-}
-
-
-def action_for(state: AlState, error: bool) -> Action:
-    """Return what is done with a slave that is in `state`."""
-    return TABLE.get((state, error), Action.RECONFIGURE)
-
-
-@dataclass
-class MonitoredSlave:
-    """One slave in the watcher's care."""
-
-    position: int
-    name: str
-    state: AlState = AlState.OP
-    error: bool = False
-    code: int = 0
-    lost: int = 0
-    """How often it left OP."""
-    recovered: int = 0
-    """How often it was back in OP after that."""
-    left_at: float | None = None
-    was_in_op: bool = True
-    back_at: float = LONG_AGO
-    """When it last came to OP."""
-    flaps: int = 0
-    """How often in a row it fell out of OP again at once."""
-    kept: bool = False
-    """Whether it is in PRE-OP because it was sent there, its set-up untouched."""
-    leaving: bool = False
-    """Whether it was sent to PRE-OP and has been seen in nothing but OP since."""
-    unfinished: bool = False
-    """Whether a restoration was begun that did not come to its end."""
-    work: Steps[None] | None = None
-    asked: tuple[Action, AlState, bool, float] | None = None
-    """What was asked, in which state it was then, and until when it may take."""
-    failed: int = 0
-    pause_until: float = 0.0
-    probe_at: float = 0.0
-    reported_at: float = LONG_AGO
-    fall_reported_at: float = LONG_AGO
-    unreported: int = 0
-    """How often it left OP since that was told last."""
-    return_due: bool = False
-    """Whether its return is to be told: its fall was."""
-
-    @property
-    def label(self) -> str:
-        """How sentences name it."""
-        return slave_label(self.position, self.name)
-
-    @property
-    def station(self) -> int:
-        """Its configured station address."""
-        return station_of(self.position)
-
-    @property
-    def well(self) -> bool:
-        """Whether it is in OP, without an error, and not about to leave it as it was told to."""
-        return self.state is AlState.OP and not self.error and not self.leaving
-
-    def update(self, state: AlState, error: bool, code: int) -> None:
-        """Note the state in which it was found."""
-        self.state, self.error, self.code = state, error, code
-        if state not in (AlState.OP, AlState.NONE):
-            self.leaving = False
-
-    def words(self) -> str:
-        """Return its state in words."""
-        return SlaveState(self.position, self.station, self.name, self.state, self.error, self.code).words()
-
-
-_REQUESTS = {
-    Action.REQUEST_OP: AlState.OP,
-    Action.REQUEST_SAFEOP: AlState.SAFEOP,
-    Action.REQUEST_PREOP: AlState.PREOP,
-}
-_TRIES = 3
-"""So often a slave may refuse before it is set up again."""
-_PAUSE_S, _LONGEST_PAUSE_S, _FOREIGN_PAUSE_S = 1.0, 5.0, 10.0
-_PATIENCE_S = 3.0
-_WELL_S = 1.0
-"""A slave that leaves OP sooner than this after it got there has not been well in between."""
-_PROBE_S = 0.05
-_POLL_S = 0.0003
-_STEPS_S = 0.003
-"""So long restorations may go on in a turn; where a slave answers at once, several steps fit."""
-
-
-class SlaveRecovery:
-    """Does with each slave what the table says.
-
-    Args:
-        port: the port for registers.
-        slaves: the slaves in the order of the cable.
-        restorer: sets up a slave again.
-        report: takes the sentences.
-    """
-
-    def __init__(
-        self,
-        port: RegisterPort,
-        slaves: Sequence[MonitoredSlave],
-        restorer: SlaveRestorer,
-        report: Callable[[str], None],
-    ) -> None:
-        self._port = port
-        self._slaves = slaves
-        self._restorer = restorer
-        self._report = report
-        self._reached = len(slaves)
-        self._op_allowed = True
-
-    def take_steps(self, now: float, reached: int, op_allowed: bool) -> None:
-        """Take a step with every slave that is not well.
-
-        Args:
-            now: the instant (time.monotonic).
-            reached: so many slaves answer on the cable.
-            op_allowed: whether OP may be asked for; otherwise slaves wait in SAFE-OP.
-        """
-        self._reached = reached
-        self._op_allowed = op_allowed
-        until = now + _STEPS_S
-        for slave in self._slaves:
-            if not slave.well:
-                if slave.work is None:
-                    self._next_action(slave, now)
-                if slave.work is not None:
-                    self._continue_restoration(slave, until)
-
-    def _next_action(self, slave: MonitoredSlave, now: float) -> None:
-        state, error = slave.state, slave.error
-        if slave.asked is not None:
-            action, state_then, error_then, until = slave.asked
-            same = (state, error) == (state_then, error_then)
-            if same and now < until:
-                return
-            slave.asked = None
-            if same or (action in _REQUESTS and error):
-                self._fail(slave, now, _REQUESTS.get(action, state))
-                return
-        if now < slave.pause_until:
-            return
-        action = action_for(state, error)
-        if slave.kept and state is AlState.PREOP and not error:
-            action = Action.REQUEST_SAFEOP
-        if (slave.failed >= _TRIES or slave.unfinished) and action is not Action.MARK_LOST:
-            action = Action.RECONFIGURE
-        if slave.leaving and state is AlState.OP:
-            action = Action.REQUEST_PREOP
-        if action is Action.REQUEST_OP and not self._op_allowed:
-            return
-        if action is Action.MARK_LOST:
-            self._probe(slave, now)
-        elif action is Action.RECONFIGURE:
-            self._start_restoration(slave, lost_address=False)
-        elif action is Action.ACKNOWLEDGE:
-            slave.asked = action, state, error, now + _PAUSE_S
-            self.request(slave, state, acknowledge=True)
-        else:
-            slave.asked = action, state, error, now + _PATIENCE_S
-            self.request(slave, _REQUESTS[action], acknowledge=error)
-
-    def request(self, slave: MonitoredSlave, state: AlState, *, acknowledge: bool = False) -> bool:
-        """Request `state` of a slave; return False where it has surely not heard. What comes of it shows later."""
-        word = state | (ERROR_BIT if acknowledge else 0)
-        data = word.to_bytes(2, "little")
-        return self._port.exchange(Command.FPWR, slave.station, AL_CONTROL, data, tries=1).wkc != 0
-
-    def note_fall(self, slave: MonitoredSlave, now: float) -> None:
-        """Note that a slave left OP; one that does so again and again is brought back after pauses, and set up."""
-        if now - slave.back_at < _WELL_S:
-            slave.flaps += 1
-            slave.pause_until = now + min(_PAUSE_S * slave.flaps, _LONGEST_PAUSE_S)
-        else:
-            slave.flaps = 0
-            slave.reported_at = LONG_AGO
-        slave.failed = slave.flaps
-
-    def _fail(self, slave: MonitoredSlave, now: float, wanted: AlState) -> None:
-        slave.failed += 1
-        slave.kept = False
-        slave.pause_until = now + _PAUSE_S
-        found = slave.state | (ERROR_BIT if slave.error else 0)
-        self.report_limited(slave, refusal(slave.label, wanted, found, slave.code) + "; it is asked again every second")
-
-    def _probe(self, slave: MonitoredSlave, now: float) -> None:
-        """Look whether a slave that lost its address has come back to its place."""
-        slave.asked = None
-        slave.kept = False
-        if self._reached < slave.position or now < slave.probe_at:
-            return
-        slave.probe_at = now + _PROBE_S
-        place = 1 - slave.position & 0xFFFF
-        data, wkc = self._port.exchange(Command.APRD, place, STATION, bytes(2), tries=1)
-        if wkc != 1:
-            return
-        station = int.from_bytes(data, "little")
-        other = next((one for one in self._slaves if one.station == station), None)
-        if other is None:
-            self._start_restoration(slave, lost_address=True)
-        elif other is not slave:
-            slave.pause_until = now + _PAUSE_S
-            self.report_limited(
-                slave, f"{slave.label}: at its place answers {other.label}: put the cables back in their order"
-            )
-
-    def _start_restoration(self, slave: MonitoredSlave, *, lost_address: bool) -> None:
-        slave.asked = None
-        slave.kept = False
-        slave.unfinished = True
-        what = "it was without supply" if lost_address else f"it is in {slave.words()}"
-        if slave.failed == 0 and slave.flaps == 0:
-            self._report(f"{slave.label} is set up again: {what}")
-        slave.work = self._restorer.restore(slave.position, lost_address)
-
-    def _continue_restoration(self, slave: MonitoredSlave, until: float) -> None:
-        work = slave.work
-        assert work is not None
-        try:
-            next(work)
-            while time.monotonic() < until:
-                time.sleep(_POLL_S)
-                next(work)
-        except StopIteration:
-            slave.work = None
-            slave.unfinished = False
-            slave.failed = 0
-        except BusError as error:
-            slave.work = None
-            slave.failed += 1
-            pause = min(_PAUSE_S * slave.failed, _LONGEST_PAUSE_S)
-            slave.pause_until = time.monotonic() + (_FOREIGN_PAUSE_S if isinstance(error, ForeignSlave) else pause)
-            self.report_limited(slave, "; ".join(error.sentences))
-
-    def drop(self, slave: MonitoredSlave) -> None:
-        """Give up what is under way with a slave."""
-        slave.asked = None
-        if slave.work is not None:
-            slave.work.close()
-            slave.work = None
-
-    def report_limited(self, slave: MonitoredSlave, sentence: str) -> None:
-        """Report something about a slave, at most every 10 s."""
-        now = time.monotonic()
-        if now - slave.reported_at >= REPORT_INTERVAL_S:
-            slave.reported_at = now
-            self._report(sentence)
+        """Return the watcher of the configured slaves, all of them in OP; `report` receives its messages."""

@@ -109,13 +109,6 @@ def test_what_is_no_object_is_refused(platform: Any, rtcp: Callable[..., Any], t
     assert ended.trouble
 
 
-def test_an_abort_of_the_slave_is_passed_on(platform: Any, rtcp: Callable[..., Any]) -> None:
-    platform.refusals["sdo_read"] = ("refused", "slave 2 (drive1), 0x6099:9: subindex does not exist (0x06090011)")
-    ended = rtcp("sdo", "read", "2", "0x6099:9")
-    assert ended.code == 3
-    assert "0x06090011" in ended.trouble
-
-
 def test_bytes_of_another_length_than_the_type_are_refused(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.objects[1, 0x6041, 0] = b"\x37\x06"
     ended = rtcp("sdo", "read", "1", "0x6041", "--type", "int32")

@@ -11,8 +11,11 @@ import pytest
 
 from rtcp import __version__
 
-COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "mode", "move", "output", "scan", "sdo",
-            "segment", "demo", "arm")  # fmt: skip
+COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "halt", "mode", "move", "run", "jog", "joystick",
+            "output", "gripper", "zero", "home", "limits", "scan", "sdo", "segment", "demo", "soak", "doctor",
+            "service", "faults", "arm")  # fmt: skip
+SUBCOMMANDS = ("limits set", "sdo write", "segment fault", "service install", "faults show", "arm fk", "arm ik",
+               "arm plot", "arm urdf")  # fmt: skip
 
 
 @pytest.mark.parametrize("option", ["-h", "--help"])
@@ -29,10 +32,9 @@ def test_without_a_command_there_is_help(rtcp: Callable[..., Any]) -> None:
     assert "status" in ended.out
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("option", ["-h", "--help"])
-def test_every_command_has_help(rtcp: Callable[..., Any], command: str, option: str) -> None:
-    ended = rtcp(command, option)
+@pytest.mark.parametrize("command", [*COMMANDS, *SUBCOMMANDS])
+def test_every_command_has_help(rtcp: Callable[..., Any], command: str) -> None:
+    ended = rtcp(*command.split(), "-h")
     assert (ended.code, ended.err) == (0, "")
     assert f"rtcp {command}" in ended.out
 

@@ -135,15 +135,6 @@ def test_the_json_of_a_fault_has_the_same_in_numbers_and_draws_only_when_asked(
     assert "<svg" in out.read_text()
 
 
-def test_a_step_across_cycles_that_are_missing_is_none(rtcp: Callable[..., Any]) -> None:
-    made = recording()
-    kept = np.r_[0:290, 310:CYCLES]
-    about = replace(made.about, at=AT - 20)
-    write(faults_directory(), Recording(about, {name: array[kept] for name, array in made.records.items()}))
-    step = json.loads(rtcp("faults", "show", "1", "--json").out)["largest_step"]
-    assert step["rad"] == pytest.approx(2e-4)
-
-
 @pytest.mark.parametrize("disabled", [299, 300])
 def test_a_step_counts_only_where_the_drives_are_enabled_on_both_of_its_cycles(
     rtcp: Callable[..., Any], disabled: int

@@ -53,13 +53,6 @@ def test_limits_are_shown_as_json(limits: dict[str, Any], rtcp: Callable[..., An
     assert json.loads(rtcp("limits", "show", "--json").out) == limits
 
 
-def test_an_arm_without_a_box_is_shown_without_one(limits: dict[str, Any], rtcp: Callable[..., Any]) -> None:
-    limits["limits"]["box"] = limits["configured"]["box"] = None
-    ended = rtcp("limits", "show")
-    assert ended.code == 0
-    assert "tool inside" not in ended.out
-
-
 def test_all_pairs_are_one_transaction(limits: dict[str, Any], platform: Any, rtcp: Callable[..., Any]) -> None:
     ended = rtcp("limits", "set", "joint2.max", "1.25", "box.min.x", "-0.5")
     assert (ended.code, ended.out) == (0, "2 limits are changed until `rtcp stop`\n")

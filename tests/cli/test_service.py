@@ -156,12 +156,6 @@ def test_a_program_whose_interpreter_the_service_does_not_see_is_refused(rtcp: C
     assert "or its interpreter is in /home" in done.trouble
 
 
-def test_where_not_even_root_may_write_install_says_so(rtcp: Callable[..., Any]) -> None:
-    done = rtcp("service", "install", "--root", "/proc", "--program", PROGRAM)
-    assert done.code == 3
-    assert "nothing was changed" in done.trouble or "cannot be changed" in done.trouble
-
-
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write to a folder whatever its mode")
 def test_where_it_may_not_write_uninstall_says_so_and_removes_nothing(
     install: Callable[..., Any], uninstall: Callable[..., Any], tmp_path: Path

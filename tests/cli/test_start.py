@@ -27,16 +27,6 @@ def loop(directory: Path) -> Iterator[subprocess.Popen[bytes]]:
     process.wait()
 
 
-@pytest.mark.parametrize("detach", [(), ("--detach",)])
-def test_a_configuration_that_is_not_there_is_a_sentence_and_exit_code_2(
-    rtcp: Callable[..., Any], tmp_path: Path, detach: tuple[str, ...]
-) -> None:
-    ended = rtcp("start", "--config", str(tmp_path / "none.yaml"), *detach)
-    assert ended.code == 2
-    assert "none.yaml" in ended.trouble
-    assert "does not exist" in ended.trouble
-
-
 def test_every_mistake_of_a_configuration_has_a_line_of_its_own(rtcp: Callable[..., Any], tmp_path: Path) -> None:
     file = tmp_path / "arm.yaml"
     file.write_text("name: arm\nslaves: []\njoints: []\n")

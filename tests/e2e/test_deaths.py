@@ -181,7 +181,7 @@ def test_a_stop_names_the_slaves_that_did_not_come_to_init_and_fails(platform: P
         segment.fault({"fault": "cable", "after": 5})
     done = platform.rtcp("stop", check=5)
     assert "stopped, but: the slaves on ecat" in done.stderr
-    assert "slave 3 (drive2) was to go to INIT and is in " in done.stderr
+    assert "slave 3 (drive2) did not reach INIT: it is in " in done.stderr
     assert "slave 6 (drive5)" in done.stderr
     assert "slave 4" not in done.stderr
 

@@ -95,11 +95,13 @@ class Machine:
             "SITE": str(Path(psutil.__file__).parents[1]), "SYSTEMD": str(SYSTEMD),
         }  # fmt: skip
         join = f'echo $$ > "{self._cgroup}/cgroup.procs"; exec "$@"'
-        apart = ["unshare", "--pid", "--fork", "--kill-child", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
+        # Also a test run that is killed leaves nothing running.
+        supervised = ["setpriv", "--pdeathsig", "KILL", "unshare", "--fork", "--kill-child"]
+        apart = ["--pid", "--mount", "--uts", "--ipc", "--cgroup", "--net"]
         self._console = base.with_suffix(".log")
         with open(self._console, "wb") as log:
             self._unshare = subprocess.Popen(
-                ["sh", "-c", join, "sh", *apart, "sh", "-c", BOOT],
+                ["sh", "-c", join, "sh", *supervised, *apart, "sh", "-c", BOOT],
                 env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
             )  # fmt: skip
 

@@ -27,7 +27,7 @@ def test_a_slave_whose_last_answers_were_lost_is_judged_by_the_next(port: Direct
     port.hole = 7
     assert read_al(port, STATION)[0] is AlState.NONE
     said = wait_for_state(port, SLAVES, AlState.PREOP, 0.0)
-    assert said == ("slave 1 (drive1) was to go to PRE-OP and is in INIT: it gave no reason (AL status code 0)",)
+    assert said == ("slave 1 (drive1) did not reach PRE-OP: it is in INIT; it gave no reason (AL status code 0)",)
 
 
 def test_a_slave_that_has_got_there_while_frames_were_lost_is_not_told(port: Direct) -> None:
@@ -38,5 +38,5 @@ def test_a_slave_that_has_got_there_while_frames_were_lost_is_not_told(port: Dir
 def test_a_slave_without_any_answer_is_told_with_what_to_check(port: Direct) -> None:
     port.hole = 1000
     assert wait_for_state(port, SLAVES, AlState.INIT, 0.0) == (
-        "slave 1 (drive1) was to go to INIT but does not answer: check its cable and its supply",
+        "slave 1 (drive1) did not reach INIT: it does not answer; check its cable and its supply",
     )

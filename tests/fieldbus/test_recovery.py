@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.fieldbus import supervision
+from rtcp.fieldbus import recovery, supervision
 from rtcp.fieldbus.al_state import AL_CONTROL, AL_STATUS, AlState
 from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.errors import BusError
@@ -70,7 +70,7 @@ class Bench:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now = 100.0
         clock = SimpleNamespace(monotonic=lambda: self.now, sleep=self.wait)
-        for module in (supervision,):
+        for module in (supervision, recovery):
             monkeypatch.setattr(module, "time", clock)
         self.port = Slaves()
         self.said: list[str] = []
@@ -229,7 +229,7 @@ def test_a_slave_that_falls_again_and_again_is_told_every_ten_seconds_and_brough
     assert len(left) == 3
     assert len(bench.said) <= 7, bench.said
     assert "it left OP" not in left[0].partition("left OP")[2]
-    assert left[1].endswith("; it left OP 4 times since that was last told")
+    assert left[1].endswith("; it left OP 4 times since the last report")
     assert bench.watcher.slaves[1].lost == falls
     assert bench.watcher.slaves[1].recovered >= falls - 1
     assert 2 in bench.restored

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rtcp.fieldbus.al_state import AlState
-from rtcp.fieldbus.supervision import Action, action_for
+from rtcp.fieldbus.recovery import Action, action_for
 from tests.fieldbus.conftest import WATCHER, Segment
 
 pytestmark = pytest.mark.alone
@@ -96,11 +96,11 @@ def test_a_slave_that_fell_is_brought_back_and_the_fall_is_told_with_its_reason(
 def test_a_slave_that_refuses_op_is_asked_again_after_a_pause_and_keeps_no_other_waiting(results):
     result = results["refusal"]
     assert result["states"] == OP
-    # It was to go to OP at once, after 1 s, and after 2 s.
+    # OP was requested at once, after 1 s, and after 2 s.
     assert result["took_s"] > 1.2
     assert 2 <= result["seen"][1].count("SAFE-OP + ERROR") <= 4
     assert result["seen"][2].count("SAFE-OP + ERROR") == 1
-    told = [sentence for sentence in result["said"] if "was to go to OP" in sentence]
+    told = [sentence for sentence in result["said"] if "did not reach OP" in sentence]
     assert len(told) == 1
     for part in ("slave 2 (drive1)", "0x0052", "external hardware is not ready", "check the device's supply"):
         assert part in told[0]
@@ -113,7 +113,7 @@ def test_a_slave_that_goes_on_refusing_op_is_set_up_again(results):
     assert result["states"] == OP
     assert result["after"] == result["before"]
     assert max(abs(difference) for difference, _ in result["clocks"][1:]) < 5_000
-    assert any("slave 3 (drive2) was to go to OP" in sentence for sentence in result["said"])
+    assert any("slave 3 (drive2) did not reach OP" in sentence for sentence in result["said"])
 
 
 def test_a_slave_whose_answers_are_late_keeps_neither_turns_nor_other_slaves_waiting(results):

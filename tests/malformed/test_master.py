@@ -119,7 +119,7 @@ EMERGENCY = "00 10 11 86 01 00 00 00 00 00"
 ENDLESS = {
     "emergencies": (True, [EMERGENCY], "its mailbox does not get empty"),
     "emergencies for an answer": (False, [EMERGENCY], "no answer in time"),
-    "an object of 4 GiB": (False, ["00 30 41 08 10 00 ff ff ff ff"], "tells of 4294967295 bytes; at most 65536 are"),
+    "an object of 4 GiB": (False, ["00 30 41 08 10 00 ff ff ff ff"], "announces 4294967295 bytes; at most 65536 are"),
     "segments without data": (
         False, ["00 30 41 08 10 00 00 01 00 00", "00 30 0e 00 00 00 00 00 00 00"], "a segment without data",
     ),

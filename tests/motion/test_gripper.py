@@ -119,12 +119,12 @@ def test_to_be_told_again_changes_nothing(motion):
 def test_no_set_point_passes_that_is_not_one_step_away(motion, monkeypatch, wanted):
     motion.grip(False)
 
-    def astray(state, dt):
+    def astray(state):
         target = Setpoint(1)
         target.position[0] = wanted
         return target
 
-    monkeypatch.setattr(motion._generator, "update", astray)
+    monkeypatch.setattr(motion._motion, "update", astray)
     path = [0.5, *run(motion, 2.0)]
     assert all(abs(b - a) <= JOINT.velocity * DT * (1 + 1e-9) for a, b in itertools.pairwise(path))
     assert JOINT.position.min <= min(path) <= max(path) <= JOINT.position.max

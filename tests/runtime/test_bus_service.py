@@ -17,8 +17,8 @@ from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.port_errors import PortErrors
+from rtcp.fieldbus.recovery import MonitoredSlave
 from rtcp.fieldbus.registers import Steps
-from rtcp.fieldbus.supervision import MonitoredSlave
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Health, Observer
 
