@@ -13,7 +13,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rtcp.gateway.limit_keeper import _read as read_kept_limits
+from rtcp.gateway.limit_settings import _read as read_kept_limits
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.faults import load_script
