@@ -109,7 +109,46 @@ def machine(part: str) -> str:
     return made
 
 
-PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine}
+def methods(part: str) -> str:
+    """Return the table of the methods of the control socket, or of the refusals or events that errors name."""
+    if part == "table":
+        from rtcp.gateway.methods import documented
+
+        rows = [
+            [f"`{one.name}`", ", ".join(_parameter(*found) for found in _parameters(one.parameters)), _line(one.about)]
+            for one in documented()
+        ]
+        return table(["method", "parameters", "what it does"], rows)
+    from rtcp.ipc.events import EVENTS
+    from rtcp.ipc.refusals import REFUSALS
+
+    kinds: Any = {"refusals": REFUSALS, "events": EVENTS}[part]
+    return table(
+        ["name", "fields", "message"],
+        [
+            [f"`{kind.name}`", ", ".join(entry.name for entry in fields(kind)) or "none", _line(kind.__doc__)]
+            for kind in sorted(kinds, key=lambda kind: kind.name)
+            if kind.__module__.startswith("rtcp.")
+        ],
+    )
+
+
+def _parameters(kind: type) -> Iterator[tuple[str, str, object]]:
+    hints = get_type_hints(kind, include_extras=True)
+    for entry in fields(kind):
+        yield entry.name, allowed(hints[entry.name]), entry.default
+
+
+def _parameter(name: str, words: str, default: object) -> str:
+    given = "" if default is MISSING else "; default none" if default is None else f"; default {_shown(default)}"
+    return f"`{name}` ({words}{given})"
+
+
+def _line(text: str | None) -> str:
+    return " ".join(inspect.cleandoc(text or "").split()).replace("|", "\\|")
+
+
+PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine, "methods": methods}
 
 
 def generated(text: str) -> str:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import struct
-import time
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from time import monotonic
 from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
@@ -46,7 +46,7 @@ class Caller:
 class _Waiter(Generic[T]):
     def __init__(self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError]) -> None:
         self._look = look
-        self._until = time.monotonic() + timeout_s
+        self._until = monotonic() + timeout_s
         self._timed_out = timed_out
         self.outcome: asyncio.Future[T] = asyncio.get_running_loop().create_future()
 
@@ -56,7 +56,7 @@ class _Waiter(Generic[T]):
             return
         try:
             found = self._look()
-            if found is None and time.monotonic() > self._until:
+            if found is None and monotonic() > self._until:
                 raise self._timed_out()
         except Exception as error:
             self.outcome.set_exception(error)

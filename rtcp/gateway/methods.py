@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, make_dataclass
 from enum import IntEnum
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 from annotated_types import Ge, Gt, Le
 
@@ -338,6 +338,28 @@ class Methods:
     def _check_count(name: str, numbers: Numbers, count: int) -> None:
         if len(numbers) != count:
             raise RtcpError("invalid", f"{name}: found {len(numbers)} numbers, allowed are {count}")
+
+
+class Documented(NamedTuple):
+    """A method as `docs/protocol.md` shows it."""
+
+    name: str
+    parameters: type
+    """A dataclass of them."""
+    about: str
+
+
+def documented() -> list[Documented]:
+    """Return every method of this package, by name."""
+    found = [one for one in vars(Methods).values() if hasattr(one, "method_flags")]
+    shown = [Documented(one.__name__, _parameters_of(one).kind, one.__doc__) for one in found]
+    names = {one.name for one in shown}
+    shown += [
+        Documented(kind.name, _parameters_of_command(kind).kind, kind.__doc__ or "")  # type: ignore[arg-type]
+        for kind in COMMANDS
+        if kind.name not in names and kind not in _INTERNAL and kind.__module__ == commands.__name__
+    ]
+    return sorted(shown)
 
 
 def _method_of(function: Any) -> Method:

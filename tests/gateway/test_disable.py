@@ -10,7 +10,7 @@ import pytest
 
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range
 from rtcp.fieldbus.al_state import AlState
-from rtcp.gateway import machine_actions
+from rtcp.gateway import command_channel
 from rtcp.gateway.command_channel import CommandChannel
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.status_snapshot import StatusSnapshot
@@ -27,9 +27,10 @@ FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=
 
 
 @pytest.fixture(autouse=True)
-def short_timeout(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What does not come is not waited for longer than the drives need here."""
-    monkeypatch.setattr(machine_actions, "_CONFIRM_S", 0.2)
+def simulated_time(rig: LoopRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The gateway waits by the clock of the rig, whatever else the host has to do."""
+    monkeypatch.setattr(command_channel, "monotonic", lambda: rig.now_ns * 1e-9)
+    monkeypatch.setattr(command_channel, "_POLL_S", 0.0)
 
 
 def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
@@ -41,10 +42,8 @@ def disable(rig: LoopRig, config: ArmConfig = CONFIG) -> dict[str, Any]:
         following = asyncio.create_task(channel.follow())
         asked = asyncio.ensure_future(MachineActions(channel).disable())
         while not asked.done():
-            # Faster than the clock by which the gateway waits, also on a busy host.
-            for _ in range(10):
-                rig.cycle()
-            await asyncio.sleep(PERIOD_S)
+            rig.cycle()
+            await asyncio.sleep(0)
         following.cancel()
         return await asked
 
