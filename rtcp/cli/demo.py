@@ -165,6 +165,8 @@ def figures(status: Mapping[str, Any], started_s: float, mean_ns: float) -> Tabl
     rows.add_row("clock offset", f"{clock_state(clocks)}, filtered p99 {filtered} us, raw p99 {raw} us")
     rows.add_row("start to OP", f"{status['start_to_op_s'] or started_s:.2f} s")
     rows.add_row("real time", realtime_line(status["realtime"]))
+    if skipped := status.get("skipped_ticks"):
+        rows.add_row("skipped ticks", f"{skipped['message']}; {skipped['remedy']}")
     return rows
 
 

@@ -223,6 +223,8 @@ def _facts(status: Json) -> Table:
     rows.add_row("inputs", _bits(status["inputs"]))
     rows.add_row("outputs", _bits(status["outputs"]))
     rows.add_row("real time", realtime_line(status["realtime"]))
+    if skipped := status.get("skipped_ticks"):
+        rows.add_row("cycle", Text(f"{skipped['message']}; {skipped['remedy']}", "yellow"))
     if status["lease"]["holder"]:
         rows.add_row("lease", Text(status["lease"]["holder"]))
     rows.add_row("processes", ", ".join(f"{name} {pid}" for name, pid in status["pids"].items() if pid))

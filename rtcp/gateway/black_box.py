@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 import rtcp
-from rtcp.ipc.events import Event, ResetDone
+from rtcp.ipc.events import ResetDone
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
@@ -63,11 +63,11 @@ class FaultEvents:
     before it did: those of CLOCK_MONOTONIC, because the wall clock may be set by hours just then.
 
     Args:
-        message: returns the text of an event.
+        names: of the arm, for the texts and for what is a fault.
     """
 
-    def __init__(self, message: Callable[[Event], str]) -> None:
-        self._message = message
+    def __init__(self, names: Names) -> None:
+        self._names = names
         self.on = False
         """A fault is on."""
         self._later: Fault | None = None
@@ -82,8 +82,8 @@ class FaultEvents:
             if isinstance(event.event, ResetDone):
                 found += self.put_off()
                 self.on = False
-            elif event.event.is_fault:
-                what = self._message(event.event)
+            elif type(event.event) in self._names.faults:
+                what = self._names.message(event.event)
                 found += self.met(Fault(event.time_ns, event.monotonic_ns, what, event.number, event.event.number))
         return found + self._due(now_ns)
 
@@ -132,7 +132,7 @@ class BlackBox:
         self._directory = directory
         self._report = report
         self._names = Names(session.config)
-        self._events = FaultEvents(self._names.message)
+        self._events = FaultEvents(self._names)
         self._event = 0
         self._since = 0.0
         """When the fault that is on was seen."""

@@ -254,12 +254,16 @@ class CommandChannel:
 
     def early_end(self, since: int) -> Event | None:
         """Return the last event after `since` that ends a motion before its goal."""
-        found = [one.event for one in self.events(since) if _ends_early(one.event)]
+        found = [one.event for one in self.events(since) if self._ends_early(one.event)]
         return found[-1] if found else None
+
+    def _ends_early(self, event: Event) -> bool:
+        ends = isinstance(event, MotionEnded | LeaseExpired | PermissionWithdrawn)
+        return ends or type(event) in self.names.faults
 
     def fault_since(self, since: int) -> RtcpError:
         """Return the error for the last fault after `since`."""
-        found = [one.event for one in self.events(since) if one.event.is_fault]
+        found = [one.event for one in self.events(since) if type(one.event) in self.names.faults]
         if found:
             return self.error("fault", found[-1])
         return RtcpError("fault", self.snapshot.last_fault or "the machine went into fault: see `rtcp status`")
@@ -273,10 +277,6 @@ class CommandChannel:
     def error(self, kind: ErrorKind, about: Refusal | Event, before: str = "", after: str = "") -> RtcpError:
         """Return the error that carries a refusal or an event."""
         return RtcpError(kind, before + self.names.message(about) + after, about.name, about.as_json())
-
-
-def _ends_early(event: Event) -> bool:
-    return event.is_fault or isinstance(event, MotionEnded | LeaseExpired | PermissionWithdrawn)
 
 
 class StreamingCommands:

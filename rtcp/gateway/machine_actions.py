@@ -161,7 +161,7 @@ class MachineActions:
                     # An earlier motion may have ended before the command was taken.
                     if begun and isinstance(event, GripperAtRest):
                         return event
-                    if event.is_fault:
+                    if type(event) in channel.names.faults:
                         raise channel.error("fault", event)
                     if isinstance(event, Disabled):
                         raise RtcpError("refused", "the gripper was stopped by another command: drives are disabled")

@@ -24,7 +24,7 @@ from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.ipc.states import ControlMode, DriveMode, State
-from rtcp.realtime.statistics import SlidingPercentiles
+from rtcp.realtime.statistics import SlidingPercentiles, diagnose
 
 AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
 _MESSAGES = 50
@@ -147,7 +147,7 @@ class StatusSnapshot:
             self._event, event = record.number, record.event
             message = self.names.message(event)
             new.append((record.time_ns, message))
-            if event.is_fault:
+            if type(event) in self.names.faults:
                 # An emergency stop out of a fault is what has to be ended first.
                 self.fault = message if event.is_emergency else self.fault or message
                 self.last_fault = message
@@ -208,6 +208,14 @@ class StatusSnapshot:
             for position, (slave, (al, code), health) in enumerate(found, 1)
         ]
 
+    def _skipped_ticks(self, cycles: int, missed: int) -> dict[str, Any] | None:
+        """Return why the loop skips more ticks than it should and what to do, or None."""
+        wakeup, exchange, compute = (self._figures[name].read() for name in ("wakeup", "exchange", "compute"))
+        found = diagnose(self._observer.period_ns * 1e-3, cycles, missed, wakeup, exchange, compute)
+        if found is None:
+            return None
+        return {"share": found.share, "part": found.part.value, "message": found.message, "remedy": found.remedy}
+
     def status(self, processes: Processes) -> dict[str, Any]:
         """Return everything, as `rtcp status --json` prints it."""
         latest = self._observer.latest()
@@ -240,6 +248,7 @@ class StatusSnapshot:
             "cycles": int(record["cycle"]),
             "time_ns": int(record["time_ns"]),
             "missed": int(record["missed"]),
+            "skipped_ticks": self._skipped_ticks(int(record["cycle"]), int(record["missed"])),
             "lost_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
             "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else int(record["wkc"])},
             "slaves": self._slaves(),

@@ -11,8 +11,8 @@ import pytest
 
 from kinematics import InverseKinematics, Pose, forward
 from rtcp.config import default_config, load
-from rtcp.ipc.codes import Command, MotionMode
-from rtcp.ipc.machine import State
+from rtcp.ipc.commands import Enable, MoveJoints, SetControlMode
+from rtcp.ipc.states import ControlMode, State
 from rtcp.launch.simulation import Simulation
 
 BASE_ABOVE_GROUND_M = 0.45
@@ -30,7 +30,7 @@ CONFIG = load(default_config())
 
 
 class Person:
-    """Looks at the tool and moves the stick: nothing else reaches the arm."""
+    """Looks at the tool and moves the joystick: nothing else reaches the arm."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -40,7 +40,7 @@ class Person:
     @property
     def tool(self) -> tuple[float, float, float]:
         assert CONFIG.arm is not None
-        return forward(CONFIG.arm, self.simulation.parts.arm.state.actual).position
+        return forward(CONFIG.arm, self.simulation.loop.arm.state.actual).position
 
     def hold(self, code: int, seconds: float) -> None:
         assert self.simulation.box is not None
@@ -53,7 +53,7 @@ class Person:
             self.hold(PADDLE_UP, 0.05)
             self.hold(NEUTRAL, 0.05)
             self.mode = (self.mode + 1) % 4
-        assert self.simulation.parts.operator.stick_mode == mode
+        assert self.simulation.loop.operator.joystick_mode == mode
 
     def bring(self, target: tuple[float, float, float]) -> None:
         self.choose(0)
@@ -90,14 +90,14 @@ def person() -> Iterator[Person]:
         assert simulation.until(lambda: simulation.state is State.READY, 5.0)
         simulation.run(0.1)
         simulation.acquire()
-        assert simulation.order(Command.ENABLE).refusal == 0
+        assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
         assert CONFIG.arm is not None
         start = InverseKinematics(CONFIG.arm).solve_near(LEVEL, (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)).q
         assert start is not None
-        assert simulation.order(Command.MOVE, [*start, 0, 0, 0, 0, 0, 0.5]).refusal == 0
+        assert simulation.send(MoveJoints(tuple(start), 0.5, True)).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 20.0)
-        assert simulation.order(Command.MOTION, [MotionMode.JOYSTICK]).refusal == 0
+        assert simulation.send(SetControlMode(ControlMode.JOYSTICK)).refusal is None
         simulation.run(0.1)
         yield Person(simulation)
 

@@ -9,14 +9,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rtcp.ipc.machine import Code, Command
+from rtcp.ipc.machine import State as MachineState
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.ipc.machine import Code, Command
-from rtcp.ipc.machine import State as MachineState
 from rtcp.launch.inprocess import InProcessBus, InProcessData
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create

@@ -1,4 +1,4 @@
-"""The stick, the toggle and the modes through the whole loop, in simulated time (bus `inprocess`)."""
+"""The joystick, the toggle and the modes through the whole loop, in simulated time (bus `inprocess`)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,22 @@ import pytest
 
 from kinematics import forward
 from rtcp.config import default_config, load
-from rtcp.ipc.codes import Code, Command, MotionMode
-from rtcp.ipc.machine import State
+from rtcp.ipc.commands import (
+    Command,
+    Disable,
+    Enable,
+    Halt,
+    Home,
+    Jog,
+    MoveJoints,
+    Reset,
+    SetControlMode,
+    Shutdown,
+    StreamPosition,
+)
+from rtcp.ipc.events import Event, UnknownJoystickCode
+from rtcp.ipc.refusals import WrongControlMode
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.launch.simulation import Simulation
 
 from .test_picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
@@ -21,7 +35,7 @@ START = (0.0, 0.23, 2.38, 0.0, 0.57, 0.0)
 
 
 class Arm:
-    """A simulation in the motion mode joystick, and what is seen of it."""
+    """A simulation in the control mode joystick, and what is seen of it."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -29,17 +43,17 @@ class Arm:
     @property
     def tool(self) -> tuple[float, float, float]:
         assert CONFIG.arm is not None
-        return forward(CONFIG.arm, self.simulation.parts.arm.state.commanded).position
+        return forward(CONFIG.arm, self.simulation.loop.arm.state.commanded).position
 
-    def stick(self, code: int, seconds: float, *, toggle: bool = True) -> None:
+    def joystick(self, code: int, seconds: float, *, toggle: bool = True) -> None:
         box = self.simulation.box
         assert box is not None
         box.inputs = box.inputs & ~0x1FF | code | (TOGGLE if toggle else 0)
         self.simulation.run(seconds)
 
     @property
-    def codes(self) -> list[int]:
-        return [event.code for event in self.simulation.events]
+    def kinds(self) -> list[type[Event]]:
+        return [type(record.event) for record in self.simulation.events]
 
 
 @pytest.fixture
@@ -49,165 +63,164 @@ def arm() -> Iterator[Arm]:
         assert simulation.until(lambda: simulation.state is State.READY, 5.0)
         simulation.run(0.1)
         simulation.acquire()
-        assert simulation.order(Command.ENABLE).refusal == 0
+        assert simulation.send(Enable()).refusal is None
         assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
         simulation.run(0.1)
         yield Arm(simulation)
 
 
-def test_a_motion_lasts_for_as_long_as_the_stick_is_held(arm: Arm) -> None:
+def test_a_motion_lasts_for_as_long_as_the_joystick_is_held(arm: Arm) -> None:
     before = arm.tool
-    arm.stick(BACKWARD, 0.8)
+    arm.joystick(BACKWARD, 0.8)
     assert arm.simulation.state is State.MOVING
-    arm.stick(NEUTRAL, 0.6)
+    arm.joystick(NEUTRAL, 0.6)
     assert arm.simulation.state is State.HOLDING
     after = arm.tool
     assert after[0] < before[0] - 0.03
     assert after[1:] == pytest.approx(before[1:], abs=1e-4)
-    arm.stick(NEUTRAL, 0.5)
+    arm.joystick(NEUTRAL, 0.5)
     assert arm.tool == after
 
 
 def test_two_directions_at_once_go_diagonally(arm: Arm) -> None:
     before = arm.tool
-    arm.stick(BACKWARD & LEFT, 0.8)
-    arm.stick(NEUTRAL, 0.6)
+    arm.joystick(BACKWARD & LEFT, 0.8)
+    arm.joystick(NEUTRAL, 0.6)
     way = [b - a for a, b in zip(before, arm.tool, strict=True)]
     assert way[0] < -0.03
     assert way[1] == pytest.approx(-way[0], rel=0.05)
     assert way[2] == pytest.approx(0.0, abs=1e-4)
 
 
-def test_a_stick_that_is_deflected_when_the_arm_is_enabled_does_nothing_until_neutral(arm: Arm) -> None:
+def test_a_joystick_that_is_deflected_when_the_arm_is_enabled_does_nothing_until_neutral(arm: Arm) -> None:
     simulation = arm.simulation
-    simulation.order(Command.DISABLE)
+    simulation.send(Disable())
     assert simulation.until(lambda: simulation.state is State.READY, 5.0)
-    arm.stick(BACKWARD, 0.2)
-    simulation.order(Command.ENABLE)
+    arm.joystick(BACKWARD, 0.2)
+    simulation.send(Enable())
     assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
     before = arm.tool
-    arm.stick(BACKWARD, 1.0)
+    arm.joystick(BACKWARD, 1.0)
     assert arm.tool == before
-    arm.stick(NEUTRAL, 0.1)
-    arm.stick(BACKWARD, 0.5)
+    arm.joystick(NEUTRAL, 0.1)
+    arm.joystick(BACKWARD, 0.5)
     assert simulation.state is State.MOVING
 
 
 def test_a_byte_that_is_no_code_stops_the_motion_until_neutral(arm: Arm) -> None:
-    arm.stick(BACKWARD, 0.5)
-    arm.stick(FORWARD & BACKWARD, 1.0)
+    arm.joystick(BACKWARD, 0.5)
+    arm.joystick(FORWARD & BACKWARD, 1.0)
     assert arm.simulation.state is State.HOLDING
-    assert Code.CAME_OUT in arm.codes
+    assert UnknownJoystickCode in arm.kinds
     rest = arm.tool
-    arm.stick(BACKWARD, 0.5)
+    arm.joystick(BACKWARD, 0.5)
     assert arm.tool == rest
-    arm.stick(NEUTRAL, 0.1)
-    arm.stick(BACKWARD, 0.5)
+    arm.joystick(NEUTRAL, 0.1)
+    arm.joystick(BACKWARD, 0.5)
     assert arm.simulation.state is State.MOVING
 
 
-def test_the_toggle_gives_the_stick_to_the_chair_and_the_arm_holds_still(arm: Arm) -> None:
-    arm.stick(BACKWARD, 0.5)
-    arm.stick(BACKWARD, 1.0, toggle=False)
+def test_the_toggle_gives_the_joystick_to_the_chair_and_the_arm_holds_still(arm: Arm) -> None:
+    arm.joystick(BACKWARD, 0.5)
+    arm.joystick(BACKWARD, 1.0, toggle=False)
     assert arm.simulation.state is State.HOLDING
     rest = arm.tool
-    arm.stick(FORWARD, 1.0, toggle=False)
+    arm.joystick(FORWARD, 1.0, toggle=False)
     assert arm.tool == rest
     # Given back while it is deflected: it counts from its neutral position on.
-    arm.stick(FORWARD, 0.5)
+    arm.joystick(FORWARD, 0.5)
     assert arm.tool == rest
-    arm.stick(NEUTRAL, 0.1)
-    arm.stick(FORWARD, 0.5)
+    arm.joystick(NEUTRAL, 0.1)
+    arm.joystick(FORWARD, 0.5)
     assert arm.tool[0] > rest[0] + 0.01
 
 
 def test_a_paddle_changes_the_mode_when_it_is_released(arm: Arm) -> None:
-    operator = arm.simulation.parts.operator
-    arm.stick(PADDLE_UP, 0.3)
-    assert operator.stick_mode == 0
-    arm.stick(NEUTRAL, 0.1)
-    assert operator.stick_mode == 1
+    operator = arm.simulation.loop.operator
+    arm.joystick(PADDLE_UP, 0.3)
+    assert operator.joystick_mode == 0
+    arm.joystick(NEUTRAL, 0.1)
+    assert operator.joystick_mode == 1
     before = arm.tool
-    arm.stick(BACKWARD, 0.6)
-    arm.stick(NEUTRAL, 0.5)
+    arm.joystick(BACKWARD, 0.6)
+    arm.joystick(NEUTRAL, 0.5)
     assert arm.tool[2] > before[2] + 0.02
 
 
-@pytest.mark.parametrize("command", [Command.MOVE, Command.STREAM])
-def test_under_the_stick_nobody_else_moves_the_arm(arm: Arm, command: Command) -> None:
-    answer = arm.simulation.order(command, [*START, 0, 0, 0, 0, 0, 0.2])
-    assert answer.refusal != 0
+@pytest.mark.parametrize("command", [MoveJoints(START, 0.2, True), StreamPosition(START, 0.2)], ids=["move", "stream"])
+def test_under_the_joystick_nobody_else_moves_the_arm(arm: Arm, command: Command) -> None:
+    assert isinstance(arm.simulation.send(command).refusal, WrongControlMode)
     assert arm.simulation.state is State.HOLDING
 
 
-def test_the_stick_moves_nothing_in_another_motion_mode(arm: Arm) -> None:
-    arm.stick(NEUTRAL, 0.1)
-    assert arm.simulation.order(Command.MOTION, [MotionMode.JOINT]).refusal == 0
+def test_the_joystick_moves_nothing_in_another_motion_mode(arm: Arm) -> None:
+    arm.joystick(NEUTRAL, 0.1)
+    assert arm.simulation.send(SetControlMode(ControlMode.JOINT)).refusal is None
     before = arm.tool
-    arm.stick(BACKWARD, 1.0)
+    arm.joystick(BACKWARD, 1.0)
     assert arm.tool == before
 
 
 def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
     simulation = arm.simulation
-    arm.stick(BACKWARD, 0.6)
+    arm.joystick(BACKWARD, 0.6)
     assert simulation.box is not None
     simulation.box.inputs &= ~0x200
     simulation.run(1.5)
     assert simulation.state is State.EMERGENCY_STOP
-    assert max(map(abs, simulation.parts.arm.state.actual_velocity)) < 0.01
-    assert simulation.parts.arm.first_with_torque() == -1
+    assert max(map(abs, simulation.loop.arm.state.actual_velocity)) < 0.01
+    assert simulation.loop.arm.first_with_torque() == -1
     simulation.run(0.2)
     assert {slave.state.name for slave in simulation.bus.read_states()} == {"PRE_OP"}
 
 
-def test_a_halt_stops_a_held_stick_until_it_has_been_neutral(arm: Arm) -> None:
+def test_a_halt_stops_a_held_joystick_until_it_has_been_neutral(arm: Arm) -> None:
     simulation = arm.simulation
-    arm.stick(BACKWARD, 0.5)
-    assert simulation.order(Command.STOP).refusal == 0
+    arm.joystick(BACKWARD, 0.5)
+    assert simulation.send(Halt()).refusal is None
     simulation.run(2.0)
     assert simulation.state is State.HOLDING
-    arm.stick(NEUTRAL, 0.1)
-    arm.stick(BACKWARD, 0.3)
+    arm.joystick(NEUTRAL, 0.1)
+    arm.joystick(BACKWARD, 0.3)
     assert simulation.state is State.MOVING
 
 
 @pytest.mark.parametrize(
-    ("command", "numbers"), [(Command.JOG, [0.02, *([0.0] * 10), 0.5]), (Command.HOME, [0])], ids=["jog", "home"]
+    "command", [Jog((0.02, 0.0, 0.0, 0.0, 0.0, 0.0), JogFrame.BASE, 0.5), Home(0)], ids=["jog", "home"]
 )
-def test_no_command_takes_the_arm_away_from_the_stick(arm: Arm, command: Command, numbers: list[float]) -> None:
-    assert arm.simulation.order(command, numbers).refusal != 0
-    arm.stick(BACKWARD, 0.3)
-    assert arm.simulation.order(command, numbers).refusal != 0
-    arm.stick(NEUTRAL, 0.6)
+def test_no_command_takes_the_arm_away_from_the_joystick(arm: Arm, command: Command) -> None:
+    assert arm.simulation.send(command).refusal is not None
+    arm.joystick(BACKWARD, 0.3)
+    assert arm.simulation.send(command).refusal is not None
+    arm.joystick(NEUTRAL, 0.6)
     assert arm.simulation.state is State.HOLDING
 
 
 def test_the_emergency_stop_is_met_while_the_loop_closes(arm: Arm) -> None:
     simulation = arm.simulation
-    arm.stick(BACKWARD, 0.6)
-    simulation.order(Command.SHUTDOWN)
+    arm.joystick(BACKWARD, 0.6)
+    simulation.send(Shutdown())
     assert simulation.box is not None
     simulation.box.inputs &= ~0x200
     simulation.run(0.05)
-    assert {drive.controlword for drive in simulation.parts.arm.drives} == {0x0002}
+    assert {drive.controlword for drive in simulation.loop.arm.drives} == {0x0002}
     assert simulation.until(lambda: simulation.done, 5.0)
-    assert simulation.parts.arm.first_with_torque() == -1
+    assert simulation.loop.arm.first_with_torque() == -1
 
 
-def test_the_stick_moves_the_arm_again_after_a_fault_that_came_while_it_did(arm: Arm) -> None:
+def test_the_joystick_moves_the_arm_again_after_a_fault_that_came_while_it_did(arm: Arm) -> None:
     simulation = arm.simulation
-    arm.stick(BACKWARD, 0.5)
+    arm.joystick(BACKWARD, 0.5)
     assert simulation.state is State.MOVING
     simulation.models[1].inject_fault(0x8611)
     assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
-    arm.stick(NEUTRAL, 1.0)
-    assert simulation.order(Command.RESET).refusal == 0
+    arm.joystick(NEUTRAL, 1.0)
+    assert simulation.send(Reset()).refusal is None
     assert simulation.until(lambda: simulation.state is State.READY, 5.0)
-    assert simulation.order(Command.ENABLE).refusal == 0
+    assert simulation.send(Enable()).refusal is None
     assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
-    arm.stick(NEUTRAL, 0.2)
+    arm.joystick(NEUTRAL, 0.2)
     before = arm.tool
-    arm.stick(BACKWARD, 0.5)
+    arm.joystick(BACKWARD, 0.5)
     assert simulation.state is State.MOVING
     assert arm.tool[0] < before[0] - 0.01
