@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.states import State

@@ -9,8 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rtcp.ipc.machine import Code, Command
-from rtcp.ipc.machine import State as MachineState
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
