@@ -4,11 +4,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: help setup oracles run test faults lint format clean
+.PHONY: help setup oracles run test test-all faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
-	@sed -n 's/^\([a-z]*\):[^#]*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-16s%s\n", $$1, $$2 }'
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{ printf "%-16s%s\n", $$1, $$2 }'
 
 setup: ## make .venv with the package and what it needs
 	@sh .ci/setup "$(PYTHON)"
@@ -19,10 +19,16 @@ oracles: setup ## add what the kinematics is compared with (Pinocchio, EAIK); wi
 run: setup ## run the demonstration: virtual segment, master, a move, the figures
 	@$(BIN)/rtcp demo --square xy
 
-test: setup ## run all tests
+test: setup ## run the tests
 	@status=0; \
-	$(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
-	$(BIN)/python -m pytest -m alone || status=1; \
+	$(BIN)/python -m pytest -m 'not alone and not slow' --numprocesses auto || status=1; \
+	$(BIN)/python -m pytest -m 'alone and not slow' || status=1; \
+	exit $$status
+
+test-all: oracles ## run the tests that take long too: every sample, systemd as PID 1
+	@status=0; \
+	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
+	RTCP_SLOW=1 $(BIN)/python -m pytest -m alone || status=1; \
 	exit $$status
 
 faults: setup ## carry out the whole fault matrix and print it as a table

@@ -8,9 +8,9 @@ from typing import Any, cast
 from rtcp.config.model import ArmConfig
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import position_of
+from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.launch.inprocess import InProcessBus
-from rtcp.virtual.protocol import State
 
 _WATCH_TURNS = 10
 _ERROR_CODE = 0x603F
@@ -68,12 +68,19 @@ class InlineService(BusService):
             self._look()
 
     def _start_all(self) -> None:
-        self._segment.request_state(State.OP)
-        self.refused = self._segment.wait_for_state(State.OP, 0.0)
+        self._segment.request_state(AlState.OP)
+        self._await_op()
+
+    def _await_op(self) -> None:
+        """Slaves enter OP with their next outputs and SYNC0."""
+        self.refused = self._segment.wait_for_state(AlState.OP, 0.0)
         self.all_op = not self.refused
+        if self.refused and not any(slave.error for slave in self._segment.slaves):
+            self.refused = ()
+            self._wanted.append(self._await_op)
 
     def _park_all(self) -> None:
-        self._segment.request_state(State.PRE_OP)
+        self._segment.request_state(AlState.PREOP)
 
     def _bring_back(self) -> None:
         if not self.comes_back:
@@ -82,18 +89,20 @@ class InlineService(BusService):
         for slave in bus.slaves:
             if slave.error:
                 bus.acknowledge(slave.position)
-            if slave.state is State.PRE_OP:
-                bus.request_state(State.SAFE_OP, [slave.position])
-            if slave.state is State.SAFE_OP:
-                bus.request_state(State.OP, [slave.position])
-        if not bus.wait_for_state(State.OP, 0.0):
-            self.lost_slave = 0
-            self.all_op = True
+            if slave.state is AlState.PREOP:
+                bus.request_state(AlState.SAFEOP, [slave.position])
+            if slave.state is AlState.SAFEOP:
+                bus.request_state(AlState.OP, [slave.position])
+        if bus.wait_for_state(AlState.OP, 0.0):
+            self._wanted.append(self._bring_back)
+            return
+        self.lost_slave = 0
+        self.all_op = True
 
     def _look(self) -> None:
         for state in self._segment.read_states():
             self._board.slave(state.position, state.state | (_ERROR_BIT if state.error else 0), state.code)
-            if self.all_op and state.state is not State.OP:
+            if self.all_op and state.state is not AlState.OP:
                 self._board.text(f"slave {state.position} ({state.name}) left OP: it is in {state.words()}")
                 self.all_op = False
                 self.lost_slave = state.position

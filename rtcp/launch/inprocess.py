@@ -1,202 +1,411 @@
-"""The bus `inprocess`: the device models without sockets and frames, in simulated time, the same in every run.
+"""The bus `inprocess`: the virtual segment without sockets, in simulated time, the same in every run.
 
-It offers what `rtcp.fieldbus.bus` describes (Bus, ProcessData) and shares no code with it: states, facts and errors are
-types of this side with the same fields. One exchange: outputs reach the slaves' buffers, inputs that were there before
-come back; at the SYNC0 that follows, the drives take their outputs over and step by one cycle; a slave without SYNC0
-does so right after the frame. Watchdog, sync error counter and the working counter of a slave that left OP are as on
-the wire. Left out: drift and delay of the clocks (all show the simulated time and one offset), and the time that
-services take: state changes and SDO are done when asked.
+It offers what `rtcp.fieldbus.bus` describes (Bus, ProcessData). A small master writes registers and objects of the
+slaves directly, sets them up with the code of the real bus, and passes one LRW frame a cycle through the segment:
+AL states, watchdogs, SYNC0 supervision and working counters are the segment's own. Left out: drift and delay of the
+clocks (all show the simulated time and one offset), and the time that services take.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from random import Random
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, cast
 
 from rtcp.config.model import SlaveConfig
-from rtcp.launch.inprocess_data import InProcessData
-from rtcp.launch.inprocess_slave import InProcessError, InProcessSlave, identity_faults
-from rtcp.virtual.al_state import AlStatusCode
+from rtcp.fieldbus.al_state import AlState, state_name
+from rtcp.fieldbus.bus import SlaveInfo, SlaveState, slave_label, station_of
+from rtcp.fieldbus.emergency import Emergency, parse
+from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.fieldbus.registers import Steps, finish
+from rtcp.fieldbus.slave_setup import configure_slave, identity_faults
+from rtcp.virtual import coe
+from rtcp.virtual.al_state import INPUTS, MAILBOX_IN, OUTPUTS
 from rtcp.virtual.device import DeviceModel
-from rtcp.virtual.protocol import State
+from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage, SyncManagerLayout
+from rtcp.virtual.protocol import (
+    COUNTER,
+    DATAGRAM_HEADER,
+    ERROR_FLAG,
+    ETHERTYPE,
+    FIRST_DATAGRAM,
+    FMMU_SIZE,
+    HEADER,
+    SM_SIZE,
+    TYPE_DATAGRAMS,
+    Command,
+    Register,
+    State,
+)
+from rtcp.virtual.segment import Segment
+from rtcp.virtual.slave import Slave
 
 _EPOCH_NS = 1_000_000_000
 """The reference clock shows at least this at the start of time."""
+_MAILBOX_HEADER = 6
+_SYNC0_ON = b"\x03"
 
 
-class SlaveFacts(NamedTuple):
-    """What a scan tells of a slave."""
+class InProcessSlave:
+    """A slave of the segment as its master sees it; it is also its SDO client and its register port."""
 
-    position: int
-    name: str
-    vendor_id: int
-    product_code: int
-    revision: int
-    serial: int
-    state: str
-    has_coe: bool
-    output_bits: int
-    input_bits: int
-    dc: bool
+    def __init__(self, slave: Slave, bus: InProcessBus, position: int) -> None:
+        self.virtual = slave
+        self.device = slave.device
+        self.position = position
+        self.name = slave.device.identity.name
+        self._bus = bus
+
+    @property
+    def state(self) -> AlState:
+        """AL state that the slave reports."""
+        return AlState(int(self.virtual.esc.state))
+
+    @property
+    def error(self) -> bool:
+        """Error flag of the AL status."""
+        return bool(self.virtual.esc.get(Register.AL_STATUS, 2) & ERROR_FLAG)
+
+    @property
+    def code(self) -> int:
+        """AL status code."""
+        return self.virtual.esc.get(Register.AL_STATUS_CODE, 2)
+
+    @property
+    def output_bytes(self) -> int:
+        """Length of its outputs by the PDO assignment."""
+        return PdoImage.from_assignment(self.device.objects, RX_ASSIGN).byte_length
+
+    @property
+    def input_bytes(self) -> int:
+        """Length of its inputs by the PDO assignment."""
+        return PdoImage.from_assignment(self.device.objects, TX_ASSIGN).byte_length
+
+    def status(self) -> SlaveState:
+        """Return what its AL status says."""
+        return SlaveState(
+            self.position, station_of(self.position), self.name, self.state, self.error, self.code
+        )  # fmt: skip
+
+    # -- registers and objects, as `configure_slave` uses them ----------------------------------------------------
+
+    def read(self, station: int, address: int, length: int) -> bytes | None:
+        """Read registers; `station` is not needed here."""
+        return self.virtual.esc.read(address, length, self._bus.now_ns)
+
+    def write(self, station: int, address: int, data: bytes) -> bool:
+        """Write registers and let the firmware act on them."""
+        written = self.virtual.esc.write(address, data, self._bus.now_ns)
+        self._bus.segment.settle(self._bus.now_ns)
+        return written
+
+    def reading(self, index: int, subindex: int) -> Steps[bytes]:
+        """Read an object; raises SdoAborted, or BusError in INIT."""
+        try:
+            return coe.read(self.device.objects, index, subindex, False, self._mailbox_state())
+        except SdoAbort as abort:
+            raise self._aborted("read", index, subindex, abort) from abort
+        yield
+
+    def writing(self, index: int, subindex: int, data: bytes) -> Steps[None]:
+        """Write an object; raises as `reading`."""
+        try:
+            coe.write(self.device.objects, index, subindex, False, self._mailbox_state(), data)
+        except SdoAbort as abort:
+            raise self._aborted("write", index, subindex, abort) from abort
+        return
+        yield
+
+    def reading_int(self, index: int, subindex: int) -> Steps[int]:
+        """Read an object as an unsigned integer."""
+        return int.from_bytes((yield from self.reading(index, subindex)), "little")
+
+    def writing_int(self, index: int, subindex: int, value: int, length: int) -> Steps[None]:
+        """Write an unsigned integer of `length` bytes."""
+        return self.writing(index, subindex, value.to_bytes(length, "little"))
+
+    def _mailbox_state(self) -> int:
+        if self.state < AlState.PREOP:
+            raise BusError(f"{slave_label(self.position, self.name)} is in INIT, where it has no mailbox")
+        return int(self.state)
+
+    def _aborted(self, what: str, index: int, subindex: int, abort: SdoAbort) -> SdoAborted:
+        where = slave_label(self.position, self.name)
+        text = f"{where} refused to {what} 0x{index:04X}:{subindex} with abort code 0x{abort.code:08X}"
+        return SdoAborted(text, abort.code)
+
+    def emergencies(self) -> Iterable[Emergency]:
+        """Yield the emergency messages in its mailbox."""
+        mailbox = self.virtual.esc.sync_managers[MAILBOX_IN]
+        while mailbox.enabled and mailbox.full:
+            message = self.read(0, mailbox.start, mailbox.length) or b""
+            self._bus.segment.settle(self._bus.now_ns)
+            found = parse(message[_MAILBOX_HEADER:], self.position, self.name)
+            if found is not None:
+                yield found
 
 
-class SlaveState(NamedTuple):
-    """What a slave's AL status says."""
+class InProcessData:
+    """The process image (ProcessData): one LRW frame for all slaves. `InProcessBus.configure` makes it.
 
-    position: int
-    station: int
-    name: str
-    state: State
-    error: bool
-    code: int
+    `lose` frames to test what follows; `heard` says whether the last `send` reached the slaves.
+    """
 
-    def words(self) -> str:
-        """Return state and code in words."""
-        name = self.state.name.replace("_", "-")
-        return f"{name} + ERROR (0x{self.code:04X})" if self.error else name
+    def __init__(self, bus: InProcessBus) -> None:
+        slaves = bus.slaves
+        self._bus = bus
+        self._random = bus.random
+        self._lengths = [slave.output_bytes for slave in slaves]
+        inputs = [slave.input_bytes for slave in slaves]
+        self.expected_wkc = sum(2 * bool(out) + bool(in_) for out, in_ in zip(self._lengths, inputs, strict=True))
+        self.missed = 0
+        self.stale = 0
+        self.heard = False
+        self.wkc = -1
+        """What the last `receive` returned."""
+        self.outputs = [bytes(length) for length in self._lengths]
+        """What the next `send` sends, slave by slave."""
+        self._data_at = FIRST_DATAGRAM + DATAGRAM_HEADER
+        self._inputs_at = self._data_at + sum(self._lengths)
+        self._places = []
+        at = self._inputs_at
+        for length in inputs:
+            self._places.append((at, at + length))
+            at += length
+        self._counter_at = at
+        length = at - self._data_at
+        header = HEADER.pack(Command.LRW, 0, 0, 0, length, 0)
+        frame_header = (length + DATAGRAM_HEADER + COUNTER | TYPE_DATAGRAMS << 12).to_bytes(2, "little")
+        ethernet = b"\xff" * 6 + b"\x01" * 6 + ETHERTYPE.to_bytes(2, "big")
+        self._empty = bytearray(ethernet + frame_header + header + bytes(length + COUNTER))
+        self._answer: bytearray | None = None
+        self.inputs = [bytes(length) for length in inputs]
+        """Inputs of each slave in the last answer."""
+        self._lost_out = self._lost_back = 0
+        self.dc_time = self._shown = bus.now_ns + bus.offset_ns
 
+    def lose(self, cycles: int, heard: bool | None = None) -> None:
+        """Lose the next `cycles` frames: on the way back (`heard`) or out; None: chance decides."""
+        if self._random.random() < 0.5 if heard is None else heard:
+            self._lost_back = max(self._lost_back, cycles)
+        else:
+            self._lost_out = max(self._lost_out, cycles)
 
-class Emergency(NamedTuple):
-    """An emergency message as it came from a slave."""
+    def send(self) -> None:
+        """Send the outputs that were set."""
+        self._answer = None
+        self.heard = not self._lost_out
+        if self._lost_out:
+            self._lost_out -= 1
+            return
+        frame, now = self._empty[:], self._bus.now_ns
+        frame[self._data_at : self._inputs_at] = b"".join(self.outputs)
+        self._shown = now + self._bus.offset_ns
+        answered = self._bus.segment.process(frame, len(frame), now)
+        self._bus.settle()
+        if self._lost_back:
+            self._lost_back -= 1
+        elif answered:
+            self._answer = frame
 
-    position: int
-    name: str
-    error_code: int
-    error_register: int
-    data: bytes
+    def receive(self) -> int:
+        """Return the working counter of the answer, -1 where none came; then inputs and `dc_time` stay."""
+        answer = self._answer
+        if answer is None:
+            self.missed += 1
+            self.wkc = -1
+            return -1
+        self.inputs = [bytes(answer[first:end]) for first, end in self._places]
+        self.dc_time = self._shown
+        self.wkc = answer[self._counter_at] | answer[self._counter_at + 1] << 8
+        return self.wkc
 
-    def sentence(self) -> str:
-        """Return the message in words."""
-        return f"slave {self.position} ({self.name}) sent emergency 0x{self.error_code:04X}"
+    def input(self, index: int) -> bytes:
+        """Return the inputs of slave `index` of the last answer."""
+        return self.inputs[index]
+
+    def set_output(self, index: int, data: bytes) -> None:
+        """Set the outputs of slave `index` for the next `send`; data of another length is not taken."""
+        if len(data) == self._lengths[index]:
+            self.outputs[index] = data
 
 
 class InProcessBus:
-    """A segment and its master in one object; whoever uses it moves the time by `advance_to` between two exchanges.
+    """A segment and its master in one object; its user moves the time by `advance_to` between two exchanges.
 
     Args:
         devices: the models in the order of the cable.
-        seed: of what is left to chance: the reference clock's offset, and which way a lost frame was going.
+        seed: of chance: the reference clock's offset, and the direction in which a frame is lost.
         now_ns: the instant at which time begins.
     """
 
     def __init__(self, devices: Sequence[DeviceModel], seed: int = 0, now_ns: int = 0) -> None:
-        self.slaves = [InProcessSlave(device, position) for position, device in enumerate(devices, 1)]
-        self._random = Random(seed)
+        self.random = Random(seed)
         self.notes: list[str] = []
         self.now_ns = now_ns
-        self.offset_ns = _EPOCH_NS + self._random.randrange(_EPOCH_NS)
+        self.offset_ns = _EPOCH_NS + self.random.randrange(_EPOCH_NS)
         """Reference clock less simulated time."""
-        self._data: InProcessData | None = None
+        shown = now_ns + self.offset_ns
+        virtual = [Slave(device, b"", 0.0, shown, 0, None, now_ns) for device in devices]
+        self.segment = Segment(virtual, now_ns)
+        self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]
+        self._configs: Sequence[SlaveConfig] = ()
+        self._period_ns = 0
 
     # -- Bus --------------------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Nothing is to be opened."""
+        """Nothing has to be opened."""
 
-    def scan(self) -> tuple[SlaveFacts, ...]:
-        """Bring the slaves to PRE-OP and tell what is known of them."""
-        self.request_state(State.PRE_OP)
-        return tuple(map(_facts, self.slaves))
+    def scan(self) -> tuple[SlaveInfo, ...]:
+        """Bring the slaves to PRE-OP and return what is known of them."""
+        self.request_state(AlState.PREOP)
+        return tuple(map(_info, self.slaves))
 
     def configure(self, slaves: Sequence[SlaveConfig], period_ns: int) -> InProcessData:
         """Compare the slaves with `slaves`, set them up, bring them to SAFE-OP with outputs of zero.
 
         Raises:
-            InProcessError: what is on the bus differs from the configuration, or a slave refuses.
+            BusError: what is on the bus differs from the configuration, or a slave refuses.
         """
-        if faults := identity_faults(self.slaves, slaves):
-            raise InProcessError(*faults)
-        self.request_state(State.PRE_OP)
-        self.notes = [
-            note
-            for slave, config in zip(self.slaves, slaves, strict=True)
-            for note in slave.configure(config, period_ns)
-        ]
-        self.request_state(State.SAFE_OP)
-        self._data = InProcessData(self.slaves, period_ns, self.now_ns, self.offset_ns, self._random)
-        return self._data
+        found = [(slave.device.identity, slave) for slave in self.slaves]
+        pysoem_like = [SimpleNamespace(man=who.vendor_id, id=who.product_code, name=who.name) for who, _ in found]
+        if faults := identity_faults(pysoem_like, slaves):
+            raise BusError(*faults)
+        self._configs, self._period_ns = slaves, period_ns
+        self.notes = [note for slave in self.slaves for note in self.set_up(slave.position)]
+        self.request_state(AlState.SAFEOP)
+        if refused := self.wait_for_state(AlState.SAFEOP, 0.0):
+            raise BusError(*refused)
+        return InProcessData(self)
+
+    def set_up(self, position: int) -> list[str]:
+        """Bring a slave to PRE-OP and configure it; return what was tolerated. Raises BusError where it refuses."""
+        slave, config = self._slave(position), self._configs[position - 1]
+        slave.name = config.name
+        self.request_state(AlState.PREOP, [position])
+        client = cast(Any, slave)
+        notes = finish(configure_slave(client, client, 0, config, self._period_ns))
+        layout = SyncManagerLayout()
+        at = sum(other.output_bytes for other in self.slaves[: position - 1])
+        self._map(slave, OUTPUTS, layout.outputs.start, layout.outputs.control, at, slave.output_bytes)
+        at = sum(other.output_bytes for other in self.slaves)
+        at += sum(other.input_bytes for other in self.slaves[: position - 1])
+        self._map(slave, INPUTS, layout.inputs.start, layout.inputs.control, at, slave.input_bytes)
+        device = config.device
+        clock = slave.virtual.clock
+        if device.assign_activate and clock is not None:
+            shift = round(device.sync0_shift_us * 1000)
+            shown = self.now_ns + self.offset_ns
+            offset = shown - clock.local(self.now_ns)
+            slave.write(0, Register.DC_OFFSET, offset.to_bytes(8, "little", signed=True))
+            start = shown + (shift - shown) % self._period_ns
+            slave.write(0, Register.DC_START_TIME, start.to_bytes(8, "little"))
+            slave.write(0, Register.DC_SYNC0_CYCLE, self._period_ns.to_bytes(4, "little"))
+            slave.write(0, Register.DC_ACTIVATION, _SYNC0_ON)
+        return notes
+
+    def _map(self, slave: InProcessSlave, manager: int, start: int, control: int, logical: int, length: int) -> None:
+        """Configure a sync manager and the FMMU for it (ETG.1000.4, 6.6 and 6.7)."""
+        if not length:
+            return
+        head = start.to_bytes(2, "little") + length.to_bytes(2, "little")
+        slave.write(0, Register.SYNC_MANAGER + SM_SIZE * manager, head + bytes((control, 0, 1, 0)))
+        direction = 2 if manager == OUTPUTS else 1
+        fmmu = logical.to_bytes(4, "little") + length.to_bytes(2, "little") + b"\x00\x07"
+        fmmu += start.to_bytes(2, "little") + bytes((0, direction, 1, 0, 0, 0))
+        slave.write(0, Register.FMMU + FMMU_SIZE * (manager - OUTPUTS), fmmu)
 
     def request_state(self, state: int, positions: Iterable[int] | None = None) -> None:
-        """Request `state` of the slaves at `positions`, None: of all; what can be done is done at once."""
+        """Request `state` of the slaves at `positions`, None: of all; a way down acknowledges an error."""
         for slave in self._at(positions):
-            slave.request(State(int(state)), self._data is not None and self._data.fed(slave))
-        self._changed()
+            if state >= AlState.PREOP and slave.state == AlState.INIT:
+                layout = SyncManagerLayout()
+                for number, manager in enumerate((layout.mailbox_receive, layout.mailbox_send)):
+                    head = manager.start.to_bytes(2, "little") + manager.length.to_bytes(2, "little")
+                    settings = head + bytes((manager.control, 0, 1, 0))
+                    slave.write(0, Register.SYNC_MANAGER + SM_SIZE * number, settings)
+            acknowledge = ERROR_FLAG if slave.error and state < slave.state else 0
+            slave.write(0, Register.AL_CONTROL, (int(state) | acknowledge).to_bytes(2, "little"))
+        self.settle()
 
     def wait_for_state(self, state: int, timeout_s: float, positions: Iterable[int] | None = None) -> tuple[str, ...]:
         """Return a sentence for each slave that is not in `state`; no time passes."""
-        wanted = State(int(state))
         return tuple(
-            f"{slave.label} is in {_state(slave).words()}, {wanted.name.replace('_', '-')} was requested"
+            f"{slave_label(slave.position, slave.name)} is in {slave.status().words()}, {state_name(int(state))} was "
+            "requested"
             for slave in self._at(positions)
-            if slave.state != wanted or slave.error
+            if slave.state != state or slave.error
         )
 
     def acknowledge(self, position: int) -> None:
         """Acknowledge a slave's error: it stays in the state that it is in, without the error indication."""
-        self._slave(position).acknowledge()
-        self._changed()
+        slave = self._slave(position)
+        slave.write(0, Register.AL_CONTROL, (int(slave.state) | ERROR_FLAG).to_bytes(2, "little"))
 
     def read_states(self) -> tuple[SlaveState, ...]:
         """Return what every slave's AL status says."""
-        return tuple(map(_state, self.slaves))
+        return tuple(slave.status() for slave in self.slaves)
 
     def emergencies(self) -> tuple[Emergency, ...]:
         """Return the emergency messages that came since the last call."""
-        found = []
-        for slave in self.slaves:
-            waiting = slave.device.emergencies
-            while waiting:
-                one = waiting.popleft()
-                found.append(Emergency(slave.position, slave.name, one.error_code, one.error_register, one.data))
-        return tuple(found)
+        return tuple(found for slave in self.slaves for found in slave.emergencies())
 
     def sdo_read(self, position: int, index: int, subindex: int) -> bytes:
-        """Return an object's value; raises InProcessError, with the abort code where the slave refused."""
-        return self._slave(position).read(index, subindex)
+        """Return an object's value; raises SdoAborted, or BusError where there is no mailbox or no such slave."""
+        return finish(self._slave(position).reading(index, subindex))
 
     def sdo_write(self, position: int, index: int, subindex: int, data: bytes) -> None:
         """Write an object's value; raises as `sdo_read`."""
-        self._slave(position).write(index, subindex, data)
+        finish(self._slave(position).writing(index, subindex, data))
 
     def close(self) -> None:
         """Bring the slaves back to INIT; may be called at any time, also twice."""
-        self.request_state(State.INIT)
+        self.request_state(AlState.INIT)
 
-    # -- time and mishaps -------------------------------------------------------------------------------------------
+    # -- time and faults --------------------------------------------------------------------------------------------
 
     def advance_to(self, now_ns: int) -> None:
-        """Let time pass up to `now_ns`: every SYNC0 on the way steps its drives."""
-        if self._data is not None:
-            self._data.pass_time(now_ns)
+        """Let time pass up to `now_ns`, with every event of the segment at its instant."""
+        segment = self.segment
+        while segment.next_event <= now_ns:
+            self.now_ns = max(self.now_ns, segment.next_event)
+            segment.tick(self.now_ns)
+            while segment.busy:
+                segment.step_one()
         self.now_ns = max(now_ns, self.now_ns)
+
+    def settle(self) -> None:
+        """Let the slaves act on what the master has written, and step their devices."""
+        segment = self.segment
+        segment.settle(self.now_ns)
+        while segment.busy:
+            segment.step_one()
 
     def drop(self, position: int, state: int, code: int) -> None:
         """Let a slave leave its state by itself, with an AL status code."""
-        slave = self._slave(position)
-        slave.fall(State(state), AlStatusCode(code))
-        self._changed()
+        self._slave(position).virtual.application.fall(State(state), code)
 
-    def _changed(self) -> None:
-        if self._data is not None:
-            self._data.count()
+    def restart(self, position: int) -> None:
+        """Take a slave's supply away and give it back."""
+        self.segment.chain.restart(self._slave(position).virtual, self.now_ns)
+        self.segment.rewire()
 
     def _slave(self, position: int) -> InProcessSlave:
         if not 1 <= position <= len(self.slaves):
-            raise InProcessError(f"there is no slave {position}; the bus has slaves 1 to {len(self.slaves)}")
+            raise BusError(f"there is no slave {position}; the bus has slaves 1 to {len(self.slaves)}")
         return self.slaves[position - 1]
 
     def _at(self, positions: Iterable[int] | None) -> list[InProcessSlave]:
         return self.slaves if positions is None else [self._slave(position) for position in positions]
 
 
-def _facts(slave: InProcessSlave) -> SlaveFacts:
-    identity = slave.device.identity
-    return SlaveFacts(
-        slave.position, identity.name, identity.vendor_id, identity.product_code, identity.revision, identity.serial,
-        _state(slave).words(), True, 8 * slave.output_bytes, 8 * slave.input_bytes, slave.device.supports_dc,
+def _info(slave: InProcessSlave) -> SlaveInfo:
+    identity, status = slave.device.identity, slave.status()
+    return SlaveInfo(
+        slave.position, status.station, identity.name, identity.vendor_id, identity.product_code, identity.revision,
+        identity.serial, 0, status.words(), status.code, "", True, None, (), (), 8 * slave.output_bytes,
+        8 * slave.input_bytes, (), 0, slave.device.supports_dc, 0, (), slave.position - 1,
     )  # fmt: skip
-
-
-def _state(slave: InProcessSlave) -> SlaveState:
-    return SlaveState(slave.position, 0x1000 + slave.position, slave.name, slave.state, slave.error, int(slave.code))

@@ -61,7 +61,7 @@ class Simulation:
 
     Raises:
         ConfigError: of the segment's file.
-        InProcessError: the segment does not fit the configuration.
+        BusError: the segment does not fit the configuration.
     """
 
     def __init__(

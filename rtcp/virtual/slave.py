@@ -163,6 +163,8 @@ class Application:
         self._enter(state)
         if state == State.SAFE_OP:
             self._lock(True, OUTPUTS if self._rx.byte_length else INPUTS)
+            # What the master sent before does not count any more.
+            self._received = False
         self._refuse(code)
 
     def _recheck(self) -> None:

@@ -13,9 +13,7 @@ from rtcp.ipc.commands import Enable, Halt, MoveJoints, Reset
 from rtcp.ipc.events import MovedSinceFault
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import State
-from rtcp.launch.inprocess_slave import InProcessSlave
 from rtcp.launch.simulation import Frame, Simulation
-from rtcp.virtual.models import create
 from rtcp.virtual.protocol import State as AlState
 
 CONFIG = load(default_config())
@@ -72,7 +70,7 @@ def bring_back(simulation: Simulation) -> None:
     for state in (AlState.SAFE_OP, AlState.OP):
         if slave.state < state:
             bus.request_state(state, [SLAVE])
-    assert (slave.state, slave.error) == (AlState.OP, False)
+    assert simulation.until(lambda: (slave.state, slave.error) == (AlState.OP, False), 0.1)
 
 
 def out_of_op(simulation: Simulation) -> None:
@@ -89,15 +87,10 @@ def without_supply(simulation: Simulation) -> None:
     bus.request_state(AlState.INIT, [SLAVE])
     assert simulation.until(lambda: simulation.state is State.FAULT, 1.0)
     simulation.run(0.3)
-    slave.device = create("cubemars-orh70", load_inertia=0.8, load_mass_moment=1.0, initial_position=TURNED_TO)
-    anew(slave)
-    bus.request_state(AlState.PRE_OP, [SLAVE])
-    slave.configure(CONFIG.slaves[SLAVE - 1], simulation.period_ns)
+    bus.restart(SLAVE)
+    slave.device.mechanics.position = TURNED_TO
+    bus.set_up(SLAVE)
     bring_back(simulation)
-
-
-def anew(slave: InProcessSlave) -> None:
-    slave.outputs = bytes(slave.output_bytes)
 
 
 def enabled_by_itself(simulation: Simulation) -> None:

@@ -10,8 +10,12 @@ from pathlib import Path
 import pytest
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.layout import PER_JOINT, RECORDS, SCALARS, records_for
+from rtcp.ipc.commands import Enable, MoveJoints, SetDriveMode
+from rtcp.ipc.events import OverSpeed
+from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, PER_JOINT, RECORDS, SCALARS, records_for
 from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
+from rtcp.ipc.refusals import Malformed, PositionOutOfRange
+from rtcp.ipc.states import DriveMode
 
 JOINTS = 6
 FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
@@ -25,14 +29,14 @@ def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
 
 
 def record(cycle: int) -> list[float]:
-    return [cycle, *([0] * (len(SCALARS) - 2)), *(float(cycle) for _ in range(4 * JOINTS)), *([cycle & 0xFFFF] * 6)]
+    return [cycle, *([0] * (len(SCALARS) - 2)), *(float(cycle) for _ in range(7 * JOINTS)), *([cycle & 0xFFFF] * 6)]
 
 
 def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observer) -> None:
     values: list[float] = [0] * FIELDS
     for at, (name, _) in enumerate(SCALARS[1:]):
         values[at] = {"state": 4, "wkc": -1, "dc_filtered_ns": -77, "elapsed_s": 0.5}.get(name, at)
-    values[len(SCALARS) - 1 :] = [*(0.1 * i for i in range(4 * JOINTS)), *range(100, 100 + JOINTS)]
+    values[len(SCALARS) - 1 :] = [*(0.1 * i for i in range(7 * JOINTS)), *range(100, 100 + JOINTS)]
     board.publish(values)
     latest = observer.latest()
     assert latest is not None
@@ -40,8 +44,8 @@ def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observe
     assert int(latest[0]["state"]) == 4
     assert int(latest[0]["wkc"]) == -1
     assert int(latest[0]["dc_filtered_ns"]) == -77
-    assert list(latest[0]["position"]) == [0.1 * i for i in range(JOINTS)]
-    assert list(latest[0]["target"]) == [0.1 * i for i in range(3 * JOINTS, 4 * JOINTS)]
+    assert list(latest[0]["actual_position"]) == [0.1 * i for i in range(JOINTS)]
+    assert list(latest[0]["sent_position"]) == [0.1 * i for i in range(4 * JOINTS, 5 * JOINTS)]
     assert list(latest[0]["statusword"]) == list(range(100, 100 + JOINTS))
 
 
@@ -97,8 +101,8 @@ def test_a_writer_in_another_process_is_never_read_torn(path: Path) -> None:
             at = int(records[-1]["number"])
             read += len(records)
             assert (records["cycle"] == records["number"]).all()
-            assert (records["position"] == records["cycle"][:, None]).all()
-            assert (records["target"] == records["cycle"][:, None]).all()
+            assert (records["actual_position"] == records["cycle"][:, None]).all()
+            assert (records["sent_position"] == records["cycle"][:, None]).all()
     observer.close()
     assert at == 99_999
     assert read > 1000
@@ -106,21 +110,21 @@ def test_a_writer_in_another_process_is_never_read_torn(path: Path) -> None:
 
 def test_events_and_texts_arrive_in_order(board: Blackboard, observer: Observer) -> None:
     for number in range(300):
-        board.event(5, number % 6, number, 1.0)
+        board.event(OverSpeed(number % 6, number, 1.0))
     board.text("the drive's temperature is 91 °C")
     events = observer.events_since(0)
-    assert [event.value for event in events] == list(range(300 - 256, 300))
-    assert observer.events_since(299)[0].axis == 299 % 6
+    assert [record.event.value for record in events] == list(range(300 - 256, 300))
+    assert observer.events_since(299)[0].event == OverSpeed(299 % 6, 299.0, 1.0)
     assert [text.sentence for text in observer.texts_since(0)] == ["the drive's temperature is 91 °C"]
 
 
 def test_an_event_has_its_instant_on_both_clocks(board: Blackboard, observer: Observer) -> None:
     wall, monotonic = time.time_ns(), time.monotonic_ns()
-    board.event(5, 3, 0.25, 1.5)
+    board.event(OverSpeed(3, 0.25, 1.5))
     (event,) = observer.events_since(0)
     assert wall <= event.time_ns <= time.time_ns()
     assert monotonic <= event.monotonic_ns <= time.monotonic_ns()
-    assert (event.number, type(event.event), event.axis, event.value, event.limit) == (1, 5, 3, 0.25, 1.5)
+    assert (event.number, event.event) == (1, OverSpeed(3, 0.25, 1.5))
 
 
 def test_a_long_text_is_cut_and_not_lost(board: Blackboard, observer: Observer) -> None:
@@ -174,24 +178,32 @@ def test_a_lease_that_is_being_renewed_never_looks_free_to_another_process(board
 def test_commands_are_taken_in_order_and_answered(board: Blackboard, observer: Observer) -> None:
     lease = observer.acquire("test", 10.0)
     assert not board.command_waits()
-    first = observer.command(lease, 5, [0.1, -0.2])
-    second = observer.command(lease, 1)
+    first = observer.command(lease, MoveJoints((0.1, -0.2), 0.3, True))
+    second = observer.command(lease, Enable())
     assert board.command_waits()
-    assert board.take_command()[:5] == (first, lease, 5, 0.1, -0.2)
-    board.answer(first, 3, 2, 9.0, 1.5)
+    assert board.take_command() == (first, lease, MoveJoints((0.1, -0.2), 0.3, True))
+    board.answer(first, PositionOutOfRange(2, 9.0, 1.5))
     answer = observer.answer(first)
     assert answer is not None
-    assert (answer.refusal, answer.axis, answer.value, answer.limit) == (3, 2, 9.0, 1.5)
+    assert answer.refusal == PositionOutOfRange(2, 9.0, 1.5)
     assert observer.answer(second) is None
-    assert board.take_command()[0] == second
+    assert board.take_command()[2] == Enable()
     assert not board.command_waits()
+
+
+def test_a_command_that_cannot_be_read_is_malformed(board: Blackboard, observer: Observer) -> None:
+    observer.command(1, SetDriveMode(DriveMode.CSP))
+    memory = board.memory
+    at = COMMANDS_AT + COMMAND_SIZE + COMMAND.size
+    memory[at : at + 8] = (77).to_bytes(8, "little")
+    assert board.take_command()[2] == Malformed(SetDriveMode.number)
 
 
 def test_a_ring_that_nobody_empties_is_refused(observer: Observer) -> None:
     for _ in range(64):
-        observer.command(1, 1)
+        observer.command(1, Enable())
     with pytest.raises(BlackboardError, match="takes no commands"):
-        observer.command(1, 1)
+        observer.command(1, Enable())
 
 
 def test_a_file_that_is_no_blackboard_is_refused(tmp_path: Path) -> None:

@@ -227,8 +227,8 @@ def test_on_the_bus_inprocess_drives_and_inputs_fail_alike() -> None:
     for model in models:
         for _ in range(120):
             model.step(0.001)
-    assert models[0].objects[0x6000, 1].value == 0
+    assert models[0].objects[0x6000, 1].value == 0x0300
     assert models[1].objects[0x603F, 0].value == 0x3210
     undo(bus.now_ns)
     models[0].step(0.001)
-    assert models[0].objects[0x6000, 1].value == 0x3F
+    assert models[0].objects[0x6000, 1].value == 0x033F

@@ -1,0 +1,48 @@
+"""What a cycle record says was commanded and sent, compared with the frame of that cycle, decoded here."""
+
+from __future__ import annotations
+
+import pytest
+
+from rtcp.ipc.commands import MoveJoints
+from rtcp.motion.state import ArmState, Setpoint
+
+from .rig import COUNTS, CSP, CST, CSV, LoopRig
+
+
+def sent(rig: LoopRig, name: str) -> list[float]:
+    """A field of the last record, one number a joint, in counts."""
+    latest = rig.observer.latest()
+    assert latest is not None
+    return [float(value) * COUNTS for value in latest[0][name]]
+
+
+@pytest.mark.parametrize("mode", [CSP, CSV, CST])
+def test_a_record_says_what_left_on_the_wire(rig: LoopRig, mode: int) -> None:
+    rig.set_in_motion(mode)
+    for _ in range(50):
+        rig.cycle()
+        frame = rig.log[-1].drives
+        # The frame carries whole counts.
+        assert sent(rig, "sent_position") == pytest.approx([one.target for one in frame], abs=0.5)
+        if mode == CSV:
+            assert sent(rig, "sent_velocity") == pytest.approx([one.speed for one in frame], abs=0.5)
+        if mode == CST:
+            assert sent(rig, "sent_torque") == pytest.approx([one.effort for one in frame], abs=0.5)
+
+
+def test_a_record_says_what_was_commanded_where_the_limiter_sends_less(rig: LoopRig) -> None:
+    rig.hold()
+
+    def jump(state: ArmState) -> Setpoint:
+        setpoint = Setpoint(2)
+        setpoint.position = [0.002, 0.0]
+        return setpoint
+
+    rig.arm.trajectory_guard.apply = lambda state, setpoint, tolerates: state.commanded.__setitem__(0, 0.1) or 0  # type: ignore[method-assign]
+    rig.arm.controllers[MoveJoints].update = jump  # type: ignore[method-assign]
+    rig.cycle()
+    frame = rig.log[-1].drives[0]
+    assert sent(rig, "commanded_position")[0] == pytest.approx(0.1 * COUNTS)
+    assert sent(rig, "sent_position")[0] == pytest.approx(frame.target, abs=0.5)
+    assert frame.target <= rig.arm.limits.velocity[0] * rig.arm.period_s * COUNTS + 1
