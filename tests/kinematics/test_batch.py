@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinematics.batch import forward_batch
+from kinematics.forward import forward_batch
 from kinematics.forward import forward
 from kinematics.model import ArmModel, DhRow
 from kinematics.pose import Pose

@@ -11,7 +11,7 @@ import pytest
 
 from kinematics.jacobian import characteristic_length, jacobian
 from kinematics.model import ArmModel
-from kinematics.velocity import THRESHOLD, joint_velocity
+from kinematics.jacobian import THRESHOLD, joint_velocity
 
 REGULAR = [0.3, -0.4, 1.1, 0.4, 0.8, 0.2]
 WRIST, ELBOW = [0.3, -0.4, 1.1, 0.4, 0.0, 0.2], [0.3, -0.4, 0.0, 0.4, 0.8, 0.2]

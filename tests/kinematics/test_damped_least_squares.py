@@ -12,7 +12,7 @@ import pytest
 from kinematics.forward import forward
 from kinematics.jacobian import characteristic_length
 from kinematics.model import ArmModel, DhRow, JointLimit
-from kinematics.numeric import NumericResult, solve_numeric
+from kinematics.damped_least_squares import NumericResult, solve_numeric
 from kinematics.pose import IDENTITY, Pose, Rotation
 from kinematics.spherical import has_spherical_wrist
 
