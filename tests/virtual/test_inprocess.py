@@ -9,14 +9,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from rtcp.ipc.machine import Code, Command
-from rtcp.ipc.machine import State as MachineState
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.fieldbus import bus as protocol
 from rtcp.fieldbus.errors import BusError, SdoAborted
+from rtcp.ipc.commands import Enable, MoveJoints, Reset
+from rtcp.ipc.events import SlaveLost
+from rtcp.ipc.states import State as MachineState
 from rtcp.launch.inprocess import InProcessBus, InProcessData
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create
@@ -370,17 +371,17 @@ def simulation(config: ArmConfig, segment: SegmentConfig) -> Iterator[Simulation
 
 def to_holding(simulation: Simulation) -> None:
     assert simulation.until(lambda: simulation.state is MachineState.READY, 3.0)
-    assert simulation.order(Command.ENABLE).refusal == 0
+    assert simulation.send(Enable()).refusal is None
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 3.0)
 
 
-def numbers(*target: float, speed: float = 0.4) -> list[float]:
-    return [*target, *[0.0] * (11 - len(target)), speed]
+def joint_move(*target: float) -> MoveJoints:
+    return MoveJoints(q=target, speed=0.4, synchronized=True)
 
 
 def test_the_loop_follows_the_clock_brings_the_slaves_to_op_and_moves_the_arm(simulation: Simulation) -> None:
     to_holding(simulation)
-    assert simulation.order(Command.MOVE, numbers(0.4, 0.3)).refusal == 0
+    assert simulation.send(joint_move(0.4, 0.3)).refusal is None
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 5.0)
     simulation.run(0.3)
     assert [model.axis.position for model in simulation.models] == pytest.approx([0.4, 0.3], abs=1e-3)
@@ -388,7 +389,7 @@ def test_the_loop_follows_the_clock_brings_the_slaves_to_op_and_moves_the_arm(si
 
 def test_a_lease_that_is_not_renewed_runs_out_in_simulated_time(simulation: Simulation) -> None:
     to_holding(simulation)
-    assert simulation.order(Command.MOVE, numbers(1.5, 1.5)).refusal == 0
+    assert simulation.send(joint_move(1.5, 1.5)).refusal is None
     simulation.fall_silent()
     assert simulation.until(lambda: simulation.state is MachineState.STOPPING, 0.7)
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 1.0)
@@ -404,10 +405,11 @@ def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_befor
         to_holding(simulation)
         simulation.bus.drop(2, State.SAFE_OP, 0x001A)
         assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
-        assert [event.axis for event in simulation.events if event.code == Code.SLAVE_NOT_OP] == [2]
+        lost = [found.event for found in simulation.events if isinstance(found.event, SlaveLost)]
+        assert [event.slave for event in lost] == [2]
         simulation.run(0.5)
         assert simulation.state is MachineState.FAULT
-        assert simulation.order(Command.RESET).refusal == 0
+        assert simulation.send(Reset()).refusal is None
         assert simulation.until(lambda: simulation.state is MachineState.READY, 1.0)
         simulation.run(0.3)
         assert simulation.state is MachineState.READY
@@ -419,7 +421,7 @@ def story(config: ArmConfig, segment: SegmentConfig, seed: int) -> list[Frame]:
         simulation.acquire()
         simulation.on_frame = frames.append
         to_holding(simulation)
-        simulation.order(Command.MOVE, numbers(0.2, 0.1))
+        simulation.send(joint_move(0.2, 0.1))
         simulation.run(0.1)
         simulation.data.lose(3)
         simulation.run(0.2)
