@@ -15,15 +15,15 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from rtcp.ipc.machine import Command, State
-
 from rtcp.config import default_config, load
+from rtcp.ipc.commands import Enable, MoveJoints
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Simulation
 
 START = [0.3, 0.2, 0.9, 0.2, 0.6, 0.1]
-TARGET = [1.3, -0.4, 1.5, 1.2, -0.4, 1.1]
+TARGET = (1.3, -0.4, 1.5, 1.2, -0.4, 1.1)
 INPUTS = 0x033F
-"""Stick neutral, emergency stop not pressed."""
+"""Joystick neutral, emergency stop not pressed."""
 BATCH_S = 0.2
 DRIVE = struct.Struct("<Hiiib")
 
@@ -47,10 +47,10 @@ def moving(period_us: int) -> Simulation:
         simulation.box.inputs = INPUTS
     simulation.acquire()
     assert simulation.until(lambda: simulation.state is State.READY, 3.0)
-    assert simulation.order(Command.ENABLE).refusal == 0
+    assert simulation.send(Enable()).refusal is None
     assert simulation.until(lambda: simulation.state is State.HOLDING, 3.0)
-    answer = simulation.order(Command.MOVE, [*TARGET, *[0.0] * 5, 0.1])
-    assert answer.refusal == 0, answer
+    refusal = simulation.send(MoveJoints(TARGET, 0.1, True)).refusal
+    assert refusal is None, refusal
     return simulation
 
 

@@ -110,7 +110,7 @@ class Platform:
         The distance and not the speed: where a host takes cycles away the motion takes longer, and its speed is less.
         """
         return self.until(
-            lambda found: found["state"] == "moving" and abs(found["joints"]["position"][0]) > far_rad, "motion"
+            lambda found: found["state"] == "moving" and abs(found["joints"]["actual_position"][0]) > far_rad, "motion"
         )
 
     def wire(self, *arguments: str) -> str:

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.alone
 
 
 def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform) -> None:
-    start = enabled.status()["joints"]["position"]
+    start = enabled.status()["joints"]["actual_position"]
     target = [start[0] + (1.35 if start[0] < 0.5 else -1.35), *start[1:]]
     with recording(blackboard_file(enabled.directory)) as made:
         enabled.rtcp("move", *(f"{q:.6f}" for q in target), "--speed", "0.2")
@@ -40,9 +40,9 @@ def test_a_square_of_200_mm_at_50_mm_s_is_driven_within_1_mm_commanded_and_3_mm_
     assert config.arm is not None
     square = place(config, "xy")
     with ControlClient("the experiment", control_socket(enabled.directory)) as client:
-        client.call("move", {"q": list(square.start), "speed": None}, timeout_s=60.0)
+        client.call("move_joints", {"q": list(square.start), "speed": None}, timeout_s=60.0)
         with recording(blackboard_file(enabled.directory)) as made:
-            client.call("line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
+            client.call("move_line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
     driven = judge(config.arm, square, made)
     commanded, actual = driven.worst
     assert driven.lost == 0

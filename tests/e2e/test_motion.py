@@ -28,12 +28,12 @@ NUMBERS = [f"{q:g}" for q in BENT]
 @pytest.fixture
 def bent(enabled: Platform) -> Iterator[Platform]:
     """The shared platform, enabled, the arm bent away from all limits, taking moves; as it was afterwards."""
-    enabled.call("motion", name="joint")
-    enabled.call("move", q=BENT, speed=None)
+    enabled.call("mode", name="joint")
+    enabled.call("move_joints", q=BENT, speed=None)
     yield enabled
     enabled.until(lambda found: found["state"] in ("holding", "stopped_by_limit"), "rest")
     enabled.call("reset")
-    enabled.call("motion", name="joint")
+    enabled.call("mode", name="joint")
 
 
 @pytest.fixture
@@ -46,7 +46,7 @@ def tool(status: dict[str, Any]) -> list[float]:
     """Where the commanded joints have the tool, m."""
     model = load(default_config()).arm
     assert model is not None
-    return list(forward(model, status["joints"]["target"]).position)
+    return list(forward(model, status["joints"]["commanded_position"]).position)
 
 
 def far(one: list[float], other: list[float]) -> float:
@@ -67,11 +67,11 @@ def test_a_pose_is_reached_on_a_line_and_by_the_joints(bent: Platform) -> None:
 
 
 def test_a_pose_out_of_reach_is_refused_with_the_reason_and_nothing_moves(bent: Platform) -> None:
-    before = bent.status()["joints"]["target"]
+    before = bent.status()["joints"]["commanded_position"]
     for options in ((), ("--line",)):
         done = bent.rtcp("move", "--pose", "-2", "0", "0.6", "0", "0", "0", *options, check=3)
         assert "out of reach" in done.stderr
-    assert bent.status()["joints"]["target"] == before
+    assert bent.status()["joints"]["commanded_position"] == before
 
 
 def test_a_trajectory_file_is_run_with_progress(bent: Platform, tmp_path: Path) -> None:
@@ -80,7 +80,7 @@ def test_a_trajectory_file_is_run_with_progress(bent: Platform, tmp_path: Path) 
     file.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 2, q: {there}}}\n  - {{t: 4, q: {BENT}}}\n")
     done = bent.rtcp("run", str(file))
     assert "moving:" in done.stdout
-    assert far(bent.status()["joints"]["target"], BENT) < 1e-6
+    assert far(bent.status()["joints"]["commanded_position"], BENT) < 1e-6
 
 
 def test_ctrl_c_stops_a_line_on_its_way(bent: Platform) -> None:
@@ -120,20 +120,20 @@ def test_a_jogger_that_is_killed_leaves_an_arm_at_rest(bent: Platform) -> None:
     jogging.communicate()
     found = bent.until(lambda found: found["state"] == "holding", "rest")
     assert found["lease"]["holder"] in ("", None)
-    again = bent.status()["joints"]["target"]
-    assert again == found["joints"]["target"]
+    again = bent.status()["joints"]["commanded_position"]
+    assert again == found["joints"]["commanded_position"]
 
 
 def test_a_jogger_that_was_suspended_does_not_move_the_arm_again(bent: Platform) -> None:
     jogging = bent.background("jog", "joint1", "0.2", "--seconds", "30")
     bent.until_moving()
     jogging.send_signal(signal.SIGSTOP)
-    rest = bent.until(lambda found: found["state"] == "holding", "rest")["joints"]["target"]
+    rest = bent.until(lambda found: found["state"] == "holding", "rest")["joints"]["commanded_position"]
     jogging.send_signal(signal.SIGCONT)
     _, trouble = jogging.communicate(timeout=20)
     assert jogging.returncode == 5
     assert "the arm had stopped, and stays so" in trouble
-    assert bent.status()["joints"]["target"] == rest
+    assert bent.status()["joints"]["commanded_position"] == rest
 
 
 def test_ctrl_z_stops_a_move_on_its_way(bent: Platform) -> None:
@@ -144,7 +144,7 @@ def test_ctrl_z_stops_a_move_on_its_way(bent: Platform) -> None:
     assert moving.returncode == 148
     assert "ended, not suspended" in trouble
     found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert found["joints"]["target"][0] < 0.6
+    assert found["joints"]["commanded_position"][0] < 0.6
 
 
 def test_an_object_that_does_not_come_is_a_timeout_and_one_that_is_refused_a_refusal(bent: Platform) -> None:
@@ -158,12 +158,12 @@ def test_an_object_that_does_not_come_is_a_timeout_and_one_that_is_refused_a_ref
 
 
 def test_a_second_jogger_is_refused_with_the_firsts_name(bent: Platform, client: ControlClient) -> None:
-    client.call("jog", {"v": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
+    client.call("jog", {"velocity": [0, 0.02, 0, 0, 0, 0], "frame": "base", "hold_s": 0.5})
     with (
         ControlClient("another", control_socket(bent.directory)) as other,
         pytest.raises(RtcpError, match="the arm is commanded by a test") as raised,
     ):
-        other.call("jog", {"v": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
+        other.call("jog", {"velocity": [0, -0.02, 0, 0, 0, 0], "frame": "base"})
     assert raised.value.kind == "refused"
 
 
@@ -171,41 +171,41 @@ def test_a_stream_is_followed_and_its_end_stops_the_arm(bent: Platform, client: 
     q = list(BENT)
     for _ in range(50):
         q[0] += 0.004
-        client.call("stream", {"q": q, "t": time.monotonic()})
+        client.call("stream_position", {"q": q, "stamp_s": time.monotonic()})
         time.sleep(0.02)
     found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert abs(found["joints"]["target"][0] - q[0]) < 0.03
+    assert abs(found["joints"]["commanded_position"][0] - q[0]) < 0.03
 
 
 def test_joint_speeds_move_in_mode_velocity_only(bent: Platform, client: ControlClient) -> None:
     with pytest.raises(RtcpError, match="the arm is in mode joint"):
-        client.call("velocity", {"numbers": [0.1, 0, 0, 0, 0, 0]})
-    client.call("motion", {"name": "velocity"})
-    start = client.call("status")["joints"]["target"][0]
+        client.call("move_at_velocity", {"velocity": [0.1, 0, 0, 0, 0, 0]})
+    client.call("mode", {"name": "velocity"})
+    start = client.call("status")["joints"]["commanded_position"][0]
     for _ in range(20):
-        client.call("velocity", {"numbers": [0.1, 0, 0, 0, 0, 0]})
+        client.call("move_at_velocity", {"velocity": [0.1, 0, 0, 0, 0, 0]})
         time.sleep(0.05)
     found = bent.until(lambda found: found["state"] == "holding", "rest")
-    assert found["mode"] == "csv"
-    assert 0.05 < found["joints"]["target"][0] - start < 0.25
+    assert found["drive_mode"] == "csv"
+    assert 0.05 < found["joints"]["commanded_position"][0] - start < 0.25
 
 
 def test_a_stiffness_in_mode_torque_holds_the_arm_where_it_is(bent: Platform, client: ControlClient) -> None:
-    client.call("motion", {"name": "torque"})
-    start = client.call("status")["joints"]["position"]
+    client.call("mode", {"name": "torque"})
+    start = client.call("status")["joints"]["actual_position"]
     for _ in range(20):
-        client.call("torque", {"numbers": [0] * 6, "stiffness": 1.0, "damping": 1.0})
+        client.call("apply_torque", {"torque": [0.0] * 6, "stiffness": 1.0, "damping": 1.0})
         time.sleep(0.05)
-    assert far(client.call("status")["joints"]["position"], start) < 0.01
+    assert far(client.call("status")["joints"]["actual_position"], start) < 0.01
 
 
 def test_the_stick_moves_the_arm_and_silence_lets_it_go(bent: Platform, client: ControlClient) -> None:
-    client.call("motion", {"name": "joystick"})
-    client.call("stick", {"byte": 63})
+    client.call("mode", {"name": "joystick"})
+    client.call("joystick", {"byte": 63})
     start = tool(client.call("status"))
     until = time.monotonic() + 1.5
     while time.monotonic() < until:
-        client.call("stick", {"byte": 61})
+        client.call("joystick", {"byte": 61})
         time.sleep(0.1)
     moved = client.call("status")
     assert moved["state"] == "moving"
@@ -262,7 +262,7 @@ def test_a_stick_is_let_go_of_by_the_box_itself_when_the_gateway_is_killed(runni
         return latest is not None and int(latest[0]["inputs"]) & 0xFF == byte
 
     with ControlClient("a test", control_socket(running.directory)) as client:
-        client.call("stick", {"byte": 62, "hold_s": 1.0})
+        client.call("joystick", {"byte": 62, "hold_s": 1.0})
         wait_for(lambda: shows(62))
         kill(running.pids()["gateway"])
     wait_for(lambda: shows(63))

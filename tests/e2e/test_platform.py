@@ -24,7 +24,7 @@ Q = ["0.3", "-0.2", "0.4", "-0.1", "0.25", "-0.35"]
 
 
 def distance(status: dict, q: list[str]) -> float:  # type: ignore[type-arg]
-    return max(abs(have - float(want)) for have, want in zip(status["joints"]["position"], q, strict=True))
+    return max(abs(have - float(want)) for have, want in zip(status["joints"]["actual_position"], q, strict=True))
 
 
 def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> None:
@@ -78,7 +78,7 @@ def test_a_move_ends_within_a_milliradian(enabled: Platform, mode: str) -> None:
     enabled.rtcp("mode", mode)
     enabled.rtcp("move", *Q)
     status = enabled.until(lambda found: distance(found, Q) < 1e-3, f"arrival in {mode}")
-    assert status["mode"] == mode
+    assert status["drive_mode"] == mode
     assert status["state"] == "holding"
     enabled.rtcp("move", "--", *["-0.05"] * 6)
     enabled.until(lambda found: distance(found, ["-0.05"] * 6) < 1e-3, f"arrival in {mode}")
@@ -87,15 +87,15 @@ def test_a_move_ends_within_a_milliradian(enabled: Platform, mode: str) -> None:
 def test_the_arm_holds_between_commands(enabled: Platform) -> None:
     for mode in ("csp", "csv", "cst"):
         enabled.rtcp("mode", mode)
-        before = enabled.status()["joints"]["position"]
+        before = enabled.status()["joints"]["actual_position"]
         time.sleep(0.5)
-        after = enabled.status()["joints"]["position"]
+        after = enabled.status()["joints"]["actual_position"]
         assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 1e-3, mode
 
 
 def test_the_arm_holds_against_gravity_through_every_change_of_mode(enabled: Platform) -> None:
     enabled.rtcp("move", "0", "-1.2", "-0.3", "0", "0", "0")
-    before = enabled.status()["joints"]["position"]
+    before = enabled.status()["joints"]["actual_position"]
     observer = Observer(blackboard_file(enabled.directory))
     first = observer.head
     for mode in ("cst", "csv", "cst", "csp", "csv", "csp"):
@@ -107,12 +107,12 @@ def test_the_arm_holds_against_gravity_through_every_change_of_mode(enabled: Pla
 
 
 def test_enabling_does_not_move_the_arm(shared: Platform) -> None:
-    before = shared.status()["joints"]["position"]
+    before = shared.status()["joints"]["actual_position"]
     shared.rtcp("enable")
     status = shared.status()
     assert status["state"] == "holding"
-    assert max(abs(a - b) for a, b in zip(before, status["joints"]["position"], strict=True)) < 1e-3
-    assert max(abs(a - b) for a, b in zip(before, status["joints"]["target"], strict=True)) < 1e-3
+    assert max(abs(a - b) for a, b in zip(before, status["joints"]["actual_position"], strict=True)) < 1e-3
+    assert max(abs(a - b) for a, b in zip(before, status["joints"]["commanded_position"], strict=True)) < 1e-3
     shared.rtcp("disable")
     assert shared.status()["state"] == "ready"
 
@@ -130,11 +130,11 @@ def test_enabling_does_not_move_the_arm(shared: Platform) -> None:
 def test_what_is_not_allowed_is_refused_and_nothing_moves(
     enabled: Platform, arguments: list[str], code: int | None, said: str
 ) -> None:
-    before = enabled.status()["joints"]["target"]
+    before = enabled.status()["joints"]["commanded_position"]
     done = enabled.rtcp(*arguments, check=code)
     assert done.returncode in (2, 3)
     assert said in " ".join(done.stderr.split())
-    assert enabled.status()["joints"]["target"] == before
+    assert enabled.status()["joints"]["commanded_position"] == before
 
 
 def test_moves_that_the_generator_finds_hard_are_made_or_refused(enabled: Platform) -> None:
@@ -186,7 +186,7 @@ def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform)
     moving.kill()
     moving.wait()
     status = enabled.until(lambda found: found["state"] == "holding", "standstill")
-    assert 0.0 < status["joints"]["position"][0] < 1.4
+    assert 0.0 < status["joints"]["actual_position"][0] < 1.4
     assert any("controlled stop" in sentence for sentence in status["messages"])
     enabled.rtcp("move", *["0"] * 6)
 

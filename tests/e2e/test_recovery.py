@@ -67,7 +67,7 @@ def reset_and_enable(platform: Platform) -> None:
 def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     enabled: Platform, segment: SegmentClient, tmp_path: Path
 ) -> None:
-    enabled.call("motion", name="joint")
+    enabled.call("mode", name="joint")
     moving = enabled.background("move", "1.5", "0.5", "0.3", "0", "0", "0", "--speed", "0.3")
     enabled.until_moving()
     observer = Observer(blackboard_file(enabled.directory))
@@ -76,7 +76,9 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     with enabled.capture(path):
         lose(enabled, segment, [{"fault": "power", "slave": 4, "lasts": 0.2}])
         assert moving.wait() == 5
-        enabled.until(lambda found: not any(abs(one) > 0.002 for one in found["joints"]["velocity"]), "standstill")
+        enabled.until(
+            lambda found: not any(abs(one) > 0.002 for one in found["joints"]["actual_velocity"]), "standstill"
+        )
         stood = enabled.status()["joints"]
         time.sleep(0.3)
         assert enabled.status()["state"] == "fault"
@@ -117,7 +119,7 @@ def test_an_io_box_that_was_without_supply_takes_the_segments_time_up_again(
     passed = np.diff(good["dc_time_ns"].astype(np.int64)) - np.diff(good["time_ns"].astype(np.int64))
     assert np.abs(passed).max() < 5_000_000
     assert np.abs(np.diff(records["target"], axis=0)).max() <= LARGEST_STEP
-    told = [one["sentence"] for one in enabled.status()["events"]]
+    told = list(enabled.status()["messages"])
     assert any("slave 1 (io) is back in OP" in sentence for sentence in told), told
 
 
@@ -131,7 +133,7 @@ def test_a_fall_that_is_over_at_once_still_needs_a_reset(enabled: Platform, segm
     with pytest.raises(RtcpError, match="fault"):
         enabled.call("enable")
     assert enabled.status()["state"] == "fault"
-    told = [one["sentence"] for one in found["events"]]
+    told = list(found["messages"])
     (fell,) = [one for one in told if "left OP: it is in" in one]
     for part in ("slave 3 (drive2)", "SAFE-OP + ERROR", "0x001A: synchronization error", "check the cycle's jitter"):
         assert part in fell
@@ -171,7 +173,7 @@ def test_a_cable_that_damages_frames_is_named_with_the_errors_counted(shared: Pl
     shared.until(
         lambda found: found["slaves"][5]["errors"]["forwarded"] == before[5]["errors"]["forwarded"] + 40, "forwarded"
     )
-    told = [one["sentence"] for one in shared.status()["events"]]
+    told = list(shared.status()["messages"])
     assert any("errors enter between slave 4 (drive3) and slave 5 (drive4): " in one for one in told), told
     shown = shared.rtcp("status").stdout
     assert "lost/err/links" in shown

@@ -28,8 +28,8 @@ FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=
 
 @pytest.fixture(autouse=True)
 def simulated_time(rig: LoopRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The gateway waits by the clock of the rig, whatever else the host has to do."""
-    monkeypatch.setattr(command_channel, "monotonic", lambda: rig.now_ns * 1e-9)
+    """The gateway waits so many cycles, whatever else the host has to do."""
+    monkeypatch.setattr(command_channel, "monotonic", lambda: rig.observer.head * PERIOD_S)
     monkeypatch.setattr(command_channel, "_POLL_S", 0.0)
 
 

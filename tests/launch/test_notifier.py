@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rtcp.ipc.machine import State
 
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.states import State
 from rtcp.launch.supervisor import Notifier
 
 JOINTS = 6

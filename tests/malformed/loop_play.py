@@ -9,7 +9,8 @@ from dataclasses import replace
 from random import Random
 
 from rtcp.config import default_config, load
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from tests.malformed.mutate import EDGES
 from tests.malformed.segment_play import Found, Memory
@@ -162,7 +163,7 @@ def _play(count: int, seed: int, mode: str) -> Found:
                 memory = Memory()
             garbler.share = random.choice(_SHARES)
             try:
-                _deed(simulation, random)
+                _send_something(simulation, random)
                 for _ in range(random.randrange(_STRETCH)):
                     before = simulation.now_ns
                     simulation.cycle()
@@ -185,18 +186,18 @@ def _play(count: int, seed: int, mode: str) -> Found:
     return found
 
 
-def _deed(simulation: Simulation, random: Random) -> None:
+def _send_something(simulation: Simulation, random: Random) -> None:
     """Enable, move, jog, halt, come back: whatever fits the state, and now and then what does not."""
     state = simulation.state
     if state in (State.FAULT, State.STOPPED_BY_LIMIT, State.EMERGENCY_STOP):
-        simulation.order(Command.RESET)
+        simulation.send(Reset())
     elif state is State.READY:
-        simulation.order(Command.ENABLE)
+        simulation.send(Enable())
     elif random.random() < 0.6:
         speed = random.choice((0.0, 0.5))
-        simulation.order(Command.MOVE, [*(q + random.uniform(-0.3, 0.3) for q in START), speed])
+        simulation.send(MoveJoints(tuple(q + random.uniform(-0.3, 0.3) for q in START), speed, True))
     else:
-        simulation.order(random.choice((Command.STOP, Command.DISABLE, Command.ENABLE, Command.RESET)))
+        simulation.send(random.choice((Halt(), Disable(), Enable(), Reset())))
 
 
 def _sane(simulation: Simulation) -> bool:
@@ -204,10 +205,10 @@ def _sane(simulation: Simulation) -> bool:
     simulation.run(0.5)
     for _ in range(5):
         if simulation.state not in (State.READY, State.HOLDING, State.MOVING):
-            simulation.order(Command.RESET)
+            simulation.send(Reset())
             simulation.run(1.0)
         if simulation.state is State.READY:
-            simulation.order(Command.ENABLE)
+            simulation.send(Enable())
             simulation.run(1.0)
         if simulation.state is State.HOLDING:
             return True

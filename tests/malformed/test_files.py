@@ -13,7 +13,6 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from rtcp.gateway.limit_keeper import _read as read_kept_limits
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.faults import load_script
@@ -21,6 +20,7 @@ from rtcp.config.loader import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, store_zero, zero_file
+from rtcp.gateway.limit_settings import _read as read_kept_limits
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
 from rtcp.ipc.observer import BlackboardError, Observer

@@ -7,11 +7,20 @@ from math import sqrt
 from random import Random
 
 from kinematics import forward
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import (
+    ApplyTorque,
+    Command,
+    Jog,
+    MoveAtVelocity,
+    Reset,
+    RunLines,
+    RunTrajectory,
+    StreamPosition,
+)
+from rtcp.ipc.states import JogFrame, State
 from rtcp.motion.limits import Values
-from tests.sessions.driver import NONSENSE, STICK, Driver, configuration, is_free
+from tests.sessions.driver import NONSENSE, ODD_INTEGERS, STICK, Driver, configuration, is_free
 
-COMMANDS = {name: int(command) for name, command in Command.__members__.items()}
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
 """Column 19 of a plan's row (`rtcp.motion.planning.plan`)."""
 HOLD_S = 0.2
@@ -29,9 +38,13 @@ class Deeds:
         """Return the number, or now and then one that nobody should send."""
         return self.random.choice(NONSENSE) if self.random.random() < share else number
 
-    def order(self, name: str, numbers: list[float] | None = None) -> bool:
-        """Give a command, if there is one of that name."""
-        return name in COMMANDS and self.driver.order(COMMANDS[name], numbers or [])
+    def or_odd(self, number: int) -> int:
+        """Return the integer, or now and then one that nobody should send."""
+        return self.random.choice(ODD_INTEGERS) if self.random.random() < 0.03 else number
+
+    def send(self, command: Command) -> bool:
+        """Send a command."""
+        return self.driver.send(command)
 
     def goes_on(self, taken: bool) -> bool:
         """Whether a commander says it again: not for long where it was refused."""
@@ -43,9 +56,6 @@ class Deeds:
 
     def _near(self, by: float) -> list[float]:
         return [q + self.random.uniform(-by, by) for q in self.driver.commanded]
-
-    def _padded(self, numbers: list[float], *last: float) -> list[float]:
-        return [*numbers, *[0.0] * (12 - len(numbers) - len(last)), *last]
 
     # -- plans ------------------------------------------------------------------------------------------------------
 
@@ -68,7 +78,7 @@ class Deeds:
         if random.random() < 0.1:
             rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
         slot = self.driver.simulation.observer.write_plan(rows)
-        self.order("TRAJECTORY", [self.or_nonsense(slot), self.or_nonsense(len(rows))])
+        self.send(RunTrajectory(self.or_odd(slot), self.or_odd(len(rows))))
 
     def invade(self) -> None:
         """A smooth trajectory to where a point of the arm would be in a keep-out box, or the tool outside its box."""
@@ -83,7 +93,7 @@ class Deeds:
         took = 0.1 + max(abs(b - a) for a, b in zip(here, there, strict=True)) / self.random.choice((0.1, 0.25))
         rows = [[t, *q, *[0.0] * 12, QUINTIC] for t, q in ((0.0, here), (took, there))]
         slot = self.driver.simulation.observer.write_plan(rows)
-        if self.order("TRAJECTORY", [slot, len(rows)]):
+        if self.send(RunTrajectory(slot, len(rows))):
             self.seconds(0.5 * took, took)
 
     def line(self) -> None:
@@ -106,7 +116,7 @@ class Deeds:
         if random.random() < 0.1:
             rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
         slot = self.driver.simulation.observer.write_plan(rows)
-        self.order("LINE", [self.or_nonsense(slot), self.or_nonsense(len(rows))])
+        self.send(RunLines(self.or_odd(slot), self.or_odd(len(rows))))
 
     # -- what has to be said again and again --------------------------------------------------------------------------
 
@@ -124,8 +134,8 @@ class Deeds:
             target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
             sent = self._near(0.5) if random.random() < 0.03 else target
             stamp = driver.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
-            numbers = [self.or_nonsense(q, 0.01) for q in sent]
-            taken = self.order("STREAM", self._padded(numbers, self.or_nonsense(stamp, 0.01)))
+            q = tuple(self.or_nonsense(q, 0.01) for q in sent)
+            taken = self.send(StreamPosition(q, self.or_nonsense(stamp, 0.01)))
             if not self.goes_on(taken):
                 return
             driver.wait(max(1, int(interval * random.uniform(0.5, 1.5) / self._period_s)))
@@ -133,16 +143,15 @@ class Deeds:
     def jog(self) -> None:
         """Speeds of the tool or of joints, held for a while."""
         random = self.random
-        frame = float(random.randrange(3))
+        frame = random.choice(list(JogFrame))
         speeds = [
             random.choice((0.0, 0.0, 1.0, -1.0))
-            * (random.choice((0.05, 0.1, 0.2, 0.3)) if frame == 2 or axis > 2 else 0.1)
+            * (random.choice((0.05, 0.1, 0.2, 0.3)) if frame is JogFrame.JOINTS or axis > 2 else 0.1)
             for axis in range(6)
         ]
         for _ in range(random.randrange(1, 9)):
-            numbers = [self.or_nonsense(v, 0.01) for v in speeds]
-            last = (self.or_nonsense(frame, 0.01), self.or_nonsense(HOLD_S, 0.01))
-            if not self.goes_on(self.order("JOG", self._padded(numbers, *last))):
+            velocity = tuple(self.or_nonsense(v, 0.01) for v in speeds)
+            if not self.goes_on(self.send(Jog(velocity, frame, self.or_nonsense(HOLD_S, 0.01)))):
                 return
             self.seconds(0.02, 0.15)
             if random.random() < 0.1:
@@ -153,9 +162,9 @@ class Deeds:
         random = self.random
         for _ in range(random.randrange(1, 5)):
             speeds = [random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)) for _ in range(6)]
-            numbers = [self.or_nonsense(v, 0.01) for v in speeds]
+            velocity = tuple(self.or_nonsense(v, 0.01) for v in speeds)
             hold_s = self.or_nonsense(random.choice((0.1, 0.5, 1.0)), 0.02)
-            if not self.goes_on(self.order("VELOCITY", self._padded(numbers, hold_s))):
+            if not self.goes_on(self.send(MoveAtVelocity(velocity, hold_s))):
                 return
             self.seconds(0.02, 0.4)
 
@@ -165,10 +174,10 @@ class Deeds:
         for _ in range(random.randrange(1, 5)):
             size = random.choice((1.0, 5.0, 20.0))
             torques = [random.uniform(-size, size) for _ in range(6)]
-            numbers = [self.or_nonsense(v, 0.01) for v in torques]
-            shares = [random.choice((0.0, 0.5, 1.0)), random.choice((0.0, 1.0))]
+            torque = tuple(self.or_nonsense(v, 0.01) for v in torques)
+            stiffness, damping = random.choice((0.0, 0.5, 1.0)), random.choice((0.0, 1.0))
             hold_s = self.or_nonsense(random.choice((0.1, 0.5)), 0.02)
-            if not self.goes_on(self.order("TORQUE", self._padded(numbers, *shares, hold_s))):
+            if not self.goes_on(self.send(ApplyTorque(torque, stiffness, damping, hold_s))):
                 return
             self.seconds(0.02, 0.4)
 
@@ -230,7 +239,7 @@ class Deeds:
         self.driver.press(False)
         self.seconds(0.0, 0.1)
         if self.random.random() < 0.8:
-            self.order("RESET")
+            self.send(Reset())
             self.driver.simulation.until(lambda: self.driver.state is not State.RESETTING, 0.5)
 
 

@@ -1,21 +1,30 @@
-"""A commander that plays with a simulated arm as a user, a broken program and a bad day would; the judge beside it."""
+"""A commander of a simulated arm that acts like a user, a broken program and a bad day; the judge beside it."""
 
 from __future__ import annotations
 
+import mmap
+import struct
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from math import inf, nan
+from random import Random
+from typing import Any
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import COMMANDS, Command, Enable, Reset, SetLimits, SetZero
+from rtcp.ipc.message import PAYLOAD_SIZE, Joints, MalformedMessage
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.limits import Values, rows
 from tests.sessions.geometry import Box, depth, points
 from tests.sessions.judge import COUNTS, Bounds, Judge
 
+KINDS = sorted((kind for kind in COMMANDS if kind.__module__ == Command.__module__), key=lambda kind: kind.name)
+"""All commands of the platform; a test of another file may have registered its own."""
+ODD_INTEGERS = (-1, 0, 7, 99, 1 << 40, -(1 << 63), (1 << 63) - 1)
 PERIODS_US = (1000, 1250, 1500, 2000)
 DRIVE_MODES = (8, 9, 10)
 FAULTS = (0x2310, 0x3210, 0x3220, 0x4310, 0x8130, 0x8400, 0x8611, 0x8612, 0x7305)
@@ -56,6 +65,52 @@ def is_free(bounds: Bounds, q: Sequence[float], clearance: float = 0.0) -> bool:
     return all(depth(point, box) < -clearance for box in bounds.keep_out for point in seen)
 
 
+class Raw:
+    """Bytes in the place of a command: doubles where the fields of the kind `number` would be."""
+
+    name = "raw"
+
+    def __init__(self, number: int, numbers: Sequence[float]) -> None:
+        self.number = number
+        count = PAYLOAD_SIZE // 8
+        self.payload = struct.pack(f"<{count}d", *[*numbers, *[0.0] * count][:count])
+
+    def __repr__(self) -> str:
+        return f"Raw({self.number}, {self.payload.hex()})"
+
+    @property
+    def decoded(self) -> Command | None:
+        """The command that the bytes are, or None."""
+        try:
+            return COMMANDS.unpack_from(self.number, self.payload, 0)
+        except MalformedMessage:
+            return None
+
+    def pack_into(self, memory: mmap.mmap | bytearray, at: int) -> None:
+        """Write the bytes."""
+        memory[at : at + PAYLOAD_SIZE] = self.payload
+
+
+def random_command(random: Random) -> Command:
+    """Return a command of any kind, with fields that are of the right types and of any value."""
+    kind = random.choice(KINDS)
+    return kind(*(_random_field(field, random) for _, field in kind._fields))
+
+
+def _random_field(kind: Any, random: Random) -> Any:
+    if kind == Joints:
+        return tuple(_random_number(random) for _ in range(random.choice((0, 2, 6, 6, 6, 8))))
+    if kind is float:
+        return _random_number(random)
+    if kind is int:
+        return random.choice((random.randrange(8), random.choice(ODD_INTEGERS)))
+    return random.choice((False, True) if kind is bool else list(kind))
+
+
+def _random_number(random: Random) -> float:
+    return random.choice(NONSENSE) if random.random() < 0.03 else random.uniform(-3.0, 3.0)
+
+
 class Driver:
     """Commands, mishaps and time; counts what became of them.
 
@@ -91,7 +146,7 @@ class Driver:
         self.simulation.until(lambda: self.state is State.READY, START_S)
 
     def _see(self, frame: Frame) -> None:
-        self.states[self.simulation.parts.behaviour.state] += 1
+        self.states[self.simulation.state] += 1
         self.judge.see(frame)
 
     def close(self) -> None:
@@ -124,26 +179,28 @@ class Driver:
                 return
             self.simulation.cycle()
 
-    def order(self, kind: int, numbers: Sequence[float] = (), lease: int | None = None) -> bool:
-        """Give a command; return whether it was taken."""
+    def send(self, command: Command, lease: int | None = None) -> bool:
+        """Send a command; return whether it was accepted."""
         if self.simulation.done:
             return False
-        known = kind in Command.__members__.values()
-        name = Command(kind).name.lower() if known else "unknown"
-        self.log.append(f"{self.simulation.now_ns * 1e-9:.4f} {self.state.name} {name} {[*numbers]}")
-        answer = self.simulation.order(kind, numbers, lease)
-        taken = answer.refusal == 0
-        (self.taken if taken else self.refused)[name] += 1
-        self.log[-1] += f" -> {answer.refusal}"
-        if taken and name == "zero":
-            self.judge.zero[int(numbers[0])] = round(numbers[1] * COUNTS)
-        return taken
+        self.log.append(f"{self.simulation.now_ns * 1e-9:.4f} {self.state.name} {command}")
+        refusal = self.simulation.send(command, lease).refusal
+        (self.taken if refusal is None else self.refused)[command.name] += 1
+        self.log[-1] += f" -> {refusal}"
+        if refusal is None and isinstance(command, SetZero):
+            self.judge.zero[command.axis] = round(command.offset * COUNTS)
+        return refusal is None
+
+    def send_raw(self, number: int, numbers: Sequence[float]) -> bool:
+        """Send bytes that may be no command; return whether they were accepted as one."""
+        raw = Raw(number, numbers)
+        return self.send(raw.decoded or raw)  # type: ignore[arg-type]
 
     def set_limits(self, new: Values) -> bool:
         """Change the limits; the judge knows them from the frame on that is worked out under them."""
         plan = rows(new)
         slot = self.simulation.observer.write_plan(plan)
-        if not self.order(Command.LIMITS, [slot, len(plan)]):
+        if not self.send(SetLimits(slot, len(plan))):
             return False
         self.limits = new
         bounds = self.bounds
@@ -162,10 +219,10 @@ class Driver:
     def enable(self) -> None:
         """Enable, and come back from whatever keeps the arm from it."""
         if self.state in (State.FAULT, State.STOPPED_BY_LIMIT, State.EMERGENCY_STOP):
-            self.order(Command.RESET)
+            self.send(Reset())
             self.simulation.until(lambda: self.state in (State.READY, State.HOLDING, State.FAULT), 0.5)
         if self.state is State.READY:
-            self.order(Command.ENABLE)
+            self.send(Enable())
             self.simulation.until(lambda: self.state is not State.ENABLING, 0.1)
 
     def fault(self, axis: int, code: int) -> None:
@@ -220,6 +277,6 @@ class Driver:
 
 
 def with_start(config: ArmConfig, period_us: float, mode: str, motion: str = "joint") -> ArmConfig:
-    """Return the configuration with another cycle, drive mode and motion mode."""
+    """Return the configuration with another cycle, drive mode and control mode."""
     cycle = replace(config.cycle, period_us=period_us)
     return replace(config, cycle=cycle, drive_mode=mode, control_mode=motion)  # type: ignore[arg-type]

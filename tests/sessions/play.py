@@ -8,16 +8,29 @@ from dataclasses import dataclass, field
 from random import Random
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import (
+    Disable,
+    Enable,
+    Halt,
+    MoveGripper,
+    MoveJoints,
+    Reset,
+    SetControlMode,
+    SetDriveMode,
+    SetOutput,
+    Shutdown,
+)
+from rtcp.ipc.states import ControlMode, DriveMode, State
 from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
-    DRIVE_MODES,
     FAULTS,
+    KINDS,
     PERIODS_US,
     Driver,
     bounds_of,
     configuration,
     is_free,
+    random_command,
     with_start,
 )
 
@@ -79,15 +92,16 @@ class Player:
         self.actions: list[tuple[int, Callable[[], object]]] = [
             (4, self._enable),
             (24, self._begin_motion),
-            (5, lambda: deeds.order("STOP")),
-            (2, lambda: deeds.order("DISABLE")),
-            (2, lambda: deeds.order("MODE", [deeds.or_nonsense(random.choice(DRIVE_MODES))])),
+            (5, lambda: deeds.send(Halt())),
+            (2, lambda: deeds.send(Disable())),
+            (2, lambda: deeds.send(SetDriveMode(random.choice(list(DriveMode))))),
             (4, self._change_motion),
-            (2, lambda: deeds.order("OUTPUT", [deeds.or_nonsense(random.randrange(0, 18)), random.randrange(3)])),
-            (1, lambda: deeds.order("GRIPPER", [deeds.or_nonsense(random.randrange(2))])),
-            (2, lambda: deeds.order("RESET")),
-            (1, lambda: driver.order(random.randrange(64), [self._number() for _ in range(12)])),
-            (1, lambda: driver.order(Command.MOVE, self._move_numbers(), lease=random.randrange(3))),
+            (2, lambda: deeds.send(SetOutput(deeds.or_odd(random.randrange(0, 18)), random.random() < 0.5))),
+            (1, lambda: deeds.send(MoveGripper(random.random() < 0.5))),
+            (2, lambda: deeds.send(Reset())),
+            (1, lambda: driver.send(random_command(random))),
+            (1, lambda: driver.send_raw(self._kind(), [self._number() for _ in range(14)])),
+            (1, lambda: driver.send(self._random_move(), lease=random.randrange(3))),
             (1, lambda: driver.fault(random.randrange(6), random.choice(FAULTS))),
             (2, lambda: driver.lose(random.choice((1, 1, 2, 5, 20, 60)), random.random() < 0.5)),
             (1, lambda: driver.drop(random.randrange(1, 8))),
@@ -110,11 +124,14 @@ class Player:
             if not free or is_free(bounds, found, 0.01):
                 return found
 
+    def _kind(self) -> int:
+        return self.random.choice((self.random.randrange(1 << 32), self.random.choice(KINDS).number))
+
     def _number(self) -> float:
         return self.deeds.or_nonsense(self.random.uniform(-3.0, 3.0))
 
     def _begin_motion(self) -> None:
-        """Mostly one that the motion mode takes, now and then another."""
+        """Mostly one that the control mode takes, now and then another."""
         deeds, motion = self.deeds, self.motion
         if self.random.random() < 0.1:
             motion = self.random.randrange(1, 6)
@@ -130,17 +147,17 @@ class Player:
             )()
 
     def _change_motion(self) -> None:
-        wanted = self.random.choices(range(1, 6), SHARES)[0]
-        if self.deeds.order("MOTION", [self.deeds.or_nonsense(wanted)]):
+        (wanted,) = self.random.choices(list(ControlMode), SHARES)
+        if self.deeds.send(SetControlMode(wanted)):
             self.motion = wanted
 
     def _enable(self) -> None:
         if self.random.random() < 0.9:
             self.driver.enable()
         else:
-            self.deeds.order("ENABLE")
+            self.deeds.send(Enable())
 
-    def _move_numbers(self) -> list[float]:
+    def _random_move(self) -> MoveJoints:
         random, bounds = self.random, self.bounds
         span = random.choice((1.0, 1.0, 0.2, 0.02))
         here = self.driver.commanded
@@ -155,10 +172,10 @@ class Player:
             kept = random.randrange(6)
             target = [q if axis != kept else wanted for axis, (q, wanted) in enumerate(zip(here, target, strict=True))]
         speed = random.choice((0.5, 0.5, 0.2, random.uniform(0.0, 0.6)))
-        return [*target, *[0.0] * 4, float(random.randrange(2)), self.deeds.or_nonsense(speed)]
+        return MoveJoints(tuple(target), self.deeds.or_nonsense(speed), random.random() < 0.5)
 
     def _move(self) -> None:
-        self.deeds.order("MOVE", self._move_numbers())
+        self.deeds.send(self._random_move())
 
     def _silence(self) -> None:
         self.driver.fall_silent()
@@ -187,7 +204,7 @@ class Player:
                 if random.random() < 0.3:
                     driver.wait(int(random.uniform(0.0, LONGEST_WAIT_S) / self.period_s))
             if random.random() < 0.15:
-                driver.order(Command.SHUTDOWN)
+                driver.send(Shutdown())
                 driver.wait(int(2.5 / self.period_s))
         finally:
             driver.close()

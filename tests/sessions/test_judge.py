@@ -9,7 +9,8 @@ from math import pi
 import pytest
 
 from kinematics import forward
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import Halt, MoveJoints, SetDriveMode
+from rtcp.ipc.states import DriveMode, State
 from tests.sessions.driver import Driver, configuration, is_free, with_start
 from tests.sessions.geometry import depth, points
 from tests.sessions.judge import CSP, CST, CSV, ENABLE_OPERATION, WIRE
@@ -53,8 +54,7 @@ def enable(driver: Driver) -> None:
 
 
 def move(driver: Driver, by: float = 0.5, speed: float = 0.4) -> None:
-    target = [q + by for q in START]
-    assert driver.order(Command.MOVE, [*target, *[0.0] * 5, speed])
+    assert driver.send(MoveJoints(tuple(q + by for q in START), speed, True))
     driver.wait(700)
 
 
@@ -67,7 +67,7 @@ def test_a_sound_loop_is_not_blamed(mode: str) -> None:
         driver.wait(20)
         driver.lose(3, heard=True)
         driver.wait(20)
-        driver.order(Command.STOP)
+        driver.send(Halt())
         driver.wait(500)
         assert driver.violations == []
         assert driver.judge.obeyed > 1000
@@ -195,7 +195,7 @@ def test_a_set_point_that_jumps_on_the_change_of_the_mode_is_seen() -> None:
         for wanted in (CST, CSP):
             if wanted == CSP:
                 spoil(driver, defect)
-            assert driver.order(Command.MODE, [wanted])
+            assert driver.send(SetDriveMode(DriveMode(wanted)))
             driver.wait(100)
         assert "after the change of mode" in driver.violations[0]
 

@@ -9,11 +9,12 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import Command, Disable, Halt, MoveJoints, Reset, SetControlMode, SetDriveMode, Shutdown
+from rtcp.ipc.states import ControlMode, DriveMode, State
 from tests.sessions.deeds import Deeds
 from tests.sessions.driver import (
-    DRIVE_MODES,
     FAULTS,
+    KINDS,
     NONSENSE,
     PERIODS_US,
     STICK,
@@ -21,6 +22,7 @@ from tests.sessions.driver import (
     bounds_of,
     configuration,
     is_free,
+    random_command,
     with_start,
 )
 from tests.sessions.play import MOTIONS, Outcome, play
@@ -42,7 +44,7 @@ def test_the_sessions_visit_every_state_and_give_every_command() -> None:
     assert total.failures == []
     assert set(State.__members__) - set(total.states) <= {"OFF", "HOMING"}
     given = set(total.taken) | set(total.refused)
-    assert {command.name.lower() for command in Command} - given <= {"zero", "home"}
+    assert {command.name for command in KINDS} - given <= {"set_zero", "home"}
 
 
 def test_a_session_is_the_same_each_time_it_is_played() -> None:
@@ -99,36 +101,42 @@ class AnySession(RuleBasedStateMachine):
     def enable(self) -> None:
         self.it.enable()
 
-    @rule(goal=TARGETS, speed=SPEEDS, each=st.integers(0, 1))
-    def move(self, goal: list[float], speed: float, each: int) -> None:
-        self.it.order(Command.MOVE, [*goal, *[0.0] * 4, each, speed])
+    @rule(goal=TARGETS, speed=SPEEDS, synchronized=st.booleans())
+    def move(self, goal: list[float], speed: float, synchronized: bool) -> None:
+        self.it.send(MoveJoints(tuple(goal), speed, synchronized))
 
     @rule(by=st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
     def move_a_little(self, by: list[float]) -> None:
-        target = [q + d for q, d in zip(self.it.commanded, by, strict=True)]
-        self.it.order(Command.MOVE, [*target, *[0.0] * 5, 0.5])
+        target = tuple(q + d for q, d in zip(self.it.commanded, by, strict=True))
+        self.it.send(MoveJoints(target, 0.5, True))
 
     @rule(name=st.sampled_from(DEEDS), seed=st.integers(0, 10_000))
     def do(self, name: str, seed: int) -> None:
         """Something longer: a plan, a stream, a hand on the stick."""
         getattr(Deeds(self.it, Random(seed), self.period_s), name)()
 
-    @rule(motion=st.integers(1, 5))
-    def change_the_motion(self, motion: int) -> None:
-        self.it.order(Command.MOTION, [motion])
+    @rule(mode=st.sampled_from(ControlMode))
+    def change_the_control_mode(self, mode: ControlMode) -> None:
+        self.it.send(SetControlMode(mode))
 
-    @rule(command=st.sampled_from([Command.STOP, Command.DISABLE, Command.RESET]))
+    @rule(command=st.sampled_from([Halt(), Disable(), Reset()]))
     def stop(self, command: Command) -> None:
-        self.it.order(command)
+        self.it.send(command)
 
-    @rule(mode=st.sampled_from(DRIVE_MODES) | st.sampled_from(NONSENSE))
-    def change_the_mode(self, mode: float) -> None:
-        self.it.order(Command.MODE, [mode])
+    @rule(mode=st.sampled_from(DriveMode))
+    def change_the_drive_mode(self, mode: DriveMode) -> None:
+        self.it.send(SetDriveMode(mode))
 
-    @rule(kind=st.integers(0, 40), numbers=st.lists(ANGLES, max_size=12))
-    def say_anything(self, kind: int, numbers: list[float]) -> None:
-        if kind != Command.SHUTDOWN:
-            self.it.order(kind, numbers)
+    @rule(seed=st.integers(0, 10_000))
+    def send_any_command(self, seed: int) -> None:
+        command = random_command(Random(seed))
+        if not isinstance(command, Shutdown):
+            self.it.send(command)
+
+    @rule(kind=st.integers(0, 40) | st.sampled_from([kind.number for kind in KINDS]), numbers=st.lists(ANGLES))
+    def send_any_bytes(self, kind: int, numbers: list[float]) -> None:
+        if kind != Shutdown.number:
+            self.it.send_raw(kind, numbers)
 
     @rule(axis=AXES, code=st.sampled_from(FAULTS))
     def break_a_drive(self, axis: int, code: int) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rtcp.ipc.machine import Command, State
+from rtcp.ipc.commands import MoveJoints
+from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Values
 from tests.e2e.wire import DRIVE, HEAD, LEAVES, LRW, frame
@@ -71,7 +72,7 @@ def moving() -> list[Frame]:
     driver.enable()
     assert driver.simulation.until(lambda: driver.state is State.HOLDING, 2.0)
     driver.wait(50)
-    driver.order(Command.MOVE, [*[q + 0.3 for q in START], *[0.0] * 5, 0.4])
+    driver.send(MoveJoints(tuple(q + 0.3 for q in START), 0.4, True))
     driver.wait(200)
     driver.close()
     assert driver.violations == []

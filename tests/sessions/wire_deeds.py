@@ -51,7 +51,7 @@ class WireDeeds:
         return self.random.choice(NONSENSE) if self.random.random() < share else number
 
     def commanded(self) -> Q:
-        return list(self.voice.status()["joints"]["target"])
+        return list(self.voice.status()["joints"]["commanded_position"])
 
     def near(self, by: float) -> Q:
         return [q + self.random.uniform(-by, by) for q in self.commanded()]
@@ -94,7 +94,7 @@ class WireDeeds:
 
     def motion_mode(self) -> None:
         (name,) = self.random.choices(MOTIONS, SHARES)
-        if self.voice.ask("motion", name=name) is not None and self.random.random() < 0.3:
+        if self.voice.ask("mode", name=name) is not None and self.random.random() < 0.3:
             self.voice.ask("mode", name=self.random.choice(DRIVE_MODES))
 
     # -- what has an end --------------------------------------------------------------------------------------------
@@ -170,7 +170,7 @@ class WireDeeds:
         ]
         for _ in range(random.randrange(1, 12)):
             v = [self.or_nonsense(speed, 0.005) for speed in speeds]
-            taken = self.voice.ask("jog", v=v, frame=frame, hold_s=random.choice((0.1, 0.25)))
+            taken = self.voice.ask("jog", velocity=v, frame=frame, hold_s=random.choice((0.1, 0.25)))
             if taken is None and random.random() < 0.5:
                 break
             self.seconds(0.02, 0.15)
@@ -182,7 +182,7 @@ class WireDeeds:
         random = self.random
         for _ in range(random.randrange(1, 6)):
             numbers = [self.or_nonsense(random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)), 0.01) for _ in range(6)]
-            taken = self.voice.ask("velocity", numbers=numbers, hold_s=self.or_nonsense(0.5))
+            taken = self.voice.ask("move_at_velocity", numbers=numbers, hold_s=self.or_nonsense(0.5))
             if taken is None and random.random() < 0.5:
                 break
             self.seconds(0.02, 0.4)
@@ -194,7 +194,7 @@ class WireDeeds:
         for _ in range(random.randrange(1, 6)):
             numbers = [self.or_nonsense(random.uniform(-share, share) * most, 0.005) for most in self.now.torque]
             shares = {"stiffness": random.choice((0.0, 0.5, 1.0)), "damping": random.choice((0.0, 1.0))}
-            taken = self.voice.ask("torque", numbers=numbers, **shares, hold_s=self.or_nonsense(0.3))
+            taken = self.voice.ask("apply_torque", numbers=numbers, **shares, hold_s=self.or_nonsense(0.3))
             if taken is None and random.random() < 0.5:
                 break
             self.seconds(0.02, 0.3)
@@ -214,7 +214,7 @@ class WireDeeds:
             target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
             sent = [q + random.uniform(-0.5, 0.5) for q in target] if random.random() < 0.03 else target
             told = stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
-            if self.voice.ask("stream", q=[self.or_nonsense(q, 0.003) for q in sent], t=told) is None:
+            if self.voice.ask("stream_position", q=[self.or_nonsense(q, 0.003) for q in sent], t=told) is None:
                 break
             time.sleep(interval * random.uniform(0.5, 1.5))
         self._leave()
@@ -232,7 +232,7 @@ class WireDeeds:
     def _hold(self, seconds: float, **position: Any) -> None:
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
-            self.voice.ask("stick", **position, hold_s=0.4)
+            self.voice.ask("joystick", **position, hold_s=0.4)
             time.sleep(min(SAY_AGAIN_S, left))
 
     def stick(self) -> None:
@@ -247,19 +247,19 @@ class WireDeeds:
                 self._hold(0.05, byte=63)
         if random.random() < 0.7:
             self._hold(0.05, byte=63)
-        self.voice.ask("stick")
+        self.voice.ask("joystick")
 
     def chair(self) -> None:
         """Give the stick to the wheelchair for a while."""
         self._hold(
             self.random.uniform(0.02, 0.4), pressed=["chair", self.random.choice(("forward", "left", "mode_up"))]
         )
-        self.voice.ask("stick")
+        self.voice.ask("joystick")
 
     def emergency(self) -> None:
         """Press the emergency stop, and mostly reset it later."""
         self._hold(self.random.uniform(0.02, 0.6), pressed=["emergency_stop"])
-        self.voice.ask("stick")
+        self.voice.ask("joystick")
         self.seconds(0.0, 0.2)
         if self.random.random() < 0.8:
             self.voice.ask("reset")

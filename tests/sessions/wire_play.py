@@ -69,7 +69,7 @@ class WirePlayer:
         self._hopeless += 1
         if self._hopeless % 4 == 0:
             # Limits may have become such that nothing is allowed.
-            self.voice.ask("stick")
+            self.voice.ask("joystick")
             self.deeds.widen()
         if self._hopeless == HOPELESS:
             raise RuntimeError(f"the arm cannot be enabled any more: {self.voice.status()['message']}")
@@ -77,7 +77,7 @@ class WirePlayer:
 
     def _motion(self) -> None:
         """Mostly one that the motion mode takes, now and then another."""
-        deeds, motion = self.deeds, str(self.voice.status()["motion"])
+        deeds, motion = self.deeds, str(self.voice.status()["control_mode"])
         if self.random.random() < 0.1:
             motion = self.random.choice(MOTIONS)
         if motion == "velocity":

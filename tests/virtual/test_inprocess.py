@@ -375,13 +375,13 @@ def to_holding(simulation: Simulation) -> None:
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 3.0)
 
 
-def joint_move(*target: float) -> MoveJoints:
-    return MoveJoints(q=target, speed=0.4, synchronized=True)
+def move(*target: float) -> MoveJoints:
+    return MoveJoints(target, 0.4, True)
 
 
 def test_the_loop_follows_the_clock_brings_the_slaves_to_op_and_moves_the_arm(simulation: Simulation) -> None:
     to_holding(simulation)
-    assert simulation.send(joint_move(0.4, 0.3)).refusal is None
+    assert simulation.send(move(0.4, 0.3)).refusal is None
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 5.0)
     simulation.run(0.3)
     assert [model.axis.position for model in simulation.models] == pytest.approx([0.4, 0.3], abs=1e-3)
@@ -389,7 +389,7 @@ def test_the_loop_follows_the_clock_brings_the_slaves_to_op_and_moves_the_arm(si
 
 def test_a_lease_that_is_not_renewed_runs_out_in_simulated_time(simulation: Simulation) -> None:
     to_holding(simulation)
-    assert simulation.send(joint_move(1.5, 1.5)).refusal is None
+    assert simulation.send(move(1.5, 1.5)).refusal is None
     simulation.fall_silent()
     assert simulation.until(lambda: simulation.state is MachineState.STOPPING, 0.7)
     assert simulation.until(lambda: simulation.state is MachineState.HOLDING, 1.0)
@@ -405,8 +405,7 @@ def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_befor
         to_holding(simulation)
         simulation.bus.drop(2, State.SAFE_OP, 0x001A)
         assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
-        lost = [found.event for found in simulation.events if isinstance(found.event, SlaveLost)]
-        assert [event.slave for event in lost] == [2]
+        assert [record.event for record in simulation.events if record.event.is_fault] == [SlaveLost(2)]
         simulation.run(0.5)
         assert simulation.state is MachineState.FAULT
         assert simulation.send(Reset()).refusal is None
@@ -421,7 +420,7 @@ def story(config: ArmConfig, segment: SegmentConfig, seed: int) -> list[Frame]:
         simulation.acquire()
         simulation.on_frame = frames.append
         to_holding(simulation)
-        simulation.send(joint_move(0.2, 0.1))
+        simulation.send(move(0.2, 0.1))
         simulation.run(0.1)
         simulation.data.lose(3)
         simulation.run(0.2)
