@@ -38,13 +38,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from kinematics.batch import forward_batch
-from kinematics.forward import forward, frames
+from kinematics.damped_least_squares import NumericResult, solve_numeric
+from kinematics.forward import forward, forward_batch, frames
 from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import jacobian
 from kinematics.model import ArmModel
-from kinematics.numeric import NumericResult, solve_numeric
 from kinematics.pose import Pose
 from kinematics.urdf import to_urdf
 from rtcp.config import find_arm, load_kinematics

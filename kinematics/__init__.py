@@ -1,25 +1,23 @@
-"""Mathematics of six-axis arms under the modified (Craig) Denavit-Hartenberg convention.
+"""Kinematics of six-joint arms in the modified (Craig) Denavit-Hartenberg convention.
 
-What computes on one configuration uses plain floats and is imported here. `forward_batch`, which needs numpy, and
-`to_urdf` are imported when they are first asked for, so that the process of the loop stays free of both.
+Functions for one configuration use plain floats. Importing this package loads neither numpy, which `forward_batch`
+imports when it is called, nor the XML of `to_urdf`.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from kinematics.forward import forward, frames
+from kinematics.damped_least_squares import NumericResult, solve_numeric
+from kinematics.forward import forward, forward_batch, frames
 from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
-from kinematics.jacobian import jacobian, manipulability, singularity_distances, tool_jacobian
+from kinematics.jacobian import JointVelocity, jacobian, joint_velocity, manipulability, singularity_distances
 from kinematics.model import ArmModel, DhRow, JointLimit, LinkMass
-from kinematics.numeric import NumericResult, solve_numeric
 from kinematics.pose import IDENTITY, Pose
 from kinematics.solution import Branch, Near, Singularity, Solution, Solutions
-from kinematics.velocity import JointVelocity, joint_velocity
 
 if TYPE_CHECKING:
-    from kinematics.batch import forward_batch
     from kinematics.urdf import to_urdf
 
 __all__ = [
@@ -47,15 +45,10 @@ __all__ = [
     "singularity_distances",
     "solve_numeric",
     "to_urdf",
-    "tool_jacobian",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "forward_batch":
-        from kinematics.batch import forward_batch
-
-        return forward_batch
     if name == "to_urdf":
         from kinematics.urdf import to_urdf
 

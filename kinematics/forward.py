@@ -1,22 +1,26 @@
-"""Where the tool, and every frame of the arm, is for given joint angles; plain floats, for one configuration.
-
-For many configurations at once see `kinematics.batch`.
-"""
+"""Forward kinematics: the tool and every frame of the arm for given joint angles, one configuration or many at once."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, sin
+from typing import TYPE_CHECKING
 
 from kinematics.model import JOINTS, ArmModel
-from kinematics.pose import Pose, require_finite
+from kinematics.pose import IDENTITY, Pose, require_finite
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+_BLOCK = 2048  # configurations: the arrays of a block stay in a second-level cache of 1 MiB
 
 
 def forward(model: ArmModel, q: Sequence[float]) -> Pose:
     """The tool's pose in the base frame for six joint angles `q`, rad.
 
     The product of T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d) over the rows, then the tool. Raises ValueError
-    for another count than six, and for an angle that is NaN or infinite, naming the joint.
+    for a count other than six, and for an angle that is NaN or infinite, naming the joint.
     """
     _check(model, q)
     xx = yy = zz = 1.0
@@ -24,7 +28,7 @@ def forward(model: ArmModel, q: Sequence[float]) -> Pose:
     for (sa, ca, a, d, offset), angle in zip(model.constants, q, strict=True):
         s, c = sin(angle + offset), cos(angle + offset)
         px, py, pz = px + a * xx, py + a * xy, pz + a * xz
-        # Rx(alpha) turns the y and z axes, Rz(theta) then x and the new y
+        # Rx(alpha) rotates the y and z axes, Rz(theta) then x and the new y
         tx, ty, tz = ca * yx + sa * zx, ca * yy + sa * zy, ca * yz + sa * zz
         zx, zy, zz = ca * zx - sa * yx, ca * zy - sa * yy, ca * zz - sa * yz
         yx, yy, yz = c * tx - s * xx, c * ty - s * xy, c * tz - s * xz
@@ -53,7 +57,50 @@ def frames(model: ArmModel, q: Sequence[float]) -> tuple[Pose, ...]:
     return tuple(poses)
 
 
+def forward_batch(model: ArmModel, q: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Tool poses of N configurations: positions (N, 3), m, and rotations (N, 3, 3), base <- tool.
+
+    `q` has the shape (N, 6), rad. Agrees with `forward` to round-off (1e-14 of the reach). Raises ValueError for
+    another shape, and for a value that is not finite, naming its place.
+    """
+    import numpy as np  # here, because the loop's process imports this module and must not load numpy
+
+    angles = np.asarray(q, dtype=np.float64)
+    if angles.ndim != 2 or angles.shape[1] != JOINTS:
+        raise ValueError(f"q has shape {angles.shape}; expected (N, {JOINTS})")
+    if not np.isfinite(angles).all():
+        row, joint = np.argwhere(~np.isfinite(angles))[0]
+        raise ValueError(f"q[{row}, {joint}] is {angles[row, joint]}; a finite number is required")
+    positions = np.empty((len(angles), 3))
+    rotations = np.empty((len(angles), 3, 3))
+    base = np.eye(3)[:, :, None]
+    tool = np.reshape(model.tool.rotation, (3, 3))
+    for start in range(0, len(angles), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        theta = np.ascontiguousarray(angles[block].T) + [[row.offset] for row in model.rows]
+        x, y, z = base  # axes and origin of the frame: (3, n)
+        origin = np.zeros((3, 1))
+        for (sa, ca, a, d, _), s, c in zip(model.constants, np.sin(theta), np.cos(theta), strict=True):
+            origin = origin + a * x if a else origin
+            if sa == 0.0:
+                y, z = ca * y, ca * z
+            elif ca == 0.0:
+                y, z = sa * z, -sa * y
+            else:
+                y, z = ca * y + sa * z, ca * z - sa * y
+            origin = origin + d * z if d else origin
+            x, y = c * x + s * y, c * y - s * x
+        for length, axis in zip(model.tool.position, (x, y, z), strict=True):
+            origin = origin + length * axis if length else origin
+        if model.tool.rotation != IDENTITY.rotation:
+            x, y, z = (tool[0, j] * x + tool[1, j] * y + tool[2, j] * z for j in range(3))
+        positions[block] = origin.T
+        for j, axis in enumerate((x, y, z)):
+            rotations[block, :, j] = axis.T
+    return positions, rotations
+
+
 def _check(model: ArmModel, q: Sequence[float]) -> None:
     if len(q) != JOINTS:
-        raise ValueError(f"{len(q)} joint angles were given: {JOINTS} are needed")
+        raise ValueError(f"{len(q)} joint angles given; {JOINTS} are required")
     require_finite(q, model.joint_names)

@@ -1,4 +1,4 @@
-"""Torques that the joints must give to hold the arm against gravity."""
+"""Joint torques that hold the arm against gravity."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from kinematics.pose import Pose, require_finite
 
 Torques = tuple[float, float, float, float, float, float]
 
-STANDARD_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2 along the base's axes, base upright; CGPM 1901
+STANDARD_GRAVITY = (0.0, 0.0, -9.80665)  # m/s^2 in the base frame of an upright arm; CGPM 1901
 
 
 def gravity_torques(
@@ -19,19 +19,19 @@ def gravity_torques(
     gravity: Sequence[float] = STANDARD_GRAVITY,
     payload: LinkMass | None = None,
 ) -> Torques:
-    """Six torques in Nm with which the arm stands still at `q` (rad): g(q) of M(q) q'' + c(q, q') + g(q) = tau.
+    """Six torques, Nm, that hold the arm still at `q` (rad): g(q) of M(q) q'' + c(q, q') + g(q) = tau.
 
-    `gravity`: acceleration of free fall in m/s^2, in the base frame. `payload`: a mass whose centre is given in the
-    tool frame. ValueError when the model has no link masses, and for a value that is not finite, which it names.
+    `gravity`: acceleration of free fall, m/s^2, in the base frame. `payload`: a mass whose centre is given in the
+    tool frame. Raises ValueError when the model has no link masses, and for a value that is not finite, naming it.
 
-    Joint i holds the moment of all weights beyond it about its axis: -z_i . (sum over j >= i of (c_j - p_i) x m_j g).
+    Joint i carries the moment of all weights beyond it: -z_i . (sum over j >= i of (c_j - p_i) x m_j g).
     """
     if not model.links:
-        raise ValueError(f"the link masses of arm {model.name!r} are not known: its gravity torques cannot be computed")
+        raise ValueError(f"arm {model.name!r} has no link masses; gravity torques need `links`")
     gx, gy, gz = gravity
     require_finite((gx, gy, gz), ("gravity x", "gravity y", "gravity z"))
     poses = frames(model, q)
-    mass = mx = my = mz = 0.0  # of everything beyond the joint: mass in kg, and first moment about the base in kg m
+    mass = mx = my = mz = 0.0  # mass (kg) and first moment about the base (kg m) of all bodies beyond the joint
     if payload is not None:
         mass, mx, my, mz = _moment(poses[6], payload)
     torques = []
@@ -51,13 +51,8 @@ def gravity_torques(
 
 
 def _moment(pose: Pose, body: LinkMass) -> tuple[float, float, float, float]:
-    """Mass in kg, and mass times the centre's position in the base frame in kg m."""
+    """Mass, kg, and mass times the centre's position in the base frame, kg m."""
     (px, py, pz), (a, b, c, d, e, f, g, h, i) = pose
     m = body.mass
     x, y, z = body.centre
-    return (
-        m,
-        m * (px + a * x + b * y + c * z),
-        m * (py + d * x + e * y + f * z),
-        m * (pz + g * x + h * y + i * z),
-    )
+    return m, m * (px + a * x + b * y + c * z), m * (py + d * x + e * y + f * z), m * (pz + g * x + h * y + i * z)

@@ -1,28 +1,38 @@
-"""Inverse kinematics of any arm of the model: chooses the method that its geometry allows."""
+"""Inverse kinematics: all solutions of a pose, or the one that continues a motion, by the best method for the arm."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf, remainder, sin, tau
 from typing import Literal
 
+from kinematics.damped_least_squares import (
+    NumericResult,
+    damped_least_squares,
+    pose_error,
+    require_rotation,
+    solve_numeric,
+)
+from kinematics.forward import forward
 from kinematics.model import JOINTS, ArmModel
-from kinematics.near import solve_near
-from kinematics.numeric import NumericResult, solve_numeric
-from kinematics.pose import Pose, require_finite
-from kinematics.reasons import refuse_no_rotation, why_none
-from kinematics.solution import Near, Singularity, Solution, Solutions
-from kinematics.spherical import SphericalArm, has_spherical_wrist
-from kinematics.turns import Turns
+from kinematics.pose import Pose, Rotation, Vector, require_finite
+from kinematics.solution import SINGULARITIES, AngleWrap, Near, Singularity, Solution, Solutions, nearest_turn
+from kinematics.spherical import ObliqueWrist, SphericalArm, has_spherical_wrist
+
+# A joint that moves by less than this, rad, and by less than this many times the tool's move, in m and rad, does not
+# jump.
+_NO_JUMP = 1e-4
+_JUMP_RATIO = 4.0
+_BESIDE = 1e-4  # |sin theta5| below which the round-off of joints 1 to 3 could make joint 4 jump
 
 Method = Literal["spherical wrist, parallel axes 2 and 3", "spherical wrist, general", "numeric"]
 
 
 class InverseKinematics:
-    """Joint angles for tool poses of one arm; everything that is constant is computed once, here.
+    """Joint angles for tool poses of one arm; the constructor computes everything that is constant.
 
-    `method` says how: in closed form where axes 4 to 6 meet in one point (with axes 2 and 3 parallel by a triangle,
-    otherwise by Pieper's quartic), else numerically. All that is called afterwards computes with plain floats, imports
-    nothing, and keeps no state.
+    `method`: closed form where axes 4 to 6 meet in one point (a triangle where axes 2 and 3 are parallel, otherwise
+    Pieper's quartic), else numeric. The calls keep no state.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -39,10 +49,9 @@ class InverseKinematics:
     def solve(self, pose: Pose, q_near: Sequence[float] | None = None) -> Solutions:
         """All configurations that bring the tool to `pose` (base frame), each confirmed by forward kinematics.
 
-        Joint limits are told of, not kept. On a singularity the solutions are given that leave the free joint at
-        `q_near` (six rad; default: zero, or the limit nearest to it). Numerically: one solution, the one found from
-        there, inside the limits if one is found. Raises ValueError for numbers that are not finite, naming them, and
-        for a rotation that is none.
+        Joint limits are reported, not enforced. On a singularity the free joint stays at `q_near` (six rad; default:
+        zero, or the limit nearest to it). The numeric method gives one solution, found from there, inside the limits
+        if possible. Raises ValueError for a value that is not finite, naming it, and for an invalid rotation.
         """
         near = self._home if q_near is None else q_near
         _require_finite(self.model, pose, near)
@@ -52,42 +61,32 @@ class InverseKinematics:
         solutions = self._arm.solve(point, rotation, near)
         if solutions:
             return Solutions(tuple(solutions), None)
-        return Solutions((), why_none(self._arm, pose)[0])
+        return Solutions((), _why_none(self._arm, pose)[0])
 
     def solve_near(self, pose: Pose, q_near: Sequence[float]) -> Near:
         """The solution inside the joint limits that is nearest to `q_near` (six rad), or why there is none.
 
-        Nearest is the one whose joint that moves most moves least, turns of 2 pi considered; so along a continuous
-        motion it is the branch that continues. It may still be far away, where no near one exists: how large a step may
-        be is for the caller to say. A joint that is free on a singularity stays where it is. Raises ValueError as
-        `solve`.
+        Nearest means the smallest largest joint motion, multiples of 2 pi considered: along a continuous motion this
+        is the branch that continues. It may be far away when no near one exists; the caller bounds the step. A joint
+        that is free on a singularity keeps its position. Raises ValueError as `solve`.
         """
         _require_finite(self.model, pose, q_near)
         if self._arm is None:
             return self._near_numeric(pose, q_near)
-        return solve_near(self._arm, pose, q_near)
-
-    def solve_nearest(self, pose: Pose, q_near: Sequence[float]) -> NumericResult:
-        """The configuration inside the joint limits that comes as near to `pose` as the numeric method can get.
-
-        For a pose out of reach, and for any arm; outside the loop: it takes milliseconds. Raises ValueError as `solve`.
-        """
-        return solve_numeric(self.model, pose, q_near)
+        return _solve_near(self._arm, pose, q_near)
 
     def _solve_numeric(self, pose: Pose, q_near: Sequence[float]) -> Solutions:
-        refuse_no_rotation(pose)
         result = solve_numeric(self.model, pose, q_near)
         if not result.converged:
             result = solve_numeric(self.model, pose, q_near, respect_limits=False)
         if not result.converged:
             return Solutions((), _nearest(result))
-        turns = Turns(self.model)
-        (arm, beyond), (hand, outside) = turns.into_limits(0, *result.q[:3]), turns.into_limits(3, *result.q[3:])
-        outside = beyond + outside
+        wrap = AngleWrap(self.model)
+        (arm, arm_outside), (hand, outside) = wrap.into_limits(0, *result.q[:3]), wrap.into_limits(3, *result.q[3:])
+        outside = arm_outside + outside
         return Solutions((Solution((*arm, *hand), None, not outside, outside, Singularity.NONE),), None)
 
     def _near_numeric(self, pose: Pose, q_near: Sequence[float]) -> Near:
-        refuse_no_rotation(pose)
         result = solve_numeric(self.model, pose, q_near)
         if result.converged:
             return Near(result.q, "", Singularity.NONE, 0.0, -1)
@@ -96,18 +95,169 @@ class InverseKinematics:
 
 def _nearest(result: NumericResult) -> str:
     return (
-        f"no solution was found inside the joint limits: the nearest stays away by {result.position_error:.6g} m and "
-        f"{result.rotation_error:.6g} rad"
+        f"no solution found inside the joint limits: the nearest configuration misses the pose by "
+        f"{result.position_error:.6g} m and {result.rotation_error:.6g} rad"
     )
 
 
 def _require_finite(model: ArmModel, pose: Pose, q_near: Sequence[float]) -> None:
-    """One sum finds whether a number is not finite; only then each is looked at."""
+    """Check one sum; only when that is not finite check each number."""
     if len(q_near) != JOINTS:
-        raise ValueError(f"q_near has {len(q_near)} joint angles: {JOINTS} are needed")
+        raise ValueError(f"q_near has {len(q_near)} joint angles; {JOINTS} are required")
     (x, y, z), (a, b, c, d, e, f, g, h, i) = pose
     q1, q2, q3, q4, q5, q6 = q_near
     rest = x + y + z + a + b + c + d + e + f + g + h + i + q1 + q2 + q3 + q4 + q5 + q6
     if rest - rest != 0.0:
         Pose(*pose).require_finite()
         require_finite(q_near, (f"{name} of q_near" for name in model.joint_names))
+
+
+def _solve_near(arm: SphericalArm, pose: Pose, q_near: Sequence[float]) -> Near:
+    """`InverseKinematics.solve_near` for finite numbers.
+
+    Fast path: the nearest branch of joints 1 to 3, then its nearer wrist. All solutions are compared only when joints
+    1 to 3 of another branch move less than all six joints of this one, a joint is outside its limits, or a singularity
+    is near.
+    """
+    point, rotation = arm.target(pose)
+    n1, n2, n3, n4, n5, n6 = q_near
+    o1, o2, o3, o4, o5, o6 = arm.offsets
+    h1, h2, h3 = n1 + o1, n2 + o2, n3 + o3
+    least = second = inf
+    for branch in arm.arm.solve(*point, h1, h2):
+        m1 = remainder(branch[0] - h1, tau)
+        if not -second < m1 < second:
+            continue
+        m2, m3 = remainder(branch[1] - h2, tau), remainder(branch[2] - h3, tau)
+        move = max(m1, -m1, m2, -m2, m3, -m3)
+        if move < least:
+            least, second = move, least
+            d1, d2, d3, nearest = m1, m2, m3, branch
+        elif move < second:
+            second = move
+    if least == inf:
+        return _no_near(arm, pose)
+    theta1, theta2, theta3, _, arm_singular = nearest
+    inner = arm.arm.confirm(theta1, theta2, theta3, point, rotation)
+    if inner is not None:
+        h4, h5, h6 = n4 + o4, n5 + o5, n6 + o6
+        closest = inf
+        for angles in arm.wrist.solve(inner, h4):
+            m1, m2, m3 = remainder(angles[0] - h4, tau), remainder(angles[1] - h5, tau), remainder(angles[2] - h6, tau)
+            move = max(m1, -m1, m2, -m2, m3, -m3)
+            if move < closest:
+                closest = move
+                d4, d5, d6, wrist = m1, m2, m3, angles
+        if (
+            max(least, closest) <= second
+            and closest < inf
+            and not arm_singular
+            and not -_BESIDE < sin(wrist[1]) < _BESIDE
+        ):
+            (l1, u1), (l2, u2), (l3, u3), (l4, u4), (l5, u5), (l6, u6) = arm.wrap.limits
+            q = q1, q2, q3, q4, q5, q6 = n1 + d1, n2 + d2, n3 + d3, n4 + d4, n5 + d5, n6 + d6
+            if (
+                l1 <= q1 <= u1 and l2 <= q2 <= u2 and l3 <= q3 <= u3
+                and l4 <= q4 <= u4 and l5 <= q5 <= u5 and l6 <= q6 <= u6
+                and arm.wrist.error(wrist[0], wrist[1], wrist[2], inner) <= arm.confirmed
+            ):  # fmt: skip
+                return Near(q, "", SINGULARITIES[wrist[4]], 0.0, -1)
+    return _compare_all(arm, pose, point, rotation, q_near)
+
+
+def _compare_all(arm: SphericalArm, pose: Pose, point: Vector, rotation: Rotation, q_near: Sequence[float]) -> Near:
+    """The nearest of all solutions, at all multiples of 2 pi that the limits allow."""
+    held = [min(max(near, lower), upper) for near, (lower, upper) in zip(q_near, arm.wrap.limits, strict=True)]
+    solutions = arm.solve(point, rotation, held)
+    if not solutions:
+        return _no_near(arm, pose)
+    candidates = solutions + _with_joint_6_at_its_limit(arm, point, rotation, solutions, q_near)
+    least, best = inf, None
+    for solution in candidates:
+        if solution.within_limits:
+            q = arm.wrap.nearest(solution.q, q_near)
+            move = _largest(q, q_near)
+            if move < least:
+                least, best = move, Near(q, "", solution.singularity, 0.0, -1)
+    if any(_is_beside_singularity(arm, solution) for solution in solutions):
+        best = _by_least_squares(arm, pose, q_near, least, solutions) or best
+    return best or _beyond_limit(arm, solutions, q_near)
+
+
+def _is_beside_singularity(arm: SphericalArm, solution: Solution) -> bool:
+    return bool(solution.singularity) or abs(sin(solution.q[4] + arm.offsets[4])) < _BESIDE
+
+
+def _by_least_squares(
+    arm: SphericalArm, pose: Pose, q_near: Sequence[float], least: float, solutions: list[Solution]
+) -> Near | None:
+    """A solution by damped least squares, if the closed form's best move `least` is a jump and this one is smaller."""
+    if least <= _NO_JUMP + _JUMP_RATIO * max(map(abs, pose_error(pose, forward(arm.model, q_near)))):
+        return None
+    q = damped_least_squares(arm.model, pose, q_near)
+    if q is None or not _largest(q, q_near) < least or not arm.wrap.allow(q):
+        return None
+    beside = min(solutions, key=lambda solution: _largest_turn(solution.q, q))
+    return Near(q, "", beside.singularity, 0.0, -1)
+
+
+def _largest(q: Sequence[float], q_near: Sequence[float]) -> float:
+    return max(abs(angle - near) for angle, near in zip(q, q_near, strict=True))
+
+
+def _largest_turn(q: Sequence[float], q_near: Sequence[float]) -> float:
+    """As `_largest`, regardless of multiples of 2 pi."""
+    return max(abs(remainder(angle - near, tau)) for angle, near in zip(q, q_near, strict=True))
+
+
+def _with_joint_6_at_its_limit(
+    arm: SphericalArm, point: Vector, rotation: Rotation, solutions: list[Solution], q_near: Sequence[float]
+) -> list[Solution]:
+    """Solutions on a wrist singularity with joint 6 at the limit that it would exceed, compensated by joint 4."""
+    lower, upper = arm.wrap.limits[5]
+    found = []
+    for solution in solutions:
+        if Singularity.WRIST in solution.singularity:
+            wanted = nearest_turn(solution.q[5], q_near[5])
+            rest = wanted - min(max(wanted, lower), upper)
+            if rest != 0.0:
+                for held4 in (solution.q[3] + rest, solution.q[3] - rest):
+                    found += arm.solve(point, rotation, (*solution.q[:3], held4, 0.0, 0.0))
+    return found
+
+
+def _beyond_limit(arm: SphericalArm, solutions: list[Solution], q_near: Sequence[float]) -> Near:
+    """The answer that names the joint whose limit prevents the nearest solution."""
+    solution = min(solutions, key=lambda solution: _largest_turn(solution.q, q_near))
+    joint = solution.outside[0]
+    lower, upper = arm.wrap.limits[joint]
+    angle = nearest_turn(solution.q[joint], q_near[joint])
+    limit = upper if angle > upper else lower
+    name = arm.model.joint_names[joint]
+    reason = f"joint limit: {name} would have to be at {angle:.6g} rad, beyond its limit of {limit:.6g} rad"
+    return Near(None, reason, solution.singularity, 0.0, joint)
+
+
+def _no_near(arm: SphericalArm, pose: Pose) -> Near:
+    reason, out_of_reach = _why_none(arm, pose)
+    return Near(None, reason, Singularity.NONE, out_of_reach, -1)
+
+
+def _why_none(arm: SphericalArm, pose: Pose) -> tuple[str, float]:
+    """Why a pose has no solution, as a sentence, and how far (m) the wrist centre is out of reach.
+
+    0 m when only the orientation is out of reach. Raises ValueError for an invalid rotation.
+    """
+    require_rotation(pose)
+    point, rotation = arm.target(pose)
+    branches = arm.arm.solve(*point, 0.0, 0.0)
+    if not branches:
+        gap = arm.arm.shortfall(*point)
+        x, y, z = arm.wrist_centre(pose)
+        return f"out of reach by {gap:.6g} m: the wrist centre cannot reach ({x:.6g}, {y:.6g}, {z:.6g}) m", gap
+    if isinstance(arm.wrist, ObliqueWrist):
+        inner = (arm.arm.confirm(*branch[:3], point, rotation) for branch in branches)
+        missing = min((arm.wrist.shortfall(rotation) for rotation in inner if rotation is not None), default=0.0)
+        if missing > 0.0:
+            return f"out of reach by {missing:.6g} rad: the wrist cannot tilt axis 6 that far", 0.0
+    return "no solution was confirmed by forward kinematics", 0.0

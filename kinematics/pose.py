@@ -1,7 +1,6 @@
-"""Positions and orientations as plain floats: the pose, its three angles, and the check for numbers that are none.
+"""Poses as plain floats: positions, rotations and the three angles of a rotation.
 
-Rotations are 3x3 matrices written row by row in a tuple of nine. The angles are those of R = Rx(rx) Ry(ry) Rz(rz):
-turn about the fixed x axis last. Imports nothing but `math`, so that the loop may use it.
+A rotation is a 3x3 matrix, row by row in a tuple of nine. Its angles are those of R = Rx(rx) Ry(ry) Rz(rz).
 """
 
 from __future__ import annotations
@@ -13,15 +12,15 @@ from typing import NamedTuple, TypeAlias
 Vector: TypeAlias = tuple[float, float, float]
 Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 
-# Below this cos(ry) the two outer axes coincide and only rx + rz or rx - rz is defined.
-SINGULAR_COSINE = 1e-12
+# cos(ry) below which the two outer axes coincide: only rx + rz or rx - rz is then defined.
+_SINGULAR_COSINE = 1e-12
 
 
 def require_finite(values: Iterable[float], names: Iterable[str]) -> None:
-    """Raise ValueError that names the first value which is NaN or infinite."""
-    for value, name in zip(values, names):  # noqa: B905  names may go on for ever
+    """Raise ValueError naming the first value that is NaN or infinite; `names` may be the longer of the two."""
+    for value, name in zip(values, names):  # noqa: B905
         if not math.isfinite(value):
-            raise ValueError(f"{name} is {value}: a finite number is needed")
+            raise ValueError(f"{name} is {value}; a finite number is required")
 
 
 def rotation_from_rpy(rx: float, ry: float, rz: float) -> Rotation:
@@ -35,7 +34,7 @@ def rotation_from_rpy(rx: float, ry: float, rz: float) -> Rotation:
 
 
 def turned(sine: float, cosine: float, theta: float) -> Rotation:
-    """Rx(alpha) Rz(theta), the rotation of a row of the table, from the sine and cosine of alpha; theta in rad."""
+    """Rx(alpha) Rz(theta), the rotation of one Denavit-Hartenberg row; sine and cosine of alpha, theta in rad."""
     s, c = math.sin(theta), math.cos(theta)
     return c, -s, 0.0, cosine * s, cosine * c, -sine, sine * s, sine * c, cosine
 
@@ -52,7 +51,7 @@ def times(one: Rotation, other: Rotation) -> Rotation:
 
 
 def transposed(rotation: Rotation) -> Rotation:
-    """The rotation back."""
+    """The inverse of a rotation."""
     a, b, c, d, e, f, g, h, i = rotation
     return a, d, g, b, e, h, c, f, i
 
@@ -67,21 +66,21 @@ def applied(rotation: Rotation, vector: Vector) -> Vector:
 def rpy_from_rotation(rotation: Rotation) -> Vector:
     """The angles (rx, ry, rz), rad, with R = Rx(rx) Ry(ry) Rz(rz), ry in [-pi/2, pi/2], rx and rz in [-pi, pi].
 
-    At ry = +-pi/2 only rx + rz (or rx - rz) is defined: rz = 0 by choice, and rx carries the whole turn.
+    At ry = +-pi/2 only rx + rz (or rx - rz) is defined: rz = 0 by convention, and rx is the whole angle.
     """
     _, _, r02, r10, r11, r12, r20, r21, r22 = rotation
     cosine = math.hypot(r12, r22)
     ry = math.atan2(r02, cosine)
-    if cosine < SINGULAR_COSINE:
+    if cosine < _SINGULAR_COSINE:
         return math.atan2(r21, r11), ry, 0.0
     rx = math.atan2(-r12, r22)
     sx, cx = math.sin(rx), math.cos(rx)
-    # rz from Rx(-rx) R and not from r00, r01: close to the singular orientation the error of rx then cancels in R
+    # rz from Rx(-rx) R instead of r00, r01: beside the singular orientation the error of rx then cancels in R
     return rx, ry, math.atan2(cx * r10 + sx * r20, cx * r11 + sx * r21)
 
 
 def orthonormality_error(rotation: Rotation) -> float:
-    """The largest entry of R R^T - 1, or 2 for a reflection: 0 for a rotation."""
+    """The largest entry of R R^T - 1: 0 for a rotation; 2 for a reflection."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
     determinant = (
         r00 * (r11 * r22 - r12 * r21) - r01 * (r10 * r22 - r12 * r20) + r02 * (r10 * r21 - r11 * r20)
@@ -99,14 +98,14 @@ def orthonormality_error(rotation: Rotation) -> float:
 
 
 class Pose(NamedTuple):
-    """Where a frame is: `position` (3), m, and `rotation` (9), row by row; its columns are the frame's axes."""
+    """A frame's `position` (3), m, and `rotation` (9), row by row; the columns of the matrix are the frame's axes."""
 
     position: Vector
     rotation: Rotation
 
     @classmethod
     def from_xyzrpy(cls, x: float, y: float, z: float, rx: float, ry: float, rz: float) -> Pose:
-        """The pose at x, y, z (m) with R = Rx(rx) Ry(ry) Rz(rz) (rad); ValueError names a number that is not finite."""
+        """The pose at x, y, z (m) with R = Rx(rx) Ry(ry) Rz(rz) (rad); ValueError names a value that is not finite."""
         require_finite((x, y, z, rx, ry, rz), ("x", "y", "z", "rx", "ry", "rz"))
         return cls((float(x), float(y), float(z)), rotation_from_rpy(rx, ry, rz))
 
@@ -116,19 +115,19 @@ class Pose(NamedTuple):
         return rpy_from_rotation(self.rotation)
 
     def __matmul__(self, other: Pose) -> Pose:
-        """This transform after `other`: A <- C from A <- B and B <- C."""
+        """A <- C from A <- B and B <- C."""
         x, y, z = applied(self.rotation, other.position)
         px, py, pz = self.position
         return Pose((px + x, py + y, pz + z), times(self.rotation, other.rotation))
 
     def inverse(self) -> Pose:
-        """The transform back."""
+        """B <- A from A <- B."""
         back = transposed(self.rotation)
         x, y, z = applied(back, self.position)
         return Pose((-x, -y, -z), back)
 
     def require_finite(self) -> None:
-        """Raise ValueError that names the first entry which is NaN or infinite."""
+        """Raise ValueError naming the first entry that is NaN or infinite."""
         require_finite(self.position, ("x", "y", "z"))
         require_finite(self.rotation, (f"rotation[{row}][{column}]" for row in range(3) for column in range(3)))
 

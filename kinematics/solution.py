@@ -1,16 +1,20 @@
-"""What inverse kinematics answers with: solutions with their branch, and reasons where there are none."""
+"""Results of inverse kinematics: solutions with their branch and singularities, and angles wrapped into the limits."""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from math import ceil, pi, remainder, tau
 from typing import Literal, NamedTuple, TypeAlias
+
+from kinematics.model import ArmModel
+from kinematics.pose import Vector
 
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 
 
 def six(values: Iterable[float]) -> Six:
-    """Six numbers as the tuple that they are."""
+    """Exactly six numbers as a tuple."""
     q1, q2, q3, q4, q5, q6 = values
     return q1, q2, q3, q4, q5, q6
 
@@ -20,13 +24,13 @@ class Branch(NamedTuple):
 
     shoulder: "front" where the wrist centre has x >= 0 in frame 1, "back" where x < 0.
     elbow: "up" where cos(alpha_2) det J >= 0, else "down"; J is the derivative of the wrist centre by joints 1 to 3.
-        With axes 2 and 3 parallel this is the side of the line from axis 2 to the wrist centre that the elbow lies on,
+        With axes 2 and 3 parallel this is the side of the line from axis 2 to the wrist centre on which the elbow lies,
         seen with x of frame 1 to the right and z up: "up" is to the left of it for a front solution and to the right
-        for a back one, which is above it unless the wrist centre is between the axes 1 and 2.
+        for a back one. That is above the line unless the wrist centre is between axes 1 and 2.
     wrist: "no-flip" where sin(q5 + offset) >= 0, "flip" where it is negative.
 
-    Where axes 2 and 3 are not parallel two solutions may bear the same name, and "front" may become "back" without a
-    singularity: there the words are no more than the signs above.
+    Where axes 2 and 3 are not parallel two solutions may have the same name, and "front" may become "back" without a
+    singularity: there the words are only the signs above.
     """
 
     shoulder: Literal["front", "back"]
@@ -38,9 +42,9 @@ class Branch(NamedTuple):
 
 
 class Singularity(enum.Flag):
-    """At which singularities a solution is, to round-off.
+    """The singularities that a solution is on, to round-off.
 
-    SHOULDER: the wrist centre is on axis 1, so that joint 1 is free; with a lateral offset, as near to it as it comes.
+    SHOULDER: the wrist centre is on axis 1, so that joint 1 is free; with a lateral offset, as near to it as possible.
     ELBOW: the arm is stretched or folded; with axes 2 and 3 not parallel, joints 1 to 3 lose a direction.
     WRIST: axes 4 and 6 are in one line, so that joint 4 is free; in an oblique wrist, axes 4 to 6 are in one plane.
     """
@@ -54,8 +58,8 @@ class Singularity(enum.Flag):
 class Solution(NamedTuple):
     """One configuration that reaches the pose.
 
-    q: rad, each joint in the turn of 2 pi that its limits allow, else in (-pi, pi]. branch: None for an arm without a
-    spherical wrist, whose solutions have no names. outside: the joints, counted from 0, outside their limits.
+    q: rad, each joint inside its limits where a multiple of 2 pi brings it there, else in (-pi, pi]. branch: None for
+    an arm without a spherical wrist. outside: the joints, counted from 0, outside their limits.
     """
 
     q: Six
@@ -66,7 +70,7 @@ class Solution(NamedTuple):
 
 
 class Solutions(NamedTuple):
-    """All solutions of a pose; `reason` says in a sentence why there are none, and is None where there are."""
+    """All solutions of a pose; `reason` is a sentence when there are none, else None."""
 
     solutions: tuple[Solution, ...]
     reason: str | None
@@ -75,9 +79,9 @@ class Solutions(NamedTuple):
 class Near(NamedTuple):
     """The solution that continues a motion, or why there is none.
 
-    q: rad, inside the limits, or None. reason: a sentence, empty where q was found. out_of_reach: m from the wanted
-    wrist centre to the nearest point that it can be brought to, 0 where it is in reach. limited: the joint, counted
-    from 0, whose limit is in the way, else -1.
+    q: rad, inside the limits, or None. reason: a sentence, empty when q was found. out_of_reach: m from the wanted
+    wrist centre to the nearest point within reach, 0 when it is in reach. limited: the joint, counted from 0, whose
+    limit prevents a solution, else -1.
     """
 
     q: Six | None
@@ -87,8 +91,7 @@ class Near(NamedTuple):
     limited: int
 
 
-# Between the solvers of this package: bits for branches and singularities, since enums cost more than the arithmetic,
-# and plain tuples.
+# The solvers exchange branches and singularities as bits and plain tuples: enums cost more than the arithmetic.
 BACK, DOWN, FLIP = 1, 2, 4
 SHOULDER, ELBOW, WRIST = 1, 2, 4
 BRANCHES = tuple(
@@ -100,10 +103,73 @@ SINGULARITIES = tuple(Singularity(bits) for bits in range(8))
 # Three angles theta = q + offset (rad), of joints 1 to 3 or 4 to 6; bits of the branch; bits of the singularity.
 Angles: TypeAlias = tuple[float, float, float, int, int]
 
-# m. Nearer to an edge of the workspace than ON_EDGE is on it: there the round-off of the pose decides. A wrist centre
-# that is beyond it by less than SLACK is brought back; one that is nearer than that to an axis leaves its joint free.
+# m. A wrist centre nearer to an edge of the workspace than ON_EDGE is on it: the round-off of the pose decides. One
+# that is beyond it by less than SLACK is moved onto it; one nearer than SLACK to an axis leaves that joint free.
 ON_EDGE = 1e-14
 SLACK = 1e-10
 
-# The square (m^2) of what the wrist centre of a solution may be beside the wanted one.
-CONFIRMED = (5e-10) ** 2
+CONFIRMED = (5e-10) ** 2  # m^2: largest squared error of the wrist centre of a solution
+
+
+class AngleWrap:
+    """Brings angles, which are defined up to multiples of 2 pi, into the joint limits of an arm.
+
+    A joint that round-off has moved beyond its limit is set to the limit: by 1e-10 rad at most, and less for an arm
+    whose reach amplifies that to more than 1e-10 m.
+    """
+
+    def __init__(self, model: ArmModel) -> None:
+        self.limits = tuple((limit.lower, limit.upper) for limit in model.limits)
+        self._triples = {0: self.limits[:3], 3: self.limits[3:]}
+        x, y, z = model.tool.position
+        reach = sum(abs(row.a) + abs(row.d) for row in model.rows) + abs(x) + abs(y) + abs(z)
+        self._slack = 1e-10 / max(1.0, reach)
+
+    def into_limits(self, joint: int, one: float, two: float, three: float) -> tuple[Vector, tuple[int, ...]]:
+        """Wrap the angles of `joint` (0 or 3) and the two after it into their limits, else into (-pi, pi].
+
+        Also returns the joints that are outside their limits.
+        """
+        (l1, u1), (l2, u2), (l3, u3) = self._triples[joint]
+        q1, q2, q3 = remainder(one, tau), remainder(two, tau), remainder(three, tau)
+        outside: tuple[int, ...] = ()
+        if not l1 <= q1 <= u1:
+            q1, outside = self._wrap(q1, joint, outside)
+        if not l2 <= q2 <= u2:
+            q2, outside = self._wrap(q2, joint + 1, outside)
+        if not l3 <= q3 <= u3:
+            q3, outside = self._wrap(q3, joint + 2, outside)
+        return (q1, q2, q3), outside
+
+    def allow(self, q: Six) -> bool:
+        """Whether every joint is inside its limits."""
+        return all(lower <= angle <= upper for angle, (lower, upper) in zip(q, self.limits, strict=True))
+
+    def nearest(self, q: Six, near: Sequence[float]) -> Six:
+        """Wrap each angle to the value nearest to `near` inside the limits; one that has none there keeps its value."""
+        return six(
+            angle if lower <= angle <= upper else self._shifted(angle, lower, upper)
+            for angle, (lower, upper) in zip(map(nearest_turn, q, near), self.limits, strict=True)
+        )
+
+    def _wrap(self, angle: float, joint: int, outside: tuple[int, ...]) -> tuple[float, tuple[int, ...]]:
+        """An angle of [-pi, pi] outside its limits, shifted into them; otherwise its joint is added to `outside`."""
+        lower, upper = self.limits[joint]
+        allowed = self._shifted(angle, lower, upper)
+        if lower <= allowed <= upper:
+            return allowed, outside
+        return (pi if angle == -pi else angle), (*outside, joint)
+
+    def _shifted(self, angle: float, lower: float, upper: float) -> float:
+        """An angle outside its limits, shifted by the fewest turns that bring it back inside, else as it is."""
+        slack = self._slack
+        if angle > upper:
+            shifted = angle - tau * ceil((angle - upper - slack) / tau)
+        else:
+            shifted = angle + tau * ceil((lower - angle - slack) / tau)
+        return min(max(shifted, lower), upper) if lower - slack <= shifted <= upper + slack else angle
+
+
+def nearest_turn(angle: float, near: float) -> float:
+    """`angle` plus the multiple of 2 pi that brings it nearest to `near`, rad."""
+    return near + remainder(angle - near, tau)

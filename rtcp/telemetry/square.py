@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kinematics.batch import forward_batch
-from kinematics.forward import forward, frames
+from kinematics.forward import forward, forward_batch, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose

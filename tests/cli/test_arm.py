@@ -197,7 +197,7 @@ def test_an_arm_without_a_spherical_wrist_has_one_solution_without_a_branch(rtcp
     assert last[:5] == ["1", "-", "-", "-", "-"]  # and the smallest singular value, which every arm has
     far = rtcp("arm", "ik", "5", "0", "0", "0", "0", "0", *arm)
     assert far.code == 3
-    assert "the nearest stays away by" in far.err
+    assert "the nearest configuration misses the pose by" in far.err
 
 
 # -- bad usage ---------------------------------------------------------------------------------------------------------

@@ -82,15 +82,21 @@ def launched(platform: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
     return platform
 
 
-def test_a_start_waits_until_the_machine_is_ready(rtcp: Callable[..., Any], launched: Any) -> None:
+def test_a_start_waits_until_the_machine_is_ready(
+    rtcp: Callable[..., Any], launched: Any, wait_until: Callable[..., None]
+) -> None:
     launched.status["state"] = "starting"
-    becomes_ready = threading.Timer(0.5, launched.status.update, [{"state": "ready"}])
-    becomes_ready.start()
+
+    def become_ready() -> None:
+        wait_until(lambda: len(launched.asked("status")) > 2)
+        launched.status["state"] = "ready"
+
+    machine = threading.Thread(target=become_ready)
+    machine.start()
     ended = rtcp("start", "--detach")
-    becomes_ready.join()
+    machine.join()
     assert ended.code == 0
     assert ended.out.startswith("ready: `rtcp enable`")
-    assert len(launched.asked("status")) > 2
 
 
 @pytest.mark.parametrize("state", ["fault", "emergency_stop"])

@@ -32,3 +32,19 @@ def rig(rig_board: tuple[Blackboard, Observer]) -> Iterator[LoopRig]:
     made = LoopRig(*rig_board)
     yield made
     rig_board[1].release(made.lease)
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    """A blackboard's file in shared memory, removed at the end."""
+    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
+    yield made
+    made.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def board(path: Path) -> Iterator[Blackboard]:
+    """A blackboard of six joints."""
+    made = Blackboard(path, 6, 500_000)
+    yield made
+    made.close()

@@ -9,8 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinematics.batch import forward_batch
-from kinematics.forward import forward
+from kinematics.forward import forward, forward_batch
 from kinematics.model import ArmModel, DhRow
 from kinematics.pose import Pose
 

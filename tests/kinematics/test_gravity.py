@@ -94,7 +94,7 @@ def test_the_payload_is_given_in_the_frame_of_the_tool_and_not_of_the_flange(loa
 
 
 def test_an_arm_of_unknown_masses_is_refused_by_name(assistive):
-    with pytest.raises(ValueError, match=f"masses of arm '{assistive.name}' are not known"):
+    with pytest.raises(ValueError, match=f"arm '{assistive.name}' has no link masses"):
         gravity_torques(assistive, [0.0] * 6)
 
 

@@ -159,7 +159,7 @@ def test_a_configuration_to_be_near_that_is_not_finite_is_refused_by_its_joint(v
 
 @pytest.mark.parametrize("count", [0, 5, 7])
 def test_a_configuration_to_be_near_of_another_length_is_refused(count, assistive):
-    with pytest.raises(ValueError, match=f"q_near has {count} joint angles: 6 are needed"):
+    with pytest.raises(ValueError, match=f"q_near has {count} joint angles; 6 are required"):
         InverseKinematics(assistive).solve_near(IN_REACH, [0.0] * count)
 
 
@@ -174,9 +174,9 @@ def test_a_pose_at_the_end_of_the_numbers_is_out_of_reach_like_any_other(size, e
 def test_a_pose_whose_rotation_is_none_is_refused(distance, assistive):
     solver = InverseKinematics(assistive)
     pose = Pose((0.3 + distance, 0.1, 0.5), (1.001, *IDENTITY.rotation[1:]))
-    with pytest.raises(ValueError, match=r"the rotation of the pose is none: R R\^T differs from 1 by 0.002"):
+    with pytest.raises(ValueError, match=r"the rotation of the pose is invalid: R R\^T differs from 1 by 0.002"):
         solver.solve(pose)
-    with pytest.raises(ValueError, match="the rotation of the pose is none"):
+    with pytest.raises(ValueError, match="the rotation of the pose is invalid"):
         solver.solve_near(pose, [0.0] * 6)
 
 

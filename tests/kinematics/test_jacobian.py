@@ -16,7 +16,6 @@ from kinematics.jacobian import (
     manipulability,
     scaled_rows,
     singularity_distances,
-    tool_jacobian,
 )
 from kinematics.model import ArmModel, DhRow
 from kinematics.pose import Pose
@@ -70,15 +69,6 @@ def test_the_jacobian_is_the_derivative_of_the_tool_pose(arm, change, request):
             turn = np.reshape(b.rotation, (3, 3)) @ np.reshape(a.rotation, (3, 3)).T / (2 * step)
             angular = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
             assert columns[joint] == pytest.approx([*linear, *np.divide(angular, 2)], abs=1e-8)
-
-
-def test_the_tool_jacobian_gives_the_same_velocity_in_directions_of_the_tool(irb120):
-    model = with_tool(irb120)
-    for q in configurations(model, 20):
-        turn = np.reshape(forward(model, q).rotation, (3, 3)).T
-        base = np.array(jacobian(model, q))
-        expected = np.vstack([turn @ base[:3], turn @ base[3:]])
-        assert np.array(tool_jacobian(model, q)) == pytest.approx(expected, abs=1e-14)
 
 
 def test_the_rows_are_plain_floats(assistive):
@@ -185,6 +175,6 @@ def test_the_characteristic_length_is_half_the_reach_from_axis_2(assistive):
 def test_an_angle_that_is_not_finite_is_named(assistive):
     q = [0.0] * 6
     q[3] = math.nan
-    for function in (jacobian, tool_jacobian, manipulability, singularity_distances):
+    for function in (jacobian, manipulability, singularity_distances):
         with pytest.raises(ValueError, match="joint4"):
             function(assistive, q)

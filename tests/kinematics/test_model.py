@@ -65,8 +65,8 @@ def test_a_link_refuses_numbers_that_no_body_has(mass, centre, reason):
         (lambda arm: {"joint_names": ("a", "b", "c", "d", "e", "a")}, "different names"),
         (lambda arm: {"joint_names": ("a", "b", "c", "d", "e", "")}, "different names"),
         (lambda arm: {"tool": Pose((0.0, nan, 0.0), arm.tool.rotation)}, "y is nan"),
-        (lambda arm: {"tool": Pose((0.0, 0.0, 0.0), (2.0, *arm.tool.rotation[1:]))}, "tool's rotation is none"),
-        (lambda arm: {"tool": Pose((0.0, 0.0, 0.0), (-1.0, *arm.tool.rotation[1:]))}, "tool's rotation is none"),
+        (lambda arm: {"tool": Pose((0.0, 0.0, 0.0), (2.0, *arm.tool.rotation[1:]))}, "tool's rotation is invalid"),
+        (lambda arm: {"tool": Pose((0.0, 0.0, 0.0), (-1.0, *arm.tool.rotation[1:]))}, "tool's rotation is invalid"),
     ],
 )
 def test_an_arm_says_what_is_wrong_with_it(change, reason, assistive):

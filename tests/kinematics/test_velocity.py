@@ -9,9 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kinematics.jacobian import characteristic_length, jacobian
+from kinematics.jacobian import THRESHOLD, characteristic_length, jacobian, joint_velocity
 from kinematics.model import ArmModel
-from kinematics.velocity import THRESHOLD, joint_velocity
 
 REGULAR = [0.3, -0.4, 1.1, 0.4, 0.8, 0.2]
 WRIST, ELBOW = [0.3, -0.4, 1.1, 0.4, 0.0, 0.2], [0.3, -0.4, 0.0, 0.4, 0.8, 0.2]

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kinematics.damped_least_squares import NumericResult, solve_numeric
 from kinematics.forward import forward
 from kinematics.jacobian import characteristic_length
 from kinematics.model import ArmModel, DhRow, JointLimit
-from kinematics.numeric import NumericResult, solve_numeric
 from kinematics.pose import IDENTITY, Pose, Rotation
 from kinematics.spherical import has_spherical_wrist
 

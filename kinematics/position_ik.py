@@ -1,28 +1,35 @@
-"""The first three joints of an arm whose axes 2 and 3 are parallel: how they bring the wrist centre to a point.
+"""Position inverse kinematics: joints 1 to 3 for a wrist centre, where axes 2 and 3 are parallel (nearly all arms).
 
 With f = (fx, fy) the wrist centre seen from axis 2, in the plane of the upper arm and the forearm, and h its constant
 height along axis 2, the wrist centre in frame 1 is
 
     (a1 + fx,  cos(alpha1) fy - sin(alpha1) h,  sin(alpha1) fy + cos(alpha1) h)
 
-Its z is that of the target, which gives fy; its y is then known, and the distance from axis 1 gives x = a1 + fx up to
-the sign: front or back. What is left is the triangle with the sides a2 (upper arm), l (forearm), |f|: elbow up or down.
+Its z is that of the target and gives fy; its y is then known, and the distance from axis 1 gives x = a1 + fx up to
+the sign: front or back. The triangle with the sides a2 (upper arm), l (forearm) and |f| remains: elbow up or down.
+For other arms see `position_ik_general`.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, hypot, inf, pi, sin, sqrt
+from collections.abc import Callable
+from math import atan2, cos, hypot, inf, pi, sin, sqrt, tau
 
 from kinematics.model import ArmModel
 from kinematics.pose import Rotation, Vector
-from kinematics.reach import smallest_of_turn
 from kinematics.solution import BACK, CONFIRMED, DOWN, ELBOW, ON_EDGE, SHOULDER, SLACK, Angles
+
+_SAMPLES = 48
+_VALLEYS = 2
+_GOLDEN = 0.6180339887498949
+_GOLDEN_STEPS = 46  # of golden section, down to 1e-10 rad: a distance of 1e-6 m is then exact to 1e-8 of it
 
 
 class PlanarArm:
     """The first three joints of `model`, whose axes 2 and 3 are parallel and axes 1 and 2 are not.
 
-    Points and rotations are given in the frame that joint 1 turns in; angles are the table's theta, q + offset.
+    Points and rotations are in the fixed frame whose z is axis 1 and in which frame 1 is Rz(theta1); angles are
+    theta = q + offset, rad.
     """
 
     def __init__(self, model: ArmModel) -> None:
@@ -39,14 +46,14 @@ class PlanarArm:
         self._shortest = abs(abs(self._a2) - self._length)
         # Rx(alpha2) Rz(theta3) Rx(alpha3) = Rz(sign theta3) Rx(alpha2 + alpha3)
         self._s3, self._c3 = sign * s3, sign * c3
-        # the side that the elbow bends to for front and up
+        # sign of the bend for front and up
         self._up = -1.0 if sign * s1 * self._a2 > 0.0 else 1.0
 
     def solve(self, wx: float, wy: float, wz: float, near1: float, near2: float) -> list[Angles]:
-        """All angles of joints 1 to 3 that bring the wrist centre to the point.
+        """All angles of joints 1 to 3 that bring the wrist centre to the point; empty when it is out of reach.
 
         On a singularity joint 1 (or 2, where the wrist centre is on axis 2) stays at `near1` (`near2`), and branches
-        that have become one are given once. Empty when the point is out of reach.
+        that coincide are returned once.
         """
         height = self._height
         fy = (wz - self._c1 * height) / self._s1
@@ -105,7 +112,7 @@ class PlanarArm:
     def confirm(
         self, theta1: float, theta2: float, theta3: float, point: Vector, rotation: Rotation
     ) -> Rotation | None:
-        """`rotation` seen from what joint 4 turns in, at these angles; None when they do not lead to `point`."""
+        """`rotation` relative to the forearm at these angles; None when they do not reach `point`."""
         sine, cosine = sin(theta2), cos(theta2)
         theta23 = theta2 + self._sign * theta3
         sb, cb = sin(theta23), cos(theta23)
@@ -119,7 +126,7 @@ class PlanarArm:
         dx, dy, dz = ca * x - sa * y - wx, sa * x + ca * y - wy, s1 * fy + c1 * height - wz
         if not dx * dx + dy * dy + dz * dz <= CONFIRMED:
             return None
-        # The axes of the forearm: u x + v y + w z of the rows of Rx(-a2 - a3) Rz(-theta23) Rx(-alpha1) Rz(-theta1)
+        # The axes of the forearm u, v, z: rows of Rx(-alpha2 - alpha3) Rz(-theta23) Rx(-alpha1) Rz(-theta1)
         s3, c3 = self._s3, self._c3
         k, m = c1 * cb, c1 * sb
         ux, uy, uz = cb * ca - m * sa, cb * sa + m * ca, s1 * sb
@@ -135,7 +142,7 @@ class PlanarArm:
         )  # fmt: skip
 
     def shortfall(self, wx: float, wy: float, wz: float) -> float:
-        """How far (m) the wrist centre would stay from a point out of reach; joint limits are not looked at."""
+        """Distance, m, from a point out of reach to the nearest wrist centre; joint limits are not considered."""
         radius = hypot(wx, wy)
         a1, s1, c1, height = self._a1, self._s1, self._c1, self._height
         if c1 == 0.0 and height == 0.0:  # the edges are circles in a plane with axis 1
@@ -147,7 +154,7 @@ class PlanarArm:
             return hypot(hypot(x, y) - radius, s1 * fy + c1 * height - wz)
 
         def at_tube(angle: float) -> float:
-            """At x = 0 in frame 1: as near to axis 1 as the lateral offset lets the wrist centre come."""
+            """At x = 0 in frame 1: as near to axis 1 as the lateral offset allows."""
             fy = self._longest * sin(angle)
             return distance(-a1, fy) if self._shortest <= hypot(a1, fy) <= self._longest else inf
 
@@ -158,3 +165,33 @@ class PlanarArm:
             return distance(self._shortest * cos(angle), self._shortest * sin(angle))
 
         return min(map(smallest_of_turn, (stretched, folded, at_tube)))
+
+
+def smallest_of_turn(function: Callable[[float], float]) -> float:
+    """The smallest value of a function of an angle (rad) over one turn.
+
+    By sampling, then golden section in the two lowest valleys.
+    """
+    step = tau / _SAMPLES
+    values = [function(index * step) for index in range(_SAMPLES)]
+    valleys = sorted(
+        (value, index)
+        for index, value in enumerate(values)
+        if value <= values[index - 1] and value <= values[(index + 1) % _SAMPLES]
+    )
+    return min(_golden_section(function, (index - 1) * step, (index + 1) * step) for _, index in valleys[:_VALLEYS])
+
+
+def _golden_section(function: Callable[[float], float], lower: float, upper: float) -> float:
+    left, right = upper - _GOLDEN * (upper - lower), lower + _GOLDEN * (upper - lower)
+    at_left, at_right = function(left), function(right)
+    for _ in range(_GOLDEN_STEPS):
+        if at_left < at_right:
+            upper, right, at_right = right, left, at_left
+            left = upper - _GOLDEN * (upper - lower)
+            at_left = function(left)
+        else:
+            lower, left, at_left = left, right, at_right
+            right = lower + _GOLDEN * (upper - lower)
+            at_right = function(right)
+    return min(at_left, at_right)

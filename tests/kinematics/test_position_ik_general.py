@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kinematics.roots import real_roots, value
-from kinematics.trigonometric import product, solve_linear, solve_quadratic
+from kinematics.position_ik_general import product, real_roots, solve_linear, solve_quadratic
 
 numbers = st.integers(-2000, 2000).map(lambda thousandths: thousandths / 1000.0)
 angles = st.floats(-pi, pi)
@@ -35,10 +34,6 @@ def test_complex_roots_are_left_out(one, middle, height):
 def test_a_double_root_is_found_however_round_off_has_moved_it(gap):
     quartic = np.polymul(np.poly([2.0, -1.0]), [1.0, -0.6, 0.09 + gap]).tolist()
     assert min(abs(root - 0.3) for root in real_roots(quartic, 1e-7)) < 1e-5
-
-
-def test_the_value_is_that_of_the_polynomial():
-    assert value([2.0, -3.0, 0.5], 1.5) == 2.0 * 1.5**2 - 3.0 * 1.5 + 0.5
 
 
 @given(angles, st.floats(-0.999, 0.999), st.floats(0.1, 3.0))

@@ -1,39 +1,46 @@
-"""Numeric inverse kinematics for any arm of six joints, and the nearest pose where there is no solution."""
+"""Damped least squares (Marquardt 1963): numeric inverse kinematics of any arm, small steps through singularities."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from math import atan2, hypot, pi, sqrt
+from math import atan2, hypot, pi, sqrt, tau
 from operator import add, mul
 from typing import NamedTuple, TypeAlias
 
 from kinematics.forward import frames
-from kinematics.jacobian import Row, characteristic_length, jacobian_columns
-from kinematics.linear import gram, solve_positive
+from kinematics.jacobian import Row, characteristic_length, gram, jacobian_columns, solve_positive
 from kinematics.model import ArmModel
-from kinematics.pose import Pose, Rotation, Vector, require_finite
-from kinematics.reasons import refuse_no_rotation
+from kinematics.pose import Pose, Rotation, Vector, orthonormality_error, require_finite
+from kinematics.solution import Six, six
 
-TOLERANCE = 1e-9  # m and rad, below which a pose counts as reached
+TOLERANCE = 1e-9  # m and rad: a pose with smaller errors is reached
 
 _STARTS = 24
 _ITERATIONS = 80  # of one start
-_FINE = 1e-24  # square of the scaled error below which nothing is left to gain
-_ROUGH, _FINAL = 1e-5, 1e-12  # fractions of the cost: three steps in a row that gain less end a descent
-_EQUAL = 0.999  # ratio of two costs from which on they count as equal
+_FINE = 1e-24  # square of the scaled error at which a descent ends
+_ROUGH, _FINAL = 1e-5, 1e-12  # relative gain in cost; three smaller ones in a row end a descent
+_EQUAL = 0.999  # ratio of two costs above which they count as equal
 _GOLDEN = 1.1127756842787055  # root of x^7 = x + 1: its powers fill six dimensions evenly (Roberts 2018)
 
+# Of `damped_least_squares`
+_STEPS = 7  # limit; two or three are usual, and on the edge of the workspace each halves the error
+_DAMPING, _RELAXATION, _LEAST_DAMPING = 1e-3, 1e-3, 1e-13
+_ENOUGH = 1e-28  # m^2 and rad^2: beside a singularity the error that remains is amplified
+_REACHED = (5e-10) ** 2
+_HOPEFUL = 1e-4  # of the initial cost; give up when three steps do not reach it
 
-_Bound: TypeAlias = tuple[float, float] | None  # None: the joint may turn without end
+_INVALID_ROTATION = 1e-10  # orthonormality error that prevents a solution from being confirmed
+
+_Bound: TypeAlias = tuple[float, float] | None  # None: the joint is unlimited
 _Bounds: TypeAlias = Sequence[_Bound]
 _UNBOUNDED: _Bounds = (None,) * 6
 
 
 class NumericResult(NamedTuple):
-    """The configuration found, and how far its tool pose is from the wanted one.
+    """The configuration found, and the errors of its tool pose.
 
-    q: six rad. converged: both errors below 1e-9. position_error: m. rotation_error: rad, 0 to pi. iterations: of all
-    starts together.
+    q: six rad. converged: both errors below 1e-9. position_error: m. rotation_error: rad, 0 to pi. iterations: total
+    of all starts.
     """
 
     q: Row
@@ -44,7 +51,7 @@ class NumericResult(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """A configuration on the way: its frames, its error (three scaled lengths, three angles), the error's square."""
+    """A configuration during a descent: its frames, its error (three scaled lengths, three angles) and its square."""
 
     q: list[float]
     poses: Sequence[Pose]
@@ -52,26 +59,69 @@ class _Point(NamedTuple):
     cost: float
 
 
+def pose_error(wanted: Pose, actual: Pose) -> list[float]:
+    """Difference of two poses that are close: three lengths (m) and three angles (rad) in the base frame."""
+    (x, y, z), (a, b, c, d, e, f, g, h, i) = wanted
+    (px, py, pz), (j, k, m, n, o, p, q, r, s) = actual
+    return [
+        x - px,
+        y - py,
+        z - pz,
+        0.5 * (n * g - q * d + o * h - r * e + p * i - s * f),
+        0.5 * (q * a - j * g + r * b - k * h + s * c - m * i),
+        0.5 * (j * d - n * a + k * e - o * b + m * f - p * c),
+    ]
+
+
+def damped_least_squares(model: ArmModel, pose: Pose, q_near: Sequence[float]) -> Six | None:
+    """The configuration at `pose` reached from `q_near` (rad) by the smallest joint steps, or None; 0.1 ms a step.
+
+    For poses a small step away, where singularities meet. The closed form finds the joints one after the other: its
+    choice at one singularity (a free joint), or the bend of a stretched arm (known to 1e-8 only), becomes a jump of
+    the later joints beside a second singularity. Least squares move all joints at once. The damping falls with every
+    step; gives up when the first three steps do not come much nearer.
+    """
+    q = list(q_near)
+    damping = _DAMPING
+    poses = frames(model, q)
+    error = pose_error(pose, poses[6])
+    cost = start = sum(map(mul, error, error))
+    for step in range(_STEPS):
+        if cost < _ENOUGH or (step == 3 and cost > _HOPEFUL * start):
+            break
+        columns = jacobian_columns(poses)
+        matrix = gram(list(zip(*columns, strict=True)))
+        for index, row in enumerate(matrix):
+            row[index] += damping
+        weights = solve_positive(matrix, error)
+        if weights is None:
+            break
+        q = [angle + sum(map(mul, column, weights)) for angle, column in zip(q, columns, strict=True)]
+        poses = frames(model, q)
+        error = pose_error(pose, poses[6])
+        cost = sum(map(mul, error, error))
+        damping = max(_LEAST_DAMPING, _RELAXATION * damping)
+    return six(q) if cost < _REACHED else None
+
+
 def solve_numeric(
     model: ArmModel, pose: Pose, q_near: Sequence[float], *, respect_limits: bool = True
 ) -> NumericResult:
-    """A configuration that brings the tool to `pose`, or as near as it comes; not for the loop (0.3 ms to 0.2 s).
+    """A configuration that brings the tool to `pose`, or as near as possible; too slow for the loop (0.3 ms to 0.2 s).
 
-    Damped least squares from `q_near` (six rad), then from fixed starts spread over the joints' ranges, until one
-    reaches the pose. It gives one solution, often but not always the nearest to `q_near`, and always the same for the
-    same arguments. Where no start reaches the pose, the result has the smallest sum of squares found of the position
-    error, in units of the arm's `characteristic_length`, and the rotation error in rad: the nearest pose, as far as
-    the starts can tell.
+    Damped least squares from `q_near` (six rad), then from fixed starts spread over the joint ranges, until one
+    reaches the pose. The result is deterministic, and often but not always the solution nearest to `q_near`. When no
+    start reaches the pose, it is the configuration with the smallest sum of squares of the position error, in units of
+    the arm's `characteristic_length`, and the rotation error, rad.
 
-    With `respect_limits` every joint is inside its limits. Joints are given in the turn nearest to `q_near` that the
-    limits allow. ValueError for a value that is not finite, which it names, and for a rotation that is none.
+    With `respect_limits` every joint is inside its limits. Each joint is wrapped to the value nearest to `q_near` that
+    the limits allow. Raises ValueError for a value that is not finite, naming it, and for an invalid rotation.
 
-    Sources: Marquardt 1963 for the damping, Bertsekas 1982 for the bounds: a joint at a bound that would leave it is
-    held for the step.
+    Bounds as Bertsekas 1982: a joint at a bound that the step would exceed is held for this step.
     """
     pose.require_finite()
     require_finite(q_near, model.joint_names)
-    refuse_no_rotation(pose)
+    require_rotation(pose)
     bounds: _Bounds = _UNBOUNDED
     if respect_limits:
         bounds = [(limit.lower, limit.upper) for limit in model.limits]
@@ -85,7 +135,7 @@ def solve_numeric(
         iterations += count
         best = _nearer(best, reached)
         if respect_limits and max(_errors(best, length)) >= TOLERANCE:
-            # A way to the pose may lead through what the limits forbid.
+            # The path of a descent may leave the limits and return.
             beyond, count = _descend(model, pose, start, _UNBOUNDED, length)
             turned = map(_near_turn, beyond.q, q_near, bounds)
             reached, again = _descend(model, pose, _inside(turned, bounds), bounds, length)
@@ -104,7 +154,7 @@ def _errors(point: _Point, length: float) -> tuple[float, float]:
 
 
 def _nearer(first: _Point, other: _Point) -> _Point:
-    """The better of two; of equals the first, which lies nearer to where the search began."""
+    """The better of two; of equals the first, which is nearer to the start of the search."""
     return other if other.cost < _EQUAL * first.cost else first
 
 
@@ -124,7 +174,7 @@ def _starts(bounds: _Bounds) -> Iterator[list[float]]:
 def _descend(
     model: ArmModel, pose: Pose, start: list[float], bounds: _Bounds, length: float, stalled: float = _ROUGH
 ) -> tuple[_Point, int]:
-    """The minimum downhill of `start`, and how many steps were tried."""
+    """The local minimum reached from `start`, and the number of steps."""
     point = _point(model, pose, start, length)
     damping = 1e-2
     small_gains = 0
@@ -147,7 +197,7 @@ def _descend(
 
 
 def _step(point: _Point, bounds: _Bounds, damping: float, length: float) -> list[float] | None:
-    """(J^T J + damping)^-1 J^T error over the joints that are free to move; None where it cannot be solved."""
+    """(J^T J + damping)^-1 J^T error over the joints that no bound holds; None when it cannot be solved."""
     columns = [
         (vx / length, vy / length, vz / length, wx, wy, wz) for vx, vy, vz, wx, wy, wz in jacobian_columns(point.poses)
     ]
@@ -175,7 +225,7 @@ def _point(model: ArmModel, pose: Pose, q: list[float], length: float) -> _Point
 
 
 def _rotation_error(wanted: Rotation, actual: Rotation) -> Vector:
-    """Axis times angle (rad, 0 to pi) of the turn, about the base's axes, from the actual to the wanted rotation."""
+    """Axis times angle (rad, 0 to pi), in the base frame, from the actual to the wanted rotation."""
     a, b, c, d, e, f, g, h, i = wanted
     j, k, m, n, o, p, r, s, t = actual
     # wanted actual^T, entry by entry
@@ -187,7 +237,7 @@ def _rotation_error(wanted: Rotation, actual: Rotation) -> Vector:
     if sine > 1e-6 or cosine > 0.0:
         factor = atan2(sine, cosine) / sine if sine > 0.0 else 1.0
         return factor * x, factor * y, factor * z
-    # Half a turn: the axis is the longest column of the symmetric part, R = 2 n n^T - 1.
+    # Near pi the axis is the longest column of the symmetric part, since R = 2 n n^T - 1.
     axis = max(
         (xx + 1.0, 0.5 * (xy + yx), 0.5 * (xz + zx)),
         (0.5 * (xy + yx), yy + 1.0, 0.5 * (yz + zy)),
@@ -203,10 +253,16 @@ def _clip(angle: float, bound: _Bound) -> float:
 
 
 def _near_turn(angle: float, near: float, bound: _Bound) -> float:
-    """`angle` plus the turns of 2 pi that bring it nearest to `near` inside the bound; a joint in no turn stays."""
-    turn = 2.0 * pi
-    nearest = angle + turn * round((near - angle) / turn)
+    """`angle` plus the multiple of 2 pi that brings it nearest to `near` inside the bound, else `angle` itself."""
+    nearest = angle + tau * round((near - angle) / tau)
     if bound is None or bound[0] <= nearest <= bound[1]:
         return nearest
-    inside = [candidate for candidate in (nearest - turn, nearest + turn) if bound[0] <= candidate <= bound[1]]
+    inside = [candidate for candidate in (nearest - tau, nearest + tau) if bound[0] <= candidate <= bound[1]]
     return min(inside, key=lambda candidate: abs(candidate - near), default=angle)
+
+
+def require_rotation(pose: Pose) -> None:
+    """Raise ValueError unless the rotation of the pose is orthonormal."""
+    error = orthonormality_error(pose[1])
+    if not error <= _INVALID_ROTATION:
+        raise ValueError(f"the rotation of the pose is invalid: R R^T differs from 1 by {error:.3g}")

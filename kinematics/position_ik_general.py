@@ -1,35 +1,45 @@
-"""The first three joints of an arm in general geometry: how they bring the wrist centre to a point.
+"""Position inverse kinematics: joints 1 to 3 for a wrist centre, where axes 2 and 3 are not parallel.
 
-Seen from what joint 2 turns, the wrist centre is g(theta3) = (g1, g2, g3), linear in the cosine and sine of theta3.
-Joint 2 turns it to f = Rz(theta2) g, and in frame 1 it is (a1, 0, 0) + Rx(alpha1) f. Neither its z nor its distance
-from the origin depends on theta1 (Pieper 1968), which gives for the wanted point, at the height z and the distance R:
+Relative to the link that joint 2 moves, the wrist centre is g(theta3) = (g1, g2, g3), linear in cos and sin(theta3).
+Joint 2 rotates it to f = Rz(theta2) g, and in frame 1 it is (a1, 0, 0) + Rx(alpha1) f. Neither its z nor its distance
+from the origin depends on theta1 (Pieper 1968), which gives for a target at the height z and the distance R:
 
     sin(alpha1) f2 = z - cos(alpha1) g3          2 a1 f1 = R^2 - a1^2 - g^2
 
-f1^2 + f2^2 = g1^2 + g2^2 is then an equation of theta3 alone, of second degree in its cosine and sine: a quartic in
-tan(theta3 / 2). Where a1 or sin(alpha1) is zero one of the two equations is already free of theta2. Newton's method
-makes all roots exact.
+f1^2 + f2^2 = g1^2 + g2^2 is then an equation in theta3 alone, of second degree in its cosine and sine: a quartic in
+tan(theta3 / 2). Where a1 or sin(alpha1) is zero, one of the two equations is already independent of theta2. Newton's
+method polishes all roots.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, hypot, remainder, sin, sqrt, tau
+from collections.abc import Sequence
+from math import atan, atan2, copysign, cos, hypot, pi, remainder, sin, sqrt, tau
+from typing import TypeAlias
 
 from kinematics.model import ArmModel
 from kinematics.pose import Rotation, Vector, applied, times, transposed, turned
-from kinematics.reach import smallest_of_turn
+from kinematics.position_ik import smallest_of_turn
 from kinematics.solution import BACK, CONFIRMED, DOWN, ELBOW, SHOULDER, SLACK, Angles
-from kinematics.trigonometric import product, solve_linear, solve_quadratic
 
-# m, or a sine. What is smaller than SMALL brings roots of the quartic so near to each other that round-off may hide
-# them: the roots without it are then tried too. What is smaller than ZERO is none.
+# constant, factor of cos, factor of sin
+Linear: TypeAlias = tuple[float, float, float]
+# constant, factors of cos x, sin x, cos 2x, sin 2x
+Quadratic: TypeAlias = tuple[float, ...]
+
+# m, or a sine. A value of a1 or sin(alpha1) below SMALL brings roots of the quartic so close together that round-off
+# may hide them: the roots of the equation without it are then tried too. Below ZERO it counts as zero.
 _SMALL = 1e-4
 _ZERO = 1e-12
-_LOOSE = 10.0  # so many times what is left out, relative, they may then be out of reach
-_SAME = 1e-7  # rad; two solutions that are nearer are one, on a singularity
-_REGULAR = 1e-6  # determinant, in units of the size, that an arm reaches somewhere if it is one
-_FLAT = 1e-12  # determinant, in units of the size, with which there is no step
-_STEPS = 20  # of Newton's method, at most: towards a double root each only halves the way
+_LOOSE = 10.0  # relative tolerance of those roots, in units of the value that is left out
+_SAME = 1e-7  # rad; nearer solutions are one, on a singularity
+_REGULAR = 1e-6  # largest determinant, in units of the size cubed, below which an arm moves in two directions only
+_FLAT = 1e-12  # determinant, in units of the size cubed, below which Newton's method has no step
+_NEWTON_STEPS = 20  # limit; near a double root each step only halves the error
+_ROOT_STEPS = 200  # limit; about ten are usual
+# Relative to the largest factor: an extremum this near to zero counts as a root, since round-off may have removed it.
+# A false root is rejected by the check of the wrist centre.
+_NEARLY = 1e-7
 
 
 class GeneralArm:
@@ -54,7 +64,7 @@ class GeneralArm:
         )
 
     def is_regular(self) -> bool:
-        """Whether the three joints can move the wrist centre in three directions; else nothing can be solved."""
+        """Whether the three joints can move the wrist centre in three directions; `solve` requires it."""
         samples = ((0.3 + 0.9 * i, 0.1 + 0.7 * j) for i in range(7) for j in range(9))
         return max(abs(self._determinant(*sample)) for sample in samples) > _REGULAR * self._size**3
 
@@ -91,7 +101,7 @@ class GeneralArm:
         return times(transposed(forearm), rotation)
 
     def shortfall(self, wx: float, wy: float, wz: float) -> float:
-        """As `PlanarArm.shortfall`, but by search over joints 2 and 3: 20 ms, too long for the loop."""
+        """As `PlanarArm.shortfall`, but by search over joints 2 and 3: 20 ms, too slow for the loop."""
         radius = hypot(wx, wy)
 
         def of_plane(theta3: float) -> float:
@@ -104,7 +114,7 @@ class GeneralArm:
         return smallest_of_turn(of_plane)
 
     def _planes(self, wx: float, wy: float, wz: float) -> list[tuple[float, float, float]]:
-        """(theta3, f1, f2) that give the point its height and its distance from the origin."""
+        """All (theta3, f1, f2) at the height of the point and at its distance from the origin."""
         a1, s1, c1 = self._a1, self._s1, self._c1
         constant, along, across = self._square
         # R^2 - a1^2 - g^2 and z - cos(alpha1) g3
@@ -137,7 +147,7 @@ class GeneralArm:
         ]
 
     def _other(self, theta3: float, one: float, left_out: float) -> list[float]:
-        """The second of f1 and f2, both signs, where the first is known; with something left out, not quite."""
+        """The other of f1 and f2, both signs; `left_out` is the value that the equation neglects."""
         g1, g2, _ = self._wrist(theta3)
         size = hypot(g1, g2)
         if abs(left_out) > _ZERO:
@@ -161,7 +171,7 @@ class GeneralArm:
         return c * x - s * y, s * x + c * y, z
 
     def _columns(self, theta2: float, theta3: float) -> tuple[Vector, Vector, Vector]:
-        """What the wrist centre moves by with each joint, in frame 1."""
+        """Derivatives of the wrist centre by joints 1 to 3, in frame 1."""
         x, y, _ = self._point(0.0, theta2, theta3)
         upper = times(turned(self._s1, self._c1, theta2), turned(self._s2, self._c2, theta3))
         g1, g2, _ = self._wrist(theta3)
@@ -182,9 +192,9 @@ class GeneralArm:
         return x * x + y * y + z * z <= CONFIRMED
 
     def _polish(self, angles: Vector, point: Vector) -> Vector:
-        """Newton's method, for as long as it brings the wrist centre nearer to the point."""
+        """Newton's method, while it brings the wrist centre nearer to the point."""
         error = self._error(angles, point)
-        for _ in range(_STEPS):
+        for _ in range(_NEWTON_STEPS):
             theta1, theta2, theta3 = angles
             one, two, three = self._columns(theta2, theta3)
             s, c = sin(theta1), cos(theta1)
@@ -206,7 +216,7 @@ class GeneralArm:
 
 
 def _starts(form: Vector, left_out: float) -> list[float]:
-    """Where the form is zero; with something left out of it also those to start from where it just is not."""
+    """Roots of the form, and those of a looser form when a value is left out of it."""
     angles = solve_linear(form)
     if abs(left_out) > _ZERO:
         angles += solve_linear((form[0] * (1.0 - _LOOSE * abs(left_out)), form[1], form[2]))
@@ -225,3 +235,99 @@ def _triple(one: Vector, two: Vector, three: Vector) -> float:
 
 def _same(one: Vector, other: Vector) -> bool:
     return all(abs(remainder(angle - known, tau)) < _SAME for angle, known in zip(one, other, strict=True))
+
+
+def product(one: Linear, other: Linear) -> Quadratic:
+    """The product of two linear forms."""
+    k, c, s = one
+    m, d, t = other
+    return k * m + 0.5 * (c * d + s * t), k * d + c * m, k * t + s * m, 0.5 * (c * d - s * t), 0.5 * (c * t + s * d)
+
+
+def solve_linear(form: Linear) -> list[float]:
+    """The angles (rad) where the form is zero: two, which may coincide, or none."""
+    constant, along, across = form
+    size = hypot(along, across)
+    if size == 0.0 or abs(constant) > size * (1.0 + _NEARLY):
+        return []
+    middle = atan2(across, along)
+    half = atan2(sqrt(max(0.0, (size - constant) * (size + constant))), -constant)
+    return [middle + half, middle - half]
+
+
+def solve_quadratic(form: Quadratic) -> list[float]:
+    """The angles (rad) where the form is zero or nearly touches zero: up to four."""
+    constant, c1, s1, c2, s2 = form
+    if not max(map(abs, form)) > 0.0:
+        return []
+
+    def at(angle: float) -> float:
+        return constant + c1 * cos(angle) + s1 * sin(angle) + c2 * cos(2.0 * angle) + s2 * sin(2.0 * angle)
+
+    # tan(x / 2) is infinite at x = pi: count x from the angle half a turn from which the form is largest
+    start = max((0.25 * pi * eighth for eighth in range(8)), key=lambda angle: abs(at(angle + pi)))
+    c, s = cos(start), sin(start)
+    c1, s1 = c * c1 + s * s1, c * s1 - s * c1
+    c, s = cos(2.0 * start), sin(2.0 * start)
+    c2, s2 = c * c2 + s * s2, c * s2 - s * c2
+    quartic = (
+        constant - c1 + c2, 2.0 * s1 - 4.0 * s2, 2.0 * constant - 6.0 * c2, 2.0 * s1 + 4.0 * s2, constant + c1 + c2
+    )  # fmt: skip
+    return [start + 2.0 * atan(tangent) for tangent in real_roots(quartic, _NEARLY)]
+
+
+def real_roots(coefficients: Sequence[float], nearly: float) -> list[float]:
+    """The real roots, ascending, of a polynomial given highest power first; the first coefficient is not zero.
+
+    Between two neighbouring stationary points there is at most one. A stationary point that misses zero by less than
+    `nearly` times the size of the polynomial's terms is a root too: round-off may have made a double root complex.
+    """
+    degree = len(coefficients) - 1
+    if degree == 1:
+        return [-coefficients[1] / coefficients[0]]
+    slope = [factor * (degree - index) for index, factor in enumerate(coefficients[:-1])]
+    bound = 1.0 + max(abs(factor / coefficients[0]) for factor in coefficients[1:])
+    roots = []
+    lower, at_lower = -bound, _value(coefficients, -bound)
+    for upper in (*real_roots(slope, 0.0), bound):
+        at_upper = _value(coefficients, upper)
+        if at_upper == 0.0 or (at_lower < 0.0) != (at_upper < 0.0):
+            roots.append(_root_between(coefficients, slope, lower, upper, at_lower))
+        elif upper != bound and abs(at_upper) <= nearly * _value(list(map(abs, coefficients)), abs(upper)):
+            roots.append(upper)
+        lower, at_lower = upper, at_upper
+    return roots
+
+
+def _value(coefficients: Sequence[float], x: float) -> float:
+    """The polynomial at x (Horner)."""
+    result = 0.0
+    for factor in coefficients:
+        result = result * x + factor
+    return result
+
+
+def _root_between(
+    coefficients: Sequence[float], slope: Sequence[float], lower: float, upper: float, at_lower: float
+) -> float:
+    """The root in an interval with a change of sign: Newton's steps, bisection where they leave the interval."""
+    sign = copysign(1.0, at_lower)
+    x = 0.5 * (lower + upper)
+    for _ in range(_ROOT_STEPS):
+        here = _value(coefficients, x)
+        if here == 0.0:
+            return x
+        if here * sign > 0.0:
+            lower = x
+        else:
+            upper = x
+        steepness = _value(slope, x)
+        candidate = x - here / steepness if steepness != 0.0 else lower
+        if not lower < candidate < upper:
+            candidate = 0.5 * (lower + upper)
+            if not lower < candidate < upper:
+                break
+        if candidate == x:
+            break
+        x = candidate
+    return x
