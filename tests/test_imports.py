@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -120,6 +121,19 @@ def test_a_folder_imports_only_folders_above_it() -> None:
         if is_ours(found) and breaks_the_order(found) and (found.file, found.module) not in EXCEPTIONS
     ]
     assert told(breaches) == []
+
+
+def test_no_file_imports_itself_by_way_of_others() -> None:
+    paths = {path for found in IMPORTS if (path := ROOT / found.file).name != "__init__.py"}
+    modules = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in paths}
+    graph: dict[Path, set[Path]] = {}
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text())):
+            named = modules_named(node, "")
+            if isinstance(node, ast.ImportFrom):
+                named += [f"{node.module}.{alias.name}" for alias in node.names]
+            graph.setdefault(path, set()).update(modules[name] for name in named if name in modules)
+    TopologicalSorter(graph).prepare()  # CycleError names the files
 
 
 def test_every_exception_is_still_needed() -> None:
