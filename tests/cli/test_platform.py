@@ -16,9 +16,9 @@ SLOW = ("--cycle-us", "2000")
 """A cycle that a loaded machine keeps: what is tested here is how the commands start and end it."""
 
 FIELDS = {
-    "state": str, "mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict, "slaves": list,
-    "joints": dict, "inputs": int, "outputs": int, "wakeup_us": dict, "exchange_us": dict, "compute_us": dict,
-    "dc": dict, "realtime": dict, "pids": dict,
+    "state": str, "drive_mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict,
+    "slaves": list, "joints": dict, "inputs": int, "outputs": int, "wakeup_us": dict, "exchange_us": dict,
+    "compute_us": dict, "dc": dict, "realtime": dict, "pids": dict,
 }  # fmt: skip
 
 
@@ -41,7 +41,7 @@ def test_a_detached_start_returns_when_the_platform_answers_and_stop_ends_it(
     assert (started.code, started.err) == (0, "")
     status = json.loads(rtcp("status", "--json").out)
     assert {name: type(status[name]) for name in FIELDS} == FIELDS
-    assert (status["state"], status["mode"], status["cycle_ns"]) == ("ready", "csv", 2_000_000)
+    assert (status["state"], status["drive_mode"], status["cycle_ns"]) == ("ready", "csv", 2_000_000)
     assert rtcp("start", "--config", str(arm)).code == 3
     assert rtcp("segment", "faults").out == "no fault is active\n"
     assert rtcp("stop").code == 0

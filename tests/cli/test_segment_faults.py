@@ -43,7 +43,7 @@ def begin(rtcp_process: Callable[..., Any], config: Path) -> Callable[..., Segme
     return start
 
 
-def test_faults_are_made_listed_and_mended_on_the_segment_that_runs(
+def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(
     rtcp: Rtcp, begin: Callable[..., Segment], directory: Path
 ) -> None:
     process, said = begin()

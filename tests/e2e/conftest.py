@@ -94,6 +94,29 @@ class Platform:
         """Return what `rtcp status --json` prints."""
         return self.call("status")
 
+    def events(self, since: int = 0) -> list[str]:
+        """Return the names of the loop's events after the number `since`, oldest first."""
+        return [event["name"] for event in self.call("events", since=since)["events"]]
+
+    def last_event(self) -> int:
+        """Return the number of the last event."""
+        return max((int(event["number"]) for event in self.call("events")["events"]), default=0)
+
+    def restore(self) -> None:
+        """Start what a test has ended, leave a fault, and bring the arm to 0 in mode joint, csp, disabled."""
+        if not all(lives(pid) for pid in self.pids().values()):
+            self.rtcp("stop", check=None)
+            self.rtcp("start", "--detach")
+        found = self.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
+        if found["state"] in ("fault", "emergency_stop", "stopped_by_limit"):
+            self.call("reset")
+        self.call("mode", name="joint")
+        self.call("mode", name="csp")
+        if max(map(abs, found["joints"]["actual_position"])) > 1e-2:
+            self.call("enable")
+            self.call("move_joints", q=[0.0] * 6)
+        self.call("disable")
+
     def until(self, met: Callable[[dict[str, Any]], bool], what: str, patience_s: float = 20.0) -> dict[str, Any]:
         """Ask for the status until `met`; the patience only keeps a broken platform from hanging the tests."""
         end = time.monotonic() + patience_s
@@ -187,11 +210,10 @@ def platform() -> Iterator[Platform]:
 
 
 @pytest.fixture
-def running(platform: Platform) -> Platform:
-    """A platform of its own, started: for tests that break it."""
-    platform.be_patient(2000)
-    platform.rtcp("start", "--detach")
-    return platform
+def running(shared: Platform) -> Platform:
+    """The platform of the module, started again where the test before broke it, the arm disabled at 0."""
+    shared.restore()
+    return shared
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform)
     with recording(blackboard_file(enabled.directory)) as made:
         enabled.rtcp("move", *(f"{q:.6f}" for q in target), "--speed", "0.2")
     assert made.lost == 0
-    commanded, actual = made.column("target")[:, 0], made.column("position")[:, 0]
+    commanded, actual = made.column("commanded_position")[:, 0], made.column("actual_position")[:, 0]
     moving = np.flatnonzero(np.abs(np.diff(commanded)) > 0)
     begun = moving[0]
     away = np.flatnonzero(np.abs(actual - target[0]) > 0.0007)
@@ -40,7 +40,7 @@ def test_a_square_of_200_mm_at_50_mm_s_is_driven_within_1_mm_commanded_and_3_mm_
     assert config.arm is not None
     square = place(config, "xy")
     with ControlClient("the experiment", control_socket(enabled.directory)) as client:
-        client.call("move_joints", {"q": list(square.start), "speed": None}, timeout_s=60.0)
+        client.call("move_joints", {"q": list(square.start)}, timeout_s=60.0)
         with recording(blackboard_file(enabled.directory)) as made:
             client.call("move_line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
     driven = judge(config.arm, square, made)

@@ -7,12 +7,15 @@ import os
 import socket
 import stat
 import time
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 from rtcp.config.find import default_config
+from rtcp.ipc.errors import Refused
+from rtcp.ipc.jsonrpc import INTERNAL_ERROR
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from tests.e2e.conftest import Platform
@@ -20,11 +23,12 @@ from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
 pytestmark = pytest.mark.alone
 
-Q = ["0.3", "-0.2", "0.4", "-0.1", "0.25", "-0.35"]
+ZERO = [0.0] * 6
+Q = [0.3, -0.2, 0.4, -0.1, 0.25, -0.35]
 
 
-def distance(status: dict, q: list[str]) -> float:  # type: ignore[type-arg]
-    return max(abs(have - float(want)) for have, want in zip(status["joints"]["actual_position"], q, strict=True))
+def distance(status: dict[str, Any], q: list[float]) -> float:
+    return max(abs(have - want) for have, want in zip(status["joints"]["actual_position"], q, strict=True))
 
 
 def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> None:
@@ -41,10 +45,13 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
 
 def test_the_status_has_every_promised_field(shared: Platform) -> None:
     status = shared.status()
-    assert {"state", "mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "inputs", "outputs",
-            "wakeup_us", "exchange_us", "compute_us", "dc", "realtime", "pids"} <= set(status)  # fmt: skip
+    assert {"state", "drive_mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "inputs",
+            "outputs", "wakeup_us", "exchange_us", "compute_us", "dc", "realtime", "pids"} <= set(status)  # fmt: skip
     assert {"position", "name", "state"} <= set(status["slaves"][0])
-    assert all(len(status["joints"][name]) == 6 for name in ("position", "velocity", "torque", "target"))
+    assert all(
+        len(status["joints"][name]) == 6
+        for name in ("actual_position", "actual_velocity", "actual_torque", "commanded_position", "sent_position")
+    )
     assert all({"p50", "p99", "max"} <= set(status[name]) for name in ("wakeup_us", "exchange_us", "compute_us"))
     assert {"locked", "offset_ns"} <= set(status["dc"])
     assert {"scheduler", "memory_locked", "cpu"} <= set(status["realtime"])
@@ -75,18 +82,18 @@ def test_an_sdo_that_the_slave_refuses_is_a_sentence(shared: Platform) -> None:
 
 @pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
 def test_a_move_ends_within_a_milliradian(enabled: Platform, mode: str) -> None:
-    enabled.rtcp("mode", mode)
-    enabled.rtcp("move", *Q)
+    enabled.call("mode", name=mode)
+    enabled.rtcp("move", *map(str, Q))
     status = enabled.until(lambda found: distance(found, Q) < 1e-3, f"arrival in {mode}")
     assert status["drive_mode"] == mode
     assert status["state"] == "holding"
-    enabled.rtcp("move", "--", *["-0.05"] * 6)
-    enabled.until(lambda found: distance(found, ["-0.05"] * 6) < 1e-3, f"arrival in {mode}")
+    enabled.call("move_joints", q=[-0.05] * 6)
+    enabled.until(lambda found: distance(found, [-0.05] * 6) < 1e-3, f"arrival in {mode}")
 
 
 def test_the_arm_holds_between_commands(enabled: Platform) -> None:
     for mode in ("csp", "csv", "cst"):
-        enabled.rtcp("mode", mode)
+        enabled.call("mode", name=mode)
         before = enabled.status()["joints"]["actual_position"]
         time.sleep(0.5)
         after = enabled.status()["joints"]["actual_position"]
@@ -99,28 +106,28 @@ def test_the_arm_holds_against_gravity_through_every_change_of_mode(enabled: Pla
     observer = Observer(blackboard_file(enabled.directory))
     first = observer.head
     for mode in ("cst", "csv", "cst", "csp", "csv", "csp"):
-        enabled.rtcp("mode", mode)
+        enabled.call("mode", name=mode)
     records, _ = observer.since(first)
     observer.close()
-    assert np.abs(records["position"] - np.array(before)).max() < 5e-3
-    enabled.rtcp("move", *["0"] * 6)
+    assert np.abs(records["actual_position"] - np.array(before)).max() < 5e-3
+    enabled.call("move_joints", q=ZERO)
 
 
 def test_enabling_does_not_move_the_arm(shared: Platform) -> None:
     before = shared.status()["joints"]["actual_position"]
-    shared.rtcp("enable")
+    shared.call("enable")
     status = shared.status()
     assert status["state"] == "holding"
     assert max(abs(a - b) for a, b in zip(before, status["joints"]["actual_position"], strict=True)) < 1e-3
     assert max(abs(a - b) for a, b in zip(before, status["joints"]["commanded_position"], strict=True)) < 1e-3
-    shared.rtcp("disable")
+    shared.call("disable")
     assert shared.status()["state"] == "ready"
 
 
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["move", "9", "0", "0", "0", "0", "0"], 3, "outside its range -3.1 to 3.1 rad (joints[0].position"),
+        (["move", "9", "0", "0", "0", "0", "0"], 3, "(joints[0].position in assistive_arm.yaml"),
         (["move", "0", "0", "0", "0", "0", "0", "--speed", "50"], 3, "speed 50 rad/s is not allowed"),
         (["move", "0", "0", "0"], 2, "6"),
         (["move", "nan", "0", "0", "0", "0", "0"], None, "nan"),
@@ -138,57 +145,63 @@ def test_what_is_not_allowed_is_refused_and_nothing_moves(
 
 
 def test_moves_that_the_generator_finds_hard_are_made_or_refused(enabled: Platform) -> None:
-    enabled.rtcp("move", "0.5", "0", "0", "0", "0", "0")
-    enabled.rtcp("move", "0.54", "0", "0", "0", "0", "0")
-    assert "no trajectory" in enabled.rtcp("move", *["0"] * 6, "--speed", "1e-6", check=3).stderr
+    enabled.call("move_joints", q=[0.5, 0, 0, 0, 0, 0])
+    enabled.call("move_joints", q=[0.54, 0, 0, 0, 0, 0])
+    with pytest.raises(Refused) as refused:
+        enabled.call("move_joints", q=ZERO, speed=1e-6)
+    assert refused.value.reason == "no_trajectory"
     assert enabled.status()["state"] == "holding"
-    enabled.rtcp("move", *["0"] * 6)
+    enabled.call("move_joints", q=ZERO)
 
 
 def test_malformed_requests_are_answered_and_end_nothing(shared: Platform) -> None:
-    requests = [
-        b"garbage",
-        b"[]",
-        b'{"do": "nothing"}',
-        b'{"do": "move", "args": {"q": "x"}}',
-        b'{"do": "sdo_read", "args": {"slave": 2, "index": -1, "subindex": 0}}',
-        b'{"do": "sdo_read", "args": {"slave": 99, "index": 1, "subindex": 70000}}',
-        b'{"do": "sdo_write", "args": {"slave": 2, "index": 24677, "subindex": 0, "hex": "zz"}}',
-        b'{"do": "output", "args": {"number": 1' + b"0" * 400 + b', "value": 1}}',
+    calls = [
+        ("move_joints", {"q": "x"}),
+        ("sdo_read", {"slave": 2, "index": -1, "subindex": 0}),
+        ("sdo_read", {"slave": 99, "index": 1, "subindex": 70000}),
+        ("sdo_write", {"slave": 2, "index": 24677, "subindex": 0, "hex": "zz"}),
+        ("set_output", {"output": 10**400, "value": True}),
+    ]
+    requests = [b"garbage", b"[]", b'{"jsonrpc": "2.0", "id": 1, "method": "nothing"}']
+    requests += [
+        json.dumps({"jsonrpc": "2.0", "id": 1, "method": method, "params": params}).encode() for method, params in calls
     ]
     for request in requests:
         with socket.socket(socket.AF_UNIX) as client:
             client.connect(str(shared.directory / "control.sock"))
             client.sendall(request + b"\n")
-            answer = json.loads(client.makefile().readline())
-            assert answer["ok"] is False
-            assert len(answer["error"]["message"]) > 10
+            error = json.loads(client.makefile().readline())["error"]
+            assert error["code"] != INTERNAL_ERROR
+            assert len(error["message"]) > 10
     assert shared.status()["state"] == "ready"
 
 
 def test_a_move_without_enabling_is_refused(shared: Platform) -> None:
-    done = shared.rtcp("move", *Q, check=3)
-    assert "not possible while ready" in done.stderr
+    with pytest.raises(Refused) as refused:
+        shared.call("move_joints", q=Q)
+    assert (refused.value.reason, refused.value.fields["state"]) == ("wrong_state", "ready")
 
 
 def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) -> None:
     moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
     enabled.until(lambda found: found["state"] == "moving", "motion")
-    done = enabled.rtcp("move", *Q, check=3)
-    assert f"pid {moving.pid}" in done.stderr
+    with pytest.raises(Refused) as refused:
+        enabled.call("move_joints", q=Q)
+    assert f"pid {moving.pid}" in refused.value.fields["holder"]
     assert moving.wait() == 0
-    enabled.rtcp("move", *["0"] * 6)
+    enabled.call("move_joints", q=ZERO)
 
 
 def test_a_commander_that_is_killed_ends_in_a_controlled_stop(enabled: Platform) -> None:
     moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.1")
     enabled.until_moving()
+    since = enabled.last_event()
     moving.kill()
     moving.wait()
     status = enabled.until(lambda found: found["state"] == "holding", "standstill")
     assert 0.0 < status["joints"]["actual_position"][0] < 1.4
-    assert any("controlled stop" in sentence for sentence in status["messages"])
-    enabled.rtcp("move", *["0"] * 6)
+    assert "lease_expired" in enabled.events(since)
+    enabled.call("move_joints", q=ZERO)
 
 
 def test_the_control_socket_is_its_owners_alone(shared: Platform) -> None:
@@ -205,16 +218,17 @@ def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_spe
 ) -> None:
     path = enabled.directory / "frames"
     with enabled.capture(path):
-        enabled.rtcp("move", *Q)
-        enabled.rtcp("move", "3.2", "0", "0", "0", "0", "0", check=3)
-        enabled.rtcp("mode", "csv")
-        enabled.rtcp("move", *["0"] * 6)
-        enabled.rtcp("mode", "cst")
-        enabled.rtcp("move", *Q)
-        enabled.rtcp("mode", "csp")
-        enabled.rtcp("move", *["0"] * 6)
-        enabled.rtcp("disable")
-        enabled.rtcp("enable")
+        enabled.call("move_joints", q=Q)
+        with pytest.raises(Refused):
+            enabled.call("move_joints", q=[3.2, 0, 0, 0, 0, 0])
+        enabled.call("mode", name="csv")
+        enabled.call("move_joints", q=ZERO)
+        enabled.call("mode", name="cst")
+        enabled.call("move_joints", q=Q)
+        enabled.call("mode", name="csp")
+        enabled.call("move_joints", q=ZERO)
+        enabled.call("disable")
+        enabled.call("enable")
     limits = [(-3.1, 3.1), (-2.0, 2.0), (-2.4, 2.4), (-3.1, 3.1), (-2.0, 2.0), (-3.1, 3.1)]
     torques = [float(joint["torque"]) for joint in yaml.safe_load(default_config().read_text())["joints"]]
     # 0.5 rad/s at 500 us are 2.5 counts a cycle: a step on the wire is at most three.
@@ -234,4 +248,4 @@ def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_spe
                 assert step <= largest + 0.5
         before = [drive.position for drive in drives]
     assert seen > 4000
-    assert moved > 4 * 10_000 * sum(abs(float(q)) for q in Q) * 0.99
+    assert moved > 4 * 10_000 * sum(abs(q) for q in Q) * 0.99

@@ -85,14 +85,14 @@ class WireDeeds:
         verb, arguments = self.random.choice(
             (
                 ("enable", {}), ("disable", {}), ("reset", {}), ("halt", {}), ("halt", {}),
-                ("mode", {"name": self.random.choice((*DRIVE_MODES, "none"))}),
-                ("output", {"number": self.random.randrange(0, 18), "value": self.random.random() < 0.5}),
-                ("gripper", {"open": self.random.random() < 0.5}),
+                ("set_drive_mode", {"mode": self.random.choice((*DRIVE_MODES, "none"))}),
+                ("set_output", {"output": self.random.randrange(0, 18), "value": self.random.random() < 0.5}),
+                ("move_gripper", {"open": self.random.random() < 0.5}),
             )
         )  # fmt: skip
         self.voice.ask(verb, **arguments)
 
-    def motion_mode(self) -> None:
+    def control_mode(self) -> None:
         (name,) = self.random.choices(MOTIONS, SHARES)
         if self.voice.ask("mode", name=name) is not None and self.random.random() < 0.3:
             self.voice.ask("mode", name=self.random.choice(DRIVE_MODES))
@@ -104,7 +104,7 @@ class WireDeeds:
         span = random.choice((1.0, 0.3, 0.1, 0.02))
         now = self.now
         if random.random() < 0.2:
-            self._travel("move", q=[q + random.uniform(-0.2, 0.2) for q in BENT])
+            self._travel("move_joints", q=[q + random.uniform(-0.2, 0.2) for q in BENT])
             return
         q = [
             self.or_nonsense(here + span * (random.uniform(low, high) - here))
@@ -113,7 +113,7 @@ class WireDeeds:
         if random.random() < 0.1:
             q[random.randrange(6)] = random.choice((-3.2, 3.2, 3.1, -3.1))
         speed = self.or_nonsense(random.choice((0.5, 0.5, 0.2, random.uniform(0.0, 0.6))))
-        self._travel("move", q=q, speed=speed, each=random.random() < 0.5)
+        self._travel("move_joints", q=q, speed=speed, synchronized=random.random() < 0.5)
 
     def pose_move(self) -> None:
         self._travel("move_pose", pose=self.pose(0.2), line=self.random.random() < 0.5)
@@ -121,7 +121,7 @@ class WireDeeds:
     def line(self) -> None:
         random = self.random
         poses = [self.pose(random.choice((0.05, 0.2))) for _ in range(random.randrange(1, 4))]
-        self._travel("line", poses=poses, speed=self.or_nonsense(random.choice((0.05, 0.1, 0.25))))
+        self._travel("move_line", poses=poses, speed=self.or_nonsense(random.choice((0.05, 0.1, 0.25))))
 
     def trajectory(self) -> None:
         random = self.random
@@ -133,7 +133,7 @@ class WireDeeds:
             t += step
             here = [q + random.uniform(-pace, pace) * step for q in here]
             points.append({"t": t, "q": [self.or_nonsense(q, 0.003) for q in here]})
-        self._travel("trajectory", points=points, approach=random.random() < 0.3)
+        self._travel("run_trajectory", points=points, approach=random.random() < 0.3)
 
     def _travel(self, verb: str, **arguments: Any) -> None:
         """Begin it; now and then something comes in between, or nobody waits for its end."""
@@ -182,7 +182,7 @@ class WireDeeds:
         random = self.random
         for _ in range(random.randrange(1, 6)):
             numbers = [self.or_nonsense(random.choice((0.0, random.uniform(-0.5, 0.5), 0.5)), 0.01) for _ in range(6)]
-            taken = self.voice.ask("move_at_velocity", numbers=numbers, hold_s=self.or_nonsense(0.5))
+            taken = self.voice.ask("move_at_velocity", velocity=numbers, hold_s=self.or_nonsense(0.5))
             if taken is None and random.random() < 0.5:
                 break
             self.seconds(0.02, 0.4)
@@ -194,7 +194,7 @@ class WireDeeds:
         for _ in range(random.randrange(1, 6)):
             numbers = [self.or_nonsense(random.uniform(-share, share) * most, 0.005) for most in self.now.torque]
             shares = {"stiffness": random.choice((0.0, 0.5, 1.0)), "damping": random.choice((0.0, 1.0))}
-            taken = self.voice.ask("apply_torque", numbers=numbers, **shares, hold_s=self.or_nonsense(0.3))
+            taken = self.voice.ask("apply_torque", torque=numbers, **shares, hold_s=self.or_nonsense(0.3))
             if taken is None and random.random() < 0.5:
                 break
             self.seconds(0.02, 0.3)
@@ -214,7 +214,7 @@ class WireDeeds:
             target = [q + v * interval for q, v in zip(target, velocity, strict=True)]
             sent = [q + random.uniform(-0.5, 0.5) for q in target] if random.random() < 0.03 else target
             told = stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.5, interval))
-            if self.voice.ask("stream_position", q=[self.or_nonsense(q, 0.003) for q in sent], t=told) is None:
+            if self.voice.ask("stream_position", q=[self.or_nonsense(q, 0.003) for q in sent], stamp_s=told) is None:
                 break
             time.sleep(interval * random.uniform(0.5, 1.5))
         self._leave()
@@ -311,7 +311,7 @@ class WireDeeds:
 
     def _set(self, changes: dict[str, float]) -> None:
         asked = time.monotonic_ns()
-        answer = self.voice.ask("limits", set=changes)
+        answer = self.voice.ask("set_limits", changes=changes)
         if answer is not None:
             self.now = from_answer(answer["limits"], self.widest.jerk)
             self.changes.append(Change(asked, time.monotonic_ns(), self.now))
@@ -354,7 +354,7 @@ class WireDeeds:
         self._window(slave, 1, 0)
         self.voice.happen("following error window of 1 count", f"slave {slave}")
         self.voice.ask("enable")
-        self.voice.begin("move", q=self.near(0.5))
+        self.voice.begin("move_joints", q=self.near(0.5))
         self.voice.busy(2.0)
         self.voice.drop()
 

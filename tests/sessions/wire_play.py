@@ -39,7 +39,7 @@ class WirePlayer:
         self._actions: list[tuple[int, Callable[[], object]]] = [
             (24, self._motion),
             (4, deeds.command),
-            (8, deeds.motion_mode),
+            (8, deeds.control_mode),
             (3, deeds.limits),
             (2, deeds.stick),
             (1, deeds.chair),
@@ -76,7 +76,7 @@ class WirePlayer:
         self.deeds.enable()
 
     def _motion(self) -> None:
-        """Mostly one that the motion mode takes, now and then another."""
+        """Mostly one that the control mode takes, now and then another."""
         deeds, motion = self.deeds, str(self.voice.status()["control_mode"])
         if self.random.random() < 0.1:
             motion = self.random.choice(MOTIONS)

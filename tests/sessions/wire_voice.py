@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rtcp.ipc import jsonrpc
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
 
@@ -30,8 +31,9 @@ class Line:
 
     def begin(self, verb: str, arguments: Mapping[str, Any]) -> None:
         """Ask."""
-        request = {"id": 1, "do": verb, "args": dict(arguments), "client": NAME}
-        self._socket.sendall(json.dumps(request).encode() + b"\n")
+        identify = {"jsonrpc": jsonrpc.VERSION, "method": "identify", "params": {"name": NAME}}
+        request = {"jsonrpc": jsonrpc.VERSION, "id": 1, "method": verb, "params": dict(arguments)}
+        self._socket.sendall(b"".join(json.dumps(one).encode() + b"\n" for one in (identify, request)))
 
     def answer(self, patience_s: float) -> dict[str, Any] | None:
         """Return the answer, or None where it has not come in time."""
@@ -39,7 +41,7 @@ class Line:
         while True:
             *lines, self._received = self._received.split(b"\n")
             for reply in map(json.loads, lines):
-                if "progress" not in reply:
+                if jsonrpc.progress(reply) is None:
                     return dict(reply)
             self._socket.settimeout(max(end - time.monotonic(), 1e-3))
             try:
@@ -47,7 +49,7 @@ class Line:
             except TimeoutError:
                 return None
             if not got:
-                return {"ok": False, "error": {"kind": "lost", "message": "the connection was closed"}}
+                return {"error": {"message": "the connection was closed", "data": {"kind": "lost"}}}
             self._received += got
 
     def close(self) -> None:
@@ -154,9 +156,9 @@ def _is_json(value: Any) -> bool:
 def _read(reply: dict[str, Any] | None) -> tuple[str, str, dict[str, Any] | None]:
     if reply is None:
         return "timeout", "no answer", None
-    if reply.get("ok"):
+    if "result" in reply:
         return "", "", dict(reply["result"])
-    return str(reply["error"]["kind"]), str(reply["error"]["message"]), None
+    return str(reply["error"]["data"]["kind"]), str(reply["error"]["message"]), None
 
 
 def _short(value: Any) -> str:
