@@ -191,11 +191,11 @@ class Kind:
 
 def kinds() -> list[Kind]:
     """Return every kind of fault."""
-    from rtcp.config.faults import FAULTS
+    from rtcp.config.faults import installed
 
     return [
         Kind(name, str(kind.__doc__).partition("\n")[0], {field.name: _allowed(kind, field) for field in fields(kind)})
-        for name, kind in FAULTS.items()
+        for name, kind in installed().items()
     ]
 
 

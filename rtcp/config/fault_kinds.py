@@ -1,13 +1,17 @@
 """The kinds of faults of the virtual segment: one dataclass each, with what is allowed for its keys.
 
-Positions count from 1, as on the cable; 0 is the master.
+Positions count from 1, as on the cable; 0 is the master. A package outside adds a kind by a subclass of `PluginFault`
+and an entry point of the group `rtcp.faults`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
 from types import MappingProxyType
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from annotated_types import Ge, Gt, Le
 
@@ -243,10 +247,32 @@ class Noise:
     seed: Seed = 0
 
 
+@dataclass(frozen=True)
+class PluginFault:
+    """Base of the kinds of faults of packages outside: a frozen dataclass, whose fields are the keys of the fault.
+
+    The first line of its docstring is what `rtcp segment kinds` shows. A key `slave` of type `Position` is checked
+    against the segment's slaves.
+    """
+
+    name: ClassVar[str]
+
+    def begin(self, devices: Sequence[Any]) -> Callable[[int], None]:
+        """Let the fault begin; return what ends it, called with the instant, ns.
+
+        Args:
+            devices: the device models (`rtcp.virtual.device.DeviceModel`) in the order of the cable.
+
+        Raises:
+            FaultRefused: (`rtcp.virtual.faults.devices`) the segment cannot have this fault.
+        """
+        raise NotImplementedError
+
+
 Fault = (
     CableFault | PowerFault | AlRefuse | AlHang | AlFall | SdoLate | SdoAbort | Loss | Delay | Duplicate | Reorder
     | Corrupt | Garble | WorkingCounter | DriveFault | Sync0Lost | ClockJump | ClockDrift | TerminalFault
-    | InputsFrozen | StickCode | Noise
+    | InputsFrozen | StickCode | Noise | PluginFault
 )  # fmt: skip
 _KINDS: tuple[type[Fault], ...] = (
     CableFault, PowerFault, AlRefuse, AlHang, AlFall, SdoLate, SdoAbort, Loss, Delay, Duplicate, Reorder, Corrupt,
@@ -254,6 +280,31 @@ _KINDS: tuple[type[Fault], ...] = (
     Noise,
 )  # fmt: skip
 FAULTS = MappingProxyType({kind.name: kind for kind in _KINDS})
-"""Every kind of fault by the name that commands and scripts give it."""
+"""Every kind of fault of this package by the name that commands and scripts give it."""
 ONCE = (AlFall, ClockJump)
 """Faults that happen and are over: they do not last and cannot be cleared."""
+ENTRY_POINTS = "rtcp.faults"
+
+
+@cache
+def installed() -> Mapping[str, type[Fault]]:
+    """Return every kind of fault by its name: those of this package, then those of packages outside.
+
+    Raises:
+        RuntimeError: an entry point is not a dataclass that extends `PluginFault`, or its name is taken.
+    """
+    found: dict[str, type[Fault]] = dict(FAULTS)
+    for entry in sorted(entry_points(group=ENTRY_POINTS)):
+        loaded = entry.load()
+        if not (
+            isinstance(loaded, type) and issubclass(loaded, PluginFault) and "__dataclass_fields__" in vars(loaded)
+        ):
+            raise RuntimeError(
+                f"entry point {entry.name} = {entry.value} of {ENTRY_POINTS} is no dataclass that extends PluginFault"
+            )
+        if found.setdefault(loaded.name, loaded) is not loaded:
+            raise RuntimeError(
+                f"entry point {entry.name} = {entry.value} of {ENTRY_POINTS}: there is another fault {loaded.name}; "
+                "change its `name`"
+            )
+    return MappingProxyType(found)

@@ -41,6 +41,7 @@ from rtcp.config.fault_kinds import (
     Sync0Lost,
     TerminalFault,
     WorkingCounter,
+    installed,
 )
 from rtcp.config.model import ConfigError
 from rtcp.config.validation import Checker, unknown_key
@@ -48,8 +49,8 @@ from rtcp.config.validation import Checker, unknown_key
 __all__ = [
     "FAULTS", "ONCE", "AlFall", "AlHang", "AlRefuse", "CableFault", "ClockDrift", "ClockJump", "Corrupt", "Delay",
     "DriveFault", "Duplicate", "Fault", "Garble", "InputsFrozen", "Loss", "Noise", "Planned", "PowerFault", "Reorder",
-    "SdoAbort", "SdoLate", "StickCode", "Sync0Lost", "TerminalFault", "WorkingCounter", "load_script", "parse",
-    "sentence_of",
+    "SdoAbort", "SdoLate", "StickCode", "Sync0Lost", "TerminalFault", "WorkingCounter", "installed", "load_script",
+    "parse", "sentence_of",
 ]  # fmt: skip
 
 _BY_RATE = (Loss, Delay, Duplicate, Reorder, Corrupt, Garble, WorkingCounter)
@@ -91,10 +92,11 @@ def parse(mapping: object) -> tuple[Planned | None, list[Finding]]:
         if not sound:
             findings.append(((key,), f"found {shown(value)}, allowed is a number from {lowest:g} to {_LONGEST_S:g}"))
         times[key] = value
-    if not isinstance(name, str) or name not in FAULTS:
-        text = f"found {shown(name)}, allowed is one of {', '.join(FAULTS)}"
+    known = installed()
+    if not isinstance(name, str) or name not in known:
+        text = f"found {shown(name)}, allowed is one of {', '.join(known)}"
         if isinstance(name, str):
-            text = unknown_key(name, list(FAULTS), what="fault")
+            text = unknown_key(name, list(known), what="fault")
         return None, [(("fault",), text), *findings]
     fault, wrong = _checker(name).check(own)
     findings += wrong
@@ -117,7 +119,7 @@ def sentence_of(finding: Finding) -> str:
 @cache
 def _checker(name: str) -> Checker[Any]:
     """Return the checker of a kind: made once, a segment that runs reads its commands between frames."""
-    return Checker(FAULTS[name])
+    return Checker(installed()[name])
 
 
 def load_script(path: Path, slaves: int = 255) -> tuple[Planned, ...]:

@@ -68,7 +68,8 @@ class Cycle:
     ) -> None:
         others = make_others(config)
         box = next(((slot, driver) for slot, driver in others if isinstance(driver, IoBox)), None)
-        self._others = [one for one in others if one != box]
+        self.others = [one for one in others if one != box]
+        """Index of the slave and driver of each device of another kind than drive and IO box."""
         self.arm = Arm(config, make_drives(config), make_gripper(config), blackboard.plan)
         self.box = None if box is None else box[1]
         self.operator = Operator(config, self.box)
@@ -122,7 +123,7 @@ class Cycle:
             arm.decode(data)
             if box is not None:
                 box.decode(data.input(self._box_slot))
-            for slot, driver in self._others:
+            for slot, driver in self.others:
                 driver.decode(data.input(slot))
         elif wkc > 0 and box is not None and context.box_in_op:
             # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
@@ -137,7 +138,7 @@ class Cycle:
         arm.encode(data)
         if box is not None:
             data.set_output(self._box_slot, box.encode())
-        for slot, driver in self._others:
+        for slot, driver in self.others:
             data.set_output(slot, driver.encode())
         self._publish(woken, planned, received, wkc)
         discipline = self._discipline

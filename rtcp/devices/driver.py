@@ -25,7 +25,8 @@ class Driver:
 
     A kind of device is one subclass: it names the channels that it cannot do without, unpacks the inputs in `decode`
     and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
-    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name.
+    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name. In the
+    loop, `rtcp.control.cycle.Cycle.others` holds the drivers that are neither a drive nor the IO box.
 
     Args:
         slave: the slave's name and description.

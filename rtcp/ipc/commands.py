@@ -31,7 +31,10 @@ class Command(Message, abstract=True):
 
 
 class MotionCommand(Command, abstract=True):
-    """Base of what a motion controller accepts (`rtcp.motion.controllers`)."""
+    """Base of what a motion controller accepts (`rtcp.motion.controllers`).
+
+    A field `hold_s` makes it a command that expires: on the control socket it then is 0.25 s where it is left out.
+    """
 
     states = MOTION
     waits_for_drive_mode = True

@@ -1,8 +1,8 @@
 """What happens in the loop: one frozen dataclass a kind, whose docstring is its message.
 
 The number of a kind is also the error code in cycle records, in `rtcp status` and in ROS-Industrial's RobotStatus.
-Code decides on kinds and fields; `rtcp.ipc.names` makes the text, at the edge. A fault kind of a package outside is
-a subclass of `Fault` there, with a number from 1000 on.
+Code decides on kinds and fields; `rtcp.ipc.names` makes the text, at the edge. An event of a package outside is
+a subclass of `MotionEnded` with a number from 1000 on, which its controller returns by `give_up`.
 """
 
 from __future__ import annotations

@@ -15,13 +15,18 @@ import pytest
 from rtcp.ipc.runtime_directory import segment_control
 from rtcp.ipc.session import read_session
 from rtcp.virtual.faults.client import SegmentClient
-from tests.e2e.conftest import Platform, kill, lives
+from tests.e2e.conftest import Platform, gone, kill, lives
+from tests.e2e.wire import inputs, outputs
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.slow]
 
 ZERO = [0.0] * 6
 
-SAFE_OP_ERROR, SYNC_MANAGER_WATCHDOG = 0x14, 0x1B
+INIT, SAFE_OP_ERROR, SYNC_MANAGER_WATCHDOG = 0x01, 0x14, 0x1B
+QUICK_STOP = 0x0002
+"""Controlword."""
+STATE_BITS, OPERATION_ENABLED, QUICK_STOP_ACTIVE, SWITCH_ON_DISABLED = 0x6F, 0x27, 0x07, 0x40
+"""Of the statusword."""
 STILL_RAD_S = 0.002
 MOVE = ("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
 
@@ -196,3 +201,60 @@ def test_a_stop_without_a_segment_says_that_no_frame_comes_back(platform: Platfo
     assert foreground.returncode == 5, said
     assert "no frame comes back" in "".join(said)
     assert list(platform.directory.glob("*.sock")) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_the_foreground_start_stops_in_order_on_a_signal(platform: Platform, number: signal.Signals) -> None:
+    foreground = started(platform)
+    platform.call("enable")
+    pids = platform.pids()
+    foreground.send_signal(number)
+    foreground.communicate()
+    assert foreground.returncode == 0
+    assert not any(lives(pid) for pid in pids.values())
+
+
+def test_a_loop_that_is_terminated_alone_is_a_fault_of_the_foreground_start(platform: Platform) -> None:
+    foreground = started(platform)
+    pids = platform.pids()
+    os.kill(pids["loop"], signal.SIGTERM)
+    foreground.communicate()
+    assert foreground.returncode == 5
+    assert not any(lives(pid) for pid in pids.values())
+
+
+def test_a_defect_in_the_cycle_ramps_the_joints_down_and_leaves_slaves_in_init(platform: Platform) -> None:
+    # A defect cannot be ordered from outside: the interpreter's own start-up hook puts one into the real loop.
+    hook = platform.directory / "hook"
+    hook.mkdir()
+    (hook / "sitecustomize.py").write_text(
+        "import sys\n"
+        "if 'rtcp.control.process' in sys.orig_argv:\n"
+        "    from rtcp.control.cycle import Cycle\n"
+        "    cycle = Cycle.cycle\n"
+        "    def defective(self, *given):\n"
+        "        if self.arm.drives[0].velocity > 0.3:\n"
+        "            raise ZeroDivisionError('a defect for the test')\n"
+        "        return cycle(self, *given)\n"
+        "    Cycle.cycle = defective\n"
+    )
+    platform.environment["PYTHONPATH"] = str(hook)
+    platform.be_patient(2000)
+    platform.rtcp("start", "--detach")
+    # A drive that does not ramp down on `disable operation` has nothing but the quick stop.
+    platform.rtcp("sdo", "write", "2", "0x605C:0", "0", "--type", "int16")
+    platform.call("enable")
+    loop = platform.pids()["loop"]
+    path = platform.directory / "frames"
+    with platform.capture(path):
+        assert platform.rtcp("move", "1.5", "0", "0", "0", "0", "0", check=5).stderr
+        gone(loop)
+    assert "a defect for the test" in platform.logs()
+    told = [when for when, drives in outputs(path) if {drive.controlword for drive in drives} == {QUICK_STOP}]
+    assert told[-1] - told[0] > 75e6
+    shown = list(inputs(path))
+    turning = [drive.statusword & STATE_BITS for _, drives in shown for drive in drives if abs(drive.velocity) > 100]
+    assert set(turning) == {OPERATION_ENABLED, QUICK_STOP_ACTIVE}
+    assert {drive.statusword & 0x4F for drive in shown[-1][1]} == {SWITCH_ON_DISABLED}
+    assert platform.al_states() == [INIT] * 7
+    assert "ended unexpectedly" in platform.status()["message"]

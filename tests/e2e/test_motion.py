@@ -21,6 +21,9 @@ from tests.e2e.conftest import Platform, kill
 
 pytestmark = pytest.mark.alone
 
+PERIOD_US = 1000
+"""A cycle that a loaded host keeps."""
+
 BENT = [0.0, 0.2, 1.57, 0.0, 0.4, 0.0]
 NUMBERS = [f"{q:g}" for q in BENT]
 

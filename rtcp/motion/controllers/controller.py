@@ -90,7 +90,11 @@ class Controller:
         raise NotImplementedError
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle, in the phases MOVE and STOP; used up at once."""
+        """Return the setpoints of the next cycle, in the phases MOVE and STOP; used up at once.
+
+        Fill lists of your own and set them in `setpoint`: after `rest` its lists are those of the state. Set `phase` to
+        HOLD in the cycle that reaches the end; `give_up` ends a motion early.
+        """
         raise NotImplementedError
 
     def begin(self) -> None:

@@ -19,7 +19,7 @@ from types import MappingProxyType
 from typing import Any
 
 from rtcp.config.document import shown
-from rtcp.config.faults import FAULTS, parse, sentence_of
+from rtcp.config.faults import installed, parse, sentence_of
 from rtcp.config.validation import unknown_key
 from rtcp.virtual.faults.ground_truth import GroundTruth
 from rtcp.virtual.faults.registry import FaultRegistry
@@ -98,7 +98,7 @@ class Control:
             "fault": self._fault, "clear": self._clear, "faults": self._faults, "truth": self._tell_truth,
             "clear_peaks": self._clear_peaks,
         })  # fmt: skip
-        for name in FAULTS:
+        for name in installed():
             # What a kind allows is worked out when it is first named, which takes longer than a frame may wait.
             parse({"fault": name})
 

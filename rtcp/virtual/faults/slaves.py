@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import MappingProxyType
 from typing import Any, TypeVar
 
+from rtcp.config.fault_kinds import PluginFault
 from rtcp.config.faults import (
     AlFall,
     AlHang,
@@ -100,7 +101,9 @@ def begin(segment: Segment, fault: Fault, t: int, lasts: float | None = None) ->
     Raises:
         FaultRefused: the segment has no such slave, or it is not of the kind that can have this fault.
     """
-    make = _KINDS.get(type(fault))
+    make: Callable[[Segment, Any, int], SlaveUndo] | None = _KINDS.get(type(fault))
+    if isinstance(fault, PluginFault):
+        make = _plugin
     if make is None:
         raise FaultRefused(f"{fault.name} is no fault of a slave or a cable")
     _catch_up(segment, t)
@@ -269,6 +272,10 @@ def _drift(segment: Segment, fault: ClockDrift, t: int) -> SlaveUndo:
 
 def _device(segment: Segment, fault: devices.DeviceFault, t: int) -> SlaveUndo:
     return SlaveUndo(segment, devices.begin([slave.device for slave in segment.slaves], fault))
+
+
+def _plugin(segment: Segment, fault: PluginFault, t: int) -> SlaveUndo:
+    return SlaveUndo(segment, fault.begin([slave.device for slave in segment.slaves]))
 
 
 _KINDS: MappingProxyType[type[Fault], Callable[[Segment, Any, int], SlaveUndo]] = MappingProxyType({

@@ -1,0 +1,1 @@
+"""Extensions of rtcp, one of each; `docs/extending.md` explains them."""

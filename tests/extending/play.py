@@ -1,0 +1,140 @@
+"""One scene a function, played in a process that has the example package installed: `play.py SCENE CONFIG` prints JSON.
+
+A process of its own: what a package registers stays registered for the process's life.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from rtcp.config import load
+from rtcp.ipc.commands import Enable, Halt
+from rtcp.ipc.names import Names
+from rtcp.ipc.states import State
+from rtcp.launch.simulation import Frame, Simulation
+
+
+def started(path: Path) -> Simulation:
+    """An enabled arm."""
+    simulation = Simulation(load(path), follow_clock=False)
+    assert simulation.until(lambda: simulation.state is State.READY, 5.0)
+    simulation.acquire()
+    assert simulation.send(Enable()).refusal is None
+    assert simulation.until(lambda: simulation.state is State.HOLDING, 5.0)
+    return simulation
+
+
+def sway(path: Path) -> Any:
+    """The commanded position of joint 6 through a sway, its end, a refused one, and a halt."""
+    from rtcp_example.sway import Sway
+
+    with started(path) as simulation:
+        names, state = Names(simulation.config), simulation.loop.arm.state
+        begin = state.commanded[5]
+        positions: list[float] = []
+        answer = simulation.send(Sway(5, 0.02, 1.0, 2.0))
+        assert simulation.state is State.MOVING, answer
+        while simulation.state is State.MOVING:
+            positions.append(state.commanded[5] - begin)
+            simulation.cycle()
+        arrived = simulation.state.name, state.commanded[5] - begin
+        refused = simulation.send(Sway(5, 1.0, 5.0, 2.0)).refusal
+        simulation.send(Sway(5, 0.02, 1.0, 2.0))
+        simulation.run(0.7)
+        halted_at = state.commanded[5] - begin
+        simulation.send(Halt())
+        stopped = simulation.until(lambda: simulation.state is State.HOLDING, 1.0)
+        return {
+            "positions": positions,
+            "period_s": simulation.period_ns * 1e-9,
+            "arrived": arrived,
+            "refused": refused and names.message(refused),
+            "halted_at": halted_at,
+            "stopped": stopped,
+        }
+
+
+def thermometer(path: Path) -> Any:
+    """What the driver decodes, beside the bytes on the bus and the model's own temperatures."""
+    with started(path) as simulation:
+        frames: list[Frame] = []
+        simulation.on_frame = frames.append
+        simulation.run(0.5)
+        (slot, driver), *_ = simulation.loop.others
+        counts = struct.unpack("<hh", frames[-1].received[slot])
+        model: Any = simulation.bus.slaves[slot].device
+        return {
+            "driver": type(driver).__name__,
+            "values": driver.values,
+            "counts": counts,
+            "model": model.kelvin,
+        }
+
+
+def wire_break(path: Path) -> Any:
+    """The fault on a real segment object: named as a script names it, begun and cleared by the registry."""
+    from rtcp.config.faults import parse, sentence_of
+    from rtcp.config.segment import load_segment
+    from rtcp.virtual.faults.registry import FaultRegistry
+    from rtcp.virtual.faults.slaves import FaultRefused
+    from rtcp.virtual.server import make_segment
+
+    config = load(path)
+    segment = make_segment(load_segment(config.source.parent / config.bus.segment), time.monotonic_ns())
+    model: Any = segment.slaves[7].device
+    registry = FaultRegistry(segment, lambda frame: None, time.monotonic_ns())
+    shown: list[int] = []
+
+    def step() -> None:
+        model.step(0.001)
+        shown.append(model.objects[0x6000, 1].value)
+
+    planned, _ = parse({"fault": "wire_break", "slave": 8})
+    other, _ = parse({"fault": "wire_break", "slave": 1})
+    assert planned is not None
+    assert other is not None
+    step()
+    number = registry.begin(planned, time.monotonic_ns())
+    step()
+    registry.clear(number, time.monotonic_ns())
+    step()
+    refused = ""
+    try:
+        registry.begin(other, time.monotonic_ns())
+    except FaultRefused as error:
+        refused = str(error)
+    _, wrong = parse({"fault": "wire_break", "slave": 0})
+    return {"shown": shown, "refused": refused, "wrong": [sentence_of(one) for one in wrong]}
+
+
+def methods(path: Path) -> Any:
+    """The method that the gateway makes of the command, and its answer to wrong parameters."""
+    from rtcp.gateway.methods import Methods
+    from rtcp.gateway.status_snapshot import StatusSnapshot
+    from rtcp.ipc.session import Session
+
+    async def end_platform() -> list[str]:
+        return []
+
+    with Simulation(load(path)) as simulation, tempfile.TemporaryDirectory() as directory:
+        session = Session(simulation.config, "virtual", "ecat0", 0, time.monotonic_ns())
+        snapshot = StatusSnapshot(simulation.observer, session, {})
+        table = Methods(simulation.observer, snapshot, session, Path(directory), end_platform).table
+        found = table["sway"]
+        _, findings = found.parameters.check({"axis": 5, "amplitude": 0.02, "frequency": "fast"})
+        return {
+            "documentation": found.documentation,
+            "streams": found.streams,
+            "findings": [[list(where), text] for where, text in findings],
+        }
+
+
+if __name__ == "__main__":
+    _, scene, config = sys.argv
+    json.dump({one.__name__: one for one in (sway, thermometer, wire_break, methods)}[scene](Path(config)), sys.stdout)

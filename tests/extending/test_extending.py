@@ -1,0 +1,125 @@
+"""A package outside adds a controller, a kind of device and a fault (`docs/extending.md`): the example, installed and
+run."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+HERE = Path(__file__).resolve().parent
+EXAMPLE = HERE / "example"
+REPOSITORY = HERE.parents[1]
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with the example package, installed by pip."""
+    directory = tmp_path_factory.mktemp("example")
+    shutil.copytree(EXAMPLE, directory / "source", ignore=shutil.ignore_patterns("__pycache__"))
+    target = directory / "installed"
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target)]
+    if importlib.util.find_spec("hatchling"):
+        command.append("--no-build-isolation")
+    subprocess.run([*command, str(directory / "source")], check=True)
+    return target
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The default arm with a thermometer behind its last drive."""
+    directory = tmp_path_factory.mktemp("config")
+    shutil.copytree(REPOSITORY / "config", directory, dirs_exist_ok=True)
+    shutil.copy(EXAMPLE / "thermometer.yaml", directory / "devices")
+    arm, segment = directory / "assistive_arm.yaml", directory / "segment.yaml"
+    last = "  - {name: drive6, device: cubemars-orh}\n"
+    assert last in arm.read_text()
+    arm.write_text(arm.read_text().replace(last, last + "  - {name: thermometer, device: thermometer}\n"))
+    with segment.open("a") as file:
+        file.write("  - {model: example-thermometer, options: {heating: 10}}\n")
+    return arm
+
+
+@pytest.fixture(scope="module")
+def play(installed: Path, config: Path) -> Any:
+    """Return what a scene of `play.py` prints, in a process that finds the package."""
+
+    def run(scene: str) -> Any:
+        done = subprocess.run(
+            [sys.executable, str(HERE / "play.py"), scene, str(config)],
+            check=False, capture_output=True, text=True, cwd=config.parent,
+            env={**os.environ, "PYTHONPATH": str(installed)},
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout)
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def swayed(play: Any) -> Any:
+    return play("sway")
+
+
+def test_a_controller_of_another_package_moves_the_arm_and_ends_where_it_began(swayed: Any) -> None:
+    positions = swayed["positions"]
+    assert len(positions) * swayed["period_s"] == pytest.approx(2.0, abs=0.01)
+    assert max(positions) == pytest.approx(0.0174, abs=0.0005)
+    assert min(positions) == pytest.approx(-0.0174, abs=0.0005)
+    assert swayed["arrived"] == ["HOLDING", pytest.approx(0.0, abs=1e-9)]
+    fastest = max(abs(b - a) for a, b in pairwise(positions)) / swayed["period_s"]
+    assert fastest < 0.02 * (2.0 * 3.1416 + 1.5708)
+
+
+def test_a_halt_stops_it_before_its_end(swayed: Any) -> None:
+    assert swayed["halted_at"] != 0.0
+    assert swayed["stopped"]
+
+
+def test_its_refusal_reads_as_those_of_the_platform(swayed: Any) -> None:
+    assert swayed["refused"] == ("joint6: 1 rad at 5 Hz exceeds its velocity or acceleration: reduce one of them")
+
+
+def test_a_driver_of_another_package_decodes_what_the_model_of_that_package_sends(play: Any) -> None:
+    found = play("thermometer")
+    assert found["driver"] == "Thermometer"
+    first, second = found["counts"]
+    assert found["values"] == {"first": pytest.approx(first * 0.1), "second": pytest.approx(second * 0.1)}
+    assert found["values"]["first"] == pytest.approx(300.0)
+    assert found["values"]["second"] == pytest.approx(found["model"][1], abs=0.1)
+    assert found["values"]["second"] > 304.0
+
+
+def test_a_fault_of_another_package_begins_ends_and_is_refused_where_it_does_not_fit(play: Any) -> None:
+    found = play("wire_break")
+    assert found["shown"] == [3000, 0x7FFF, 3000]
+    assert found["refused"] == "slave 1 is no thermometer"
+    assert len(found["wrong"]) == 1
+    assert found["wrong"][0].startswith("slave: found 0")
+
+
+def test_the_gateway_lists_the_command_as_a_method_that_checks_its_parameters(play: Any) -> None:
+    found = play("methods")
+    assert found["documentation"].startswith("Swing a joint")
+    assert found["streams"] is False
+    missing, wrong = sorted(found["findings"])
+    assert "duration_s is missing" in missing[1]
+    assert wrong[0] == ["frequency"]
+
+
+def test_the_page_shows_every_file_of_the_example_whole() -> None:
+    page = (REPOSITORY / "docs" / "extending.md").read_text()
+    assert len(page) <= 8000
+    for name in ("pyproject.toml", "thermometer.yaml", "sway.py", "thermometer.py", "virtual.py"):
+        path = next(EXAMPLE.rglob(name))
+        text = re.sub(r'\A""".*?"""\n\n', "", path.read_text(), flags=re.DOTALL)
+        assert f"\n{text}```" in page, path
