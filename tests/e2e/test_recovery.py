@@ -89,7 +89,7 @@ def test_a_drive_that_was_without_supply_moves_by_nothing_but_reset_and_enable(
     noticed = int(np.argmax(records["fault"] != 0))
     came_back = records["statusword"][noticed:, 2] & 0x6F
     assert ENABLED not in came_back[int(np.argmax(came_back != ENABLED)) :]
-    assert np.abs(np.diff(records["sent_position"], axis=0))[:, [0, 1, 3, 4, 5]].max() <= LARGEST_STEP
+    assert np.abs(np.diff(records["commanded_position"], axis=0))[:, [0, 1, 3, 4, 5]].max() <= LARGEST_STEP
     heard = records[noticed:][records["wkc"][noticed:] == records["wkc_expected"][noticed:]]
     back = heard[(heard["statusword"][:, 2] & 0x6F) != ENABLED]
     assert len(back) > 100
@@ -116,7 +116,7 @@ def test_an_io_box_that_was_without_supply_takes_the_segments_time_up_again(
     good = records[records["wkc"] == records["wkc_expected"]]
     passed = np.diff(good["dc_time_ns"].astype(np.int64)) - np.diff(good["time_ns"].astype(np.int64))
     assert np.abs(passed).max() < 5_000_000
-    assert np.abs(np.diff(records["sent_position"], axis=0)).max() <= LARGEST_STEP
+    assert np.abs(np.diff(records["commanded_position"], axis=0)).max() <= LARGEST_STEP
     told = enabled.status()["messages"]
     assert any("slave 1 (io) is back in OP" in sentence for sentence in told), told
 
