@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import get_args, get_type_hints
+from collections.abc import Iterable
+from typing import TypeVar, get_args, get_type_hints
 
 from rtcp.config.model import ArmConfig, StopsConfig
 from rtcp.control.machine import STATES
@@ -12,6 +13,7 @@ from rtcp.ipc.events import EVENTS, Emergency, Fault
 from rtcp.ipc.message import Message
 from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
 
+M = TypeVar("M", bound=Message)
 _EVERYWHERE = (Fault, Emergency, Shutdown)
 """Causes that lead out of nearly every state: in the table, left out of the diagram."""
 _SIGNALS = {
@@ -30,6 +32,11 @@ _STOP_EVENTS = {
     "lease_ended": "the commander of a motion fell silent or released its lease",
     "enabling_switch": "it was released while something moves",
 }
+
+
+def _ours(kinds: Iterable[type[M]]) -> list[type[M]]:
+    """Leave out those of other packages."""
+    return [kind for kind in kinds if kind.__module__.startswith("rtcp.")]
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -71,7 +78,7 @@ def states() -> str:
 def commands() -> str:
     """Return the table of commands: who may send each, and in which states it is accepted."""
     rows = []
-    for command in COMMANDS:
+    for command in _ours(COMMANDS):
         accepted = ", ".join(one.state.words for one in STATES if one.state in command.states)
         rows.append([f"`{command.name}`", "the holder of the lease" if command.needs_lease else "anyone", accepted])
     return _table(["command", "who may send it", "in the states"], rows)
@@ -81,7 +88,7 @@ def faults() -> str:
     """Return the table of faults: number, kind, the key that sets the reaction."""
     rows = [
         [str(kind.number), f"`{kind.name}`", f"`stops.{kind.stop_key}`" if kind.stop_key else "quick stop"]
-        for kind in sorted(EVENTS, key=lambda kind: kind.number)
+        for kind in sorted(_ours(EVENTS), key=lambda kind: kind.number)
         if kind.is_fault
     ]
     return _table(["error code", "event", "reaction"], rows)

@@ -60,8 +60,6 @@ def small_arm() -> ArmConfig:
 
 
 CONFIG = small_arm()
-NO_BOX = replace(CONFIG.slaves[0].device, kind="cia402")
-"""The box's description under another kind: nobody drives it, and the platform finds no box."""
 LONGEST_STEP = CONFIG.joints[0].velocity * PERIOD_S * COUNTS + 1
 """Counts; one more than the speed limit allows, for the rounding of both ends."""
 
@@ -191,7 +189,9 @@ class LoopRig:
         for position in range(1, 1 + len(config.slaves)):
             board.slave(position, AlState.OP, 0)
         if not with_box:
-            config = replace(config, slaves=(replace(config.slaves[0], device=NO_BOX), *config.slaves[1:]))
+            config = replace(
+                config, slaves=(replace(config.slaves[0], device=config.slaves[1].device), *config.slaves[1:])
+            )
         self.now_ns = monotonic_ns()
         self.loop = Cycle(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
         self.arm, self.box, self.operator = self.loop.arm, self.loop.box, self.loop.operator

@@ -298,7 +298,7 @@ def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
 @pytest.fixture
 def by_stick(with_hand: Callable[..., Hand]) -> Hand:
     """The stick closes it; nobody holds a lease."""
-    hand = with_hand(replace(CONFIG, motion="joystick"))
+    hand = with_hand(replace(CONFIG, control_mode="joystick"))
     hand.simulation.lease = 0
     for code in [PADDLE_UP, NEUTRAL] * 3:
         hand.inputs(clear=0x3F, put=code)

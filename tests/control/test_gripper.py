@@ -12,7 +12,7 @@ from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfi
 from rtcp.control.gripper import DrivenGripper, make_gripper
 from rtcp.devices.cia402 import DriveState, TargetState
 from rtcp.ipc.events import FollowingError, OverSpeed
-from rtcp.virtual.models import CubemarsDrive
+from rtcp.virtual.models.cubemars import CubemarsOrh40
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
 ARM = load(default_config())
@@ -32,7 +32,7 @@ class LoopRig:
         gripper = make_gripper(config)
         assert gripper is not None
         self.gripper: DrivenGripper = gripper
-        self.model = CubemarsDrive("orh40", load_inertia=0.02, initial_position=position)
+        self.model = CubemarsOrh40(load_inertia=0.02, initial_position=position)
         self.model.set_outputs_valid(True)
         self.model.step(0.2)
         # As the drive's description has it: 0.2 rad for 50 ms are a fault.

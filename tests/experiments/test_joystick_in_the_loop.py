@@ -171,7 +171,7 @@ def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
     assert max(map(abs, simulation.loop.arm.state.actual_velocity)) < 0.01
     assert simulation.loop.arm.first_with_torque() == -1
     simulation.run(0.2)
-    assert {slave.state.name for slave in simulation.bus.read_states()} == {"PRE_OP"}
+    assert {slave.state.name for slave in simulation.bus.read_states()} == {"PREOP"}
 
 
 def test_a_halt_stops_a_held_joystick_until_it_has_been_neutral(arm: Arm) -> None:
