@@ -1,4 +1,4 @@
-"""Forward kinematics, against the documents' poses and against matrices."""
+"""Forward kinematics, of one configuration and of many, against data sheets and products of matrices."""
 
 from __future__ import annotations
 
@@ -8,17 +8,9 @@ from math import inf, nan, pi
 import numpy as np
 import pytest
 
-from kinematics.forward import forward, frames
-from kinematics.model import DhRow
+from kinematics.forward import forward, forward_batch, frames
 from kinematics.pose import IDENTITY, Pose
-
-TOOL = Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1)
-
-
-def matrix(pose: Pose) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = np.reshape(pose.rotation, (3, 3)), pose.position
-    return result
+from tests.kinematics.arms import chain, matrix, random_configurations, with_general_rows, with_tool
 
 
 def test_the_assistive_arm_points_straight_up_at_zero(assistive):
@@ -27,14 +19,14 @@ def test_the_assistive_arm_points_straight_up_at_zero(assistive):
     assert pose.rotation == pytest.approx(IDENTITY.rotation, abs=1e-15)
 
 
-def test_the_assistive_arm_with_its_elbow_at_a_right_angle_is_where_its_document_says(assistive):
+def test_the_assistive_arm_with_a_bent_elbow_matches_its_document(assistive):
     assert forward(assistive, [0.0, 0.0, pi / 2, 0.0, 0.0, 0.0]).position == pytest.approx((-0.690, 0.0, 0.610))
 
 
-def test_the_irb_120_is_where_its_data_sheet_says_at_zero(irb120):
+def test_the_irb_120_matches_its_data_sheet_at_zero(irb120):
     pose = forward(irb120, [0.0] * 6)
     assert pose.position == pytest.approx((0.374, 0.0, 0.630), abs=1e-15)
-    assert matrix(pose)[:3, 2] == pytest.approx((1.0, 0.0, 0.0), abs=1e-15)  # the flange looks forward
+    assert matrix(pose)[:3, 2] == pytest.approx((1.0, 0.0, 0.0), abs=1e-15)  # the flange faces forward
 
 
 @pytest.mark.parametrize(
@@ -42,38 +34,33 @@ def test_the_irb_120_is_where_its_data_sheet_says_at_zero(irb120):
     [(0, (0, 1, 0)), (1, (1, 0, -1)), (2, (1, 0, -1)), (4, (0, 0, -1))],
     ids=["joint 1 turns left", "joint 2 leans forward", "joint 3 lowers the forearm", "joint 5 lowers the flange"],
 )
-def test_the_axes_of_the_irb_120_turn_the_way_they_are_drawn(joint, direction, irb120):
+def test_the_axes_of_the_irb_120_turn_in_the_drawn_directions(joint, direction, irb120):
     q = [0.0] * 6
     q[joint] = 1e-3
     moved = np.subtract(forward(irb120, q).position, forward(irb120, [0.0] * 6).position)
     assert np.sign(np.where(abs(moved) < 1e-6, 0.0, moved)).tolist() == list(direction)
 
 
-@pytest.mark.parametrize("tool", [IDENTITY, TOOL], ids=["flange", "tool"])
-def test_forward_agrees_with_the_product_of_matrices(tool, either, chain, random_configurations):
-    model = replace(either, tool=tool)
-    configurations = random_configurations(model, 300)
-    for q, expected in zip(configurations, chain(model, configurations), strict=True):
-        assert matrix(forward(model, q.tolist())) == pytest.approx(expected, abs=1e-14)
+@pytest.mark.parametrize("change", [replace, with_tool, with_general_rows])
+def test_forward_forward_batch_and_frames_agree_with_the_product_of_matrices(change, either):
+    model = change(either)
+    q = random_configurations(model, 300)
+    expected = chain(model, q)
+    positions, rotations = forward_batch(model, q)
+    assert positions == pytest.approx(expected[:, :3, 3], abs=1e-14)
+    assert rotations == pytest.approx(expected[:, :3, :3], abs=1e-14)
+    for row, pose in zip(q.tolist(), expected, strict=True):
+        assert matrix(forward(model, row)) == pytest.approx(pose, abs=1e-14)
+        assert frames(model, row)[6] == forward(model, row)
 
 
-def test_forward_agrees_for_a_table_without_right_angles(assistive, chain, random_configurations):
-    random = np.random.default_rng(4)
-    model = replace(assistive, rows=tuple(DhRow(*random.uniform(-1.0, 1.0, 4)) for _ in range(6)), tool=TOOL)
-    configurations = random_configurations(model, 100)
-    for q, expected in zip(configurations, chain(model, configurations), strict=True):
-        assert matrix(forward(model, q.tolist())) == pytest.approx(expected, abs=1e-14)
-
-
-def test_frames_are_the_products_up_to_each_joint_and_the_tool(either, random_configurations):
-    model = replace(either, tool=TOOL)
-    q = random_configurations(model, 1)[0].tolist()
+def test_frames_are_the_products_up_to_each_joint(either):
+    q = random_configurations(either, 1)[0].tolist()
     expected = IDENTITY
-    for row, angle, frame in zip(model.rows, q, frames(model, q)[:6], strict=True):
-        turn = Pose.from_xyzrpy(row.a, 0.0, 0.0, row.alpha, 0.0, 0.0)
-        expected = expected @ turn @ Pose.from_xyzrpy(0.0, 0.0, row.d, 0.0, 0.0, angle + row.offset)
+    for row, angle, frame in zip(either.rows, q, frames(either, q)[:6], strict=True):
+        link = Pose.from_xyzrpy(row.a, 0.0, 0.0, row.alpha, 0.0, 0.0)
+        expected = expected @ link @ Pose.from_xyzrpy(0.0, 0.0, row.d, 0.0, 0.0, angle + row.offset)
         assert matrix(frame) == pytest.approx(matrix(expected), abs=1e-14)
-    assert frames(model, q)[6] == forward(model, q)
 
 
 @pytest.mark.parametrize("function", [forward, frames])
@@ -87,11 +74,45 @@ def test_an_angle_that_is_not_finite_is_refused_with_its_joint(function, joint, 
 
 
 @pytest.mark.parametrize("count", [0, 5, 7])
-def test_another_count_of_angles_is_refused(count, assistive):
+def test_a_wrong_count_of_angles_is_refused(count, assistive):
     with pytest.raises(ValueError, match=f"^{count} joint angles"):
         forward(assistive, [0.0] * count)
 
 
-def test_the_pose_is_made_of_plain_floats(irb120):
+def test_a_pose_consists_of_plain_floats(irb120):
     pose = forward(irb120, (0, 0, 0, 0, 0, 0))
     assert {type(number) for number in (*pose.position, *pose.rotation)} == {float}
+
+
+@pytest.mark.parametrize("count", [0, 1, 2047, 2048, 2049, 5000])
+def test_a_batch_of_any_size_is_complete(count, irb120):
+    q = random_configurations(irb120, count)
+    positions, rotations = forward_batch(irb120, q)
+    assert positions.shape == (count, 3)
+    assert rotations.shape == (count, 3, 3)
+    for index in {0, count // 2, count - 1} if count else ():
+        pose = forward(irb120, q[index].tolist())
+        assert positions[index] == pytest.approx(pose.position, abs=1e-13)
+        assert rotations[index].ravel() == pytest.approx(pose.rotation, abs=1e-13)
+
+
+def test_a_batch_may_be_a_list_or_an_array_of_any_layout_and_is_not_changed(assistive):
+    q = random_configurations(assistive, 100)
+    expected, kept = forward_batch(assistive, q)[0], q.copy()
+    for given in (q.tolist(), np.asfortranarray(q), np.repeat(q, 2, axis=0)[::2]):
+        assert np.array_equal(forward_batch(assistive, given)[0], expected)
+    assert np.array_equal(q, kept)
+
+
+@pytest.mark.parametrize("shape", [(6,), (4, 5), (6, 4), (2, 3, 6)])
+def test_a_batch_of_another_shape_is_refused_with_the_shape(shape, assistive):
+    with pytest.raises(ValueError, match=str(shape).replace("(", r"\(").replace(")", r"\)")):
+        forward_batch(assistive, np.zeros(shape))
+
+
+@pytest.mark.parametrize("value", [nan, inf, -inf])
+def test_a_value_of_a_batch_that_is_not_finite_is_refused_with_its_place(value, assistive):
+    q = random_configurations(assistive, 3000)
+    q[2500, 4] = value
+    with pytest.raises(ValueError, match=rf"q\[2500, 4\] is {value}"):
+        forward_batch(assistive, q)

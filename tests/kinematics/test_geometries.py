@@ -1,4 +1,4 @@
-"""Arms of other geometry than the two that ship: offsets, axes that are not parallel, oblique wrists, tools, bases."""
+"""Arms of other geometries: offsets, oblique axes and wrists, tools, bases; and poses out of reach."""
 
 from __future__ import annotations
 
@@ -8,162 +8,153 @@ from math import pi
 import numpy as np
 import pytest
 
-from kinematics.forward import forward
+from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, DhRow
-from kinematics.pose import Pose
+from kinematics.pose import IDENTITY, Pose
 from kinematics.solution import Singularity
+from tests.kinematics.arms import (
+    WRISTS,
+    as_pose,
+    build_arm,
+    chain,
+    count,
+    random_configurations,
+    with_row,
+    worst_error,
+    wrapped_difference,
+    wrist_centres,
+)
 
-ARMS = 12
-CONFIGURATIONS = 25
+PARALLEL = "parallel axes 2 and 3, offsets"
 
 
-def turns_apart(one, other) -> np.ndarray:
-    return np.abs(np.remainder(np.subtract(one, other) + pi, 2 * pi) - pi).max(axis=-1)
+def solutions_of(model: ArmModel, matrix: np.ndarray, near=None) -> np.ndarray:
+    return np.array([solution.q for solution in InverseKinematics(model).solve(as_pose(matrix), near).solutions])
 
 
-@pytest.mark.parametrize("wrist", ["right-angled", "oblique", "foldable"])
-def test_every_configuration_is_found_and_every_solution_confirmed(
-    build_arm, region, wrist, chain, pose_errors, as_pose, random_configurations
-):
-    for seed in range(ARMS):
-        model = build_arm(seed, region, wrist)
+@pytest.mark.parametrize("wrist", WRISTS)
+def test_every_configuration_is_found_and_every_solution_is_confirmed(geometry, wrist):
+    for seed in range(count(4, 12)):
+        model = build_arm(seed, geometry, wrist)
         solver = InverseKinematics(model)
-        configurations = random_configurations(model, CONFIGURATIONS, seed)
+        configurations = random_configurations(model, count(8, 25), seed)
         for q, matrix in zip(configurations, chain(model, configurations), strict=True):
             found = np.array([solution.q for solution in solver.solve(as_pose(matrix)).solutions])
-            position, rotation = pose_errors(np.repeat(matrix[None], len(found), axis=0), chain(model, found))
-            assert max(position.max(), rotation.max()) < 1e-12
-            assert turns_apart(found, q).min() < 1e-8
-            near = solver.solve_near(as_pose(matrix), q.tolist())
-            assert turns_apart(near.q, q) < 1e-8
+            assert worst_error(model, matrix, found) < 1e-12
+            assert wrapped_difference(found, q).min() < 1e-8
+            assert wrapped_difference(solver.solve_near(as_pose(matrix), q.tolist()).q, q) < 1e-8
 
 
-def wrist_centres(model: ArmModel, chain, regional: np.ndarray) -> np.ndarray:
-    """Of configurations (N, 3) of joints 1 to 3, m."""
-    without_hand = replace(model, tool=Pose.from_xyzrpy(0.0, 0.0, -model.rows[5].d, 0.0, 0.0, 0.0))
-    return chain(without_hand, np.hstack([regional, np.zeros_like(regional)]))[:, :3, 3]
-
-
-def by_brute_force(model: ArmModel, chain, point: np.ndarray) -> np.ndarray:
-    """All joints 1 to 3 for a wrist centre: Newton's method from many random starts."""
-    regional = np.random.default_rng(2).uniform(-pi, pi, (400, 3))
+def by_brute_force(model: ArmModel, point: np.ndarray) -> np.ndarray:
+    """All angles of joints 1 to 3 for a wrist centre: Newton's method from many random starts."""
+    arm = np.random.default_rng(2).uniform(-pi, pi, (400, 3))
     for _ in range(40):
-        error = point - wrist_centres(model, chain, regional)
+        error = point - wrist_centres(model, arm)
         columns = [
-            (wrist_centres(model, chain, regional + step) - wrist_centres(model, chain, regional - step)) / 2e-6
-            for step in 1e-6 * np.eye(3)
+            (wrist_centres(model, arm + step) - wrist_centres(model, arm - step)) / 2e-6 for step in 1e-6 * np.eye(3)
         ]
         damped = np.stack(columns, axis=2) + 1e-9 * np.eye(3)
-        regional = regional + np.clip(np.linalg.solve(damped, error[:, :, None])[:, :, 0], -0.5, 0.5)
-    reached = regional[np.linalg.norm(point - wrist_centres(model, chain, regional), axis=1) < 1e-9]
+        arm = arm + np.clip(np.linalg.solve(damped, error[:, :, None])[:, :, 0], -0.5, 0.5)
+    reached = arm[np.linalg.norm(point - wrist_centres(model, arm), axis=1) < 1e-9]
     return np.unique(np.round(np.remainder(reached + pi, 2 * pi) - pi, 5), axis=0)
 
 
-def test_no_solution_of_the_first_three_joints_is_missing(build_arm, region, chain, as_pose, random_configurations):
-    for seed in range(4):
-        model = build_arm(seed, region, "right-angled")
+def test_no_solution_of_joints_1_to_3_is_missing(geometry):
+    for seed in range(count(1, 4)):
+        model = build_arm(seed, geometry, "right-angled")
         q = random_configurations(model, 1, seed)
-        point = wrist_centres(model, chain, q[:, :3])[0]
-        found = np.array([one.q[:3] for one in InverseKinematics(model).solve(as_pose(chain(model, q)[0])).solutions])
-        expected = by_brute_force(model, chain, point)
+        found = solutions_of(model, chain(model, q)[0])
+        expected = by_brute_force(model, wrist_centres(model, q[:, :3])[0])
         assert len(expected) >= 2
-        for regional in expected:
-            assert turns_apart(found, regional).min() < 1e-4
+        for arm in expected:
+            assert wrapped_difference(found[:, :3], arm).min() < 1e-4
 
 
-def on_a_fold(model: ArmModel, chain, seed: int) -> np.ndarray | None:
+def singular_configuration(model: ArmModel, seed: int) -> np.ndarray | None:
     """A configuration in which joints 1 to 3 move the wrist centre in two directions only, by bisection of joint 2."""
+    q = np.random.default_rng(seed).uniform(-pi, pi, 6)
+    q[4] = 0.8 - model.rows[4].offset
 
     def volume(leans: np.ndarray) -> np.ndarray:
-        regional = np.array([[q[0], lean, q[2]] for lean in leans])
+        arm = np.array([[q[0], lean, q[2]] for lean in leans])
         columns = [
-            (wrist_centres(model, chain, regional + step) - wrist_centres(model, chain, regional - step)) / 2e-5
-            for step in 1e-5 * np.eye(3)
+            (wrist_centres(model, arm + step) - wrist_centres(model, arm - step)) / 2e-5 for step in 1e-5 * np.eye(3)
         ]
         return np.linalg.det(np.stack(columns, axis=2))
 
-    q = np.random.default_rng(seed).uniform(-pi, pi, 6)
-    q[4] = 0.8 - model.rows[4].offset
-    grid = np.linspace(-pi, pi, 60)
-    signs = np.sign(volume(grid))
-    changes = np.flatnonzero(signs[1:] != signs[:-1])
-    if not len(changes):
-        return None
-    lower, upper = grid[changes[0]], grid[changes[0] + 1]
-    for _ in range(60):
-        middle = 0.5 * (lower + upper)
-        if volume(np.array([middle]))[0] * volume(np.array([lower]))[0] > 0.0:
-            lower = middle
-        else:
-            upper = middle
-    q[1] = lower
+    lower, upper = -pi, pi
+    for samples in (60, *[40] * 10):
+        grid = np.linspace(lower, upper, samples)
+        signs = np.sign(volume(grid))
+        changes = np.flatnonzero(signs[1:] != signs[:-1])
+        if not len(changes):
+            return None if samples == 60 else q
+        lower, upper = grid[changes[0]], grid[changes[0] + 1]
+        q[1] = lower
     return q
 
 
-def test_beside_a_singularity_of_the_first_three_joints_nothing_is_missing(
-    build_arm, region, chain, as_pose, pose_errors
-):
+def test_beside_a_singularity_of_joints_1_to_3_no_solution_is_missing(geometry):
     tried = 0
-    for seed in range(30):
-        model = build_arm(seed, region, "right-angled")
-        fold = on_a_fold(model, chain, seed)
-        if fold is None:
+    for seed in range(count(3, 30)):
+        model = build_arm(seed, geometry, "right-angled")
+        singular = singular_configuration(model, seed)
+        if singular is None:
             continue
         for distance in (0.0, *10.0 ** -np.arange(3.0, 10.0)):
-            q = np.add(fold, [0.0, distance, 0.0, 0.0, 0.0, 0.0])
-            matrix = chain(model, q[None])
-            solutions = InverseKinematics(model).solve(as_pose(matrix[0]), q.tolist()).solutions
-            found = np.array([solution.q for solution in solutions])
-            assert all((turns_apart(found[:index], one) > 1e-8).all() for index, one in enumerate(found))
-            # nearer than 1e-6 rad two solutions are one to the square root of round-off
-            assert turns_apart(found, q).min() < (1e-13 / distance if distance >= 1e-6 else 1e-5)
-            position, rotation = pose_errors(np.repeat(matrix, len(found), axis=0), chain(model, found))
-            assert max(position.max(), rotation.max()) < 1e-9
+            q = np.add(singular, [0.0, distance, 0.0, 0.0, 0.0, 0.0])
+            matrix = chain(model, q[None])[0]
+            found = solutions_of(model, matrix, q.tolist())
+            assert all((wrapped_difference(found[:index], one) > 1e-8).all() for index, one in enumerate(found))
+            # two solutions nearer than 1e-6 rad are one, to the square root of round-off
+            assert wrapped_difference(found, q).min() < (1e-13 / distance if distance >= 1e-6 else 1e-5)
+            assert worst_error(model, matrix, found) < 1e-9
             tried += 1
-    assert tried > 40
+    assert tried > count(0, 40)
 
 
 @pytest.mark.parametrize("amount", [1e-11, 1e-9, 1e-7, 1e-6, 1e-5, 1e-3])
-def test_a_table_with_the_small_amounts_that_a_calibration_gives_is_solved(amount, either, chain, as_pose):
+def test_a_table_with_the_small_deviations_of_a_calibration_is_solved(amount, either):
     random = np.random.default_rng(8)
-    for _ in range(6):
+    for _ in range(count(2, 6)):
+        deviations = amount * random.uniform(-1.0, 1.0, (4, 3))
         rows = [
             DhRow(row.alpha + da, row.a + dl, row.d + dd, row.offset)
-            for row, (da, dl, dd) in zip(either.rows, amount * random.uniform(-1.0, 1.0, (6, 3)), strict=True)
+            for row, (da, dl, dd) in zip(either.rows[:4], deviations, strict=True)
         ]
-        model = replace(either, rows=(*rows[:4], *either.rows[4:]))
-        solver = InverseKinematics(model)
-        assert solver.method == "spherical wrist, general"
-        configurations = random.uniform(-2.0, 2.0, (40, 6))
+        model = replace(either, rows=(*rows, *either.rows[4:]))
+        assert InverseKinematics(model).method == "spherical wrist, general"
+        configurations = random.uniform(-2.0, 2.0, (20, 6))
         configurations[:10, 2] = (-1.343 if either.name == "irb120" else 0.0) + random.uniform(-0.01, 0.01, 10)
         for q, matrix in zip(configurations, chain(model, configurations), strict=True):
-            found = [one.q for one in solver.solve(as_pose(matrix)).solutions]
-            assert turns_apart(np.array(found), q).min() < 1e-4  # some are beside the edge of the workspace
+            found = solutions_of(model, matrix)
+            assert wrapped_difference(found, q).min() < 1e-4  # some are beside the edge of the workspace
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-8, 1e-6, 1e-4, 1e-2])
 @pytest.mark.parametrize("end", [0.0, pi])
-def test_beside_the_edge_of_an_oblique_wrist_nothing_is_missing(end, distance, build_arm, chain, as_pose):
-    model = build_arm(5, "parallel axes 2 and 3, offsets", "oblique")
+def test_beside_the_edge_of_an_oblique_wrist_no_solution_is_missing(end, distance):
+    model = build_arm(5, PARALLEL, "oblique")
     q = np.array([0.3, 0.4, 0.5, 0.6, end - model.rows[4].offset + distance, 0.7])
     solutions = InverseKinematics(model).solve(as_pose(chain(model, q[None])[0])).solutions
-    own = [one for one in solutions if turns_apart(one.q[:3], q[:3]) < 1e-9]
-    assert turns_apart(np.array([one.q for one in own]), q).min() < (1e-6 if distance < 1e-6 else 1e-14 / distance)
+    own = [one for one in solutions if wrapped_difference(one.q[:3], q[:3]) < 1e-9]
+    closest = min(wrapped_difference(one.q, q) for one in own)
+    assert closest < (1e-6 if distance < 1e-6 else 1e-14 / distance)
     assert len(own) == (1 if distance < 1e-7 else 2)
     assert {one.singularity for one in own} == {Singularity.WRIST if distance < 1e-7 else Singularity.NONE}
 
 
 @pytest.mark.parametrize(
-    ("region", "method"),
+    ("name", "method"),
     [
-        ("parallel axes 2 and 3, offsets", "spherical wrist, parallel axes 2 and 3"),
+        (PARALLEL, "spherical wrist, parallel axes 2 and 3"),
         ("no parallel axes", "spherical wrist, general"),
         ("parallel axes 1 and 2", "spherical wrist, general"),
     ],
 )
-def test_the_method_follows_from_the_geometry(build_arm, region, method):
-    assert InverseKinematics(build_arm(1, region, "oblique")).method == method
+def test_the_method_follows_from_the_geometry(name, method):
+    assert InverseKinematics(build_arm(1, name, "oblique")).method == method
 
 
 @pytest.mark.parametrize(
@@ -187,9 +178,10 @@ def test_the_method_follows_from_the_geometry(build_arm, region, method):
         "axes 2 and 3 the same",
     ],
 )
-def test_an_arm_without_a_closed_form_is_solved_numerically(change, assistive, random_configurations):
-    rows = [replace(row, **change.get(number, {})) for number, row in enumerate(assistive.rows)]
-    model = replace(assistive, rows=tuple(rows))
+def test_an_arm_without_a_closed_form_is_solved_numerically(change, assistive):
+    model = assistive
+    for number, values in change.items():
+        model = with_row(model, number, **values)
     solver = InverseKinematics(model)
     assert solver.method == "numeric"
     q = (0.5 * random_configurations(model, 1)[0]).tolist()
@@ -202,7 +194,7 @@ def test_an_arm_without_a_closed_form_is_solved_numerically(change, assistive, r
         assert forward(model, found).rotation == pytest.approx(pose.rotation, abs=2e-9)
 
 
-def test_a_numeric_arm_says_how_near_it_comes_to_what_it_cannot_reach(ur5):
+def test_a_numeric_arm_reports_how_near_it_comes_to_a_pose_out_of_reach(ur5):
     solver = InverseKinematics(ur5)
     pose = Pose.from_xyzrpy(2.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     near = solver.solve_near(pose, [0.1] * 6)
@@ -211,3 +203,82 @@ def test_a_numeric_arm_says_how_near_it_comes_to_what_it_cannot_reach(ur5):
     assert f"{near.out_of_reach:.6g} m" in near.reason
     assert solver.solve(pose).solutions == ()
     assert "no solution found" in solver.solve(pose).reason
+
+
+def hand_at(model: ArmModel, point: np.ndarray) -> Pose:
+    """A tool pose with the wrist centre at a point."""
+    turn = Pose.from_xyzrpy(0.0, 0.0, 0.0, 0.3, -0.8, 1.9)
+    hand = turn @ Pose((0.0, 0.0, model.rows[5].d), IDENTITY.rotation) @ model.tool
+    return Pose(tuple(np.add(point, hand.position).tolist()), hand.rotation)
+
+
+def test_far_out_of_reach_the_amount_is_the_distance_to_the_nearest_wrist_centre(geometry):
+    for seed in range(count(1, 4)):
+        model = build_arm(seed, geometry, "right-angled")
+        centres = wrist_centres(model, np.random.default_rng(1).uniform(-pi, pi, (count(50_000, 200_000), 3)))
+        middle, direction = centres.mean(axis=0), np.random.default_rng(seed).normal(size=3)
+        point = middle + direction / np.linalg.norm(direction) * 2.5
+        near = InverseKinematics(model).solve_near(hand_at(model, point), [0.0] * 6)
+        nearest = np.linalg.norm(centres - point, axis=1).min()
+        assert near.q is None
+        assert nearest - 0.02 < near.out_of_reach <= nearest
+
+
+def test_just_out_of_reach_the_amount_is_proportional_to_the_distance(geometry):
+    for seed in range(count(1, 4)):
+        model = build_arm(seed, geometry, "right-angled")
+        solver = InverseKinematics(model)
+        inside = wrist_centres(model, np.random.default_rng(seed).uniform(-pi, pi, (1, 3)))[0]
+        direction = np.array([1.0, 0.4, -0.7])
+        reached, beyond = 0.0, 5.0
+        while beyond - reached > 1e-12:
+            middle = 0.5 * (reached + beyond)
+            point, rotation = solver._arm.target(hand_at(model, inside + middle * direction))
+            if solver._arm.solve(point, rotation, [0.0] * 6):
+                reached = middle
+            else:
+                beyond = middle
+        amounts = [
+            solver.solve_near(hand_at(model, inside + (beyond + step) * direction), [0.0] * 6).out_of_reach
+            for step in (1e-6, 2e-6, 4e-6)
+        ]
+        assert 0.0 < amounts[0] <= 1.3e-6
+        assert np.divide(amounts, amounts[0]) == pytest.approx([1.0, 2.0, 4.0], rel=1e-2)
+
+
+def test_beyond_a_stretched_arm_with_lateral_offset_the_amount_is_exact(assistive):
+    model = with_row(assistive, 2, d=0.12)
+    for lean in (0.3, 0.9, -1.4):
+        edge = wrist_centres(model, np.array([[0.0, lean, 0.0]]))[0]
+        along = edge - [0.0, edge[1], model.rows[0].d]
+        # perpendicular to the directions in which joints 1 and 2 move the wrist centre
+        normal = np.add(along, [0.0, edge[1] * along[0] / edge[0], 0.0])
+        normal /= np.linalg.norm(normal)
+        near = InverseKinematics(model).solve_near(hand_at(model, edge + 1e-6 * normal), [0.0] * 6)
+        assert near.out_of_reach == pytest.approx(1e-6, rel=1e-3)
+
+
+def test_inside_the_tube_of_a_lateral_offset_the_amount_is_the_distance_to_its_wall(assistive):
+    model = with_row(assistive, 2, d=0.12)
+    near = InverseKinematics(model).solve_near(hand_at(model, np.array([0.0, 0.12 - 1e-6, 0.9])), [0.0] * 6)
+    assert near.out_of_reach == pytest.approx(1e-6, rel=1e-6)
+
+
+def test_an_orientation_out_of_reach_of_an_oblique_wrist_is_refused_with_the_angle(irb120):
+    # Axis 6 is 0.05 to 0.65 rad from axis 4; the right-angled wrist finds all positions of the forearm.
+    solver = InverseKinematics(with_row(with_row(irb120, 4, alpha=0.30), 5, alpha=-0.35))
+    refused = 0
+    for q in random_configurations(irb120, 30):
+        pose = forward(irb120, q.tolist())
+        forearms = {frames(irb120, one.q)[3].rotation[2::3] for one in InverseKinematics(irb120).solve(pose).solutions}
+        angles = np.arccos([np.dot(axis, pose.rotation[2::3]) for axis in forearms])
+        missing = np.maximum(angles - 0.65, 0.05 - angles).min()
+        near = solver.solve_near(pose, [0.0] * 6)
+        if missing > 0.0:
+            assert near.q is None
+            assert near.reason.startswith(f"out of reach by {missing:.6g} rad")
+            assert near.out_of_reach == 0.0
+            refused += 1
+        else:
+            assert solver.solve(pose).solutions
+    assert 5 < refused < 30

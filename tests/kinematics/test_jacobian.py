@@ -1,9 +1,8 @@
-"""The geometric Jacobian, and the distances from the singularities."""
+"""The geometric Jacobian, the distances from the singularities, and joint velocities for tool velocities."""
 
 from __future__ import annotations
 
 import math
-import random
 from dataclasses import replace
 
 import numpy as np
@@ -11,46 +10,45 @@ import pytest
 
 from kinematics.forward import forward, frames
 from kinematics.jacobian import (
+    THRESHOLD,
     characteristic_length,
+    determinant,
+    gram,
     jacobian,
+    joint_velocity,
     manipulability,
     scaled_rows,
+    singular_values,
     singularity_distances,
+    solve_positive,
 )
-from kinematics.model import ArmModel, DhRow
-from kinematics.pose import Pose
+from kinematics.model import ArmModel
 from kinematics.spherical import has_spherical_wrist
+from tests.kinematics.arms import random_configurations, with_row, with_tool
 
-TOOL = Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1)
-
-
-def with_tool(model: ArmModel) -> ArmModel:
-    return replace(model, tool=TOOL)
+REGULAR = [0.3, -0.4, 1.1, 0.4, 0.8, 0.2]
+WRIST, ELBOW = [0.3, -0.4, 1.1, 0.4, 0.0, 0.2], [0.3, -0.4, 0.0, 0.4, 0.8, 0.2]
+SHOULDER = [0.7, math.atan2(0.550 * math.sin(1.3), 0.440 + 0.550 * math.cos(1.3)), 1.3, 0.4, 0.8, 0.2]
+UP = [0.0] * 6
+TWIST = [0.05, -0.02, 0.03, 0.1, 0.2, -0.1]
 
 
 def with_lateral_offset(model: ArmModel) -> ArmModel:
-    """As a PUMA: the arm's plane passes beside axis 1."""
-    rows = list(model.rows)
-    rows[2] = replace(rows[2], d=0.12)
-    return replace(model, rows=tuple(rows))
+    """As in a PUMA: the plane of the arm passes beside axis 1."""
+    return with_row(model, 2, d=0.12)
 
 
 def with_skewed_forearm(model: ArmModel) -> ArmModel:
-    """Upper arm and forearm both have a part along axis 2, which turns with neither."""
-    rows = list(with_lateral_offset(model).rows)
-    rows[3] = replace(rows[3], alpha=-1.2)
-    return replace(model, rows=tuple(rows))
+    """Upper arm and forearm both have an offset along axis 2."""
+    return with_row(with_lateral_offset(model), 3, alpha=-1.2)
 
 
 def without_spherical_wrist(model: ArmModel) -> ArmModel:
-    rows = list(model.rows)
-    rows[4] = replace(rows[4], d=0.09)
-    return replace(model, rows=tuple(rows))
+    return with_row(model, 4, d=0.09)
 
 
-def configurations(model: ArmModel, count: int, seed: int = 1) -> list[list[float]]:
-    numbers = random.Random(seed)
-    return [[numbers.uniform(limit.lower, limit.upper) for limit in model.limits] for _ in range(count)]
+def configurations(model: ArmModel, count: int) -> list[list[float]]:
+    return random_configurations(model, count).tolist()
 
 
 @pytest.mark.parametrize("change", [with_tool, with_lateral_offset, without_spherical_wrist])
@@ -71,7 +69,7 @@ def test_the_jacobian_is_the_derivative_of_the_tool_pose(arm, change, request):
             assert columns[joint] == pytest.approx([*linear, *np.divide(angular, 2)], abs=1e-8)
 
 
-def test_the_rows_are_plain_floats(assistive):
+def test_the_jacobian_consists_of_six_rows_of_plain_floats(assistive):
     rows = jacobian(assistive, [0.1] * 6)
     assert [len(row) for row in rows] == [6] * 6
     assert {type(value) for row in rows for value in row} == {float}
@@ -117,25 +115,22 @@ def test_the_elbow_distance_is_the_angle_from_stretched(assistive):
 
 
 def test_the_elbow_distance_is_zero_where_an_offset_elbow_is_stretched_or_folded(irb120):
-    stretched = -math.atan2(0.302, 0.070)  # the forearm's line to the wrist centre turned into that of the upper arm
+    stretched = -math.atan2(0.302, 0.070)  # upper arm and wrist centre in one line
     for angle in (stretched, stretched + math.pi):
         q = [0.3, -0.4, angle, 0.4, 0.8, 0.2]
         assert singularity_distances(irb120, q).elbow == pytest.approx(0.0, abs=1e-15)
         assert manipulability(irb120, q) == pytest.approx(0.0, abs=1e-17)
 
 
-def test_the_shoulder_distance_is_that_of_the_wrist_centre_from_axis_1(irb120):
+def test_the_shoulder_distance_is_the_distance_of_the_wrist_centre_from_axis_1(irb120):
     for q in configurations(irb120, 50):
         x, y, _ = frames(irb120, q)[4].position
         assert singularity_distances(irb120, q).shoulder == pytest.approx(math.hypot(x, y), abs=1e-14)
 
 
 def test_the_shoulder_distance_is_zero_with_the_wrist_centre_over_axis_1(assistive):
-    bend = 1.3
-    lean = math.atan2(0.550 * math.sin(bend), 0.440 + 0.550 * math.cos(bend))
-    q = [0.7, lean, bend, 0.4, 0.8, 0.2]
-    assert singularity_distances(assistive, q).shoulder == pytest.approx(0.0, abs=1e-15)
-    q[1] += 1e-6
+    assert singularity_distances(assistive, SHOULDER).shoulder == pytest.approx(0.0, abs=1e-15)
+    q = [SHOULDER[0], SHOULDER[1] + 1e-6, *SHOULDER[2:]]
     height = frames(assistive, q)[4].position[2] - 0.170
     assert singularity_distances(assistive, q).shoulder == pytest.approx(1e-6 * height, rel=1e-6)
 
@@ -145,9 +140,9 @@ def test_all_distances_are_zero_straight_up(assistive):
 
 
 @pytest.mark.parametrize("change", [with_tool, without_spherical_wrist])
-def test_the_smallest_singular_value_is_numpys(change, irb120):
+def test_the_smallest_singular_value_matches_numpy(change, irb120):
     model = change(irb120)
-    for q in [*configurations(model, 50), [0.0] * 6]:
+    for q in [*configurations(model, 50), UP]:
         scaled = np.array(scaled_rows(jacobian(model, q), 1.0 / characteristic_length(model)))
         smallest = np.linalg.svd(scaled, compute_uv=False)[-1]
         assert singularity_distances(model, q).smallest == pytest.approx(smallest, abs=1e-14)
@@ -161,9 +156,7 @@ def test_an_arm_without_a_spherical_wrist_has_only_the_smallest_singular_value(i
 
 
 def test_an_arm_whose_axes_2_and_3_are_not_parallel_has_only_the_wrist_distance(irb120):
-    rows = list(irb120.rows)
-    rows[2] = DhRow(math.pi / 2, 0.270, 0.0)
-    shoulder, elbow, wrist, _ = singularity_distances(replace(irb120, rows=tuple(rows)), [0.2] * 6)
+    shoulder, elbow, wrist, _ = singularity_distances(with_row(irb120, 2, alpha=math.pi / 2), [0.2] * 6)
     assert (shoulder, elbow) == (None, None)
     assert wrist == pytest.approx(0.2)
 
@@ -172,9 +165,154 @@ def test_the_characteristic_length_is_half_the_reach_from_axis_2(assistive):
     assert characteristic_length(assistive) == pytest.approx((0.440 + 0.550 + 0.140) / 2)
 
 
-def test_an_angle_that_is_not_finite_is_named(assistive):
+def test_an_angle_that_is_not_finite_is_refused_with_its_joint(assistive):
     q = [0.0] * 6
     q[3] = math.nan
     for function in (jacobian, manipulability, singularity_distances):
         with pytest.raises(ValueError, match="joint4"):
             function(assistive, q)
+
+
+def cases(model: ArmModel, count: int) -> list[tuple[list[float], list[float]]]:
+    """Configurations and tool velocities."""
+    twists = np.random.default_rng(3).normal(0.0, (0.1, 0.1, 0.1, 0.3, 0.3, 0.3), (count, 6))
+    return list(zip(configurations(model, count), twists.tolist(), strict=True))
+
+
+def test_away_from_singularities_the_tool_moves_exactly_as_commanded(either):
+    regular = 0
+    for q, twist in cases(either, 200):
+        result = joint_velocity(either, q, twist, respect_limits=False)
+        if result.damping == 0.0:
+            regular += 1
+            assert np.array(jacobian(either, q)) @ result.qd == pytest.approx(twist, abs=1e-9)
+            assert result.lost == pytest.approx([0.0] * 6, abs=1e-9)
+    assert regular > 120
+
+
+def test_the_lost_velocity_is_the_commanded_minus_the_achieved_one(assistive):
+    for q in (WRIST, ELBOW, SHOULDER, UP, REGULAR):
+        for respect in (True, False):
+            qd, lost, _, _ = joint_velocity(assistive, q, TWIST, respect_limits=respect)
+            assert lost == pytest.approx(TWIST - np.array(jacobian(assistive, q)) @ qd, abs=1e-15)
+
+
+@pytest.mark.parametrize("q", [WRIST, ELBOW, SHOULDER, UP])
+def test_on_a_singularity_the_damping_is_full_and_the_loss_is_reported(q, assistive):
+    result = joint_velocity(assistive, q, TWIST, respect_limits=False)
+    assert result.damping == pytest.approx(THRESHOLD)
+    assert math.hypot(*result.lost) > 0.001
+
+
+def test_the_joint_speed_is_bounded_everywhere(either):
+    length = characteristic_length(either)
+    extreme = [(q, twist) for q in (WRIST, ELBOW, SHOULDER, UP) for _, twist in cases(either, 20)]
+    beside = [([angle + 1e-3 * k for angle in q], twist) for k, (q, twist) in enumerate(extreme)]
+    for q, twist in [*cases(either, 100), *extreme, *beside]:
+        size = math.hypot(*(value / length for value in twist[:3]), *twist[3:])
+        qd = joint_velocity(either, q, twist, respect_limits=False).qd
+        assert math.hypot(*qd) <= size / THRESHOLD * (1.0 + 1e-9)
+
+
+def test_the_damping_grows_towards_the_singularity(assistive):
+    dampings = [
+        joint_velocity(assistive, [*REGULAR[:4], angle, 0.2], TWIST).damping for angle in (0.5, 0.05, 0.02, 0.01, 0.0)
+    ]
+    assert dampings[0] == 0.0
+    assert dampings == sorted(set(dampings))
+
+
+@pytest.mark.parametrize(("q", "joint"), [(WRIST, 4), (ELBOW, 2), (SHOULDER, 1)])
+def test_the_joint_velocity_is_continuous_through_a_singularity(q, joint, assistive):
+    step = 2e-4
+    previous = None
+    dampings = set()
+    for k in range(-1500, 1501):
+        here = list(q)
+        here[joint] += k * step
+        qd, _, damping, _ = joint_velocity(assistive, here, TWIST, respect_limits=False)
+        dampings.add(damping > 0.0)
+        if previous is not None:
+            # Bound of the slope: |qd| / threshold per rad, times the largest derivative of the Jacobian (about 3).
+            assert max(abs(a - b) for a, b in zip(qd, previous, strict=True)) < 0.1
+        previous = qd
+    assert dampings == {True, False}
+
+
+@pytest.mark.parametrize("factor", [20.0, -20.0])
+def test_a_speed_limit_scales_the_tool_velocity_and_keeps_its_direction(factor, assistive):
+    fast = [factor * value for value in TWIST]
+    result = joint_velocity(assistive, REGULAR, fast)
+    assert 0.0 < result.scale < 1.0
+    assert max(abs(speed) for speed in result.qd) == pytest.approx(0.5)
+    assert np.array(jacobian(assistive, REGULAR)) @ result.qd == pytest.approx(np.multiply(result.scale, fast))
+    assert result.lost == pytest.approx(np.multiply(1.0 - result.scale, fast))
+
+
+def test_the_joint_nearest_to_its_speed_limit_sets_the_scale(assistive):
+    free = joint_velocity(assistive, REGULAR, TWIST)
+    assert free.scale == 1.0
+    limits = list(assistive.limits)
+    for joint, part in ((1, 0.9), (4, 0.25), (5, 0.6)):
+        limits[joint] = replace(limits[joint], velocity=part * abs(free.qd[joint]))
+    result = joint_velocity(replace(assistive, limits=tuple(limits)), REGULAR, TWIST)
+    assert result.scale == pytest.approx(0.25)
+    assert result.qd == pytest.approx([0.25 * speed for speed in free.qd])
+
+
+def test_without_respect_for_limits_nothing_is_scaled(assistive):
+    result = joint_velocity(assistive, REGULAR, [20.0 * value for value in TWIST], respect_limits=False)
+    assert result.scale == 1.0
+    assert max(abs(speed) for speed in result.qd) > 0.5
+
+
+def test_a_tool_velocity_of_zero_moves_no_joint(assistive):
+    for q in (REGULAR, UP):
+        assert joint_velocity(assistive, q, [0.0] * 6).qd == pytest.approx([0.0] * 6, abs=0.0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_twist_or_angle_that_is_not_finite_is_refused_by_name(bad, assistive):
+    with pytest.raises(ValueError, match="wy"):
+        joint_velocity(assistive, REGULAR, [*TWIST[:4], bad, 0.0])
+    with pytest.raises(ValueError, match="joint3"):
+        joint_velocity(assistive, [0.1, 0.1, bad, 0.1, 0.1, 0.1], TWIST)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -0.1, math.nan])
+def test_a_threshold_that_is_not_positive_is_refused(threshold, assistive):
+    with pytest.raises(ValueError, match="threshold"):
+        joint_velocity(assistive, REGULAR, TWIST, threshold=threshold)
+
+
+NUMBERS = np.random.default_rng(16)
+MATRICES = [NUMBERS.normal(size=(6, 6)) for _ in range(20)]
+
+
+@pytest.mark.parametrize("size", [6, 4, 1, 0])
+def test_a_positive_definite_system_of_any_size_is_solved(size):
+    right = NUMBERS.normal(size=size)
+    for matrix in MATRICES:
+        assert np.array(gram(matrix.tolist())) == pytest.approx(matrix @ matrix.T)
+        system = (matrix @ matrix.T + 0.1 * np.eye(6))[:size, :size]
+        expected = np.linalg.solve(system, right)
+        assert solve_positive(system.tolist(), right.tolist()) == pytest.approx(expected, rel=1e-8)
+
+
+def test_a_system_that_is_not_positive_definite_has_no_solution():
+    assert solve_positive([[1.0, 2.0], [2.0, 1.0]], [1.0, 1.0]) is None
+
+
+def test_the_determinant_matches_numpy_also_where_rows_must_be_exchanged():
+    exchanged = [np.eye(6)[NUMBERS.permutation(6)] + np.diag([0.5] * 5, 1) for _ in range(20)]
+    for matrix in MATRICES + exchanged:
+        assert determinant(matrix.tolist()) == pytest.approx(np.linalg.det(matrix), rel=1e-10, abs=1e-14)
+    assert determinant([[0.0] * 6] * 6) == 0.0
+
+
+def test_singular_values_keep_their_digits_close_to_zero():
+    for matrix in MATRICES:
+        left, _, right = np.linalg.svd(matrix)
+        for smallest in (1.0, 1e-3, 1e-9, 0.0):
+            scaled = left @ np.diag([5.0, 4.0, 3.0, 2.0, 1.5, smallest]) @ right
+            assert min(singular_values(scaled.tolist())) == pytest.approx(smallest, abs=1e-14)

@@ -1,4 +1,4 @@
-"""The model of an arm refuses what it cannot be, and the package loads nothing that the loop must not have."""
+"""The model of an arm refuses invalid values; the package loads nothing that the loop must not load."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINK = LinkMass(1.0, (0.0, 0.0, 0.1))
 
 @pytest.mark.parametrize("name", ["alpha", "a", "d", "offset"])
 @pytest.mark.parametrize("value", [nan, inf, -inf])
-def test_a_row_refuses_a_parameter_that_is_not_finite_by_name(name, value):
+def test_a_row_refuses_a_parameter_that_is_not_finite(name, value):
     with pytest.raises(ValueError, match=f"^{name} is {value}"):
         replace(DhRow(0.0, 0.1, 0.2, 0.3), **{name: value})
 
@@ -30,7 +30,7 @@ def test_a_limit_refuses_an_empty_interval(lower, upper):
 
 
 @pytest.mark.parametrize(("lower", "upper", "name"), [(-inf, 1.0, "lower"), (0.0, inf, "upper"), (nan, 1.0, "lower")])
-def test_a_limit_refuses_a_bound_that_is_not_finite_by_name(lower, upper, name):
+def test_a_limit_refuses_a_bound_that_is_not_finite(lower, upper, name):
     with pytest.raises(ValueError, match=f"^{name} is"):
         JointLimit(lower, upper)
 
@@ -50,7 +50,7 @@ def test_a_limit_refuses_a_speed_that_is_not_positive(speed):
         (1.0, (0.0, 0.0), "2 numbers"),
     ],
 )
-def test_a_link_refuses_numbers_that_no_body_has(mass, centre, reason):
+def test_a_link_refuses_an_impossible_mass_or_centre(mass, centre, reason):
     with pytest.raises(ValueError, match=reason):
         LinkMass(mass, centre)
 
@@ -69,21 +69,21 @@ def test_a_link_refuses_numbers_that_no_body_has(mass, centre, reason):
         (lambda arm: {"tool": Pose((0.0, 0.0, 0.0), (-1.0, *arm.tool.rotation[1:]))}, "tool's rotation is invalid"),
     ],
 )
-def test_an_arm_says_what_is_wrong_with_it(change, reason, assistive):
+def test_an_invalid_arm_is_refused_with_the_reason(change, reason, assistive):
     with pytest.raises(ValueError, match=reason):
         replace(assistive, **change(assistive))
 
 
-def test_an_arm_may_know_all_its_masses_or_none(assistive):
+def test_an_arm_has_all_masses_or_none(assistive):
     assert replace(assistive, links=(LINK,) * 6).links == (LINK,) * 6
     assert assistive.links == ()
 
 
-def test_right_angles_of_the_table_are_exact(assistive):
+def test_right_angles_have_exact_sines_and_cosines(assistive):
     assert [constants[:2] for constants in assistive.constants] == [(0, 1), (-1, 0), (0, -1), (-1, 0), (-1, 0), (1, 0)]
 
 
-def test_other_angles_of_the_table_are_left_as_they_are():
+def test_angles_close_to_a_right_angle_are_kept():
     row = DhRow(pi / 2 - 1e-6, 0.0, 0.0)
     arm = ArmModel("oblique", (row,) * 6, (JointLimit(-1.0, 1.0),) * 6)
     assert arm.constants[0][1] == pytest.approx(1e-6, rel=1e-9)
@@ -95,7 +95,7 @@ def test_importing_the_package_loads_neither_numpy_nor_xml():
     assert result.stdout.strip() == "[]"
 
 
-def test_everything_that_the_package_offers_is_there():
+def test_every_name_of_the_package_exists():
     assert [name for name in kinematics.__all__ if getattr(kinematics, name, None) is None] == []
     with pytest.raises(AttributeError, match="has no attribute 'backward'"):
         _ = kinematics.backward

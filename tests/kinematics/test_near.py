@@ -1,14 +1,14 @@
-"""The solution that continues a motion: the nearest inside the limits, in the right turn, or what is in the way."""
+"""The solution that continues a motion: the nearest inside the limits, without a jump, or what prevents it."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
-from math import inf, pi
+from math import atan2, inf, pi
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kinematics.forward import forward
@@ -16,8 +16,19 @@ from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import Pose
 from kinematics.solution import Singularity
+from tests.kinematics.arms import (
+    as_pose,
+    chain,
+    count,
+    matrix,
+    pose_errors,
+    random_configurations,
+    stretched,
+    worst_error,
+)
 
 shares = st.tuples(*(st.floats(-0.99, 0.99) for _ in range(6)))
+Q = [0.3, 0.4, 0.5, 0.6, 0.7, 0.8]
 
 
 def inside(model: ArmModel, shape) -> list[float]:
@@ -28,12 +39,18 @@ def inside(model: ArmModel, shape) -> list[float]:
     ]
 
 
+def narrow(model: ArmModel, q, joints=range(6)) -> ArmModel:
+    """The arm with limits of 0.1 rad around `q` for some joints."""
+    limits = [JointLimit(q[i] - 0.1, q[i] + 0.1) if i in joints else limit for i, limit in enumerate(model.limits)]
+    return replace(model, limits=tuple(limits))
+
+
 def largest(q, near) -> float:
     return float(np.abs(np.subtract(q, near)).max())
 
 
 def smallest_move(model: ArmModel, pose: Pose, near) -> float:
-    """By brute force: all solutions in all turns that are inside the limits."""
+    """By brute force: all solutions at all multiples of 2 pi inside the limits."""
     moves = []
     for solution in InverseKinematics(model).solve(pose, near).solutions:
         turns = [
@@ -44,16 +61,18 @@ def smallest_move(model: ArmModel, pose: Pose, near) -> float:
     return min(moves, default=inf)
 
 
+@settings(max_examples=count(40, 100))
 @given(shape=shares, step=st.floats(1e-6, 0.05), direction=shares)
-def test_the_configuration_that_a_small_step_away_was_one_is_found(shape, step, direction, either):
+def test_a_configuration_a_small_step_away_is_found(shape, step, direction, either):
     q = inside(either, shape)
     near = [angle + step * share for angle, share in zip(q, direction, strict=True)]
     found = InverseKinematics(either).solve_near(forward(either, q), near)
     assert found.reason == ""
-    assert largest(found.q, near) <= 4.0 * step + 1e-3  # a joint that is free and held costs the others its step
+    assert largest(found.q, near) <= 4.0 * step + 1e-3  # a free joint that is held costs the others its step
     assert (found.out_of_reach, found.limited) == (0.0, -1)
 
 
+@settings(max_examples=count(40, 100))
 @given(shape=shares, elsewhere=shares)
 def test_no_other_solution_inside_the_limits_is_nearer(shape, elsewhere, either):
     pose, near = forward(either, inside(either, shape)), inside(either, elsewhere)
@@ -61,55 +80,49 @@ def test_no_other_solution_inside_the_limits_is_nearer(shape, elsewhere, either)
     assert largest(found.q, near) <= smallest_move(either, pose, near) + 1e-9
 
 
+@settings(max_examples=count(30, 100))
 @given(shape=shares, elsewhere=st.tuples(*(st.floats(-40.0, 40.0) for _ in range(6))))
-def test_from_anywhere_what_is_found_is_inside_the_limits_and_confirmed(shape, elsewhere, either, chain, pose_errors):
-    q = inside(either, shape)
-    found = InverseKinematics(either).solve_near(forward(either, q), elsewhere).q
+def test_from_anywhere_the_solution_is_inside_the_limits_and_confirmed(shape, elsewhere, either):
+    pose = forward(either, inside(either, shape))
+    found = InverseKinematics(either).solve_near(pose, elsewhere).q
     assert all(limit.lower <= angle <= limit.upper for angle, limit in zip(found, either.limits, strict=True))
-    position, rotation = pose_errors(chain(either, np.array([q])), chain(either, np.array([found])))
-    assert max(position[0], rotation[0]) < 1e-9
+    assert worst_error(either, matrix(pose), [found]) < 1e-9
 
 
 @pytest.mark.parametrize(("near", "expected"), [(6.2, 6.4), (-6.2, 6.4 - 4 * pi), (0.0, 6.4 - 2 * pi), (6.9, 6.4)])
-def test_a_joint_that_may_turn_more_than_once_stays_in_its_turn(near, expected, irb120):
+def test_a_joint_with_a_range_above_a_turn_takes_the_nearest_multiple_of_2_pi(near, expected, irb120):
     q = [0.3, 0.2, 0.4, 0.5, 0.6, 6.4]
     found = InverseKinematics(irb120).solve_near(forward(irb120, q), [*q[:5], near])
     assert found.q == pytest.approx([*q[:5], expected], abs=1e-12)
 
 
-def test_a_joint_at_its_limit_goes_back_by_a_turn(irb120):
+def test_a_joint_that_would_exceed_its_limit_goes_back_by_a_turn(irb120):
     q = [0.3, 0.2, 0.4, 0.5, 0.6, 7.1]  # the limit is 6.98
-    model = replace(irb120, limits=(*(JointLimit(angle - 0.1, angle + 0.1) for angle in q[:5]), irb120.limits[5]))
+    model = narrow(irb120, q, range(5))
     found = InverseKinematics(model).solve_near(forward(model, q), [*q[:5], 6.95])
     assert found.q == pytest.approx([*q[:5], 7.1 - 2 * pi], abs=1e-12)
 
 
-def test_where_the_continuing_branch_leaves_the_limits_another_is_taken(assistive):
+def test_another_branch_is_used_where_the_nearest_exceeds_the_limits(assistive):
     q = [0.3, 0.4, 0.5, 3.2, 0.6, 0.7]  # the limit of joint 4 is 3.1
-    model = replace(
-        assistive, limits=(*(JointLimit(angle - 0.1, angle + 0.1) for angle in q[:3]), *assistive.limits[3:])
-    )
+    model = narrow(assistive, q, range(3))
     found = InverseKinematics(model).solve_near(forward(model, q), [*q[:3], 3.09, *q[4:]])
     assert found.q == pytest.approx([0.3, 0.4, 0.5, 3.2 - pi, -0.6, 0.7 - pi], abs=1e-12)
 
 
 @pytest.mark.parametrize(("joint", "beyond"), [(0, 0.2), (2, -0.3), (4, 0.25)])
-def test_with_all_solutions_beyond_the_limits_the_joint_that_is_in_the_way_is_named(joint, beyond, assistive):
-    q = [0.3, 0.4, 0.5, 0.6, 0.7, 0.8]
-    limits = tuple(JointLimit(angle - 0.1, angle + 0.1) for angle in q)
-    model = replace(assistive, limits=limits)
-    moved = [*q[:joint], q[joint] + beyond, *q[joint + 1 :]]
-    found = InverseKinematics(model).solve_near(forward(model, moved), q)
-    limit = q[joint] + (0.1 if beyond > 0 else -0.1)
-    assert found.q is None
-    assert found.limited == joint
-    assert found.out_of_reach == 0.0
+def test_with_all_solutions_beyond_the_limits_the_limiting_joint_is_named(joint, beyond, assistive):
+    model = narrow(assistive, Q)
+    moved = [*Q[:joint], Q[joint] + beyond, *Q[joint + 1 :]]
+    found = InverseKinematics(model).solve_near(forward(model, moved), Q)
+    limit = Q[joint] + (0.1 if beyond > 0 else -0.1)
+    assert (found.q, found.limited, found.out_of_reach) == (None, joint, 0.0)
     assert found.reason == (
         f"joint limit: joint{joint + 1} would have to be at {moved[joint]:.6g} rad, beyond its limit of {limit:.6g} rad"
     )
 
 
-def test_a_limit_is_not_passed_by_round_off(assistive, random_configurations):
+def test_round_off_does_not_exceed_a_limit(assistive):
     solver = InverseKinematics(assistive)
     limit = assistive.limits[2].upper
     for q in random_configurations(assistive, 200).tolist():
@@ -119,15 +132,15 @@ def test_a_limit_is_not_passed_by_round_off(assistive, random_configurations):
         assert found[2] <= limit
 
 
-def test_at_a_wrist_singularity_joint_4_stays_and_joint_6_takes_the_turn(assistive):
+def test_at_a_wrist_singularity_joint_4_stays_and_joint_6_takes_the_rotation(assistive):
     near = [0.3, 0.4, 0.5, 0.6, 0.0, 0.7]
-    found = InverseKinematics(assistive).solve_near(forward(assistive, [0.3, 0.4, 0.5, 0.6, 0.0, 0.9]), near)
-    assert found.q == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.0, 0.9], abs=1e-12)
+    found = InverseKinematics(assistive).solve_near(forward(assistive, [*near[:5], 0.9]), near)
+    assert found.q == pytest.approx([*near[:5], 0.9], abs=1e-12)
     assert found.singularity == Singularity.WRIST
 
 
 @pytest.mark.parametrize("turn", [0.5, -0.5])
-def test_at_a_wrist_singularity_joint_4_helps_where_joint_6_is_at_its_limit(turn, assistive):
+def test_at_a_wrist_singularity_joint_4_helps_when_joint_6_is_at_its_limit(turn, assistive):
     at_limit = 3.05 * np.sign(turn)
     near = [0.3, 0.4, 0.5, 0.6, 0.0, at_limit]
     pose = forward(assistive, [*near[:5], at_limit + turn])
@@ -137,15 +150,113 @@ def test_at_a_wrist_singularity_joint_4_helps_where_joint_6_is_at_its_limit(turn
     assert forward(assistive, found).rotation == pytest.approx(pose.rotation, abs=1e-12)
 
 
-def test_the_answer_is_made_of_plain_floats(either):
-    near = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
-    found = InverseKinematics(either).solve_near(forward(either, near), near).q
-    assert [type(angle) for angle in found] == [float] * 6
-
-
-def test_the_same_question_has_the_same_answer(either, random_configurations):
+def test_the_answer_consists_of_plain_floats_and_does_not_depend_on_earlier_calls(either):
     solver = InverseKinematics(either)
     pairs = random_configurations(either, 40).reshape(20, 2, 6).tolist()
     questions = [(forward(either, q), near) for q, near in pairs]
     answers = [solver.solve_near(*question) for question in questions]
     assert [solver.solve_near(*question) for question in reversed(questions)] == answers[::-1]
+    assert {type(angle) for answer in answers for angle in answer.q} == {float}
+
+
+EVEN = np.linspace(-0.3, 0.3, count(301, 601))
+# A move that brakes at zero and leaves it again, in steps of every size down to round-off
+_SCALES = 10.0 ** np.linspace(-13.0, -0.8, count(200, 400))
+BRAKING = np.concatenate([-_SCALES[::-1], [0.0], _SCALES])
+
+
+def wrist_centre(model: ArmModel, q) -> np.ndarray:
+    pose = forward(model, q)
+    return np.subtract(pose.position, np.multiply(model.rows[5].d, pose.rotation[2::3]))
+
+
+def above_axis_1(model: ArmModel, q: list[float]) -> list[float]:
+    """With joint 2 moved so that the wrist centre is on axis 1."""
+    at_zero, at_quarter = (wrist_centre(model, [0.0, lean, *q[2:]])[0] for lean in (0.0, pi / 2))
+    lean = atan2(-at_zero, at_quarter)
+    return [q[0], lean if abs(lean) < pi / 2 else lean - np.copysign(pi, lean), *q[2:]]
+
+
+SINGULAR = {
+    "wrist": lambda model: [0.3, 0.4, 0.5, 0.6, 0.0, 0.2],
+    "workspace edge": lambda model: [0.3, 0.4, stretched(model), 0.6, 0.7, 0.2],
+    "shoulder": lambda model: above_axis_1(model, [0.2, 0.0, 0.9, 0.7, 0.6, -0.4]),
+    "wrist and workspace edge": lambda model: [0.2, 0.5, stretched(model), 0.7, 0.0, -0.4],
+    "wrist and shoulder": lambda model: above_axis_1(model, [0.2, 0.0, 0.9, 0.7, 0.0, -0.4]),
+    "workspace edge and shoulder": lambda model: above_axis_1(model, [0.2, 0.0, stretched(model), 0.7, 0.6, -0.4]),
+    "all three": lambda model: above_axis_1(model, [0.2, 0.0, stretched(model), 0.7, 0.0, -0.4]),
+    "all three, straight up": lambda model: above_axis_1(model, [0.0, 0.0, stretched(model), 0.0, 0.0, 0.0]),
+}
+
+
+def track(model: ArmModel, poses, start) -> np.ndarray:
+    """The path of `solve_near` when each call starts from the last answer."""
+    solver = InverseKinematics(model)
+    path = [tuple(start)]
+    for pose in poses:
+        near = solver.solve_near(pose, path[-1])
+        assert near.q is not None, near.reason
+        path.append(near.q)
+    return np.array(path)
+
+
+def steps(path: np.ndarray) -> np.ndarray:
+    """The largest move of a joint in each step, rad."""
+    return np.abs(np.diff(path, axis=0)).max(axis=1)
+
+
+@pytest.mark.parametrize("profile", [EVEN, BRAKING], ids=["even steps", "braking"])
+@pytest.mark.parametrize("place", SINGULAR)
+def test_a_joint_path_through_a_singularity_is_tracked_without_a_jump(place, profile, either):
+    for seed in range(count(1, 6)):
+        path = np.array(SINGULAR[place](either)) + profile[:, None] * np.random.default_rng(seed).uniform(-1, 1, 6)
+        matrices = chain(either, path)
+        tracked = track(either, map(as_pose, matrices[1:]), path[0])
+        assert np.max(pose_errors(matrices, chain(either, tracked))) < 1e-9
+        # At the edge the elbow may bend to the other side: another path, but not a jump.
+        assert (steps(tracked) < 4.0 * steps(path) + 1e-3).all()
+        if place in ("wrist", "shoulder") and profile is EVEN:
+            assert np.abs(tracked - path)[np.abs(EVEN) > 0.01].max() < 1e-6
+
+
+@pytest.mark.parametrize("joint", range(6))
+def test_a_single_joint_through_straight_up_is_tracked_exactly(joint, assistive):
+    path = np.zeros((len(EVEN), 6))
+    path[:, joint] = EVEN
+    tracked = track(assistive, map(as_pose, chain(assistive, path)[1:]), path[0])
+    # Joints 1, 4 and 6 rotate about one axis here: only their sum is visible in the pose.
+    assert np.abs(tracked[:, [1, 2, 4]] - path[:, [1, 2, 4]]).max() < 1e-6
+    assert np.abs(tracked[:, [0, 3, 5]].sum(axis=1) - path[:, [0, 3, 5]].sum(axis=1)).max() < 1e-6
+    assert (steps(tracked) < 1.001 * (EVEN[1] - EVEN[0])).all()
+
+
+def radial(model: ArmModel, radius: float) -> Pose:
+    """The wrist centre at a distance from axis 2, forward and up, the tool in the same direction but rolled."""
+    turn = Pose.from_xyzrpy(0.0, 0.0, 0.0, 0.0, 0.9, 0.0)
+    centre = Pose.from_xyzrpy(0.0, 0.0, model.rows[0].d, 0.0, 0.0, 0.0) @ turn @ Pose.from_xyzrpy(0, 0, radius, 0, 0, 0)
+    return centre @ Pose.from_xyzrpy(0.0, 0.0, 0.0, 0.7, 0.2, 0.4) @ Pose.from_xyzrpy(0, 0, model.rows[5].d, 0, 0, 0)
+
+
+def test_a_line_to_the_edge_of_the_workspace_and_back_is_tracked_without_a_jump(either):
+    longest = either.rows[2].a + np.hypot(either.rows[3].a, either.rows[3].d)
+    # The bend is proportional to the square root of the remaining distance: it moves evenly when the tool brakes.
+    poses = [radial(either, longest - 0.5 * share * share) for share in np.linspace(-0.3, 0.3, 601)]
+    start = InverseKinematics(either).solve_near(poses[0], [0.0] * 6).q
+    tracked = track(either, poses[1:], start)
+    assert steps(tracked).max() < 0.01
+    assert tracked[300, 2] == pytest.approx(stretched(either), abs=1e-6)
+
+
+def test_a_line_across_axis_1_is_tracked_without_a_jump(either):
+    hand = Pose.from_xyzrpy(0.0, 0.0, 0.0, 0.3, 0.2, 0.1) @ Pose.from_xyzrpy(0.0, 0.0, either.rows[5].d, 0.0, 0.0, 0.0)
+    height = either.rows[0].d + 0.45
+    poses = [Pose.from_xyzrpy(x, 0.0, height, 0.0, 0.0, 0.0) @ hand for x in np.linspace(0.2, -0.2, 801)]
+    start = InverseKinematics(either).solve_near(poses[0], [0.0, 0.3, 0.3, 0.0, 0.3, 0.0]).q
+    assert steps(track(either, poses[1:], start)).max() < 0.01
+
+
+def test_a_joint_path_beyond_pi_is_tracked(irb120):
+    path = np.tile([0.3, 0.2, 0.4, 0.5, 0.6, 0.0], (500, 1))
+    path[:, 5] = np.linspace(-6.9, 6.9, 500)
+    tracked = track(irb120, map(as_pose, chain(irb120, path)[1:]), path[0])
+    assert np.abs(tracked - path).max() < 1e-12

@@ -10,14 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kinematics.pose import IDENTITY, Pose, orthonormality_error, rotation_from_rpy, rpy_from_rotation
+from tests.kinematics.arms import matrix
 
 angles = st.floats(-pi, pi)
 lengths = st.floats(-2.0, 2.0)
 poses = st.builds(Pose.from_xyzrpy, lengths, lengths, lengths, angles, angles, angles)
-
-
-def matrix(rotation) -> np.ndarray:
-    return np.reshape(rotation, (3, 3))
 
 
 def about(axis: int, angle: float) -> np.ndarray:
@@ -29,56 +26,52 @@ def about(axis: int, angle: float) -> np.ndarray:
     return turn
 
 
-def homogeneous(pose: Pose) -> np.ndarray:
-    result = np.eye(4)
-    result[:3, :3], result[:3, 3] = matrix(pose.rotation), pose.position
-    return result
-
-
 @given(angles, angles, angles)
 def test_the_rotation_is_rx_ry_rz_in_this_order(rx, ry, rz):
-    assert matrix(rotation_from_rpy(rx, ry, rz)) == pytest.approx(about(0, rx) @ about(1, ry) @ about(2, rz), abs=1e-15)
+    assert np.reshape(rotation_from_rpy(rx, ry, rz), (3, 3)) == pytest.approx(
+        about(0, rx) @ about(1, ry) @ about(2, rz), abs=1e-15
+    )
 
 
 @given(angles, angles, angles)
-def test_angles_of_a_rotation_give_it_back(rx, ry, rz):
+def test_the_angles_of_a_rotation_reproduce_it(rx, ry, rz):
     rotation = rotation_from_rpy(rx, ry, rz)
     assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
-def test_angles_away_from_the_singular_orientations_come_back_themselves(rx, ry, rz):
+def test_angles_away_from_the_singular_orientations_are_recovered(rx, ry, rz):
     found = rpy_from_rotation(rotation_from_rpy(rx, ry, rz))
     error = [abs(np.remainder(a - b + pi, 2 * pi) - pi) for a, b in zip(found, (rx, ry, rz), strict=True)]
     assert max(error) < 1e-13
 
 
 @given(angles, st.sampled_from([-1, 1]), st.floats(-12, -5), angles)
-def test_angles_beside_a_singular_orientation_give_the_rotation_back(rx, side, exponent, rz):
+def test_the_angles_of_a_rotation_beside_a_singular_one_reproduce_it(rx, side, exponent, rz):
     rotation = rotation_from_rpy(rx, side * (pi / 2 - 10**exponent), rz)
     assert rotation_from_rpy(*rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-14)
 
 
 @pytest.mark.parametrize("side", [-1, 1])
-def test_in_a_singular_orientation_rz_is_zero_and_rx_carries_the_turn(side):
+def test_in_a_singular_orientation_rz_is_zero_and_rx_is_the_whole_angle(side):
     rx, ry, rz = rpy_from_rotation(rotation_from_rpy(0.4, side * pi / 2, 0.9))
     assert (rx, ry, rz) == (pytest.approx(0.4 + side * 0.9, abs=1e-15), pytest.approx(side * pi / 2), 0.0)
 
 
 @given(poses, poses)
 def test_poses_compose_as_their_matrices_do(one, other):
-    assert homogeneous(one @ other) == pytest.approx(homogeneous(one) @ homogeneous(other), abs=1e-14)
+    assert matrix(one @ other) == pytest.approx(matrix(one) @ matrix(other), abs=1e-14)
 
 
 @given(poses)
 def test_a_pose_times_its_inverse_is_the_identity(pose):
-    assert homogeneous(pose @ pose.inverse()) == pytest.approx(np.eye(4), abs=1e-14)
-    assert homogeneous(pose.inverse() @ pose) == pytest.approx(np.eye(4), abs=1e-14)
+    assert matrix(pose @ pose.inverse()) == pytest.approx(np.eye(4), abs=1e-14)
+    assert matrix(pose.inverse() @ pose) == pytest.approx(np.eye(4), abs=1e-14)
 
 
 @pytest.mark.parametrize("index", range(6))
 @pytest.mark.parametrize("value", [nan, inf, -inf])
-def test_a_number_that_is_not_finite_is_refused_by_name(index, value):
+def test_a_value_that_is_not_finite_is_refused_by_name(index, value):
     numbers = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     numbers[index] = value
     with pytest.raises(ValueError, match=f"^{('x', 'y', 'z', 'rx', 'ry', 'rz')[index]} is {value}"):
@@ -93,12 +86,12 @@ def test_a_rotation_with_an_entry_that_is_not_finite_is_refused_by_its_place():
 
 
 @given(poses)
-def test_rotations_have_no_error_of_orthonormality(pose):
+def test_rotations_have_no_orthonormality_error(pose):
     assert orthonormality_error(pose.rotation) < 1e-14
 
 
 @pytest.mark.parametrize("index", range(9))
-def test_a_change_of_any_entry_is_an_error_of_orthonormality(index):
+def test_a_change_of_any_entry_is_an_orthonormality_error(index):
     rotation = list(rotation_from_rpy(0.3, 0.5, 0.7))
     rotation[index] += 1e-3
     assert orthonormality_error(tuple(rotation)) > 1e-4

@@ -1,8 +1,7 @@
-"""On and beside singularities: nothing is missing, a free joint is held, and which singularity it is is told."""
+"""On and beside singularities: no solution is missing, a free joint is held, and the singularity is named."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import acos, atan2, hypot, pi, sin
 
 import numpy as np
@@ -12,11 +11,12 @@ from hypothesis import strategies as st
 
 from kinematics.forward import forward
 from kinematics.inverse import InverseKinematics
-from kinematics.model import ArmModel, DhRow
+from kinematics.model import ArmModel
 from kinematics.solution import Singularity
+from tests.kinematics.arms import as_pose, chain, count, stretched, with_row, worst_error, wrapped_difference
 
 KINDS = ("wrist", "elbow", "shoulder")
-APART = 0.05  # sine of joint 5 and of the elbow, where the singularity is not asked for
+APART = 0.05  # sine of joint 5 and of the elbow, where the singularity is not requested
 FLAGS = {"wrist": Singularity.WRIST, "elbow": Singularity.ELBOW, "shoulder": Singularity.SHOULDER}
 
 kinds = st.sets(st.sampled_from(KINDS), min_size=1)
@@ -26,26 +26,25 @@ configurations = st.tuples(*(st.floats(-1.0, 1.0) for _ in range(6)))
 
 
 def wrist_height_and_distance(model: ArmModel, q: list[float]) -> tuple[float, float]:
-    """Of the wrist centre seen from axis 2, in the plane of the arm (m): along x of frame 1, and upwards."""
+    """Wrist centre from axis 2 in the plane of the arm, m: along x of frame 1, and up."""
     pose = forward(model, [0.0, *q[1:]])
     x, _, z = np.subtract(pose.position, np.multiply(model.rows[5].d, pose.rotation[2::3]))
     return x, z - model.rows[0].d
 
 
 def beside(model: ArmModel, shape, kinds, distance: float, side: float) -> list[float]:
-    """A configuration inside the limits at a distance (rad, or m from axis 1) from all the singularities named."""
+    """A configuration inside the limits at a distance (rad, or m from axis 1) from all named singularities."""
     q = [share * min(-limit.lower, limit.upper) for share, limit in zip(shape, model.limits, strict=True)]
     if "wrist" in kinds:
         q[4] = side * distance
     elif abs(sin(q[4])) < APART:
         q[4] = 0.5
-    stretched = -model.rows[2].offset - atan2(-sin(model.rows[3].alpha) * model.rows[3].d, model.rows[3].a)
     if "elbow" in kinds:
-        q[2] = stretched + side * distance
-    elif abs(sin(q[2] - stretched)) < APART:
-        q[2] = stretched + 0.5
+        q[2] = stretched(model) + side * distance
+    elif abs(sin(q[2] - stretched(model))) < APART:
+        q[2] = stretched(model) + 0.5
     if "shoulder" in kinds:
-        # the distance from axis 1 is that of a rigid triangle which joint 2 turns
+        # joint 2 rotates a rigid triangle about axis 2
         x, z = wrist_height_and_distance(model, [q[0], 0.0, *q[2:]])
         quarter, _ = wrist_height_and_distance(model, [q[0], pi / 2, *q[2:]])
         q[1] = atan2(quarter, x) + acos(side * distance / hypot(x, z))
@@ -56,10 +55,10 @@ def beside(model: ArmModel, shape, kinds, distance: float, side: float) -> list[
 
 
 def tolerance(kinds, distance: float) -> float:
-    """How far (rad) round-off of the pose, 1e-16, may move a solution at a distance from the singularities named.
+    """How far (rad) the round-off of the pose, 1e-16, may move a solution at a distance from the named singularities.
 
-    A distance from axis 1 divides it. On the edge of the workspace it is the bend's square that is known: nearer than
-    5e-7 the arm is given as stretched. What direction of the forearm is lost is divided by the distance of the wrist.
+    Distance from axis 1 divides it. At the edge of the workspace only the square of the bend is known: nearer than
+    5e-7 the arm is stretched. The error of the forearm's direction is divided by the distance of the wrist.
     """
     if distance == 0.0:
         return 1e-12
@@ -71,25 +70,19 @@ def tolerance(kinds, distance: float) -> float:
     return 1e-12 + arm / (distance if "wrist" in kinds else APART)
 
 
-def apart(one, other) -> float:
-    return float(np.abs(np.remainder(np.subtract(one, other) + pi, 2 * pi) - pi).max())
-
-
-@settings(max_examples=400)
+@settings(max_examples=count(60, 400))
 @given(shape=configurations, kinds=kinds, distance=distances, side=sides)
-def test_no_solution_is_missing_beside_singularities(shape, kinds, distance, side, either, chain, pose_errors, as_pose):
+def test_no_solution_is_missing_beside_singularities(shape, kinds, distance, side, either):
     q = beside(either, shape, kinds, distance, side)
-    matrix = chain(either, np.array([q]))
-    answer = InverseKinematics(either).solve(as_pose(matrix[0]), q)
-    assert min(apart(solution.q, q) for solution in answer.solutions) < tolerance(kinds, distance)
-    found = np.array([solution.q for solution in answer.solutions])
-    position, rotation = pose_errors(np.repeat(matrix, len(found), axis=0), chain(either, found))
-    assert max(position.max(), rotation.max()) < 1e-9
+    matrix = chain(either, np.array([q]))[0]
+    found = [solution.q for solution in InverseKinematics(either).solve(as_pose(matrix), q).solutions]
+    assert wrapped_difference(found, q).min() < tolerance(kinds, distance)
+    assert worst_error(either, matrix, found) < 1e-9
 
 
-@settings(max_examples=100)
+@settings(max_examples=count(30, 100))
 @given(shape=configurations, kinds=kinds, side=sides, held=st.floats(-1.0, 1.0))
-def test_on_a_singularity_the_free_joints_stay_and_it_is_named(shape, kinds, side, held, either, chain, as_pose):
+def test_on_a_singularity_the_free_joints_stay_and_it_is_named(shape, kinds, side, held, either):
     q = beside(either, shape, kinds, 0.0, side)
     near = [held, q[1], q[2], -held, q[4], q[5]]
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), near).solutions
@@ -103,15 +96,13 @@ def test_on_a_singularity_the_free_joints_stay_and_it_is_named(shape, kinds, sid
         assert all(FLAGS[kind] in solution.singularity for solution in solutions)
 
 
-@settings(max_examples=100)
+@settings(max_examples=count(30, 100))
 @given(shape=configurations, kinds=kinds, side=sides)
-def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_there(
-    shape, kinds, side, either, chain, as_pose
-):
+def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_found(shape, kinds, side, either):
     q = beside(either, shape, kinds, 1e-3, side)
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0])).solutions
     assert len(solutions) == 8
-    own = min(solutions, key=lambda solution: apart(solution.q, q))
+    own = min(solutions, key=lambda solution: wrapped_difference(solution.q, q))
     assert own.singularity == Singularity.NONE
 
 
@@ -120,15 +111,15 @@ def test_a_thousandth_away_no_singularity_is_named_and_all_eight_solutions_are_t
     [({"elbow"}, 4), ({"shoulder"}, 4), ({"shoulder", "elbow"}, 2)],
     ids=["elbow", "shoulder", "both"],
 )
-def test_solutions_that_have_become_one_are_given_once(kinds, count, either, chain, as_pose):
+def test_solutions_that_coincide_are_returned_once(kinds, count, either):
     q = beside(either, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), kinds, 0.0, 1.0)
     solutions = InverseKinematics(either).solve(as_pose(chain(either, np.array([q]))[0]), q).solutions
     assert len(solutions) == count
 
 
 @pytest.mark.parametrize(("arm", "count"), [("assistive", 2), ("irb120", 1)])
-def test_both_wrists_become_one_in_every_arm_whose_forearm_points_along_axis_6(arm, count, chain, as_pose, request):
-    # Without an elbow offset the arm turned by half a turn about axis 1 and leant back has the same forearm
+def test_both_wrist_solutions_coincide_where_the_forearm_points_along_axis_6(arm, count, request):
+    # Without an elbow offset, half a turn of joint 1 and leaning back gives the same forearm.
     model = request.getfixturevalue(arm)
     q = beside(model, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"wrist"}, 0.0, 1.0)
     solutions = InverseKinematics(model).solve(as_pose(chain(model, np.array([q]))[0]), q).solutions
@@ -136,7 +127,7 @@ def test_both_wrists_become_one_in_every_arm_whose_forearm_points_along_axis_6(a
     assert len(solutions) == 8 - count
 
 
-def test_straight_up_has_the_one_solution_that_holds_joints_1_and_4(assistive):
+def test_straight_up_has_one_solution_which_holds_joints_1_and_4(assistive):
     near = [0.3, 0.1, -0.1, -0.8, 0.2, 0.9]
     (solution,) = InverseKinematics(assistive).solve(forward(assistive, [0.0] * 6), near).solutions
     assert solution.q == pytest.approx((0.3, 0.0, 0.0, -0.8, 0.0, 0.5), abs=1e-15)
@@ -145,16 +136,14 @@ def test_straight_up_has_the_one_solution_that_holds_joints_1_and_4(assistive):
 
 
 def equal_lengths(model: ArmModel) -> ArmModel:
-    """With an upper arm as long as the forearm, which folds onto axis 2."""
-    rows = list(model.rows)
-    rows[2] = replace(rows[2], a=hypot(rows[3].a, rows[3].d))
-    return replace(model, rows=tuple(rows))
+    """The upper arm as long as the forearm, which can fold onto axis 2."""
+    return with_row(model, 2, a=hypot(model.rows[3].a, model.rows[3].d))
 
 
 @pytest.mark.parametrize("opened", [0.0, 5e-11, 1e-3])
 def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(opened, assistive):
     model = equal_lengths(assistive)
-    folded = pi - model.rows[2].offset - atan2(-sin(model.rows[3].alpha) * model.rows[3].d, model.rows[3].a)
+    folded = pi + stretched(model)
     q = [0.4, 0.7, folded - 2 * pi * round(folded / (2 * pi)) - opened, 0.3, 0.6, 0.1]
     near = [0.4, 0.9, 0.0, 0.3, 0.6, 0.1]
     pose = forward(model, q)
@@ -167,13 +156,13 @@ def test_with_the_wrist_centre_on_axis_2_joint_2_is_held(opened, assistive):
 
 
 @pytest.mark.parametrize("distance", [0.0, 1e-9, 1e-7, 1e-5, 1e-3])
-def test_beside_the_tube_that_a_lateral_offset_keeps_free_nothing_is_missing(distance, assistive, chain, as_pose):
-    rows = list(assistive.rows)
-    rows[2] = DhRow(rows[2].alpha, rows[2].a, 0.12, rows[2].offset)
-    model = replace(assistive, rows=tuple(rows))
+def test_beside_the_tube_of_a_lateral_offset_no_solution_is_missing(distance, assistive):
+    model = with_row(assistive, 2, d=0.12)
     q = beside(assistive, (0.2, 0.3, 0.4, 0.5, 0.6, 0.7), {"shoulder"}, distance, 1.0)
     solutions = InverseKinematics(model).solve(as_pose(chain(model, np.array([q]))[0])).solutions
-    assert min(apart(solution.q, q) for solution in solutions) < (1e-6 if distance < 1e-6 else 1e-14 / distance)
-    nearest = min(solutions, key=lambda solution: apart(solution.q, q))
+    assert min(wrapped_difference(solution.q, q) for solution in solutions) < (
+        1e-6 if distance < 1e-6 else 1e-14 / distance
+    )
+    nearest = min(solutions, key=lambda solution: wrapped_difference(solution.q, q))
     assert (Singularity.SHOULDER in nearest.singularity) == (distance < 1e-8)
     assert len(solutions) == (4 if distance < 1e-8 else 8)

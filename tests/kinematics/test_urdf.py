@@ -1,4 +1,4 @@
-"""The arm as URDF, read back with the standard library only."""
+"""The exported URDF, read back with the standard library."""
 
 from __future__ import annotations
 
@@ -11,20 +11,12 @@ import numpy as np
 import pytest
 
 from kinematics.forward import forward
-from kinematics.model import ArmModel, DhRow, LinkMass
-from kinematics.pose import IDENTITY, Pose
+from kinematics.model import LinkMass
+from kinematics.pose import IDENTITY
 from kinematics.urdf import UNKNOWN, fixed_axes_rpy, to_urdf
+from tests.kinematics.arms import with_general_rows, with_tool
 
 LINKS = tuple(LinkMass(0.1 * i, (0.01 * i, -0.02, 0.03)) for i in range(1, 7))
-
-
-def with_tool(model: ArmModel) -> ArmModel:
-    return replace(model, tool=Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1))
-
-
-def with_general_rows(model: ArmModel) -> ArmModel:
-    numbers = random.Random(6)
-    return replace(model, rows=tuple(DhRow(*(numbers.uniform(-2.0, 2.0) for _ in range(4))) for _ in range(6)))
 
 
 def read(element: ET.Element, name: str) -> list[float]:
@@ -66,9 +58,8 @@ def tool_of_the_document(robot: ET.Element, q: list[float]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("change", [replace, with_tool, with_general_rows])
-@pytest.mark.parametrize("arm", ["assistive", "irb120"])
-def test_the_document_puts_the_tool_where_the_model_does(arm, change, request):
-    model = change(request.getfixturevalue(arm))
+def test_the_tool_pose_of_the_document_matches_the_model(change, either):
+    model = change(either)
     robot = ET.fromstring(to_urdf(model))
     numbers = random.Random(7)
     for _ in range(50):
@@ -78,7 +69,7 @@ def test_the_document_puts_the_tool_where_the_model_does(arm, change, request):
         assert found[:3, :3].ravel() == pytest.approx(expected.rotation, abs=1e-13)
 
 
-def test_limits_are_written_to_the_last_digit(irb120):
+def test_limits_are_exact(irb120):
     joints = ET.fromstring(to_urdf(irb120, effort=[6.1, 5.0, 4.0, 3.0, 2.0, 1.0])).findall("joint[@type='revolute']")
     assert [joint.get("name") for joint in joints] == list(irb120.joint_names)
     for joint, limit, effort in zip(joints, irb120.limits, [6.1, 5.0, 4.0, 3.0, 2.0, 1.0], strict=True):
@@ -86,13 +77,13 @@ def test_limits_are_written_to_the_last_digit(irb120):
         assert written == {"lower": limit.lower, "upper": limit.upper, "velocity": limit.velocity, "effort": effort}
 
 
-def test_limits_that_are_not_known_are_large_numbers_and_not_infinite(irb120):
+def test_unknown_limits_are_large_finite_numbers(irb120):
     limits = tuple(replace(limit, velocity=math.inf) for limit in irb120.limits)
     for limit in ET.fromstring(to_urdf(replace(irb120, limits=limits))).iter("limit"):
         assert (float(limit.get("velocity")), float(limit.get("effort"))) == (UNKNOWN, UNKNOWN)
 
 
-def test_the_masses_and_their_centres_are_those_of_the_model(assistive):
+def test_masses_and_centres_match_the_model(assistive):
     robot = ET.fromstring(to_urdf(replace(assistive, links=LINKS)))
     for number, body in enumerate(LINKS, start=1):
         inertial = robot.find(f"link[@name='link{number}']/inertial")
@@ -112,7 +103,7 @@ def test_a_link_without_mass_has_no_inertial(assistive):
 
 
 @pytest.mark.parametrize("change", [with_tool, with_general_rows])
-def test_the_drawn_links_lead_from_each_joint_to_the_next(change, irb120):
+def test_the_drawn_links_connect_each_joint_to_the_next(change, irb120):
     robot = ET.fromstring(to_urdf(change(irb120)))
     for joint in robot.findall("joint"):
         corner = np.zeros(3)
@@ -127,7 +118,7 @@ def test_the_drawn_links_lead_from_each_joint_to_the_next(change, irb120):
         assert corner == pytest.approx(read(joint.find("origin"), "xyz"), abs=1e-3)
 
 
-def test_every_link_can_be_seen_without_meshes(assistive):
+def test_every_link_is_visible_without_meshes(assistive):
     robot = ET.fromstring(to_urdf(assistive))
     colours = {material.get("name") for material in robot.findall("material")}
     for link in robot.findall("link"):
@@ -137,25 +128,25 @@ def test_every_link_can_be_seen_without_meshes(assistive):
     assert robot.find(".//mesh") is None
 
 
-def test_a_name_with_the_characters_of_the_markup_is_kept(assistive):
+def test_a_name_with_markup_characters_is_escaped(assistive):
     name = 'arm <1> & "2"'
     assert ET.fromstring(to_urdf(replace(assistive, name=name))).get("name") == name
 
 
 @pytest.mark.parametrize("pitch", [0.3, -1.2, math.pi / 2, -math.pi / 2, math.pi / 2 - 1e-9, -math.pi / 2 + 1e-12])
-def test_the_angles_give_the_rotation_back_also_where_yaw_is_free(pitch):
+def test_the_angles_reproduce_the_rotation_also_where_yaw_is_undefined(pitch):
     numbers = random.Random(8)
     for _ in range(20):
         roll, yaw = numbers.uniform(-3.0, 3.0), numbers.uniform(-3.0, 3.0)
         origin = ET.Element("origin", xyz="0 0 0", rpy=f"{roll!r} {pitch!r} {yaw!r}")
-        # Round-off leaves nothing of the small numbers from which roll and yaw would be read one by one.
+        # Round-off destroys the small entries from which roll and yaw would be read separately.
         rotation = transform(origin)[:3, :3] + [[numbers.gauss(0.0, 1e-16) for _ in range(3)] for _ in range(3)]
         again = fixed_axes_rpy(tuple(rotation.ravel().tolist()))
         origin.set("rpy", " ".join(map(repr, again)))
         assert transform(origin)[:3, :3] == pytest.approx(rotation, abs=1e-14)
 
 
-def test_a_rotation_of_none_has_angles_of_zero():
+def test_the_identity_has_angles_of_zero():
     assert fixed_axes_rpy(IDENTITY.rotation) == (0.0, 0.0, 0.0)
 
 
@@ -163,6 +154,6 @@ def test_a_rotation_of_none_has_angles_of_zero():
     ("effort", "reason"),
     [([1.0] * 5, "5 values"), ([1.0] * 5 + [math.nan], "joint6"), ([-1.0] + [1.0] * 5, "negative")],
 )
-def test_efforts_that_make_no_sense_are_refused(effort, reason, assistive):
+def test_invalid_efforts_are_refused(effort, reason, assistive):
     with pytest.raises(ValueError, match=reason):
         to_urdf(assistive, effort=effort)

@@ -1,0 +1,119 @@
+"""Comparison with other libraries: Pinocchio, which reads the exported URDF, and EAIK, an analytic solver.
+
+`make oracles` installs them; the tests skip what is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from kinematics.forward import forward_batch, frames
+from kinematics.gravity import gravity_torques
+from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import jacobian
+from kinematics.model import ArmModel, LinkMass
+from kinematics.urdf import to_urdf
+from tests.kinematics.arms import (
+    as_pose,
+    chain,
+    matrix,
+    random_configurations,
+    with_general_rows,
+    with_row,
+    with_tool,
+    wrapped_difference,
+)
+
+COUNT = 2000
+LINKS = (
+    LinkMass(1.9, (0.0, 0.02, -0.05)),
+    LinkMass(2.4, (0.21, 0.01, 0.04)),
+    LinkMass(1.7, (0.03, 0.18, -0.02)),
+    LinkMass(0.9, (0.01, 0.0, -0.11)),
+    LinkMass(0.6, (-0.01, 0.03, 0.02)),
+    LinkMass(0.4, (0.0, 0.01, -0.03)),
+)
+CONFIGURATIONS = np.random.default_rng(10).uniform(-np.pi, np.pi, (COUNT, 6))
+
+
+@pytest.fixture
+def pin():
+    return pytest.importorskip("pinocchio")
+
+
+@pytest.fixture(params=["as it is", "general"])
+def model(request, either) -> ArmModel:
+    return replace(with_general_rows(either) if request.param == "general" else either, links=LINKS)
+
+
+@pytest.fixture
+def oracle(model, pin):
+    """Pinocchio's model of the document, its data, and the number of its frame tool0."""
+    built = pin.buildModelFromXML(to_urdf(model))
+    return built, built.createData(), built.getFrameId("tool0")
+
+
+def test_the_tool_pose_matches_pinocchio(model, oracle, pin):
+    built, data, tool = oracle
+    positions, rotations = forward_batch(model, CONFIGURATIONS)
+    for row, position, rotation in zip(CONFIGURATIONS, positions, rotations, strict=True):
+        pin.framesForwardKinematics(built, data, row)
+        assert np.abs(data.oMf[tool].translation - position).max() < 1e-9
+        assert np.abs(data.oMf[tool].rotation - rotation).max() < 1e-9
+
+
+def test_the_jacobian_matches_pinocchio(model, oracle, pin):
+    built, data, tool = oracle
+    for row in CONFIGURATIONS:
+        expected = pin.computeFrameJacobian(built, data, row, tool, pin.LOCAL_WORLD_ALIGNED)
+        assert np.abs(expected - jacobian(model, row.tolist())).max() < 1e-9
+
+
+@pytest.mark.parametrize("payload", [None, LinkMass(1.5, (0.02, -0.04, 0.07))])
+@pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.80665), (4.0, -2.0, 8.0)])
+def test_the_gravity_torques_match_pinocchio(gravity, payload, model, oracle, pin):
+    built, _, tool = oracle
+    if payload is not None:
+        frame = built.frames[tool]
+        body = pin.Inertia(payload.mass, np.array(payload.centre), np.eye(3) * 1e-3)
+        built.appendBodyToJoint(frame.parentJoint, body, frame.placement)
+    built.gravity.linear = np.array(gravity)
+    data = built.createData()
+    for row in CONFIGURATIONS:
+        expected = pin.computeGeneralizedGravity(built, data, row)
+        assert np.abs(expected - gravity_torques(model, row.tolist(), gravity, payload)).max() < 1e-9
+
+
+def test_pinocchio_reads_the_limits_of_the_model(model, pin):
+    built = pin.buildModelFromXML(to_urdf(model, effort=[6.0, 5.0, 4.0, 3.0, 2.0, 1.0]))
+    assert list(built.names[1:]) == list(model.joint_names)
+    assert built.lowerPositionLimit.tolist() == [limit.lower for limit in model.limits]
+    assert built.upperPositionLimit.tolist() == [limit.upper for limit in model.limits]
+    assert built.velocityLimit.tolist() == [limit.velocity for limit in model.limits]
+    assert built.effortLimit.tolist() == [6.0, 5.0, 4.0, 3.0, 2.0, 1.0]
+
+
+def with_offsets(model: ArmModel) -> ArmModel:
+    """A shoulder offset and a lateral offset, as in a PUMA, and a tool."""
+    return with_tool(with_row(with_row(model, 1, a=0.08), 2, d=0.12))
+
+
+@pytest.mark.parametrize("change", [replace, with_offsets], ids=["as it is", "with offsets and tool"])
+def test_eaik_finds_the_same_solutions(change, either):
+    eaik = pytest.importorskip("eaik.IK_Homogeneous")
+    model = change(either)
+    solver = InverseKinematics(model)
+    other = eaik.HomogeneousRobot(np.array([matrix(pose) for pose in frames(model, [0.0] * 6)]))
+    compared = 0
+    for pose in chain(model, random_configurations(model, COUNT, seed=7)):
+        ours = np.array([solution.q for solution in solver.solve(as_pose(pose)).solutions])
+        answer = other.IK(pose)
+        theirs = np.array([q for q, is_approximate in zip(answer.Q, answer.is_LS, strict=True) if not is_approximate])
+        distance = wrapped_difference(ours[:, None], theirs[None])
+        assert len(ours) == len(theirs)
+        assert max(distance.min(axis=0).max(), distance.min(axis=1).max()) < 1e-9
+        compared += len(theirs)
+    assert compared > 4 * COUNT
