@@ -258,15 +258,16 @@ def test_just_out_of_reach_the_amount_is_proportional_to_the_distance(geometry):
         assert np.divide(amounts, amounts[0]) == pytest.approx([1.0, 2.0, 4.0], rel=1e-2)
 
 
-def test_beyond_a_stretched_arm_with_lateral_offset_the_amount_is_exact(assistive):
+@pytest.mark.parametrize(("bend", "beyond"), [(0.0, 1e-6), (pi, -1e-6)], ids=["stretched", "folded"])
+def test_beyond_a_stretched_or_folded_arm_with_lateral_offset_the_amount_is_exact(bend, beyond, assistive):
     model = with_row(assistive, 2, d=0.12)
     for lean in (0.3, 0.9, -1.4):
-        edge = wrist_centres(model, np.array([[0.0, lean, 0.0]]))[0]
+        edge = wrist_centres(model, np.array([[0.0, lean, bend]]))[0]
         along = edge - [0.0, edge[1], model.rows[0].d]
         # perpendicular to the directions in which joints 1 and 2 move the wrist centre
         normal = np.add(along, [0.0, edge[1] * along[0] / edge[0], 0.0])
         normal /= np.linalg.norm(normal)
-        near = InverseKinematics(model).solve_near(hand_at(model, edge + 1e-6 * normal), [0.0] * 6)
+        near = InverseKinematics(model).solve_near(hand_at(model, edge + beyond * normal), [0.0] * 6)
         assert near.out_of_reach == pytest.approx(1e-6, rel=1e-3)
 
 
