@@ -1,12 +1,12 @@
-"""How fast and exact the kinematics is: `python benchmarks/arm_kinematics.py [--rounds N] [--poses N] [--json FILE]`.
+"""Speed and accuracy of the kinematics: `python benchmarks/arm_kinematics.py [--rounds N] [--poses N] [--json FILE]`.
 
-In one run, round after round alternating: this project's functions, EAIK (analytic, C++), the numeric solver of
-roboticstoolbox-python (`ik_LM`, C++) and Pinocchio (C++, with a damped-least-squares loop in Python). What is not
-installed (`pip install -e .[oracles,benchmark]`) is named. Poses are those of random joints inside each arm's limits.
+Alternates in one run between this project, EAIK (analytic, C++), the numeric solver of roboticstoolbox-python (`ik_LM`,
+C++) and Pinocchio (C++, with a damped-least-squares loop in Python). Missing libraries are listed
+(`pip install -e .[oracles,benchmark]`). Poses are those of random configurations inside the limits of each arm.
 
-A time is the median over the poses of one round, then the median over the rounds, with the smallest and the largest of
-them. Errors are those of what a solver called a solution, by a forward kinematics written here in matrices; a pose
-counts as solved when both errors of a solution are below 1e-6.
+A time is the median over the poses of one round, then the median, smallest and largest over the rounds. Errors of the
+reported solutions come from a separate forward kinematics in matrices; a pose is solved when both errors of a solution
+are below 1e-6.
 """
 
 # ruff: noqa: E402
@@ -29,7 +29,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-# Python puts the folder of the file that it runs first, and there this file is what `kinematics` means.
+# Python puts the folder of the script first in sys.path; without this line `kinematics` could mean a file there.
 sys.path[:] = [entry for entry in sys.path if Path(entry).resolve() != Path(__file__).resolve().parent]
 
 import numpy as np
@@ -51,18 +51,18 @@ from rtcp.config import find_arm, load_kinematics
 Array = npt.NDArray[np.float64]
 
 SOLVED = 1e-6
-"""m and rad; both errors of a solution are below it."""
+"""Largest error of a solution, m and rad."""
 STEP = 0.02
-"""rad; so far a motion's next pose is from the joints at most."""
+"""Largest joint motion to the next pose, rad."""
 BATCH = 100_000
 AIMS = {"near": (15.0, "us for the solution that continues a motion"), "all": (40.0, "us for all solutions")}
 
 TASKS = {
-    "near": "continue a motion",  # from joints at most STEP away
+    "near": "continue a motion",  # each joint within STEP
     "all": "all solutions",
-    "cold": "from nowhere near",
+    "cold": "from a distant start",
     "forward": "forward",
-    "batch": f"forward, {BATCH} at once",  # time of one
+    "batch": f"forward, {BATCH} at once",  # time per pose
     "jacobian": "Jacobian",
     "gravity": "gravity",
 }
@@ -70,7 +70,7 @@ TASKS = {
 
 @dataclass(frozen=True)
 class Case:
-    """An arm and the configurations that it is measured at, shape (N, 6), rad; `near` are those just before."""
+    """An arm and the measured configurations `q`, shape (N, 6), rad; `near` are the preceding ones of a motion."""
 
     model: ArmModel
     q: Array
@@ -82,7 +82,7 @@ class Case:
 
 @dataclass
 class Contender:
-    """Something to be timed: `solve(i)` works on configuration i; `joints` takes the solutions out of its answer."""
+    """A function to be timed: `solve(i)` handles configuration i; `joints` extracts the solutions from its answer."""
 
     task: str
     name: str
@@ -95,7 +95,7 @@ class Contender:
 
 
 def matrices(model: ArmModel, q: Array) -> Array:
-    """Return the tool's matrices, shape (N, 4, 4): nothing of the code that is measured is in them."""
+    """Return the tool poses, shape (N, 4, 4), independently of the measured code."""
     found = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for row, angle in zip(model.rows, q.T, strict=True):
         ca, sa = np.cos(row.alpha), np.sin(row.alpha)
@@ -142,7 +142,7 @@ def _converged(answer: NumericResult) -> list[Sequence[float]]:
 
 
 def eaik(case: Case) -> list[Contender]:
-    """EAIK takes axes and offsets at zero, and no rotation of the tool: it is taken out of the targets beforehand."""
+    """EAIK takes axes and offsets at zero, and no tool rotation, which is removed from the targets beforehand."""
     robot_class = importlib.import_module("eaik.IK_HP").HPRobot
     zero = frames(case.model, [0.0] * 6)
     origins = np.array([(0.0, 0.0, 0.0), *(pose.position for pose in zero)])
@@ -161,7 +161,7 @@ def eaik(case: Case) -> list[Contender]:
 
 
 def toolbox(case: Case) -> list[Contender]:
-    """`ik_LM` ends when half the squared error is below its `tol`: 1e-13 asks for about 4e-7."""
+    """`ik_LM` stops when half the squared error is below its `tol`: 1e-13 corresponds to about 4e-7."""
     rtb = importlib.import_module("roboticstoolbox")
     parts = []
     for row, limit in zip(case.model.rows, case.model.limits, strict=True):
@@ -228,7 +228,7 @@ def pinocchio(case: Case, batch: Array) -> list[Contender]:
 
 
 def contenders(case: Case) -> tuple[list[Contender], dict[str, str]]:
-    """Return what can be measured, and for the rest why not."""
+    """Return the contenders, and the reason for each that is missing."""
     batch = np.random.default_rng(1).uniform(-3.0, 3.0, (BATCH, 6))
     found, missing = ours(case, batch), {}
     others: tuple[tuple[str, str, Callable[[], list[Contender]]], ...] = (
@@ -245,7 +245,7 @@ def contenders(case: Case) -> tuple[list[Contender], dict[str, str]]:
 
 
 def measure(one: Contender, count: int) -> None:
-    """Time one round; the answers of the last one are kept."""
+    """Time one round; keeps its answers."""
     calls = count if one.per_call == 1 else 3
     times, answers = [], []
     solve, clock = one.solve, time.perf_counter_ns
@@ -261,7 +261,7 @@ def measure(one: Contender, count: int) -> None:
 
 
 def judged(one: Contender, case: Case) -> dict[str, float]:
-    """Return share of poses solved, solutions a pose, and the worst errors (m, rad) of what was called a solution."""
+    """Return the share of poses solved, the solutions per pose, and the worst errors (m, rad) of the solutions."""
     if one.joints is None:
         return {}
     found = [one.joints(answer) for answer in one.answers]
@@ -274,7 +274,7 @@ def judged(one: Contender, case: Case) -> dict[str, float]:
     reached, wanted = matrices(case.model, q), case.targets[where]
     position = np.linalg.norm(reached[:, :3, 3] - wanted[:, :3, 3], axis=1)
     between = reached[:, :3, :3] - wanted[:, :3, :3]
-    rotation = np.linalg.norm(between, axis=(1, 2)) / np.sqrt(2.0)  # of small angles; exact: 2 sin(angle / 2)
+    rotation = np.linalg.norm(between, axis=(1, 2)) / np.sqrt(2.0)  # 2 sin(angle / 2)
     good = (position < SOLVED) & (rotation < SOLVED)
     off = np.abs(np.remainder(q - case.q[where] + np.pi, 2 * np.pi) - np.pi).max(axis=1)
     limits = np.array([(limit.lower, limit.upper) for limit in case.model.limits])
@@ -320,7 +320,7 @@ def compare(model: ArmModel, rounds: int, count: int, console: Console) -> dict[
     case = case_of(model, count, seed=0)
     entries, missing = contenders(case)
     for one in entries:
-        measure(one, min(count, 50))  # the first calls pay for what later ones find ready
+        measure(one, min(count, 50))  # warm up
         one.medians.clear()
         one.slow.clear()
     gc.collect()
@@ -357,11 +357,11 @@ def compare(model: ArmModel, rounds: int, count: int, console: Console) -> dict[
 def main() -> int:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rounds", type=int, default=5, help="how often the contenders alternate")
+    parser.add_argument("--rounds", type=int, default=5, help="rounds of alternation")
     parser.add_argument("--poses", type=int, default=1000, help="random configurations of each arm")
-    parser.add_argument("--arm", action="append", help="an arm's file or name; may be repeated")
-    parser.add_argument("--json", type=Path, help="write the figures to this file too")
-    parser.add_argument("--out", type=Path, help="write what is printed to this file too")
+    parser.add_argument("--arm", action="append", help="file or name of an arm; repeatable")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    parser.add_argument("--out", type=Path, help="also write the output to this file")
     given = parser.parse_args()
     if given.rounds < 1 or given.poses < 1:
         parser.error("--rounds and --poses are at least 1")

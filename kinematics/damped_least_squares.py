@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from math import atan2, hypot, pi, sqrt, tau
+from math import atan2, hypot, inf, pi, sqrt, tau
 from operator import add, mul
 from typing import NamedTuple, TypeAlias
 
 from kinematics.forward import frames
-from kinematics.jacobian import Row, characteristic_length, gram, jacobian_columns, solve_positive
+from kinematics.jacobian import characteristic_length, gram, jacobian_columns, solve_positive
 from kinematics.model import ArmModel
 from kinematics.pose import Pose, Rotation, Vector, orthonormality_error, require_finite
 from kinematics.solution import Six, six
@@ -31,9 +31,8 @@ _HOPEFUL = 1e-4  # of the initial cost; give up when three steps do not reach it
 
 _INVALID_ROTATION = 1e-10  # orthonormality error that prevents a solution from being confirmed
 
-_Bound: TypeAlias = tuple[float, float] | None  # None: the joint is unlimited
-_Bounds: TypeAlias = Sequence[_Bound]
-_UNBOUNDED: _Bounds = (None,) * 6
+_Bounds: TypeAlias = Sequence[tuple[float, float]]
+_UNBOUNDED: _Bounds = ((-inf, inf),) * 6
 
 
 class NumericResult(NamedTuple):
@@ -43,7 +42,7 @@ class NumericResult(NamedTuple):
     of all starts.
     """
 
-    q: Row
+    q: Six
     converged: bool
     position_error: float
     rotation_error: float
@@ -122,11 +121,9 @@ def solve_numeric(
     pose.require_finite()
     require_finite(q_near, model.joint_names)
     require_rotation(pose)
-    bounds: _Bounds = _UNBOUNDED
-    if respect_limits:
-        bounds = [(limit.lower, limit.upper) for limit in model.limits]
+    bounds = [(limit.lower, limit.upper) for limit in model.limits] if respect_limits else _UNBOUNDED
     length = characteristic_length(model)
-    start = _inside(map(_near_turn, q_near, q_near, bounds), bounds)
+    start = _inside(_wrapped(q_near, q_near, bounds), bounds)
     best, iterations = _descend(model, pose, start, bounds, length)
     for start in _starts(bounds):
         if max(_errors(best, length)) < TOLERANCE:
@@ -137,16 +134,16 @@ def solve_numeric(
         if respect_limits and max(_errors(best, length)) >= TOLERANCE:
             # The path of a descent may leave the limits and return.
             beyond, count = _descend(model, pose, start, _UNBOUNDED, length)
-            turned = map(_near_turn, beyond.q, q_near, bounds)
-            reached, again = _descend(model, pose, _inside(turned, bounds), bounds, length)
+            inside = _inside(_wrapped(beyond.q, q_near, bounds), bounds)
+            reached, again = _descend(model, pose, inside, bounds, length)
             iterations += count + again
             best = _nearer(best, reached)
     if max(_errors(best, length)) >= TOLERANCE:
         best, count = _descend(model, pose, best.q, bounds, length, _FINAL)
         iterations += count
-    q = tuple(_near_turn(angle, near, bound) for angle, near, bound in zip(best.q, q_near, bounds, strict=True))
+    q = six(_wrapped(best.q, q_near, bounds))
     position, rotation = _errors(best, length)
-    return NumericResult(q, max(position, rotation) < TOLERANCE, position, rotation, iterations)  # type: ignore[arg-type]
+    return NumericResult(q, max(position, rotation) < TOLERANCE, position, rotation, iterations)
 
 
 def _errors(point: _Point, length: float) -> tuple[float, float]:
@@ -159,16 +156,14 @@ def _nearer(first: _Point, other: _Point) -> _Point:
 
 
 def _inside(q: Iterable[float], bounds: _Bounds) -> list[float]:
-    return [_clip(angle, bound) for angle, bound in zip(q, bounds, strict=True)]
+    return [min(max(angle, lower), upper) for angle, (lower, upper) in zip(q, bounds, strict=True)]
 
 
 def _starts(bounds: _Bounds) -> Iterator[list[float]]:
     for count in range(1, _STARTS):
-        start = []
-        for joint, bound in enumerate(bounds):
-            lower, upper = bound or (-pi, pi)
-            start.append(lower + (upper - lower) * ((0.5 + count * _GOLDEN ** -(joint + 1)) % 1.0))
-        yield start
+        shares = [(0.5 + count * _GOLDEN ** -(joint + 1)) % 1.0 for joint in range(len(bounds))]
+        ranges = [(-pi, pi) if upper == inf else (lower, upper) for lower, upper in bounds]
+        yield [lower + (upper - lower) * share for share, (lower, upper) in zip(shares, ranges, strict=True)]
 
 
 def _descend(
@@ -203,8 +198,8 @@ def _step(point: _Point, bounds: _Bounds, damping: float, length: float) -> list
     ]
     downhill = [sum(map(mul, column, point.error)) for column in columns]
     free = [
-        bound is None or not ((angle <= bound[0] and slope < 0.0) or (angle >= bound[1] and slope > 0.0))
-        for angle, bound, slope in zip(point.q, bounds, downhill, strict=True)
+        not ((angle <= lower and slope < 0.0) or (angle >= upper and slope > 0.0))
+        for angle, (lower, upper), slope in zip(point.q, bounds, downhill, strict=True)
     ]
     matrix = gram([column for column, is_free in zip(columns, free, strict=True) if is_free])
     for i, row in enumerate(matrix):
@@ -248,17 +243,14 @@ def _rotation_error(wanted: Rotation, actual: Rotation) -> Vector:
     return factor * axis[0], factor * axis[1], factor * axis[2]
 
 
-def _clip(angle: float, bound: _Bound) -> float:
-    return angle if bound is None else min(max(angle, bound[0]), bound[1])
-
-
-def _near_turn(angle: float, near: float, bound: _Bound) -> float:
-    """`angle` plus the multiple of 2 pi that brings it nearest to `near` inside the bound, else `angle` itself."""
-    nearest = angle + tau * round((near - angle) / tau)
-    if bound is None or bound[0] <= nearest <= bound[1]:
-        return nearest
-    inside = [candidate for candidate in (nearest - tau, nearest + tau) if bound[0] <= candidate <= bound[1]]
-    return min(inside, key=lambda candidate: abs(candidate - near), default=angle)
+def _wrapped(q: Sequence[float], q_near: Sequence[float], bounds: _Bounds) -> Iterator[float]:
+    """Each angle plus the multiple of 2 pi that brings it nearest to `q_near` inside its bounds, else the angle."""
+    for angle, near, (lower, upper) in zip(q, q_near, bounds, strict=True):
+        nearest = angle + tau * round((near - angle) / tau)
+        if not lower <= nearest <= upper:
+            inside = [candidate for candidate in (nearest - tau, nearest + tau) if lower <= candidate <= upper]
+            nearest = inside[0] if inside else angle
+        yield nearest
 
 
 def require_rotation(pose: Pose) -> None:

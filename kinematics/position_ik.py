@@ -158,13 +158,10 @@ class PlanarArm:
             fy = self._longest * sin(angle)
             return distance(-a1, fy) if self._shortest <= hypot(a1, fy) <= self._longest else inf
 
-        def stretched(angle: float) -> float:
-            return distance(self._longest * cos(angle), self._longest * sin(angle))
+        def at_edge(edge: float) -> float:
+            return smallest_of_turn(lambda angle: distance(edge * cos(angle), edge * sin(angle)))
 
-        def folded(angle: float) -> float:
-            return distance(self._shortest * cos(angle), self._shortest * sin(angle))
-
-        return min(map(smallest_of_turn, (stretched, folded, at_tube)))
+        return min(at_edge(self._longest), at_edge(self._shortest), smallest_of_turn(at_tube))
 
 
 def smallest_of_turn(function: Callable[[float], float]) -> float:

@@ -1,4 +1,4 @@
-"""Draws `branches.png`, the figure of docs/kinematics.md: `python docs/images/branches.py`.
+"""Draws `branches.png`, the figure of docs/kinematics_derivation.md: `python docs/images/branches.py`.
 
 The four ways in which joints 1 to 3 bring the wrist centre to one point, as the solver gives them, and the triangle
 that they are computed from. The arm is the IRB 120 with its shoulder moved out from axis 1: without that offset front

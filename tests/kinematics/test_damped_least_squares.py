@@ -44,7 +44,7 @@ def errors(model: ArmModel, pose: Pose, result: NumericResult) -> tuple[float, f
 @pytest.mark.parametrize("arm", ["ur5", "general", "assistive", "irb120"])
 def test_every_pose_within_reach_is_found_from_anywhere(arm, request):
     model = request.getfixturevalue(arm)
-    for q, near in random_configurations(model, 2 * count(20, 100)).reshape(-1, 2, 6).tolist():
+    for q, near in random_configurations(model, 2 * count(12, 100)).reshape(-1, 2, 6).tolist():
         pose = forward(model, q)
         result = solve_numeric(model, pose, near)
         assert result.converged

@@ -29,8 +29,8 @@ from tests.kinematics.arms import (
 PARALLEL = "parallel axes 2 and 3, offsets"
 
 
-def solutions_of(model: ArmModel, matrix: np.ndarray, near=None) -> np.ndarray:
-    return np.array([solution.q for solution in InverseKinematics(model).solve(as_pose(matrix), near).solutions])
+def solutions_of(model: ArmModel, wanted: np.ndarray, near=None) -> np.ndarray:
+    return np.array([solution.q for solution in InverseKinematics(model).solve(as_pose(wanted), near).solutions])
 
 
 @pytest.mark.parametrize("wrist", WRISTS)
@@ -39,11 +39,11 @@ def test_every_configuration_is_found_and_every_solution_is_confirmed(geometry, 
         model = build_arm(seed, geometry, wrist)
         solver = InverseKinematics(model)
         configurations = random_configurations(model, count(8, 25), seed)
-        for q, matrix in zip(configurations, chain(model, configurations), strict=True):
-            found = np.array([solution.q for solution in solver.solve(as_pose(matrix)).solutions])
-            assert worst_error(model, matrix, found) < 1e-12
+        for q, wanted in zip(configurations, chain(model, configurations), strict=True):
+            found = np.array([solution.q for solution in solver.solve(as_pose(wanted)).solutions])
+            assert worst_error(model, wanted, found) < 1e-12
             assert wrapped_difference(found, q).min() < 1e-8
-            assert wrapped_difference(solver.solve_near(as_pose(matrix), q.tolist()).q, q) < 1e-8
+            assert wrapped_difference(solver.solve_near(as_pose(wanted), q.tolist()).q, q) < 1e-8
 
 
 def by_brute_force(model: ArmModel, point: np.ndarray) -> np.ndarray:
@@ -104,12 +104,12 @@ def test_beside_a_singularity_of_joints_1_to_3_no_solution_is_missing(geometry):
             continue
         for distance in (0.0, *10.0 ** -np.arange(3.0, 10.0)):
             q = np.add(singular, [0.0, distance, 0.0, 0.0, 0.0, 0.0])
-            matrix = chain(model, q[None])[0]
-            found = solutions_of(model, matrix, q.tolist())
+            wanted = chain(model, q[None])[0]
+            found = solutions_of(model, wanted, q.tolist())
             assert all((wrapped_difference(found[:index], one) > 1e-8).all() for index, one in enumerate(found))
             # two solutions nearer than 1e-6 rad are one, to the square root of round-off
             assert wrapped_difference(found, q).min() < (1e-13 / distance if distance >= 1e-6 else 1e-5)
-            assert worst_error(model, matrix, found) < 1e-9
+            assert worst_error(model, wanted, found) < 1e-9
             tried += 1
     assert tried > count(0, 40)
 
@@ -127,8 +127,8 @@ def test_a_table_with_the_small_deviations_of_a_calibration_is_solved(amount, ei
         assert InverseKinematics(model).method == "spherical wrist, general"
         configurations = random.uniform(-2.0, 2.0, (20, 6))
         configurations[:10, 2] = (-1.343 if either.name == "irb120" else 0.0) + random.uniform(-0.01, 0.01, 10)
-        for q, matrix in zip(configurations, chain(model, configurations), strict=True):
-            found = solutions_of(model, matrix)
+        for q, wanted in zip(configurations, chain(model, configurations), strict=True):
+            found = solutions_of(model, wanted)
             assert wrapped_difference(found, q).min() < 1e-4  # some are beside the edge of the workspace
 
 
@@ -143,6 +143,18 @@ def test_beside_the_edge_of_an_oblique_wrist_no_solution_is_missing(end, distanc
     assert closest < (1e-6 if distance < 1e-6 else 1e-14 / distance)
     assert len(own) == (1 if distance < 1e-7 else 2)
     assert {one.singularity for one in own} == {Singularity.WRIST if distance < 1e-7 else Singularity.NONE}
+
+
+def test_where_an_oblique_wrist_aligns_axes_4_and_6_joint_4_is_held():
+    model = build_arm(5, PARALLEL, "foldable")
+    aligned = 0.0 if model.rows[4].alpha == -model.rows[5].alpha else pi
+    q = [0.3, 0.4, 0.5, 0.6, aligned - model.rows[4].offset, 0.7]
+    near = [*q[:3], -0.8, *q[4:]]
+    solutions = InverseKinematics(model).solve(forward(model, q), near).solutions
+    (held,) = [one for one in solutions if wrapped_difference(one.q[:3], q[:3]) < 1e-9]
+    assert held.q[3] == pytest.approx(-0.8, abs=1e-15)
+    assert held.singularity == Singularity.WRIST
+    assert worst_error(model, chain(model, np.array([q]))[0], [held.q]) < 1e-9
 
 
 @pytest.mark.parametrize(
@@ -246,15 +258,16 @@ def test_just_out_of_reach_the_amount_is_proportional_to_the_distance(geometry):
         assert np.divide(amounts, amounts[0]) == pytest.approx([1.0, 2.0, 4.0], rel=1e-2)
 
 
-def test_beyond_a_stretched_arm_with_lateral_offset_the_amount_is_exact(assistive):
+@pytest.mark.parametrize(("bend", "beyond"), [(0.0, 1e-6), (pi, -1e-6)], ids=["stretched", "folded"])
+def test_beyond_a_stretched_or_folded_arm_with_lateral_offset_the_amount_is_exact(bend, beyond, assistive):
     model = with_row(assistive, 2, d=0.12)
     for lean in (0.3, 0.9, -1.4):
-        edge = wrist_centres(model, np.array([[0.0, lean, 0.0]]))[0]
+        edge = wrist_centres(model, np.array([[0.0, lean, bend]]))[0]
         along = edge - [0.0, edge[1], model.rows[0].d]
         # perpendicular to the directions in which joints 1 and 2 move the wrist centre
         normal = np.add(along, [0.0, edge[1] * along[0] / edge[0], 0.0])
         normal /= np.linalg.norm(normal)
-        near = InverseKinematics(model).solve_near(hand_at(model, edge + 1e-6 * normal), [0.0] * 6)
+        near = InverseKinematics(model).solve_near(hand_at(model, edge + beyond * normal), [0.0] * 6)
         assert near.out_of_reach == pytest.approx(1e-6, rel=1e-3)
 
 
