@@ -22,6 +22,7 @@ from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, store_zero, zero_file
 from rtcp.gateway.limit_settings import _read as read_kept_limits
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
@@ -187,7 +188,7 @@ def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_except
     path = tmp_path / "board"
     board = Blackboard(path, 6, 500_000)
     for number in range(5):
-        board.event(number)
+        board.event(SlaveLost(number + 1))
         board.text("a sentence")
     board.close()
     whole = path.read_bytes()[:RECORDS_AT]
