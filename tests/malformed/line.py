@@ -115,8 +115,11 @@ class Line:
 
     def reset(self) -> None:
         """What SOEM does first: INIT, and nothing left of what the last master set."""
-        for _ in SIZES:  # each opens the ports of the slaves that it reaches, up to the next closed one
-            self.give(build(Datagram(Command.BWR, 0, 0, 0x0101, bytes(1))))
+        chain = self.segment.chain
+        if chain.reach < len(SIZES) or not chain.returns:
+            # A mutated frame closed or opened a port: no frame of a master opens port 0 again, the supply does.
+            for slave in self.segment.slaves:
+                chain.restart(slave, self.now)
         self.write_all(0x0120, bytes((INIT | ACK, 0)))
         for offset, data in (
             (0x0103, bytes(1)), (0x0200, bytes(2)), (0x0300, bytes(8)), (0x0600, bytes(16 * _UNITS)),
@@ -177,5 +180,5 @@ class Line:
         drive = _DRIVE.pack(controlword, target, 20_000, 0, 8)
         data = bytes(SIZES[0][0]) + drive * (len(SIZES) - 1) + bytes(_IMAGE_IN)
         answer = self.give(build(Datagram(Command.LRW, 0, 0, 0, data)), PERIOD_NS)
-        assert (answer is not None) == self.segment.chain.returns
+        assert (answer is not None) == (self.segment.chain.returns and self.segment.chain.reach > 0)
         return next(parse(answer)).counter if answer else 0
