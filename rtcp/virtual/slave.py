@@ -230,7 +230,8 @@ class Application:
         passed = t - self._stepped_at
         self._stepped_at = max(t, self._stepped_at)
         if self.state == State.OP:
-            self._rx.unpack(self._latched)
+            if len(self._latched) == self._rx.byte_length:  # the master may have changed the sync manager just now
+                self._rx.unpack(self._latched)
             outputs = self.esc.sync_managers[OUTPUTS]
             if outputs.control & CONTROL_ECAT_EVENT:
                 outputs.exchanged()
@@ -243,7 +244,8 @@ class Application:
             passed -= part
         if self.state >= State.SAFE_OP:
             inputs = self.esc.sync_managers[INPUTS]
-            self._tx.pack(inputs.buffer)
+            if inputs.length == self._tx.byte_length:
+                self._tx.pack(inputs.buffer)
             if inputs.control & CONTROL_ECAT_EVENT:
                 inputs.exchanged()
         mailbox = self._mailbox

@@ -120,6 +120,7 @@ class Line:
             # A mutated frame closed or opened a port: no frame of a master opens port 0 again, the supply does.
             for slave in self.segment.slaves:
                 chain.restart(slave, self.now)
+            self.segment.rewire()
         self.write_all(0x0120, bytes((INIT | ACK, 0)))
         for offset, data in (
             (0x0103, bytes(1)), (0x0200, bytes(2)), (0x0300, bytes(8)), (0x0600, bytes(16 * _UNITS)),
