@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from tests.e2e.conftest import Platform
 from tests.faults.cases import CASES
-from tests.faults.run import SHIPPED_MS, columns, harness_of, run_case
+from tests.faults.run import HOLD_MS, columns, harness_of, run_case
 
 HEADS = ("fault", "while", "reaction", "standstill, s", "travel", "largest step", "first message", "recovery")
 
@@ -43,7 +43,7 @@ def main() -> int:
     failed = 0
     platform = Platform()
     try:
-        platform.be_patient(SHIPPED_MS)
+        platform.be_patient(HOLD_MS)
         platform.rtcp("start", "--detach")
         with harness_of(platform) as harness:
             for number, (case, workload) in enumerate(chosen, 1):

@@ -255,8 +255,8 @@ class BusConfig:
     """Receive timeout, fraction of the period."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
-    timeout_scale: Annotated[float, Ge(1), Le(100)] = 25.0
-    """Factor on `lost_cycles` and `watchdog_ms` on the virtual bus only; above 1 its sync error check is off."""
+    timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
+    """Factor on `lost_cycles`, `watchdog_ms` and `lease_s` on the virtual bus alone; above 1 no sync error check."""
     send_phase: Fraction = 0.5
     """Instant between two SYNC0 at which the frame passes the reference clock, fraction of the period."""
     op_timeout_s: Positive = 5.0

@@ -32,6 +32,8 @@ _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
 """Bits of the AL state that INIT, PRE-OP and BOOT have, OP and SAFE-OP have not."""
 _MAP_ATTEMPTS = 8
+_DISCOVERY_ATTEMPTS = 4
+"""Each takes `_PATIENCE_US`: a host that runs master and slaves may stand still for longer than one."""
 _MAILBOXES, _MAILBOXES_SIZE = 0x0800, 16
 """Sync managers 0 and 1 (ETG.1000.4, 6.7)."""
 
@@ -233,7 +235,7 @@ class SoemBus:
         if self._master is None:
             raise BusError(f"the bus on {self.interface} is not open")
         # Also stops SYNC0 and SYNC1 that the last run left active, and resets FMMUs and sync managers (SOEM#60).
-        if self._master.config_init() <= 0:
+        if not any(self._master.config_init() > 0 for _ in range(_DISCOVERY_ATTEMPTS)):
             raise BusError(f"no slave answers on {self.interface}: check the cable and the slaves' supply")
         found = self._master.slaves
         self._names = [name_of(slave) for slave in found]

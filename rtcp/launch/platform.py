@@ -47,7 +47,7 @@ _READY_TIMEOUT_S = 60.0
 _ANSWER_TIMEOUT_S = 3.0
 """For the gateway's answer to `status`: one that hangs must not delay the stop, the arm is under torque."""
 _STOP_TIMEOUT_S = 20.0
-_EXIT_TIMEOUT_S = 0.5
+_EXIT_TIMEOUT_S = 5.0
 _LOOP_END_TIMEOUT_S = 10.0
 """For a controlled stop, disabling the drives and the way to INIT: a loop that is killed leaves them to a watchdog."""
 _END_TIMEOUT_S = 5.0

@@ -284,7 +284,7 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, [("\nsupervision:", "\nwatch:")], "watch: this key is now called supervision; rename it"),
     (ARM, [("  supervision: quick_stop", "  watch: quick_stop")],
      "stops.watch: this key is now called stops.supervision; rename it"),
-    (ARM, [("timeout_scale: 25", "virtual_patience: 25")],
+    (ARM, [("timeout_scale: 100", "virtual_patience: 100")],
      "bus.virtual_patience: this key is now called bus.timeout_scale; rename it"),
 ]  # fmt: skip
 

@@ -71,8 +71,7 @@ chmod 755 usr/bin/rtcp
 # A shared host takes the CPU away for long: the segment is not SCHED_FIFO in there.
 mkdir -p etc/rtcp
 cp -r opt/rtcp/source/config/* etc/rtcp
-sed -i -e 's/period_us: 500 /period_us: 2000 /' -e 's/timeout_scale: 25 /timeout_scale: 100 /' \\
-    etc/rtcp/assistive_arm.yaml
+sed -i 's/period_us: 500 /period_us: 2000 /' etc/rtcp/assistive_arm.yaml
 pivot_root . old
 cd /
 umount -l old

@@ -11,9 +11,8 @@ from rtcp.telemetry.trial import TrialResult, run_trial
 from tests.e2e.conftest import Platform
 from tests.faults.cases import CONTINUES, MOVING, STOPS, Case
 
-SHIPPED_MS = 500
-"""What the shipped configuration tolerates without frames on the virtual bus; the tests' lease is longer than the
-shipped one alone, because a shared host sometimes delays a gateway."""
+HOLD_MS = 500
+"""Time without frames that is tolerated in the trials."""
 
 
 @contextlib.contextmanager

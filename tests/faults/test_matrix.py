@@ -9,7 +9,7 @@ import pytest
 from rtcp.telemetry.harness import Harness
 from tests.e2e.conftest import Platform
 from tests.faults.cases import CASES, HOLDING, JOGGING, JOYSTICK, MOVING, Case
-from tests.faults.run import SHIPPED_MS, harness_of, run_case
+from tests.faults.run import HOLD_MS, harness_of, run_case
 
 pytestmark = pytest.mark.alone
 
@@ -36,7 +36,7 @@ def harness() -> Iterator[Harness]:
     """One platform for all cases: each must leave the arm usable for the next."""
     platform = Platform()
     try:
-        platform.be_patient(SHIPPED_MS)
+        platform.be_patient(HOLD_MS)
         platform.rtcp("start", "--detach")
         with harness_of(platform) as made:
             yield made

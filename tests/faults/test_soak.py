@@ -11,7 +11,7 @@ import pytest
 from rtcp.config.faults import FAULTS, parse
 from rtcp.telemetry.soak import GROWTH, Resources, grown, random_fault, resources
 from tests.e2e.conftest import Platform
-from tests.faults.run import SHIPPED_MS
+from tests.faults.run import HOLD_MS
 
 pytestmark = pytest.mark.alone
 
@@ -84,7 +84,7 @@ def test_an_impossible_duration_or_seed_is_a_usage_error(arguments: tuple[str, s
 def test_a_soak_reports_the_result_of_each_kind_of_fault_and_no_failure() -> None:
     platform = Platform()
     try:
-        platform.be_patient(SHIPPED_MS)
+        platform.be_patient(HOLD_MS)
         done = platform.rtcp("soak", "--minutes", "0.12", "--seed", "5", "--json")
         found = json.loads(done.stdout)
         assert found["failures"] == []

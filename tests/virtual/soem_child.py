@@ -54,6 +54,9 @@ def main() -> None:
     to_stop = int(sys.argv[4]) if len(sys.argv) > 4 else None
     if pid != "-":
         join(pid)
+    # By default SOEM takes an answer after 2 ms for lost; a shared host stands still for longer.
+    pysoem.settings.timeouts.ret = 40_000
+    pysoem.settings.timeouts.safe = pysoem.settings.timeouts.eeprom = 2_000_000
     master = pysoem.Master()
     without_blocking(master, interface)
     result: dict[str, object] = {"found": master.config_init()}

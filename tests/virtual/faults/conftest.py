@@ -87,7 +87,7 @@ def segment(three_slaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Ite
 
 @pytest.fixture(scope="module")
 def exchange(segment: Running) -> Iterator[Exchange]:
-    """Send frames one after the other, wait for `patience_s` after the last; return what came."""
+    """Send frames one after the other, wait for the `answers` (as many where left out) and `patience_s` more."""
     with subprocess.Popen(
         [sys.executable, str(CHILD), str(segment.process.pid), "ecat0"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -95,8 +95,9 @@ def exchange(segment: Running) -> Iterator[Exchange]:
         assert child.stdin is not None
         assert child.stdout is not None
 
-        def send(frames: Sequence[bytes], gap_s: float = 0.001, patience_s: float = 0.05) -> Traffic:
-            asked = {"frames": [frame.hex() for frame in frames], "gap_s": gap_s, "patience_s": patience_s}
+        def send(frames: Sequence[bytes], answers: int | None = None, patience_s: float = 0.05) -> Traffic:
+            expected = len(frames) if answers is None else answers
+            asked = {"frames": [f.hex() for f in frames], "gap_s": 0.001, "answers": expected, "patience_s": patience_s}
             child.stdin.write(json.dumps(asked) + "\n")
             child.stdin.flush()
             told = json.loads(child.stdout.readline())

@@ -2,14 +2,16 @@
 
     python raw_child.py PID INTERFACE
 
-joins the namespaces of process PID; answers each line of JSON, `{"frames": [hex], "gap_s": s, "patience_s": s}`, with
-one: `{"sent": [ns], "came": [[ns, hex]]}` (CLOCK_MONOTONIC).
+joins the namespaces of process PID; answers each line of JSON,
+`{"frames": [hex], "gap_s": s, "answers": number, "patience_s": s}`, with one: `{"sent": [ns], "came": [[ns, hex]]}`
+(CLOCK_MONOTONIC). It waits for as many answers, however slow the host is, and then `patience_s` for more.
 """
 
 from __future__ import annotations
 
 import ctypes
 import json
+import math
 import os
 import select
 import socket
@@ -17,6 +19,7 @@ import sys
 import time
 
 EVERYTHING = 0x0003
+LONGEST_WAIT_NS = 20_000_000_000
 OUTGOING = 4
 
 
@@ -30,8 +33,8 @@ def join(pid: str) -> None:
                 raise OSError(ctypes.get_errno(), f"cannot join the {kind} namespace")
 
 
-def collect(raw: socket.socket, until: int, came: list[tuple[int, str]]) -> None:
-    while (left := until - time.monotonic_ns()) > 0:
+def collect(raw: socket.socket, until: int, came: list[tuple[int, str]], enough: float = math.inf) -> None:
+    while len(came) < enough and (left := until - time.monotonic_ns()) > 0:
         if select.select([raw], [], [], left * 1e-9)[0]:
             frame, address = raw.recvfrom(2048)
             if address[2] != OUTGOING:
@@ -50,6 +53,7 @@ def main() -> None:
                 sent.append(time.monotonic_ns())
                 raw.send(bytes.fromhex(frame))
                 collect(raw, time.monotonic_ns() + round(asked["gap_s"] * 1e9), came)
+            collect(raw, time.monotonic_ns() + LONGEST_WAIT_NS, came, asked["answers"])
             collect(raw, time.monotonic_ns() + round(asked["patience_s"] * 1e9), came)
             print(json.dumps({"sent": sent, "came": came}), flush=True)
 

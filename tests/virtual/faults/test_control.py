@@ -58,7 +58,7 @@ def test_without_a_fault_every_frame_comes_back_from_all_slaves(exchange: Exchan
 def test_a_burst_of_lost_frames_is_lost_and_the_next_one_comes(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
         client.fault({"fault": "loss", "burst": 5})
-        assert indices(exchange(BROADCASTS).came) == list(range(5, 20))
+        assert indices(exchange(BROADCASTS, answers=15).came) == list(range(5, 20))
         assert client.faults() == []
 
 
@@ -69,8 +69,10 @@ def test_slaves_see_what_is_lost_behind_them_and_not_what_is_lost_before(
     address = (0x2000 + seed).to_bytes(2, "little")
     with segment.client() as client:
         client.fault({"fault": "loss", "rate": 1.0, "seed": seed})
-        assert exchange([build(Datagram(Command.APWR, 0, 0xFFFF, 0x0010, address))]).came == []
-        assert client.faults()[0]["counts"][lost] == 1
+        assert exchange([build(Datagram(Command.APWR, 0, 0xFFFF, 0x0010, address))], answers=0).came == []
+        while not (counts := client.faults()[0]["counts"])[lost]:
+            time.sleep(0.01)
+        assert counts[lost] == 1
         client.clear()
     (_, answer), *_ = exchange([build(Datagram(Command.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).came
     assert next(parse(answer)).counter == written
@@ -78,18 +80,18 @@ def test_slaves_see_what_is_lost_behind_them_and_not_what_is_lost_before(
 
 def test_answers_that_are_late_come_as_late_as_asked_for(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
-        client.fault({"fault": "delay", "ms": 30, "rate": 1.0})
+        client.fault({"fault": "delay", "ms": 300, "rate": 1.0})
         sent, came = exchange(BROADCASTS)
     assert indices(came) == list(range(20))
     late = [at - begun for begun, (at, _) in zip(sent, came, strict=True)]
-    assert min(late) >= 30_000_000
-    assert came[0][0] > sent[10], "frames went on being sent and answered meanwhile"
+    assert min(late) >= 300_000_000
+    assert came[0][0] > sent[1], "frames went on being sent and answered meanwhile"
 
 
 def test_answers_come_twice_or_after_the_next_one(segment: Running, exchange: Exchange) -> None:
     with segment.client() as client:
         client.fault({"fault": "duplicate", "burst": 2})
-        assert indices(exchange(BROADCASTS[:4]).came) == [0, 0, 1, 1, 2, 3]
+        assert indices(exchange(BROADCASTS[:4], answers=6).came) == [0, 0, 1, 1, 2, 3]
         client.fault({"fault": "reorder", "burst": 1})
         assert indices(exchange(BROADCASTS[:4]).came) == [1, 0, 2, 3]
 
@@ -107,7 +109,9 @@ def test_noise_comes_without_a_frame_of_the_masters_and_ends_with_its_time(
 ) -> None:
     with segment.client() as client:
         client.fault({"fault": "noise", "rate_hz": 500, "protocol": "arp", "lasts": 0.2})
-        came = exchange([], patience_s=0.4).came
+        came = exchange([], answers=1, patience_s=0.4).came
+        while client.faults():
+            time.sleep(0.01)
     assert 0 < len(came) <= 100
     assert {frame[12:14] for _, frame in came} == {b"\x08\x06"}
     assert exchange([], patience_s=0.1).came == []
@@ -117,7 +121,7 @@ def test_a_cable_broken_by_command_is_seen_by_the_master_until_it_is_mended(
     segment: Running, exchange: Exchange
 ) -> None:
     def counter() -> int:
-        return next(parse(exchange(BROADCASTS[:1], patience_s=0.05).came[0][1])).counter
+        return next(parse(exchange(BROADCASTS[:1]).came[0][1])).counter
 
     with segment.client() as client:
         number = client.fault({"fault": "cable", "after": 1})
@@ -161,7 +165,7 @@ def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
         ({"do": "clear", "id": 99999}, "there was no fault 99999; active now: none"),
         ({"do": "fault"}, "found nothing, allowed is a mapping with the key `fault`"),
         ({"do": "fault", "fault": dict.fromkeys("abcdefghijk", 1)}, "a fault has at most 10 keys, found 11"),
-        ({"do": "fault", "fault": {"fault": "cabel"}}, "fault: this fault is not known here; did you mean cable?"),
+        ({"do": "fault", "fault": {"fault": "cabel"}}, "fault: this fault does not exist; did you mean cable?"),
         ({"do": "fault", "fault": {"fault": "cable"}}, "the key after is missing"),
         ({"do": "fault", "fault": {"fault": "cable", "after": 3}}, "there is no cable behind slave 3"),
         ({"do": "fault", "fault": {"fault": "cable", "after": -1}}, "after: found -1, allowed is"),
@@ -169,7 +173,7 @@ def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
         ({"do": "fault", "fault": {"fault": "loss", "rate": float("nan")}}, "rate: "),
         ({"do": "fault", "fault": {"fault": "loss", "rate": 0.1, "lasts": float("inf")}}, "lasts: found inf"),
         ({"do": "fault", "fault": {"fault": "loss", "rate": 0.1, "at": 3}}, "at: a fault that is asked for begins"),
-        ({"do": "fault", "fault": {"fault": "\ud800", "after": 1}}, "fault: this fault is not known here"),
+        ({"do": "fault", "fault": {"fault": "\ud800", "after": 1}}, "fault: this fault does not exist"),
         ({"do": "fault", "fault": {"fault": "noise", "protocol": "\ud800"}}, "allowed is"),
     ],
 )  # fmt: skip
@@ -337,5 +341,5 @@ def test_a_script_that_is_wrong_is_refused_with_its_lines_before_the_segment_sta
     refused = begin_segment("--faults", str(script))
     said = refused.communicate(timeout=20)[1].splitlines()
     assert refused.returncode == 2
-    assert said[0].startswith(f"{script}:2: faults[0].fault: this fault is not known here; did you mean cable?")
+    assert said[0].startswith(f"{script}:2: faults[0].fault: this fault does not exist; did you mean cable?")
     assert said[1] == f"{script}:3: faults[1].slave: found 9, the segment has 3 slaves: allowed is at most 3"
