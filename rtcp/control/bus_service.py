@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.al_state import AlState
@@ -78,7 +79,7 @@ class BusService(threading.Thread):
         self._done = 0
         self._explain = [False] * len(joint_names)
         self._complaints = LogThrottle(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
-        self._emergencies: dict[int, LogThrottle] = {}
+        self._emergencies: dict[tuple[int, bool], LogThrottle] = {}
         self._end = threading.Event()
         self.all_op = False
         """Whether every slave is in OP, and was since the start or the last `recover`; read by the cycle."""
@@ -219,11 +220,12 @@ class BusService(threading.Thread):
         if self._watcher is not None and self._watcher.silent:
             return
         for emergency in self._bus.emergencies():
-            position = emergency.position
-            if position not in self._emergencies:
-                what = f"emergency messages of slave {position}"
-                self._emergencies[position] = LogThrottle(self._blackboard.text, _MOST_EMERGENCIES, what)
-            self._emergencies[position].report(emergency.sentence())
+            kind = emergency.position, emergency.is_problem
+            if kind not in self._emergencies:
+                report = partial(self._blackboard.text, is_problem=emergency.is_problem)
+                what = f"emergency messages of slave {emergency.position}"
+                self._emergencies[kind] = LogThrottle(report, _MOST_EMERGENCIES, what)
+            self._emergencies[kind].report(emergency.sentence())
 
     def _publish_states(self, states: Iterable[SlaveState | MonitoredSlave]) -> None:
         for slave in states:

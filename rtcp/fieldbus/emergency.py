@@ -128,6 +128,11 @@ class Emergency:
     data: bytes
     """Five bytes of the maker's."""
 
+    @property
+    def is_problem(self) -> bool:
+        """Whether it reports an error; code 0 takes the one before back (CiA 301, 7.2.7)."""
+        return self.error_code != 0
+
     def sentence(self) -> str:
         """Return the message in words."""
         return (

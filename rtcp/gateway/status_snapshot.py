@@ -31,8 +31,6 @@ _MESSAGES = 50
 _SHOWN = 10
 """The last so many of them are shown."""
 _SILENT_S = 1.0
-_NO_ERROR = "sent emergency 0x0000:"
-"""An emergency that takes an earlier one back (CiA 301, error code 0)."""
 _UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
 _FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "compute_ns", "offset": "dc_offset_ns",
             "filtered": "dc_filtered_ns"}  # fmt: skip
@@ -142,11 +140,11 @@ class StatusSnapshot:
         self._moving, self._moves = bool(moving[-1]), int(moves[-1])
 
     def _read_messages(self) -> list[str]:
-        new: list[tuple[int, str]] = []
+        new: list[tuple[int, str, bool]] = []
         for record in self._observer.events_since(self._event):
             self._event, event = record.number, record.event
             message = self.names.message(event)
-            new.append((record.time_ns, message))
+            new.append((record.time_ns, message, True))
             if type(event) in self.names.faults:
                 # An emergency stop out of a fault is what has to be ended first.
                 self.fault = message if event.is_emergency else self.fault or message
@@ -155,13 +153,13 @@ class StatusSnapshot:
                 self.fault = ""
         for text in self._observer.texts_since(self._text):
             self._text = text.number
-            new.append((text.time_ns, text.sentence))
+            new.append((text.time_ns, text.sentence, text.is_problem))
         new.sort()
-        self.messages.extend(new)
-        for at_ns, message in new:
-            if _NO_ERROR not in message:
+        self.messages.extend((at_ns, message) for at_ns, message, _ in new)
+        for at_ns, message, is_problem in new:
+            if is_problem:
                 self.message, self._message_ns = message, at_ns
-        return [message for _, message in new]
+        return [message for _, message, _ in new]
 
     # -- showing ------------------------------------------------------------------------------------------------------
 

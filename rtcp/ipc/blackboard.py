@@ -127,13 +127,13 @@ class Blackboard:
         self._words[EVENTS_HEAD_AT] = number
         self._events = number
 
-    def text(self, sentence: str) -> None:
+    def text(self, sentence: str, *, is_problem: bool = True) -> None:
         """Append a sentence. Not for the cycle; any other thread of the loop's process may call it."""
-        encoded = sentence.encode()[:502]
+        encoded = sentence.encode()[:500]
         with self._text_lock:
             number = self._texts + 1
             at = TEXTS_AT + (number % TEXTS) * TEXT.size
-            TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), encoded)
+            TEXT.pack_into(self._map, at, number, time.time_ns(), len(encoded), is_problem, encoded)
             self._words.fence()
             self._words[TEXTS_HEAD_AT] = number
             self._texts = number

@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_0005
+MAGIC = 0x5254_4350_0000_0006
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -71,8 +71,8 @@ in over its cables | damaged frames forwarded << 32."""
 HEALTH_SIZE = 16
 
 TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
-TEXT = struct.Struct("<QqH502s")
-"""number, CLOCK_REALTIME ns, length, UTF-8 text"""
+TEXT = struct.Struct("<QqHH500s")
+"""number, CLOCK_REALTIME ns, length, whether it is a problem, UTF-8 text"""
 TEXTS = 64
 
 EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size

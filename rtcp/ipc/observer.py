@@ -111,6 +111,8 @@ class Text:
     number: int
     time_ns: int
     sentence: str
+    is_problem: bool
+    """Whether it is of something wrong; the emergency that takes an earlier one back is not."""
 
 
 @dataclass(frozen=True)
@@ -243,9 +245,9 @@ class Observer:
         head = self._words[TEXTS_HEAD_AT]
         found = []
         for wanted in range(max(number + 1, head - TEXTS + 1, 1), head + 1):
-            made, when, length, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
+            made, when, length, is_problem, text = TEXT.unpack_from(self._map, TEXTS_AT + (wanted % TEXTS) * TEXT.size)
             if made == wanted:
-                found.append(Text(made, when, text[:length].decode(errors="replace")))
+                found.append(Text(made, when, text[:length].decode(errors="replace"), bool(is_problem)))
         return found
 
     def slaves(self, count: int) -> list[tuple[int, int]]:

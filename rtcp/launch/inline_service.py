@@ -107,4 +107,4 @@ class InlineService(BusService):
                 self.all_op = False
                 self.lost_slave = state.position
         for emergency in self._segment.emergencies():
-            self._board.text(emergency.sentence())
+            self._board.text(emergency.sentence(), is_problem=emergency.is_problem)

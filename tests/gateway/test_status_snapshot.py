@@ -83,7 +83,7 @@ def test_an_emergency_with_error_code_0_is_listed_and_never_the_message(written:
     written.publish(State.READY)
     written.board.text("something to know")
     none, over = (Emergency(2, "drive1", code, 0, bytes(5)).sentence() for code in (0x0000, 0x8611))
-    written.board.text(none)
+    written.board.text(none, is_problem=False)
     assert written.headline == "something to know"
     assert written.status["messages"] == ["something to know", none]
     written.board.text(over)
