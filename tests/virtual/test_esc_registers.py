@@ -48,10 +48,61 @@ def test_every_slave_but_the_last_has_two_open_ports(line: Line) -> None:
     assert [line.number(slave, 0x0110, 2) & 0xFFF0 for slave in range(3)] == [0x5A30, 0x5A30, 0x5610]
 
 
-def test_writing_an_error_counter_clears_all_of_them(line: Line) -> None:
-    line.slaves[0].esc.memory[0x0300:0x0304] = b"\x01\x02\x03\x04"
-    line.write(0, 0x0300, b"\xff")
-    assert line.read(0, 0x0300, 20) == bytes(20)
+@pytest.mark.parametrize(("written", "cleared"), [(0x0300, range(0x0300, 0x030C)), (0x0310, range(0x0310, 0x0314))])
+def test_a_write_to_an_error_counter_clears_its_group_alone(line: Line, written: int, cleared: range) -> None:
+    line.slaves[0].esc.memory[0x0300:0x0314] = b"\x01" * 20
+    line.write(0, written, b"\xff")
+    counts = line.read(0, 0x0300, 20)
+    assert [counts[n] for n in range(20)] == [0x0300 + n not in cleared for n in range(20)]
+
+
+def test_clock_registers_of_a_slave_without_a_clock_do_not_count() -> None:
+    line = Line([TinyDevice(supports_dc=False), TinyDevice()])
+    line.address()
+    assert line.one(Command.BRD, 0, 0x0910, bytes(8)).counter == 1
+    assert line.one(Command.FPWR, STATION, 0x0980, b"\0").counter == 0
+    assert line.one(Command.FPRD, STATION, 0x0910, bytes(8)).counter == 0
+
+
+def test_al_control_written_again_before_the_firmware_has_looked_does_not_count(line: Line) -> None:
+    control = [Datagram(Command.FPWR, number, STATION, 0x0120, bytes((PRE_OP, 0))) for number in range(2)]
+    assert [answer.counter for answer in line.send(*control)] == [1, 0]
+
+
+@pytest.mark.parametrize(("control", "event"), [("26", 0), ("36", 0x0010)])
+def test_a_sync_manager_with_the_event_bit_mirrors_it_in_0x0210(line: Line, control: str, event: int) -> None:
+    line.write(0, 0x0800, bytes.fromhex(f"0010 8000 {control} 00 01 00  8010 8000 22 00 01 00"))
+    assert line.request(0, PRE_OP) == (PRE_OP, 0)
+    line.write(0, 0x1000, SDO_READ_NAME.ljust(128, b"\0"))
+    line.pass_time(MS)
+    assert line.number(0, 0x0210, 2) & 0x0FF0 == event, "the firmware has taken the message"
+
+
+def test_a_loop_that_is_closed_by_0x0101_cuts_the_rest_off_until_it_opens_again(line: Line) -> None:
+    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 3
+    line.write(0, 0x0101, bytes((0x0C,)))  # port 1 always closed
+    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 1
+    line.write(0, 0x0101, b"\0")
+    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 3
+
+
+def test_the_reset_sequence_takes_a_slave_back_to_power_on(line: Line) -> None:
+    line.write(0, 0x0800, SM_MAILBOXES)
+    assert line.request(0, PRE_OP) == (PRE_OP, 0)
+    for byte in b"RES":
+        line.write(0, 0x0040, bytes((byte,)))
+    line.pass_time(MS)
+    assert line.one(Command.FPRD, STATION, 0x0130, bytes(2)).counter == 0, "its station address is gone"
+    answer = line.one(Command.APRD, 0, 0x0130, bytes(2))
+    assert (answer.counter, answer.data[0]) == (1, INIT)
+
+
+def test_the_link_that_came_up_at_power_on_is_an_event_until_the_dl_status_is_read() -> None:
+    line = Line()
+    line.address()
+    assert line.number(0, 0x0210, 2) & 0x0004
+    line.read(0, 0x0110, 2)
+    assert line.number(0, 0x0210, 2) & 0x0004 == 0
 
 
 # EEPROM

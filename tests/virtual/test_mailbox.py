@@ -118,7 +118,19 @@ def test_answers_come_in_the_order_of_their_requests():
     assert [sent[8] for sent in drain(box)] == [0x43, 0x80]
 
 
-def test_emergencies_go_first_and_in_their_order():
+def test_an_emergency_follows_the_answer_of_the_write_that_caused_it():
+    emergencies: deque[Emergency] = deque()
+    objects = dictionary()
+    objects.variable(
+        0x2003, "Test", DataType.INTEGER16, 0, Access.RW,
+        on_write=lambda entry, value: emergencies.append(Emergency(0x8611, 0x21)),
+    )  # fmt: skip
+    box = Mailbox(objects, emergencies, 128, 128)
+    box.receive(buffer("0a00 0000 00 13 0020 2b 0320 00 01000000"), PREOP)
+    assert [sent[7] >> 4 for sent in drain(box)] == [3, 1], "CoE services: SDO response, emergency"
+
+
+def test_emergencies_that_wait_go_first_and_in_their_order():
     box = mailbox(Emergency(0x8611, 0x21, b"\x01\x02\x03\x04\x05"), Emergency(0x0000, 0))
     box.receive(buffer(UPLOAD, 1), PREOP)
     assert drain(box) == [
