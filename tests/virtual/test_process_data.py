@@ -144,6 +144,23 @@ def test_the_limit_in_object_0x10f1_counts_and_zero_switches_the_check_off() -> 
     assert line.al(0) == (OP, 0)
 
 
+@pytest.mark.parametrize(("limit", "misses"), [(8, 3), (20, 7)])
+def test_without_object_0x10f1_the_models_option_is_the_limit(limit: int, misses: int) -> None:
+    line = by_sync0(TinyDevice(sync_error_limit=limit))
+    line.pass_time(misses * MS)
+    assert line.al(0) == (OP, 0)
+    line.pass_time(MS)
+    assert line.al(0) == (SAFE_OP | ERROR, 0x001A)
+
+
+def test_a_device_that_uses_no_sync0_misses_none() -> None:
+    device = TinyDevice()
+    device.uses_sync0 = False
+    line = by_sync0(device)
+    line.pass_time(50 * MS)
+    assert line.al(0) == (OP, 0)
+
+
 def test_sync0_that_ends_in_op_is_a_fatal_sync_error() -> None:
     line = by_sync0(TinyDevice())
     line.write(0, 0x0981, b"\x00")
