@@ -291,6 +291,7 @@ class CommandHandler:
             return OffsetOutOfRange(axis, command.offset, _LARGEST_OFFSET)
         if arm.first_with_torque() >= 0:
             return TorquePresent()
-        arm.all_drives[axis].zero = command.offset
-        self._blackboard.event(ZeroSet(axis, command.offset))
+        drive = arm.all_drives[axis]
+        drive.zero = command.offset
+        self._blackboard.event(ZeroSet(axis, command.offset, drive.position))
         return None

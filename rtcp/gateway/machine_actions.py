@@ -8,7 +8,7 @@ import contextlib
 import numpy as np
 
 from rtcp.config.model import ConfigError, Joint
-from rtcp.config.zero import read_zeros, store_zero, zero_file
+from rtcp.config.zero import read_zeros, store_zero
 from rtcp.control.arm import WITH_TORQUE
 from rtcp.devices.cia402 import DriveState, state_of
 from rtcp.fieldbus.al_state import AlState
@@ -26,7 +26,7 @@ from rtcp.ipc.commands import (
     Shutdown,
 )
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed
+from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed, ZeroSet
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.ipc.stop_reactions import longest_s
 
@@ -181,15 +181,15 @@ class MachineActions:
     async def zero(self, caller: Caller, joint: str, at: float) -> Json:
         """Define the present position of a joint as `at`, rad, in the loop and in the file of offsets."""
         axis, channel, config = self._axis(joint), self._channel, self._config
-        if axis == len(config.joints):
-            # A cycle record has the joints of the arm alone: where the gripper stands is not in it.
-            file = zero_file(config.name)
-            raise RtcpError("refused", f"{joint}: no command sets the zero of a gripper; its offset stands in {file}")
         async with channel.lease(caller) as lease:
             try:
                 offsets = read_zeros(config) or (0.0,) * len(config.axes)
                 before = offsets[axis]
-                offset = before + channel.joints("actual_position")[axis] - at
+                # Unchanged at first: the answer says where the drive stands. A record has the joints of the arm alone.
+                since = channel.observer.last_event
+                await channel.send(lease, SetZero(axis, before))
+                stands = [one.event for one in channel.events(since) if isinstance(one.event, ZeroSet)][-1].position
+                offset = before + stands - at
                 await channel.send(lease, SetZero(axis, offset))
                 try:
                     path = store_zero(config, axis, offset)

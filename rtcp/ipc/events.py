@@ -169,10 +169,11 @@ class GripperAtRest(Event, number=40):
 
 
 class ZeroSet(Event, number=34):
-    """{joint}: its zero is at {offset:.6g} rad of the drive"""
+    """{joint}: its zero is at {offset:.6g} rad of the drive, it stands at {position:.6g} rad"""
 
     axis: int
     offset: float
+    position: float
 
 
 class Homed(Event, number=35):

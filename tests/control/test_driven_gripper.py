@@ -12,8 +12,17 @@ import pytest
 from rtcp.config import default_config, load, load_segment, segment_path
 from rtcp.config.model import ArmConfig, GripperConfig, InputConfig, Joint, Range, SlaveConfig
 from rtcp.config.segment import SegmentSlave
-from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, Shutdown
-from rtcp.ipc.events import DriveFault, FollowingError, GripperAtRest, Homed, LeaseExpired, OverSpeed, PositionJumped
+from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveGripper, Reset, SetZero, Shutdown
+from rtcp.ipc.events import (
+    DriveFault,
+    FollowingError,
+    GripperAtRest,
+    Homed,
+    LeaseExpired,
+    OverSpeed,
+    PositionJumped,
+    ZeroSet,
+)
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Event
 from rtcp.ipc.refusals import NoLease, NotPermitted
@@ -457,6 +466,16 @@ def test_that_it_says_to_be_elsewhere_while_it_is_being_enabled_is_a_fault_that_
     hand.model.mechanics.position += 0.1
     hand.until(State.FAULT)
     assert hand.message(PositionJumped).startswith("finger jumped from 1 to")
+
+
+def test_its_zero_is_set_and_the_loop_says_where_it_stands_then(hand: Hand) -> None:
+    disabled(hand)
+    zero = hand.gripper.drive.zero
+    assert hand.simulation.send(SetZero(AXIS, zero + START - 0.2)).refusal is None
+    event = hand.reports_of(ZeroSet)[-1]
+    assert (event.axis, event.position) == (AXIS, pytest.approx(0.2, abs=2e-3))
+    hand.simulation.run(0.1)
+    assert hand.gripper.drive.position == pytest.approx(0.2, abs=2e-3)
 
 
 def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:

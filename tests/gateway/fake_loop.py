@@ -10,14 +10,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits
-from rtcp.ipc.events import Event
+from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits, SetZero
+from rtcp.ipc.events import Event, ZeroSet
 from rtcp.ipc.layout import PER_JOINT, PLAN_COLUMNS, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.ipc.refusals import Malformed, Refusal
 from rtcp.ipc.states import ControlMode, State
 
 C = TypeVar("C", bound=Command)
 JOINTS = 6
+GRIPPER_AT = 0.4
 _SCALAR_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 _JOINTS_AT = {name: len(SCALARS) - 1 + at * JOINTS for at, (name, _) in enumerate(PER_JOINT)}
 _FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
@@ -119,6 +120,9 @@ class FakeLoop:
             self.plans.append([rows[at * PLAN_COLUMNS : (at + 1) * PLAN_COLUMNS] for at in range(command.rows)])
         refusal = self.refusals.get(type(command))
         if refusal is None:
+            if isinstance(command, SetZero):
+                stands = self.q[command.axis] if command.axis < len(self.q) else GRIPPER_AT
+                self.board.event(ZeroSet(command.axis, command.offset, stands))
             for event in self.reports.get(type(command), ()):
                 self.board.event(event)
             if isinstance(command, MotionCommand):

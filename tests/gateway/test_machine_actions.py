@@ -31,7 +31,7 @@ from tests.gateway.fake_platform import FakePlatform, fake_platform
 Q = [0.25, 0.2, 1.0, 0.0, 0.4, 0.0]
 AXIS = 6
 CONFIG = load(default_config())
-FINGER = Joint("finger", "joint6", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
+FINGER = Joint("finger", "drive6", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
 DRIVEN = replace(CONFIG, gripper=GripperConfig(joint=FINGER, open_position=1.4, closed_position=0.0))
 
 
@@ -194,7 +194,7 @@ def test_the_present_position_becomes_the_zero_or_what_it_is_said_to_be(arm: Fak
     # The fake loop still shows 0.2: now beyond the offset that is in force.
     arm.ask("zero", joint="joint2", at=0.1)
     offsets = [(command.axis, pytest.approx(command.offset)) for command in arm.loop.received(SetZero)]
-    assert offsets == [(0, 0.25), (1, 0.15), (1, 0.25)]
+    assert offsets == [(0, 0), (0, 0.25), (1, 0), (1, 0.15), (1, 0.15), (1, 0.25)]
     assert read_zeros(arm.config) == (0.25, pytest.approx(0.25), 0, 0, 0, 0)
 
 
@@ -209,14 +209,13 @@ def test_a_zero_that_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm:
     error = arm.error("zero", joint="joint1")
     assert error.kind == "refused"
     assert str(tmp_path / "state") in str(error)
-    assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.25, 0.0])
+    assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.0, 0.25, 0.0])
 
 
-def test_the_zero_of_a_gripper_is_refused_with_the_file_that_holds_it(driven: FakePlatform) -> None:
-    error = driven.error("zero", joint="finger")
-    assert error.kind == "refused"
-    assert str(zero_file(driven.config.name)) in str(error)
-    assert driven.loop.commands == []
+def test_the_gripper_with_a_drive_has_a_zero_too(driven: FakePlatform) -> None:
+    answer = driven.ask("zero", joint="finger", at=0.1)
+    assert (answer["joint"], answer["offset"]) == ("finger", pytest.approx(0.3))
+    assert read_zeros(driven.config)[6] == pytest.approx(0.3)
 
 
 def test_homing_returns_the_position_or_fails_with_the_drives_answer(arm: FakePlatform) -> None:
