@@ -25,6 +25,8 @@ from rtcp.ipc.session import read_processes
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
+PERIOD_US = 2000
+"""Cycle of a platform under test: a shared host does not hold a shorter one beside what is tested."""
 
 
 class Platform:
@@ -40,7 +42,7 @@ class Platform:
             "COLUMNS": "100",
         }
 
-    def be_patient(self, lost_ms: int, period_us: int = 2000) -> None:
+    def be_patient(self, lost_ms: int, period_us: int = PERIOD_US) -> None:
         """Use the shipped configuration, but take `lost_ms` without frames (20 to 2000) for a fault.
 
         For tests of what the platform does: a shared host at times takes the CPU away for longer than is shipped.
@@ -220,7 +222,7 @@ def running(shared: Platform) -> Platform:
 def shared(request: pytest.FixtureRequest) -> Iterator[Platform]:
     """A started platform for the tests of a module that leave it as they found it; its cycle is `PERIOD_US` there."""
     made = Platform()
-    made.be_patient(2000, getattr(request.module, "PERIOD_US", 2000))
+    made.be_patient(2000, getattr(request.module, "PERIOD_US", PERIOD_US))
     made.rtcp("start", "--detach")
     yield made
     made.end()

@@ -18,7 +18,7 @@ from rtcp.ipc.errors import Refused
 from rtcp.ipc.jsonrpc import INTERNAL_ERROR
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import PERIOD_US, Platform
 from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
 pytestmark = pytest.mark.alone
@@ -40,7 +40,7 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
     # A single late frame, where the host was busy, is no matter.
     shared.until(lambda found: found["wkc"]["actual"] == 21, "a frame with the full working counter")
     assert status["dc"]["locked"]
-    assert status["cycle_ns"] == 500_000
+    assert status["cycle_ns"] == PERIOD_US * 1000
 
 
 def test_the_status_has_every_promised_field(shared: Platform) -> None:
@@ -233,8 +233,7 @@ def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_spe
         enabled.call("enable")
     limits = [(-3.1, 3.1), (-2.0, 2.0), (-2.4, 2.4), (-3.1, 3.1), (-2.0, 2.0), (-3.1, 3.1)]
     torques = [float(joint["torque"]) for joint in yaml.safe_load(default_config().read_text())["joints"]]
-    # 0.5 rad/s at 500 us are 2.5 counts a cycle: a step on the wire is at most three.
-    largest = 0.5 * 500e-6 * COUNTS_PER_RAD
+    largest = 0.5 * PERIOD_US * 1e-6 * COUNTS_PER_RAD
     before: list[int] | None = None
     seen = moved = 0
     for _, drives in outputs(path):
@@ -249,5 +248,5 @@ def test_every_target_on_the_wire_is_inside_limits_and_every_step_inside_the_spe
                 moved += step
                 assert step <= largest + 0.5
         before = [drive.position for drive in drives]
-    assert seen > 4000
+    assert seen > 1000
     assert moved > 4 * 10_000 * sum(abs(q) for q in Q) * 0.99
