@@ -22,13 +22,19 @@ _LARGEST_FRAME_DATA = 1466
 class SoemProcessData:
     """ProcessData over a configured pysoem master. `receive` holds the interpreter and polls, at most `receive_us`.
 
-    After an exchange without an answer the next `send` first lets a fence pass, throws away what came back before it
-    and only then sends: the answer that follows can only be the new one. While the fence does not come back, outputs
+    After an exchange without an answer the next `send` first lets a barrier frame pass, throws away what came back before it
+    and only then sends: the answer that follows can only be the new one. While that frame does not come back, outputs
     are still sent (a drive that receives frames must get its targets), but no answer is taken.
     """
 
     def __init__(
-        self, master: Any, slaves: Sequence[Any], socket_fd: int, fence: FrameBarrier, receive_us: int, fence_us: int
+        self,
+        master: Any,
+        slaves: Sequence[Any],
+        socket_fd: int,
+        barrier: FrameBarrier,
+        receive_us: int,
+        barrier_us: int,
     ) -> None:
         """Take over the image of `slaves` (pysoem's), outputs zero.
 
@@ -36,9 +42,9 @@ class SoemProcessData:
             master: pysoem's master after `config_map`.
             slaves: its slaves.
             socket_fd: a duplicate of SOEM's packet socket, non-blocking.
-            fence: the fence on the same interface.
+            barrier: the frame barrier on the same interface.
             receive_us: how long an answer is waited for.
-            fence_us: how long the fence is waited for.
+            barrier_us: how long the barrier frame is waited for.
         """
         self.expected_wkc = int(master.expected_wkc)
         self.missed = 0
@@ -46,9 +52,9 @@ class SoemProcessData:
         self._master = master
         self._slaves = tuple(slaves)
         self._fd = socket_fd
-        self._fence = fence
+        self._barrier = barrier
         self._receive_us = receive_us
-        self._fence_ns = fence_us * 1000
+        self._barrier_ns = barrier_us * 1000
         self._inputs = [bytes(slave.input) for slave in slaves]
         self._outputs = [bytes(len(slave.output)) for slave in slaves]
         self._lengths = tuple(len(output) for output in self._outputs)
@@ -64,7 +70,7 @@ class SoemProcessData:
     def send(self) -> None:
         """Send the outputs that were set."""
         if self._doubtful:
-            self._blind = not self._fence.pass_through(self._fence_ns)
+            self._blind = not self._barrier.pass_through(self._barrier_ns)
             self.stale += drain(self._fd, self._buffer)
         outputs = self._outputs
         # All of them, each time: SOEM copies what comes back, also an older frame's outputs, over its image.

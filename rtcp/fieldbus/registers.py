@@ -20,7 +20,7 @@ from rtcp.fieldbus.errors import BusError
 
 ETHERTYPE = 0x88A4
 FIRST_INDEX, LAST_INDEX = 0x80, 0xEF
-"""Datagram indices of this port; those above are the fence's."""
+"""Datagram indices of this port; those above are the frame barrier's."""
 _COMMAND_AT, _INDEX_AT, _STATION_AT, _ADDRESS_AT, _LENGTH_AT = 16, 17, 18, 20, 22
 _LENGTH_MASK = 0x07FF
 _DATA_AT = 26

@@ -73,7 +73,7 @@ class SoemBus:
         self._claim: socket.socket | None = None
         self._promiscuous: PromiscuousMode | None = None
         self._port: RegisterPort | None = None
-        self._fence: FrameBarrier | None = None
+        self._barrier: FrameBarrier | None = None
         self._names: list[str] = []
         self._infos: list[MailboxInfo | None] = []
         self._serials: list[int] = []
@@ -117,7 +117,7 @@ class SoemBus:
         try:
             self._port = RegisterPort(self.interface)
             self._port.tries = PATIENT_TRIES
-            self._fence = FrameBarrier(self.interface)
+            self._barrier = FrameBarrier(self.interface)
             self._promiscuous = PromiscuousMode(self.interface)
             self._master, self._socket = open_master(self.interface)
         except BaseException:
@@ -291,12 +291,12 @@ class SoemBus:
 
     def _process_data(self, period_ns: int) -> SoemProcessData:
         assert self._socket is not None
-        assert self._fence is not None
+        assert self._barrier is not None
         period_us = period_ns / 1000
         receive_us = max(1, round(self._fraction * period_us))
-        fence_us = max(1, round(min(receive_us, 0.75 * period_us - receive_us)))
+        barrier_us = max(1, round(min(receive_us, 0.75 * period_us - receive_us)))
         return SoemProcessData(
-            self._master, self._master.slaves, self._socket.fileno(), self._fence, receive_us, fence_us
+            self._master, self._master.slaves, self._socket.fileno(), self._barrier, receive_us, barrier_us
         )  # fmt: skip
 
     def request_state(self, state: AlState, positions: Iterable[int] | None = None) -> None:
@@ -358,10 +358,10 @@ class SoemBus:
             self.notes.append(f"the slaves on {self.interface} could not be brought back to INIT: {error}")
         finally:
             # The claim last: the next master must not find what this one still undoes.
-            for part in (self._port, self._fence, self._socket, self._master, self._promiscuous, self._claim):
+            for part in (self._port, self._barrier, self._socket, self._master, self._promiscuous, self._claim):
                 if part is not None:
                     part.close()
-            self._port = self._fence = self._socket = self._claim = self._promiscuous = self._master = None
+            self._port = self._barrier = self._socket = self._claim = self._promiscuous = self._master = None
             self._names = []
 
     def _to_init(self, port: RegisterPort) -> None:

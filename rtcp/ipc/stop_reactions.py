@@ -64,7 +64,7 @@ def bounds(config: ArmConfig, reaction: StopReaction, braking: Sequence[float] =
 
     Args:
         config: limits of the joints, of the tool and of the bus, and what the drives are set to.
-        reaction: how it is stopped. Of `HOLD` it is what may pass until the next rung, not until standstill.
+        reaction: how it is stopped. Of `HOLD` it is what may pass until the next reaction, not until standstill.
         braking: rad/s^2, what each joint's closed brake slows it down by at least, weight taken off; for `TORQUE_OFF`.
 
     Raises:
@@ -112,7 +112,7 @@ def quick_stop_s(config: ArmConfig) -> float:
 
 
 def longest_s(config: ArmConfig) -> float:
-    """Return the longest time of the ladder within which all that drives move stands, s."""
+    """Return the longest time of all reactions within which all that drives move stands, s."""
     controlled = bounds(replace(config, joints=config.axes), StopReaction.CONTROLLED_STOP)
     tool = tool_bounds(config, config.cartesian.speed, config.cartesian.angular_speed)
     return max(quick_stop_s(config), *(bound.time_s for bound in (*controlled, *tool)))
