@@ -22,9 +22,9 @@ _LARGEST_FRAME_DATA = 1466
 class SoemProcessData:
     """ProcessData over a configured pysoem master. `receive` holds the interpreter and polls, at most `receive_us`.
 
-    After an exchange without an answer the next `send` first lets a barrier frame pass, throws away what came back before it
-    and only then sends: the answer that follows can only be the new one. While that frame does not come back, outputs
-    are still sent (a drive that receives frames must get its targets), but no answer is taken.
+    After an exchange without an answer the next `send` first lets a barrier frame pass, throws away what came back
+    before it and only then sends: the answer that follows can only be the new one. While that frame does not come back,
+    outputs are still sent (a drive that receives frames must get its targets), but no answer is taken.
     """
 
     def __init__(
