@@ -17,7 +17,6 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rtcp.config.document import shown
@@ -101,10 +100,14 @@ class Control:
         self._clients: dict[int, socket.socket] = {}
         self._epoll = select.epoll()
         self._epoll.register(listener, select.EPOLLIN)
-        self._verbs: MappingProxyType[str, Callable[[dict[str, Any], int], Any]] = MappingProxyType({
-            "fault": self._fault, "clear": self._clear, "faults": self._faults, "truth": self._tell_truth,
-            "clear_peaks": self._clear_peaks,
-        })  # fmt: skip
+        self._verbs: dict[str, tuple[tuple[str, ...], Callable[[dict[str, Any], int], Any]]] = {
+            "fault": (("fault",), self._fault),
+            "clear": (("id",), self._clear),
+            "faults": ((), lambda _, now: registry.listing(now)),
+            "truth": ((), lambda _, now: truth.answer(now)),
+            "clear_peaks": ((), lambda _, now: truth.clear_peaks(now)),
+        }
+        """What a request can ask for: its keys, and what answers it."""
         for name in installed():
             # What a kind allows is worked out when it is first named, which takes longer than a frame may wait.
             parse({"fault": name})
@@ -170,12 +173,15 @@ class Control:
                 raise FaultRefused(f"do: found {shown(verb)}, allowed is one of {', '.join(self._verbs)}")
             now = time.monotonic_ns()
             self._truth.requested(now)
-            return {"ok": True, "result": self._verbs[verb](request, now)}
+            known, answer = self._verbs[verb]
+            for key in request:
+                if key not in known:
+                    raise FaultRefused(f"{key}: {unknown_key(key, ['do', *known])}")
+            return {"ok": True, "result": answer(request, now)}
         except FaultRefused as refusal:
             return {"ok": False, "error": str(refusal)}
 
     def _fault(self, request: dict[str, Any], now: int) -> dict[str, int]:
-        _only(request, "fault")
         mapping = request.get("fault")
         if isinstance(mapping, dict) and len(mapping) > MOST_KEYS:
             raise FaultRefused(f"a fault has at most {MOST_KEYS} keys, found {len(mapping)}")
@@ -187,24 +193,10 @@ class Control:
         return {"id": self._registry.begin(planned, now)}
 
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
-        _only(request, "id")
         number = request.get("id")
         if number is not None and type(number) is not int:
             raise FaultRefused(f"id: found {shown(number)}, allowed is the number of a fault, or none for all")
         return {"cleared": self._registry.clear(number, now)}
-
-    def _faults(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
-        _only(request)
-        return self._registry.listing(now)
-
-    def _tell_truth(self, request: dict[str, Any], now: int) -> dict[str, Any]:
-        _only(request)
-        return self._truth.answer(now)
-
-    def _clear_peaks(self, request: dict[str, Any], now: int) -> dict[str, Any]:
-        _only(request)
-        self._truth.clear_peaks(now)
-        return {}
 
 
 def _request(packet: bytes) -> dict[str, Any]:
@@ -217,12 +209,6 @@ def _request(packet: bytes) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise FaultRefused(f"found {shown(request)}, allowed is an object with the key do")
     return request
-
-
-def _only(request: dict[str, Any], *known: str) -> None:
-    for key in request:
-        if key not in known:
-            raise FaultRefused(f"{key}: {unknown_key(key, ['do', *known])}")
 
 
 class _Joint:

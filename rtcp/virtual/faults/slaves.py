@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Gt, Le
@@ -27,15 +26,7 @@ from rtcp.virtual.faults.fault import (
 )
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
-from rtcp.virtual.models.protection import (
-    ENCODER,
-    FOLLOWING_ERROR,
-    OVER_CURRENT,
-    OVER_SPEED,
-    OVER_TEMPERATURE,
-    OVER_VOLTAGE,
-    UNDER_VOLTAGE,
-)
+from rtcp.virtual.models.protection import ErrorCode
 from rtcp.virtual.protocol import State
 from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
@@ -44,12 +35,6 @@ AlCode = Annotated[int, Ge(1), Le(0xFFFF)]
 DriveError = Literal[
     "over-current", "over-voltage", "under-voltage", "over-temperature", "encoder", "over-speed", "following-error"
 ]
-ERROR_CODES = MappingProxyType({
-    "over-current": OVER_CURRENT, "over-voltage": OVER_VOLTAGE, "under-voltage": UNDER_VOLTAGE,
-    "over-temperature": OVER_TEMPERATURE, "encoder": ENCODER, "over-speed": OVER_SPEED,
-    "following-error": FOLLOWING_ERROR,
-})  # fmt: skip
-"""Error codes (0x603F) by the names that faults give them."""
 STICK = 0x3F
 """The joystick's lines: the six first inputs."""
 
@@ -310,7 +295,8 @@ class DriveFault(DeviceFault):
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
         """Let the drive meet the error."""
-        drive, code = _device_at(devices, self.slave, CubemarsDrive, "drive"), ERROR_CODES[self.error]
+        drive = _device_at(devices, self.slave, CubemarsDrive, "drive")
+        code = ErrorCode[self.error.upper().replace("-", "_")]
         drive.begin_fault(code)
         return lambda _: drive.end_fault(code)
 
