@@ -311,8 +311,12 @@ class InputsFrozen(DeviceFault):
     def begin(self, devices: Sequence[DeviceModel]) -> End:
         """Freeze the inputs."""
         box = _device_at(devices, self.slave, DiewuIoBox, "IO box")
-        box.freeze_inputs()
-        return lambda _: box.thaw_inputs()
+
+        def thaw(_: int) -> None:
+            box.freezes -= 1
+
+        box.freezes += 1
+        return thaw
 
 
 def _device_at(devices: Sequence[DeviceModel], number: int, kind: type[_D], words: str) -> _D:
@@ -331,8 +335,8 @@ class TerminalsFault(DeviceFault):
         if box is None:
             raise FaultRefused(f"there is no IO box on the segment: {self.name} is a fault of its inputs")
         broken = self.broken(box.inputs)
-        box.break_terminals(broken)
-        return lambda _: box.release_terminals(broken)
+        box.broken.append(broken)
+        return lambda _: box.broken.remove(broken)
 
     def broken(self, inputs: int) -> BrokenTerminals:
         """Return which terminals are broken, and how; `inputs` are the levels of now."""
