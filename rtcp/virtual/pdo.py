@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from operator import attrgetter
+from typing import NamedTuple
 
 from rtcp.virtual.objects import (
     AbortCode,
@@ -66,8 +67,7 @@ class SyncManager:
     activate: int = 0x01
 
 
-@dataclass(frozen=True)
-class SyncManagerLayout:
+class SyncManagerLayout(NamedTuple):
     """The four sync managers of a slave with mailbox, as its SII tells them."""
 
     mailbox_receive: SyncManager = SyncManager(0x1000, 128, 0x26, SyncManagerType.MAILBOX_RECEIVE)
@@ -78,11 +78,6 @@ class SyncManagerLayout:
     """SM2: RxPDOs, triggers the process-data watchdog."""
     inputs: SyncManager = SyncManager(0x1400, 0, 0x20, SyncManagerType.INPUTS)
     """SM3: TxPDOs."""
-
-    @property
-    def all(self) -> tuple[SyncManager, SyncManager, SyncManager, SyncManager]:
-        """SM0 to SM3."""
-        return (self.mailbox_receive, self.mailbox_send, self.outputs, self.inputs)
 
 
 class PdoImage:
@@ -209,7 +204,7 @@ def define_pdo_objects(
     has the bits that the mapping tells and fits in 256 bytes with the others (0x06040042); an assigned PDO exists
     (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
     """
-    types = (*(sm.type for sm in SyncManagerLayout().all),)
+    types = [sm.type for sm in SyncManagerLayout()]
     objects.record(
         SM_TYPES, "Sync manager type",
         [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(t)) for n, t in enumerate(types, 1)],
