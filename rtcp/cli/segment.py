@@ -7,7 +7,7 @@ import signal
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -125,7 +125,7 @@ def _fault(
     segment: ControlPath = None,
 ) -> None:
     """Inject a fault into the running segment."""
-    from rtcp.config.faults import ONCE, parse, sentence_of
+    from rtcp.virtual.faults.registry import parse, sentence_of
 
     planned, findings = parse(_mapping(name, pairs or [], lasts))
     if planned is None:
@@ -136,7 +136,7 @@ def _fault(
         number = client.fault(planned.as_mapping())
         active = any(each["id"] == number for each in client.faults())
     fault = f"fault {number}: {_named(planned.as_mapping())}"
-    if isinstance(planned.fault, ONCE) or not active:
+    if planned.fault.once or not active:
         report(f"{fault}: done")
         return
     until = "until it is cleared" if planned.lasts is None else f"for {planned.lasts:g} s"
@@ -191,10 +191,14 @@ class Kind:
 
 def kinds() -> list[Kind]:
     """Return every kind of fault."""
-    from rtcp.config.faults import installed
+    from rtcp.virtual.faults.registry import installed
 
     return [
-        Kind(name, str(kind.__doc__).partition("\n")[0], {field.name: _allowed(kind, field) for field in fields(kind)})
+        Kind(
+            name,
+            str(kind.__doc__).partition("\n")[0],
+            {field.name: _allowed(kind, field) for field in kind.key_fields()},
+        )
         for name, kind in installed().items()
     ]
 

@@ -239,7 +239,7 @@ def run_trial(
 
     Args:
         harness: the platform.
-        faults: injected in this order, each a mapping as `rtcp.config.faults` has it.
+        faults: injected in this order, each a mapping as `rtcp.virtual.faults.registry` has it.
         workload: one of `WORKLOADS`.
         watch_s: how long a machine that continues is observed.
         reset_first: ask for a reset while the fault is active: it must not lead to an enabled arm.

@@ -45,23 +45,19 @@ class AlStatusCode(IntEnum):
     INVALID_SYNC0_CYCLE = 0x0035
 
 
-Check = Callable[[Esc, DeviceModel], AlStatusCode]
-
-
 def _in_ram(manager: SyncManager, size: int) -> bool:
     return manager.start >= REGISTER_SPACE and manager.start + size <= MEMORY_SIZE
 
 
-def check_mailboxes(esc: Esc, device: DeviceModel) -> AlStatusCode:
+def check_mailboxes(esc: Esc, device: DeviceModel) -> bool:
     """SM0 and SM1 must be mailboxes, out and in, long enough and apart."""
     out, in_ = esc.sync_managers[MAILBOX_OUT], esc.sync_managers[MAILBOX_IN]
-    good = (
+    return (
         all(m.enabled and m.mailbox and m.length >= MINIMUM_MAILBOX and _in_ram(m, m.length) for m in (out, in_))
         and out.master_writes
         and not in_.master_writes
         and (out.end <= in_.start or in_.end <= out.start)
     )
-    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_MAILBOX_PREOP
 
 
 def mapped_image(device: DeviceModel, assignment: int) -> PdoImage | None:
@@ -72,106 +68,105 @@ def mapped_image(device: DeviceModel, assignment: int) -> PdoImage | None:
         return None
 
 
-def check_output_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
-    """All that 0x1C12 maps must exist."""
-    found = mapped_image(device, RX_ASSIGN)
-    return AlStatusCode.INVALID_OUTPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
-
-
-def check_input_mapping(esc: Esc, device: DeviceModel) -> AlStatusCode:
-    """All that 0x1C13 maps must exist."""
-    found = mapped_image(device, TX_ASSIGN)
-    return AlStatusCode.INVALID_INPUT_MAPPING if found is None else AlStatusCode.NO_ERROR
-
-
-def _fits(manager: SyncManager, length: int, master_writes: bool) -> bool:
-    """Whether the sync manager is right for an image of `length` bytes; none at all needs none."""
-    if not length:
-        return not manager.enabled
+def _fits(manager: SyncManager, image: PdoImage | None, master_writes: bool) -> bool:
+    """Whether the sync manager is a buffer in the right direction as long as `image`; an empty one needs none."""
+    if image is None or not image.byte_length:
+        return image is not None and not manager.enabled
     return (
         manager.enabled
         and not manager.mailbox
         and manager.master_writes == master_writes
-        and manager.length == length
-        and _in_ram(manager, BUFFERS * length)
+        and manager.length == image.byte_length
+        and _in_ram(manager, BUFFERS * manager.length)
     )
 
 
-def check_outputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
+def check_outputs(esc: Esc, device: DeviceModel) -> bool:
     """SM2 must be a buffer that the master writes, as long as the RxPDOs."""
-    image = mapped_image(device, RX_ASSIGN)
-    good = image is not None and _fits(esc.sync_managers[OUTPUTS], image.byte_length, True)
-    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_OUTPUTS
+    return _fits(esc.sync_managers[OUTPUTS], mapped_image(device, RX_ASSIGN), True)
 
 
-def check_inputs(esc: Esc, device: DeviceModel) -> AlStatusCode:
+def check_inputs(esc: Esc, device: DeviceModel) -> bool:
     """SM3 must be a buffer that the master reads, as long as the TxPDOs."""
-    image = mapped_image(device, TX_ASSIGN)
-    good = image is not None and _fits(esc.sync_managers[INPUTS], image.byte_length, False)
-    return AlStatusCode.NO_ERROR if good else AlStatusCode.INVALID_INPUTS
+    return _fits(esc.sync_managers[INPUTS], mapped_image(device, TX_ASSIGN), False)
 
 
-def check_areas(esc: Esc, device: DeviceModel) -> AlStatusCode:
+def check_areas(esc: Esc, device: DeviceModel) -> bool:
     """No two sync managers may share memory; a buffer takes its length three times."""
     areas = sorted(
         (m.start, m.start + m.length * (1 if m.mailbox else BUFFERS)) for m in esc.sync_managers if m.enabled
     )
-    apart = all(first[1] <= second[0] for first, second in pairwise(areas))
-    return AlStatusCode.NO_ERROR if apart else AlStatusCode.INVALID_SYNC_MANAGERS
+    return all(first[1] <= second[0] for first, second in pairwise(areas))
 
 
-def check_watchdog(esc: Esc, device: DeviceModel) -> AlStatusCode:
+def check_watchdog(esc: Esc, device: DeviceModel) -> bool:
     """A watchdog that SM2 triggers and that has a time must have a divider to count it with."""
     wanted = esc.sync_managers[OUTPUTS].watchdog_trigger and esc.get(Register.WATCHDOG_PROCESS_DATA, 2)
-    if wanted and not esc.get(Register.WATCHDOG_DIVIDER, 2):
-        return AlStatusCode.INVALID_WATCHDOG
-    return AlStatusCode.NO_ERROR
+    return not wanted or bool(esc.get(Register.WATCHDOG_DIVIDER, 2))
 
 
-def check_sync(esc: Esc, device: DeviceModel) -> AlStatusCode:
-    """Where SYNC pulses are on there must be SYNC0, with a cycle that the device can keep, and it must still come."""
+def check_sync0(esc: Esc, device: DeviceModel) -> bool:
+    """Where SYNC pulses are on there must be SYNC0."""
     dc = esc.dc
-    if dc is None or not dc.cyclic:
-        return AlStatusCode.NO_ERROR
-    if not dc.sync0_active or not dc.sync0.cycle:
-        return AlStatusCode.INVALID_DC_SYNC
-    objects = device.objects
-    minimum = objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in objects else 0
-    if isinstance(minimum, int) and dc.sync0.cycle < minimum:
-        return AlStatusCode.INVALID_SYNC0_CYCLE
-    # Pulses left on by the last master whose time base was set anew since: they came and come no more (SOEM#60).
-    if dc.sync0.lost and dc.sync0.pulses:
-        return AlStatusCode.FATAL_SYNC_ERROR
-    return AlStatusCode.NO_ERROR
+    return dc is None or not dc.cyclic or (dc.sync0_active and bool(dc.sync0.cycle))
 
 
-_PROCESS_DATA: tuple[Check, ...] = (
-    check_output_mapping, check_input_mapping, check_outputs, check_inputs, check_areas, check_watchdog, check_sync,
-)  # fmt: skip
+def check_cycle(esc: Esc, device: DeviceModel) -> bool:
+    """SYNC0 must have a cycle that the device can keep."""
+    minimum = device.objects[MINIMUM_CYCLE].value if MINIMUM_CYCLE in device.objects else 0
+    return esc.dc is None or not esc.dc.cyclic or not isinstance(minimum, int) or esc.dc.sync0.cycle >= minimum
+
+
+def check_pulses(esc: Esc, device: DeviceModel) -> bool:
+    """SYNC0 that has come must still come.
+
+    It was left on by the last master where the time base was set anew since: it came and comes no more (SOEM#60).
+    """
+    dc = esc.dc
+    return dc is None or not dc.cyclic or not (dc.sync0.lost and dc.sync0.pulses)
+
+
+Check = tuple[Callable[[Esc, DeviceModel], bool], AlStatusCode]
+"""What must hold, and the code of a slave where it does not."""
+_MAILBOXES: tuple[Check, ...] = ((check_mailboxes, AlStatusCode.INVALID_MAILBOX_PREOP),)
+_BUFFERS: tuple[Check, ...] = (
+    (check_outputs, AlStatusCode.INVALID_OUTPUTS),
+    (check_inputs, AlStatusCode.INVALID_INPUTS),
+    (check_areas, AlStatusCode.INVALID_SYNC_MANAGERS),
+)
+_SYNC: tuple[Check, ...] = (
+    (check_sync0, AlStatusCode.INVALID_DC_SYNC),
+    (check_cycle, AlStatusCode.INVALID_SYNC0_CYCLE),
+    (check_pulses, AlStatusCode.FATAL_SYNC_ERROR),
+)
 
 # Steps up, and what must hold for them. A step down is always allowed; any other pair is 0x0011.
 UPWARD: dict[tuple[State, State], tuple[Check, ...]] = {
-    (State.INIT, State.PRE_OP): (check_mailboxes,),
-    (State.PRE_OP, State.SAFE_OP): (check_mailboxes, *_PROCESS_DATA),
-    (State.SAFE_OP, State.OP): (check_sync,),
+    (State.INIT, State.PRE_OP): _MAILBOXES,
+    (State.PRE_OP, State.SAFE_OP): (
+        *_MAILBOXES,
+        (lambda esc, device: mapped_image(device, RX_ASSIGN) is not None, AlStatusCode.INVALID_OUTPUT_MAPPING),
+        (lambda esc, device: mapped_image(device, TX_ASSIGN) is not None, AlStatusCode.INVALID_INPUT_MAPPING),
+        *_BUFFERS,
+        (check_watchdog, AlStatusCode.INVALID_WATCHDOG),
+        *_SYNC,
+    ),
+    (State.SAFE_OP, State.OP): _SYNC,
 }
 
+_PROCESS_DATA = ((_MAILBOXES, State.INIT), (_BUFFERS, State.PRE_OP))
 # What must go on to hold in a state when sync managers are written, and where the slave falls to otherwise.
 HELD: dict[State, tuple[tuple[tuple[Check, ...], State], ...]] = {
     State.INIT: (),
-    State.PRE_OP: (((check_mailboxes,), State.INIT),),
-    State.SAFE_OP: (((check_mailboxes,), State.INIT), ((check_outputs, check_inputs, check_areas), State.PRE_OP)),
-    State.OP: (((check_mailboxes,), State.INIT), ((check_outputs, check_inputs, check_areas), State.PRE_OP)),
+    State.PRE_OP: _PROCESS_DATA[:1],
+    State.SAFE_OP: _PROCESS_DATA,
+    State.OP: _PROCESS_DATA,
 }
 
 
 def first_failure(checks: tuple[Check, ...], esc: Esc, device: DeviceModel) -> AlStatusCode:
     """The code of the first check that fails, or NO_ERROR."""
-    for check in checks:
-        code = check(esc, device)
-        if code:
-            return code
-    return AlStatusCode.NO_ERROR
+    return next((code for holds, code in checks if not holds(esc, device)), AlStatusCode.NO_ERROR)
 
 
 def judge(state: State, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:

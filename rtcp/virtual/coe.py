@@ -283,10 +283,6 @@ class SdoServer:
         self._normal_size = send_size - MAILBOX_AND_COE_HEADER - _SDO.size
         self._transfer: _Upload | _Download | None = None
 
-    def reset(self) -> None:
-        """Forget a transfer that is under way."""
-        self._transfer = None
-
     def answer(self, request: bytes, state: int) -> bytes | None:
         """Return the answer to `request` (eight bytes or more), both without CoE header; None to an abort.
 

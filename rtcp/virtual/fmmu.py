@@ -27,11 +27,6 @@ class Fmmu:
     readable: bool
     writable: bool
 
-    @property
-    def aligned(self) -> bool:
-        """Whether it maps whole bytes to whole bytes."""
-        return not (self.logical | self.physical | self.bits) & 7
-
 
 @dataclass(frozen=True)
 class Overlap:

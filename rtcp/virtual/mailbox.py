@@ -126,14 +126,6 @@ class Mailbox:
         self._own_counter = self._own_counter % 7 + 1
         return _HEADER.pack(len(content), address, 0, self._own_counter << 4 | kind) + content
 
-    def reset(self) -> None:
-        """Forget messages, emergencies, transfers and counters: the slave went to INIT."""
-        self._waiting.clear()
-        self._emergencies.clear()
-        self._sdo.reset()
-        self._master_counter = 0
-        self._own_counter = 0
-
     def _queue_emergencies(self) -> None:
         while self._emergencies:
             self._waiting.append((MailboxType.COE, 0, emergency_message(self._emergencies.popleft()), 0))
@@ -210,10 +202,6 @@ class MailboxService:
     def pending(self, t: int) -> bool:
         """Whether a message waits at instant `t` and SM1 has room for it."""
         return self._mailbox.pending(t) and not self._in.full
-
-    def stop(self) -> None:
-        """The slave goes to INIT: forget everything."""
-        self._mailbox.reset()
 
     def _repeat(self) -> None:
         """Put the last message that was read there again, and what stands there now after it."""

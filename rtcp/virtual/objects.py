@@ -63,21 +63,23 @@ class SdoAbort(Exception):
 
 Value = int | float | bytes
 WriteHook = Callable[["Entry", Value], None]
+STRUCT_CODES = {
+    DataType.INTEGER8: "b",
+    DataType.INTEGER16: "h",
+    DataType.INTEGER32: "i",
+    DataType.INTEGER64: "q",
+    DataType.UNSIGNED8: "B",
+    DataType.UNSIGNED16: "H",
+    DataType.UNSIGNED32: "I",
+    DataType.UNSIGNED64: "Q",
+    DataType.REAL32: "f",
+    DataType.REAL64: "d",
+}
+"""Codes of the `struct` module for the types that fill whole bytes."""
+BITS = {DataType.BOOLEAN: 1, **{data_type: 8 * struct.calcsize(code) for data_type, code in STRUCT_CODES.items()}}
+SIGNED = frozenset(data_type for data_type, code in STRUCT_CODES.items() if code in "bhiq")
 _FLOATS = (DataType.REAL32, DataType.REAL64)
 _BYTES = (DataType.VISIBLE_STRING, DataType.OCTET_STRING)
-BITS = {
-    DataType.BOOLEAN: 1,
-    DataType.INTEGER8: 8,
-    DataType.UNSIGNED8: 8,
-    DataType.INTEGER16: 16,
-    DataType.UNSIGNED16: 16,
-    DataType.INTEGER32: 32,
-    DataType.UNSIGNED32: 32,
-    DataType.REAL32: 32,
-    DataType.INTEGER64: 64,
-    DataType.UNSIGNED64: 64,
-    DataType.REAL64: 64,
-}
 
 
 class Entry:
@@ -196,22 +198,6 @@ class ObjectDictionary:
     def __iter__(self) -> Iterator[DictionaryObject]:
         """Iterate over the objects in the order of their indices."""
         return iter(sorted(self._objects.values(), key=lambda found: found.index))
-
-
-SIGNED = frozenset({DataType.INTEGER8, DataType.INTEGER16, DataType.INTEGER32, DataType.INTEGER64})
-STRUCT_CODES = {
-    DataType.INTEGER8: "b",
-    DataType.INTEGER16: "h",
-    DataType.INTEGER32: "i",
-    DataType.INTEGER64: "q",
-    DataType.UNSIGNED8: "B",
-    DataType.UNSIGNED16: "H",
-    DataType.UNSIGNED32: "I",
-    DataType.UNSIGNED64: "Q",
-    DataType.REAL32: "f",
-    DataType.REAL64: "d",
-}
-"""Codes of the `struct` module for the types that fill whole bytes."""
 
 
 def byte_size(entry: Entry) -> int:

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from operator import attrgetter
+from typing import NamedTuple
 
 from rtcp.virtual.objects import (
     AbortCode,
     Access,
     DataType,
+    DictionaryObject,
     Entry,
     ObjectCode,
     ObjectDictionary,
@@ -65,8 +67,7 @@ class SyncManager:
     activate: int = 0x01
 
 
-@dataclass(frozen=True)
-class SyncManagerLayout:
+class SyncManagerLayout(NamedTuple):
     """The four sync managers of a slave with mailbox, as its SII tells them."""
 
     mailbox_receive: SyncManager = SyncManager(0x1000, 128, 0x26, SyncManagerType.MAILBOX_RECEIVE)
@@ -77,11 +78,6 @@ class SyncManagerLayout:
     """SM2: RxPDOs, triggers the process-data watchdog."""
     inputs: SyncManager = SyncManager(0x1400, 0, 0x20, SyncManagerType.INPUTS)
     """SM3: TxPDOs."""
-
-    @property
-    def all(self) -> tuple[SyncManager, SyncManager, SyncManager, SyncManager]:
-        """SM0 to SM3."""
-        return (self.mailbox_receive, self.mailbox_send, self.outputs, self.inputs)
 
 
 class PdoImage:
@@ -150,14 +146,6 @@ class PdoImage:
             image |= to_bits(entry) << shift
         target[offset : offset + self.byte_length] = image.to_bytes(self.byte_length, "little")
 
-    def packed(self) -> bytes:
-        """Return the entries' values as bytes; raises as `pack`."""
-        if self._struct is not None:
-            return self._struct.pack(*map(_VALUE, self.entries))
-        image = bytearray(self.byte_length)
-        self.pack(image)
-        return bytes(image)
-
 
 def _compile(fields: Sequence[tuple[Entry | None, int]]) -> struct.Struct | None:
     """Return one struct for all of `fields`, None where any of them is not made of whole bytes."""
@@ -216,7 +204,7 @@ def define_pdo_objects(
     has the bits that the mapping tells and fits in 256 bytes with the others (0x06040042); an assigned PDO exists
     (0x06020000) and has this direction (0x06040041). With `fixed` nothing can be written (0x06010002).
     """
-    types = (*(sm.type for sm in SyncManagerLayout().all),)
+    types = [sm.type for sm in SyncManagerLayout()]
     objects.record(
         SM_TYPES, "Sync manager type",
         [Entry(SM_TYPES, n, f"Type of SM{n - 1}", DataType.UNSIGNED8, int(t)) for n, t in enumerate(types, 1)],
@@ -233,67 +221,54 @@ def define_pdo_objects(
 def _define_mapping(
     objects: ObjectDictionary, index: int, name: str, mapped: Sequence[Mapped], wanted: Access, fixed: bool
 ) -> None:
-    def check_entry(_: Entry, value: Value) -> None:
-        if objects[index, 0].value:
-            raise SdoAbort(AbortCode.SUBINDEX_0_NOT_ZERO)
-        if value:
-            _field(objects, int(value), wanted)
+    def entry_at(n: int, value: int) -> Entry:
+        return Entry(index, n, f"Mapped object {n}", DataType.UNSIGNED32, value)
 
-    def check_count(_: Entry, value: Value) -> None:
-        places = [int(objects[index, subindex].value) for subindex in range(1, int(value) + 1)]
-        _check_length(sum(_field(objects, place, wanted)[1] for place in places))
-
-    access = Access.RO if fixed else Access.RW_PREOP
     values = [at << 16 | subindex << 8 | bits for at, subindex, bits in mapped]
-    used = len(values)
-    if not fixed:
-        values += [0] * (MAX_MAPPED - used)
-    entries = [
-        Entry(index, n, f"Mapped object {n}", DataType.UNSIGNED32, value, access, on_write=check_entry)
-        for n, value in enumerate(values, 1)
-    ]
-    count = objects.record(index, name, entries, count_access=access).entries[0]
-    count.value, count.maximum, count.on_write = used, len(values), check_count
+    places = values if fixed else values + [0] * (MAX_MAPPED - len(values))
+    made = objects.record(index, name, [entry_at(n, value) for n, value in enumerate(places, 1)])
+    _restrict(made, len(values), fixed, lambda value: _field(objects, value, wanted)[1])
 
 
 def _define_assignment(
     objects: ObjectDictionary, index: int, name: str, assigned: Sequence[int],
     own: Collection[int], opposite: Collection[int], fixed: bool,
 ) -> None:  # fmt: skip
-    def check_pdo(pdo: int) -> None:
+    def entry_at(n: int, value: int) -> Entry:
+        return Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, value)
+
+    def bits_of(pdo: int) -> int:
         if pdo in opposite:
             raise SdoAbort(AbortCode.NOT_MAPPABLE)
         if pdo not in own:
             raise SdoAbort(AbortCode.NO_OBJECT)
+        return sum(mapping & 0xFF for mapping in listed(objects, pdo))
+
+    places = [*assigned] if fixed else [*assigned] + [0] * (MAX_ASSIGNED - len(assigned))
+    entries = [entry_at(n, pdo) for n, pdo in enumerate(places, 1)]
+    _restrict(objects.record(index, name, entries, code=ObjectCode.ARRAY), len(assigned), fixed, bits_of)
+
+
+def _restrict(made: DictionaryObject, used: int, fixed: bool, bits_of: Callable[[int], int]) -> None:
+    """Let a mapping or an assignment, `used` of whose places count, be written by the rules of `define_pdo_objects`.
+
+    `bits_of` returns the bits that a place takes, or refuses what stands there.
+    """
+    count, *places = made.entries.values()
 
     def check_entry(_: Entry, value: Value) -> None:
-        if objects[index, 0].value:
+        if count.value:
             raise SdoAbort(AbortCode.SUBINDEX_0_NOT_ZERO)
         if value:
-            check_pdo(int(value))
+            bits_of(int(value))
 
     def check_count(_: Entry, value: Value) -> None:
-        bits = 0
-        for subindex in range(1, int(value) + 1):
-            pdo = int(objects[index, subindex].value)
-            check_pdo(pdo)
-            bits += sum(mapping & 0xFF for mapping in listed(objects, pdo))
-        _check_length(bits)
+        bits = sum(bits_of(int(place.value)) for place in places[: int(value)])
+        if bits > 8 * MAX_BYTES:
+            raise SdoAbort(AbortCode.PDO_LENGTH)
 
-    access = Access.RO if fixed else Access.RW_PREOP
-    values = list(assigned)
-    used = len(values)
-    if not fixed:
-        values += [0] * (MAX_ASSIGNED - used)
-    entries = [
-        Entry(index, n, f"Assigned PDO {n}", DataType.UNSIGNED16, value, access, on_write=check_entry)
-        for n, value in enumerate(values, 1)
-    ]
-    count = objects.record(index, name, entries, code=ObjectCode.ARRAY, count_access=access).entries[0]
-    count.value, count.maximum, count.on_write = used, len(values), check_count
-
-
-def _check_length(bits: int) -> None:
-    """Refuse process data that do not fit in a sync manager's buffer."""
-    if bits > 8 * MAX_BYTES:
-        raise SdoAbort(AbortCode.PDO_LENGTH)
+    count.value, count.maximum, count.on_write = used, len(places), check_count
+    for place in places:
+        place.on_write = check_entry
+    for entry in made.entries.values():
+        entry.access = Access.RO if fixed else Access.RW_PREOP

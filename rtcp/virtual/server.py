@@ -16,12 +16,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from types import FrameType
 
-from rtcp.config.faults import Planned, load_script
 from rtcp.config.segment import load_segment
-from rtcp.virtual.faults.control import Control, control_socket
-from rtcp.virtual.faults.frames import FOR_EVER
-from rtcp.virtual.faults.ground_truth import GroundTruth
-from rtcp.virtual.faults.registry import FaultRegistry
+from rtcp.virtual.faults.control import Control, GroundTruth, control_socket
+from rtcp.virtual.faults.fault import FOR_EVER
+from rtcp.virtual.faults.registry import FaultRegistry, Planned, load_script
 from rtcp.virtual.network import NetworkError, private_pair, public_pair
 from rtcp.virtual.protocol import ETHERTYPE
 from rtcp.virtual.segment import Segment, make_segment

@@ -162,7 +162,7 @@ def _contents(device: DeviceModel, layout: SyncManagerLayout) -> Iterable[tuple[
     later: list[tuple[Category, bytes]] = [
         (Category.GENERAL, _general(device, strings)),
         (Category.FMMU, bytes((*_FMMUS, 0xFF))),
-        (Category.SYNC_MANAGER, b"".join(_sync_manager(device.objects, sm) for sm in layout.all)),
+        (Category.SYNC_MANAGER, b"".join(_sync_manager(device.objects, sm) for sm in layout)),
     ]
     for category, mappings, assignment in (
         (Category.TXPDO, TX_MAPPINGS, TX_ASSIGN),

@@ -120,8 +120,8 @@ class Application:
         if before >= State.SAFE_OP > wanted:
             self._lock_process_data(True)
             self.sync.stop()
-        if before >= State.PRE_OP > wanted and self._mailbox is not None:
-            self._mailbox.stop()
+        if before >= State.PRE_OP > wanted:
+            # With it go messages, transfers and counters.
             self._mailbox = None
             self._lock(True, MAILBOX_OUT, MAILBOX_IN)
         if before < State.PRE_OP <= wanted:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli.segment import kinds
-from rtcp.config.faults import FAULTS, load_script
+from rtcp.virtual.faults.registry import FAULTS, load_script
 
 pytestmark = pytest.mark.alone
 

@@ -79,10 +79,9 @@ def thermometer(path: Path) -> Any:
 
 def wire_break(path: Path) -> Any:
     """The fault on a real segment object: named as a script names it, begun and cleared by the registry."""
-    from rtcp.config.faults import parse, sentence_of
     from rtcp.config.segment import load_segment
-    from rtcp.virtual.faults.registry import FaultRegistry
-    from rtcp.virtual.faults.slaves import FaultRefused
+    from rtcp.virtual.faults.fault import FaultRefused
+    from rtcp.virtual.faults.registry import FaultRegistry, parse, sentence_of
     from rtcp.virtual.server import make_segment
 
     config = load(path)

@@ -59,7 +59,7 @@ def test_no_cycle_record_was_torn_or_lost_in_these_trials(harness: Harness) -> N
 
 
 def test_every_kind_of_fault_is_in_the_matrix() -> None:
-    from rtcp.config.faults import FAULTS, parse
+    from rtcp.virtual.faults.registry import FAULTS, parse
 
     assert {fault["fault"] for case in CASES for fault in case.faults} == set(FAULTS)
     for case in CASES:

@@ -8,8 +8,8 @@ from random import Random
 
 import pytest
 
-from rtcp.config.faults import FAULTS, parse
 from rtcp.telemetry.soak import GROWTH, Resources, grown, random_fault, resources
+from rtcp.virtual.faults.registry import FAULTS, parse
 from tests.e2e.conftest import Platform
 from tests.faults.run import HOLD_MS
 

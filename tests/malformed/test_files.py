@@ -15,7 +15,6 @@ from random import Random
 import pytest
 
 from rtcp.config import ConfigError, default_config, load
-from rtcp.config.faults import load_script
 from rtcp.config.loader import load_kinematics
 from rtcp.config.motion_file import read_motion
 from rtcp.config.segment import load_segment
@@ -37,6 +36,7 @@ from rtcp.ipc.session import (
     read_session,
     session_file,
 )
+from rtcp.virtual.faults.registry import load_script
 from rtcp.virtual.segment import make_segment
 from tests.malformed.files import damaged
 

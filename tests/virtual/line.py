@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.faults.fault import Fault, Frames
+from rtcp.virtual.faults.registry import ActiveFault, Planned
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
 from rtcp.virtual.protocol import Command
@@ -184,3 +186,8 @@ def start_sync0(line: Line, slave: int, cycle: int, first_in: int = 10 * MS) -> 
     line.write(slave, 0x0990, (now + first_in).to_bytes(8, "little"))
     line.write(slave, 0x09A0, cycle.to_bytes(4, "little"))
     line.write(slave, 0x0981, b"\x03")
+
+
+def begin(segment: Segment, fault: Fault, t: int, lasts: float | None = None) -> ActiveFault:
+    """Let a fault begin at instant `t`; a call of what is returned ends it."""
+    return ActiveFault(Planned(fault, lasts=lasts), segment, Frames(lambda frame: None), t)

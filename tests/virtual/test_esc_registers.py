@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from rtcp.virtual.device import Emergency
 from rtcp.virtual.protocol import Command
 from tests.virtual.frames import Datagram
 from tests.virtual.line import (
@@ -190,6 +191,22 @@ def test_a_request_through_the_mailbox_is_answered_and_the_mailbox_empty_after_r
     assert answer[6:16] == bytes.fromhex("0030 43 1810 01 ad0b0000")
     assert line.read(0, 0x080D, 1)[0] & 0x08 == 0
     assert line.one(Command.FPRD, STATION, 0x1080, bytes(128)).counter == 0
+
+
+def test_a_slave_that_went_to_init_has_forgotten_messages_emergencies_transfers_and_the_masters_counter(
+    line: Line,
+) -> None:
+    line.to_pre_op()
+    line.segment.slaves[0].device.emergencies.append(Emergency(0x8611, 0x21))
+    line.write(0, 0x1000, SDO_READ_NAME.ljust(128, b"\0"))
+    line.write(0, 0x1000, bytes.fromhex("0a00 0000 00 23 0020 21 0120 00 15000000").ljust(128, b"\0"))
+    assert line.request(0, INIT) == (INIT, 0)
+    line.segment.slaves[0].device.emergencies.append(Emergency(0x8611, 0x21))
+    assert line.request(0, PRE_OP) == (PRE_OP, 0)
+    line.write(0, 0x1000, SDO_READ_NAME.ljust(128, b"\0"))
+    assert line.read(0, 0x1080, 128)[5:16] == bytes.fromhex("13 0030 43 1810 01 ad0b0000")
+    line.write(0, 0x1000, bytes.fromhex("0a00 0000 00 23 0020 00 31323334353637").ljust(128, b"\0"))
+    assert line.read(0, 0x1080, 128)[8:16] == bytes.fromhex("80 3132 33 01000405"), "no transfer is under way"
 
 
 def test_a_full_mailbox_refuses_a_second_message(line: Line) -> None:

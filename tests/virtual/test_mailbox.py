@@ -148,23 +148,6 @@ def test_sdo_information_comes_as_several_messages():
     assert all(len(found) <= 24 and len(found) == 6 + found[0] for found in sent)
 
 
-def test_a_transfer_ends_with_the_reset():
-    box = mailbox()
-    box.receive(buffer("0a00 0000 00 13 0020 21 0120 00 15000000"), PREOP)
-    box.reset()
-    assert not box.pending()
-    box.receive(buffer("0a00 0000 00 13 0020 00 31323334353637"), PREOP)
-    assert drain(box) == [message("0a00 0000 00 13 0020 80 3132 33 01000405")]
-
-
-def test_a_reset_forgets_emergencies_and_the_masters_counter():
-    box = mailbox(Emergency(0x8611, 0x21))
-    box.receive(buffer(UPLOAD, 1), PREOP)
-    box.reset()
-    box.receive(buffer(UPLOAD, 1), PREOP)
-    assert drain(box) == [message(UPLOADED, 1)]
-
-
 def test_a_master_that_never_reads_exhausts_no_memory():
     box = mailbox()
     for _ in range(10 * MAX_WAITING):

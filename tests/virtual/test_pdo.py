@@ -57,7 +57,7 @@ def refusal(call, *arguments) -> int:
 
 
 def test_the_default_layout_has_the_mailboxes_and_buffers_where_masters_expect_them():
-    registers = [(sm.start, sm.length, sm.control, int(sm.type)) for sm in SyncManagerLayout().all]
+    registers = [(sm.start, sm.length, sm.control, int(sm.type)) for sm in SyncManagerLayout()]
     assert registers == [(0x1000, 128, 0x26, 1), (0x1080, 128, 0x22, 2), (0x1100, 0, 0x64, 3), (0x1400, 0, 0x20, 4)]
 
 
@@ -122,7 +122,6 @@ def test_floats_and_octet_strings_are_mapped_too(with_bit):
     target = bytearray(len(wire))
     image.pack(target)
     assert target == wire
-    assert image.packed() == wire
 
 
 def test_an_assignment_without_pdos_has_an_empty_image():

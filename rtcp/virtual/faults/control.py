@@ -1,5 +1,7 @@
 """The control socket of a segment: faults begun and cleared, and questions, by other processes while it runs.
 
+What the joints truly do, whatever the master hears of it, is among the questions.
+
 A Unix socket of packets, one JSON object each: `{"do": "fault", "fault": {...}}` is answered by `{"ok": true, "result":
 ...}` or by `{"ok": false, "error": "a sentence"}`. Frames come first: nothing here waits for a client.
 """
@@ -12,18 +14,18 @@ import select
 import socket
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rtcp.config.document import shown
-from rtcp.config.faults import installed, parse, sentence_of
 from rtcp.config.validation import unknown_key
-from rtcp.virtual.faults.ground_truth import GroundTruth
-from rtcp.virtual.faults.registry import FaultRegistry
-from rtcp.virtual.faults.slaves import FaultRefused
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
+from rtcp.virtual.models.cubemars import CubemarsDrive
+from rtcp.virtual.segment import Segment
+from rtcp.virtual.slave import Slave
 
 LONGEST_REQUEST = 1024
 MOST_KEYS = 10
@@ -31,6 +33,10 @@ MOST_KEYS = 10
 MOST_CLIENTS = 16
 """When another comes, the one that has been silent longest has to go."""
 BACKLOG = 16
+STANDSTILL = 0.002
+"""A joint slower than this, rad/s, stands."""
+PATIENCE = 10_000_000_000
+"""Without a request for so many ns the joints are not watched any more."""
 
 
 @contextmanager
@@ -94,10 +100,14 @@ class Control:
         self._clients: dict[int, socket.socket] = {}
         self._epoll = select.epoll()
         self._epoll.register(listener, select.EPOLLIN)
-        self._verbs: MappingProxyType[str, Callable[[dict[str, Any], int], Any]] = MappingProxyType({
-            "fault": self._fault, "clear": self._clear, "faults": self._faults, "truth": self._tell_truth,
-            "clear_peaks": self._clear_peaks,
-        })  # fmt: skip
+        self._verbs: dict[str, tuple[tuple[str, ...], Callable[[dict[str, Any], int], Any]]] = {
+            "fault": (("fault",), self._fault),
+            "clear": (("id",), self._clear),
+            "faults": ((), lambda _, now: registry.listing(now)),
+            "truth": ((), lambda _, now: truth.answer(now)),
+            "clear_peaks": ((), lambda _, now: truth.clear_peaks(now)),
+        }
+        """What a request can ask for: its keys, and what answers it."""
         for name in installed():
             # What a kind allows is worked out when it is first named, which takes longer than a frame may wait.
             parse({"fault": name})
@@ -163,12 +173,15 @@ class Control:
                 raise FaultRefused(f"do: found {shown(verb)}, allowed is one of {', '.join(self._verbs)}")
             now = time.monotonic_ns()
             self._truth.requested(now)
-            return {"ok": True, "result": self._verbs[verb](request, now)}
+            known, answer = self._verbs[verb]
+            for key in request:
+                if key not in known:
+                    raise FaultRefused(f"{key}: {unknown_key(key, ['do', *known])}")
+            return {"ok": True, "result": answer(request, now)}
         except FaultRefused as refusal:
             return {"ok": False, "error": str(refusal)}
 
     def _fault(self, request: dict[str, Any], now: int) -> dict[str, int]:
-        _only(request, "fault")
         mapping = request.get("fault")
         if isinstance(mapping, dict) and len(mapping) > MOST_KEYS:
             raise FaultRefused(f"a fault has at most {MOST_KEYS} keys, found {len(mapping)}")
@@ -180,24 +193,10 @@ class Control:
         return {"id": self._registry.begin(planned, now)}
 
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
-        _only(request, "id")
         number = request.get("id")
         if number is not None and type(number) is not int:
             raise FaultRefused(f"id: found {shown(number)}, allowed is the number of a fault, or none for all")
         return {"cleared": self._registry.clear(number, now)}
-
-    def _faults(self, request: dict[str, Any], now: int) -> list[dict[str, Any]]:
-        _only(request)
-        return self._registry.listing(now)
-
-    def _tell_truth(self, request: dict[str, Any], now: int) -> dict[str, Any]:
-        _only(request)
-        return self._truth.answer(now)
-
-    def _clear_peaks(self, request: dict[str, Any], now: int) -> dict[str, Any]:
-        _only(request)
-        self._truth.clear_peaks(now)
-        return {}
 
 
 def _request(packet: bytes) -> dict[str, Any]:
@@ -212,7 +211,91 @@ def _request(packet: bytes) -> dict[str, Any]:
     return request
 
 
-def _only(request: dict[str, Any], *known: str) -> None:
-    for key in request:
-        if key not in known:
-            raise FaultRefused(f"{key}: {unknown_key(key, ['do', *known])}")
+class _Joint:
+    """A drive that is watched: when it last moved, how fast it was at most."""
+
+    __slots__ = ("drive", "moved", "peak")
+
+    def __init__(self, drive: CubemarsDrive) -> None:
+        self.drive = drive
+        self.moved = 0
+        self.peak = 0.0
+
+    def look(self, now: int) -> None:
+        """Remember what it does now."""
+        speed = abs(self.drive.mechanics.velocity)
+        if speed > STANDSTILL:
+            self.moved = now
+            self.peak = max(self.peak, speed)
+
+
+class GroundTruth:
+    """Watches the joints from the first question on, for as long as requests come: else a segment pays nothing.
+
+    While `watching`, `look` is to be called after each step of a device.
+    """
+
+    def __init__(self, segment: Segment, models: Sequence[str]) -> None:
+        self.watching = False
+        self._asked: int | None = None
+        """Instant of the last request; None: nobody has ever asked for the truth."""
+        self._chain = segment.chain
+        self._segment = segment
+        self._models = tuple(models)
+        self._joints = {
+            slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
+        }
+
+    def look(self, slave: Slave, now: int) -> None:
+        """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
+        joint = self._joints.get(slave)
+        if joint is not None:
+            joint.look(now)
+        if self._asked is not None and now - self._asked > PATIENCE:
+            self.watching = False
+
+    def requested(self, now: int) -> None:
+        """Somebody asked for something: who has once asked for the truth may ask for it again."""
+        if self._asked is not None:
+            self._watch(now)
+
+    def _watch(self, now: int) -> None:
+        self.watching = True
+        self._asked = now
+
+    def clear_peaks(self, now: int) -> None:
+        """Forget how fast the joints were."""
+        self._watch(now)
+        for joint in self._joints.values():
+            joint.peak = 0.0
+
+    def answer(self, now: int) -> dict[str, Any]:
+        """Return what is true at instant `now`, slave by slave."""
+        self._watch(now)
+        for joint in self._joints.values():
+            joint.look(now)
+        slaves = zip(self._segment.slaves, self._models, strict=True)
+        return {
+            "time_ns": now,
+            "slaves": [self._of(position, slave, model) for position, (slave, model) in enumerate(slaves, 1)],
+        }
+
+    def _of(self, position: int, slave: Slave, model: str) -> dict[str, Any]:
+        found: dict[str, Any] = {
+            "position": position,
+            "model": model,
+            "al": slave.application.state.name.replace("_", "-"),
+            "reachable": position <= self._segment.chain.reach,
+        }
+        joint = self._joints.get(slave)
+        if joint is not None:
+            drive = joint.drive
+            found |= {
+                "position_rad": drive.mechanics.position,
+                "velocity_rad_s": drive.mechanics.velocity,
+                "state": drive.state.name.lower().replace("_", " "),
+                "torque_on": drive.powered,
+                "moved_ns": joint.moved,
+                "peak_rad_s": joint.peak,
+            }
+        return found

@@ -1,298 +1,372 @@
-"""Faults of slaves and of the cables between them."""
+"""The kinds of faults of slaves, of the cables between them and of their devices."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from types import MappingProxyType
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal, TypeVar
 
-from rtcp.config.fault_kinds import PluginFault
-from rtcp.config.faults import (
-    AlFall,
-    AlHang,
-    AlRefuse,
-    CableFault,
-    ClockDrift,
-    ClockJump,
-    Corrupt,
-    DriveFault,
-    Fault,
-    InputsFrozen,
-    PowerFault,
-    SdoAbort,
-    SdoLate,
-    StickCode,
-    Sync0Lost,
-    TerminalFault,
-    WorkingCounter,
-)
+from annotated_types import Ge, Gt, Le
+
+from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.distributed_clock import Clock, SyncGenerator
-from rtcp.virtual.faults import devices
-from rtcp.virtual.faults.devices import FaultRefused
-from rtcp.virtual.faults.selector import FrameSelector
+from rtcp.virtual.faults.fault import (
+    Cable,
+    DeviceFault,
+    End,
+    Fault,
+    FaultRefused,
+    Frames,
+    Position,
+    SlaveFault,
+    StrikingFault,
+    cable_of,
+    place_of,
+    slave_at,
+)
+from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
+from rtcp.virtual.models.diewu import BrokenTerminals
+from rtcp.virtual.models.protection import ErrorCode
 from rtcp.virtual.protocol import State
 from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
-from rtcp.virtual.wire import Miscount
 
-__all__ = ["FaultRefused", "SlaveUndo", "Undo", "begin"]
+AlCode = Annotated[int, Ge(1), Le(0xFFFF)]
+DriveError = Literal[
+    "over-current", "over-voltage", "under-voltage", "over-temperature", "encoder", "over-speed", "following-error"
+]
+STICK = 0x3F
+"""The joystick's lines: the six first inputs."""
 
-_T = TypeVar("_T")
-
-Undo = Callable[[int], None]
-"""Ends a fault at an instant; it may have `over`, whether it has passed by itself."""
-
-
-class SlaveUndo:
-    """Ends one of these faults, once."""
-
-    def __init__(self, segment: Segment, end: Undo | None, strikes: _Counted | None = None) -> None:
-        self._segment = segment
-        self._end = end
-        self._strikes = strikes
-
-    @property
-    def over(self) -> bool:
-        """Whether the fault has passed by itself: it happened once, or its burst is at its end."""
-        return self._end is None or (self._strikes is not None and self._strikes.passed)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """What was done to frames."""
-        return {} if self._strikes is None else {self._strikes.what: self._strikes.count}
-
-    def __call__(self, t: int) -> None:
-        """End the fault at instant `t`."""
-        over = self.over
-        end, self._end = self._end, None
-        if end is not None and not over:
-            _catch_up(self._segment, t)
-            end(t)
-            self._segment.look_at(t)
+_D = TypeVar("_D", bound=DeviceModel)
 
 
-class _Counted:
-    """The frames that a fault strikes, counted."""
-
-    def __init__(self, what: str, fault: Corrupt | WorkingCounter) -> None:
-        self.what = what
-        self.count = 0
-        self.when_passed: Callable[[], object] | None = None
-        """Called when the burst has passed: it costs nothing any more."""
-        self._strikes = FrameSelector(fault)
-
-    @property
-    def passed(self) -> bool:
-        return self._strikes.passed
-
-    def __call__(self) -> bool:
-        struck = self._strikes.next()
-        self.count += struck
-        if struck and self.passed and self.when_passed is not None:
-            self.when_passed()
-        return struck
+# -- cables and supply ----------------------------------------------------------------------------------------------
 
 
-def begin(segment: Segment, fault: Fault, t: int, lasts: float | None = None) -> SlaveUndo:
-    """Let `fault` begin at instant `t`; return what ends it.
+@dataclass(frozen=True)
+class CableFault(Fault):
+    """The cable behind slave `after` is broken: frames turn round there, the slaves behind hear nothing."""
 
-    `lasts` (s) is what was planned: the fault of a drive without it is a single occurrence and over at once.
+    name = "cable"
+    after: Cable
 
-    Raises:
-        FaultRefused: the segment has no such slave, or it is not of the kind that can have this fault.
+    def start(self, segment: Segment, frames: Frames, t: int) -> End:
+        """Cut the cable."""
+        cable = cable_of(segment, self.after)
+
+        def join(_: int) -> None:
+            segment.chain.join(cable)
+            segment.rewire()
+
+        segment.chain.cut(cable)
+        segment.rewire()
+        return join
+
+
+@dataclass(frozen=True)
+class PowerFault(SlaveFault):
+    """A slave has no supply: no frame passes it. When it comes back its registers are those of power-on, in INIT."""
+
+    name = "power"
+
+    def start(self, segment: Segment, frames: Frames, t: int) -> End:
+        """Take the supply away."""
+        slave_at(segment, self.slave)
+
+        def on(t: int) -> None:
+            segment.chain.power_on(self.slave, t)
+            segment.rewire()
+
+        segment.chain.power_off(self.slave, t)
+        segment.rewire()
+        return on
+
+
+@dataclass
+class Corrupt(StrikingFault):
+    """Frames are damaged on the cable behind slave `after`, on their way `out` or `back`: their checksum is wrong.
+
+    Out: the slaves before it have worked; the next one counts an error (0x0300), those behind it count a forwarded one
+    (0x0308). Back: all slaves have worked; slave `after` counts an error at port 1 (0x0302), those before it count a
+    forwarded one (0x0309). Either way the master gets nothing.
     """
-    make: Callable[[Segment, Any, int], SlaveUndo] | None = _KINDS.get(type(fault))
-    if isinstance(fault, PluginFault):
-        make = _plugin
-    if make is None:
-        raise FaultRefused(f"{fault.name} is no fault of a slave or a cable")
-    _catch_up(segment, t)
-    undo = make(segment, fault, t)
-    if isinstance(fault, DriveFault) and lasts is None:
-        undo(t)
-    segment.look_at(t)
-    return undo
+
+    name = "corrupt"
+    counted = ("corrupted",)
+    after: Cable
+    way: Literal["out", "back"] = "out"
+
+    def start(self, segment: Segment, frames: Frames, t: int) -> End:
+        """Damage frames from now on."""
+        damage = Damage(cable_of(segment, self.after), self.strikes, self.way == "back")
+        return self.listed(segment.damages, damage)
 
 
-def _catch_up(segment: Segment, t: int) -> None:
-    """What is due before `t` happens before what is to come."""
-    if segment.next_event <= t:
-        segment.tick(t)
+# -- the state machine, mailboxes and the working counter -----------------------------------------------------------
 
 
-def _slave(segment: Segment, number: int) -> Slave:
-    if number > len(segment.slaves):
-        raise FaultRefused(f"there is no slave {number}: the segment has slaves 1 to {len(segment.slaves)}")
-    return segment.slaves[number - 1]
+@dataclass(frozen=True)
+class AlRefuse(SlaveFault):
+    """A slave refuses to go to `state`, with AL status code `code`."""
+
+    name = "al_refuse"
+    state: Literal["PRE-OP", "SAFE-OP", "OP"] = "OP"
+    code: AlCode = 0x0001
+
+    def begin(self, slave: Slave, t: int) -> End:
+        """Refuse from now on."""
+        refusals, refusal = slave.faults.refusals, (_state(self.state), self.code)
+        refusals.append(refusal)
+        return lambda _: refusals.remove(refusal)
 
 
-def _cable(segment: Segment, after: int) -> int:
-    last = len(segment.slaves)
-    if after >= last:
-        raise FaultRefused(
-            f"there is no cable behind slave {after}: cables lie behind slaves 0 (the master) to {last - 1}"
-        )
-    return after
+@dataclass(frozen=True)
+class AlHang(SlaveFault):
+    """A slave hangs in its AL state: what is asked of it is neither done nor refused."""
+
+    name = "al_hang"
+
+    def begin(self, slave: Slave, t: int) -> End:
+        """Hang from now on; what is asked meanwhile is done at the end."""
+
+        def go_on(t: int) -> None:
+            slave.faults.hangs -= 1
+            slave.application.attend(t)
+
+        slave.faults.hangs += 1
+        return go_on
 
 
-def _cut(segment: Segment, fault: CableFault, t: int) -> SlaveUndo:
-    cable = _cable(segment, fault.after)
+@dataclass(frozen=True)
+class AlFall(SlaveFault):
+    """A slave leaves OP by itself, once, to SAFE-OP or PRE-OP with the error flag and `code`."""
 
-    def join(_: int) -> None:
-        segment.chain.join(cable)
-        segment.rewire()
+    name = "al_fall"
+    once = True
+    state: Literal["PRE-OP", "SAFE-OP"] = "SAFE-OP"
+    code: AlCode = 0x0001
 
-    segment.chain.cut(cable)
-    segment.rewire()
-    return SlaveUndo(segment, join)
-
-
-def _power(segment: Segment, fault: PowerFault, t: int) -> SlaveUndo:
-    _slave(segment, fault.slave)
-
-    def on(t: int) -> None:
-        segment.chain.power_on(fault.slave, t)
-        segment.rewire()
-
-    segment.chain.power_off(fault.slave, t)
-    segment.rewire()
-    return SlaveUndo(segment, on)
+    def begin(self, slave: Slave, t: int) -> None:
+        """Leave OP."""
+        if slave.application.state != State.OP:
+            state = slave.application.state.name.replace("_", "-")
+            raise FaultRefused(f"slave {self.slave} is in {state}: al_fall takes a slave out of OP")
+        slave.application.fall(_state(self.state), self.code)
 
 
-def _refuse(segment: Segment, fault: AlRefuse, t: int) -> SlaveUndo:
-    refusals = _slave(segment, fault.slave).faults.refusals
-    state = State[fault.state.replace("-", "_")]
-    refusals.append((state, fault.code))
-    return SlaveUndo(segment, lambda _: refusals.remove((state, fault.code)))
+@dataclass(frozen=True)
+class SdoLate(SlaveFault):
+    """A slave answers each SDO `ms` later than it would."""
+
+    name = "sdo_late"
+    ms: Annotated[float, Gt(0), Le(60_000)]
+
+    def begin(self, slave: Slave, t: int) -> End:
+        """Delay the answers from now on."""
+        delays, delay = slave.faults.sdo_delays, round(self.ms * 1e6)
+        delays.append(delay)
+        return lambda _: delays.remove(delay)
 
 
-def _hang(segment: Segment, fault: AlHang, t: int) -> SlaveUndo:
-    slave = _slave(segment, fault.slave)
+@dataclass(frozen=True)
+class SdoAbort(SlaveFault):
+    """A slave aborts each SDO service (of object `index` only, unless that is 0) with `code`."""
 
-    def go_on(t: int) -> None:
-        slave.faults.hangs -= 1
-        slave.application.attend(t)
+    name = "sdo_abort"
+    code: Annotated[int, Ge(1), Le(0xFFFFFFFF)] = 0x08000020
+    index: Annotated[int, Ge(0), Le(0xFFFF)] = 0
 
-    slave.faults.hangs += 1
-    return SlaveUndo(segment, go_on)
-
-
-def _fall(segment: Segment, fault: AlFall, t: int) -> SlaveUndo:
-    slave = _slave(segment, fault.slave)
-    if slave.application.state != State.OP:
-        state = slave.application.state.name.replace("_", "-")
-        raise FaultRefused(f"slave {fault.slave} is in {state}: al_fall takes a slave out of OP")
-    slave.application.fall(State[fault.state.replace("-", "_")], fault.code)
-    return SlaveUndo(segment, None)
+    def begin(self, slave: Slave, t: int) -> End:
+        """Abort from now on."""
+        aborts, abort = slave.faults.sdo_aborts, (self.index, self.code)
+        aborts.append(abort)
+        return lambda _: aborts.remove(abort)
 
 
-def _late(segment: Segment, fault: SdoLate, t: int) -> SlaveUndo:
-    delays = _slave(segment, fault.slave).faults.sdo_delays
-    delay = round(fault.ms * 1e6)
-    delays.append(delay)
-    return SlaveUndo(segment, lambda _: delays.remove(delay))
+@dataclass
+class WorkingCounter(StrikingFault):
+    """A slave takes part in process data but does not count itself in the working counter."""
+
+    name = "wkc"
+    counted = ("not_counted",)
+    slave: Position
+
+    def start(self, segment: Segment, frames: Frames, t: int) -> End:
+        """Leave the slave out from now on."""
+        return self.listed(segment.miscounts, (slave_at(segment, self.slave), self.strikes))
 
 
-def _abort(segment: Segment, fault: SdoAbort, t: int) -> SlaveUndo:
-    aborts = _slave(segment, fault.slave).faults.sdo_aborts
-    aborts.append((fault.index, fault.code))
-    return SlaveUndo(segment, lambda _: aborts.remove((fault.index, fault.code)))
+def _state(name: str) -> State:
+    return State[name.replace("-", "_")]
 
 
-def _corrupt(segment: Segment, fault: Corrupt, t: int) -> SlaveUndo:
-    strikes = _Counted("corrupted", fault)
-    damage = Damage(_cable(segment, fault.after), strikes, fault.way == "back")
-    return _list(segment, segment.damages, damage, strikes)
+# -- clocks ---------------------------------------------------------------------------------------------------------
 
 
-def _miscount(segment: Segment, fault: WorkingCounter, t: int) -> SlaveUndo:
-    strikes = _Counted("not_counted", fault)
-    miscount: Miscount = (_slave(segment, fault.slave), strikes)
-    return _list(segment, segment.miscounts, miscount, strikes)
+@dataclass(frozen=True)
+class ClockFault(SlaveFault):
+    """Base of the faults of a distributed clock."""
+
+    def begin(self, slave: Slave, t: int) -> End | None:
+        """Let it begin in a slave that has a clock."""
+        if slave.clock is None:
+            raise FaultRefused(f"slave {self.slave} ({slave.device.identity.name}) has no distributed clock")
+        return self.disturb(slave, slave.clock, t)
+
+    def disturb(self, slave: Slave, clock: Clock, t: int) -> End | None:
+        """Let it begin in the clock of `slave`, as `start`."""
+        raise NotImplementedError
 
 
-def _list(segment: Segment, listed: list[_T], entry: _T, strikes: _Counted) -> SlaveUndo:
-    """Put `entry`, which calls `strikes`, on a list of the segment until its burst has passed or it is cleared."""
+@dataclass(frozen=True)
+class Sync0Lost(ClockFault):
+    """A slave's SYNC0 stops."""
 
-    def leave() -> None:
-        listed.remove(entry)
-        # entry -> strikes -> leave -> entry is a ring, and the segment's process collects none.
-        strikes.when_passed = None
+    name = "sync0"
 
-    listed.append(entry)
-    strikes.when_passed = leave
-    return SlaveUndo(segment, lambda _: leave(), strikes)
+    def disturb(self, slave: Slave, clock: Clock, t: int) -> End:
+        """Stop the pulses."""
+
+        def resume(t: int) -> None:
+            slave.faults.sync0_losses -= 1
+            if not slave.faults.sync0_losses and (sync0 := _sync0(slave)) is not None:
+                sync0.resume(t)
+
+        slave.faults.sync0_losses += 1
+        if (sync0 := _sync0(slave)) is not None:
+            sync0.suspend()
+        return resume
+
+
+@dataclass(frozen=True)
+class ClockJump(ClockFault):
+    """A slave's clock jumps by `us`, once."""
+
+    name = "clock_jump"
+    once = True
+    us: Annotated[float, Ge(-1_000_000), Le(1_000_000)]
+
+    def disturb(self, slave: Slave, clock: Clock, t: int) -> None:
+        """Jump."""
+        clock.jump(round(self.us * 1000))
+        if (sync0 := _sync0(slave)) is not None and sync0.due is not None:
+            sync0.schedule(t)
+
+
+@dataclass(frozen=True)
+class ClockDrift(ClockFault):
+    """A slave's own clock runs fast by `ppm` more than it did."""
+
+    name = "clock_drift"
+    ppm: Annotated[float, Ge(-1000), Le(1000)] = 200.0
+
+    def disturb(self, slave: Slave, clock: Clock, t: int) -> End:
+        """Drift from now on."""
+
+        def change(ppm: float, t: int) -> None:
+            slave.faults.drift_ppm += ppm
+            # Not the clock of before: the supply may have been away meanwhile.
+            if slave.clock is not None:
+                slave.clock.change_drift(ppm, t)
+
+        change(self.ppm, t)
+        return lambda t: change(-self.ppm, t)
 
 
 def _sync0(slave: Slave) -> SyncGenerator | None:
     return None if slave.esc.dc is None else slave.esc.dc.sync0
 
 
-def _clock(segment: Segment, number: int) -> tuple[Slave, Clock]:
-    slave = _slave(segment, number)
-    if slave.clock is None:
-        raise FaultRefused(f"slave {number} ({slave.device.identity.name}) has no distributed clock")
-    return slave, slave.clock
+# -- devices --------------------------------------------------------------------------------------------------------
 
 
-def _lose_sync0(segment: Segment, fault: Sync0Lost, t: int) -> SlaveUndo:
-    slave, _ = _clock(segment, fault.slave)
+@dataclass(frozen=True)
+class DriveFault(DeviceFault):
+    """A drive meets an error, sends its emergency message and reacts as its fault reaction says.
 
-    def resume(t: int) -> None:
-        slave.faults.sync0_losses -= 1
-        if not slave.faults.sync0_losses and (sync0 := _sync0(slave)) is not None:
-            sync0.resume(t)
+    While the fault lasts a fault reset is refused; `lasts` left out: a single occurrence, which a reset clears.
+    """
 
-    slave.faults.sync0_losses += 1
-    if (sync0 := _sync0(slave)) is not None:
-        sync0.suspend()
-    return SlaveUndo(segment, resume)
+    name = "drive"
+    once_unless_it_lasts = True
+    slave: Position
+    error: DriveError
 
-
-def _jump(segment: Segment, fault: ClockJump, t: int) -> SlaveUndo:
-    slave, clock = _clock(segment, fault.slave)
-    clock.jump(round(fault.us * 1000))
-    if (sync0 := _sync0(slave)) is not None and sync0.due is not None:
-        sync0.schedule(t)
-    return SlaveUndo(segment, None)
+    def begin(self, devices: Sequence[DeviceModel]) -> End:
+        """Let the drive meet the error."""
+        drive = _device_at(devices, self.slave, CubemarsDrive, "drive")
+        code = ErrorCode[self.error.upper().replace("-", "_")]
+        drive.begin_fault(code)
+        return lambda _: drive.end_fault(code)
 
 
-def _drift(segment: Segment, fault: ClockDrift, t: int) -> SlaveUndo:
-    slave, _ = _clock(segment, fault.slave)
+@dataclass(frozen=True)
+class InputsFrozen(DeviceFault):
+    """Inputs and counter of an IO box keep their value, as if its processor hung; frames are answered as ever."""
 
-    def change(ppm: float, t: int) -> None:
-        slave.faults.drift_ppm += ppm
-        # Not the clock of before: the supply may have been away meanwhile.
-        if slave.clock is not None:
-            slave.clock.change_drift(ppm, t)
+    name = "input_frozen"
+    slave: Position
 
-    change(fault.ppm, t)
-    return SlaveUndo(segment, lambda t: change(-fault.ppm, t))
+    def begin(self, devices: Sequence[DeviceModel]) -> End:
+        """Freeze the inputs."""
+        box = _device_at(devices, self.slave, DiewuIoBox, "IO box")
 
+        def thaw(_: int) -> None:
+            box.freezes -= 1
 
-def _device(segment: Segment, fault: devices.DeviceFault, t: int) -> SlaveUndo:
-    return SlaveUndo(segment, devices.begin([slave.device for slave in segment.slaves], fault))
-
-
-def _plugin(segment: Segment, fault: PluginFault, t: int) -> SlaveUndo:
-    return SlaveUndo(segment, fault.begin([slave.device for slave in segment.slaves]))
+        box.freezes += 1
+        return thaw
 
 
-_KINDS: MappingProxyType[type[Fault], Callable[[Segment, Any, int], SlaveUndo]] = MappingProxyType({
-    CableFault: _cut,
-    PowerFault: _power,
-    AlRefuse: _refuse,
-    AlHang: _hang,
-    AlFall: _fall,
-    SdoLate: _late,
-    SdoAbort: _abort,
-    Corrupt: _corrupt,
-    WorkingCounter: _miscount,
-    DriveFault: _device,
-    Sync0Lost: _lose_sync0,
-    ClockJump: _jump,
-    ClockDrift: _drift,
-    TerminalFault: _device,
-    InputsFrozen: _device,
-    StickCode: _device,
-})  # fmt: skip
+def _device_at(devices: Sequence[DeviceModel], number: int, kind: type[_D], words: str) -> _D:
+    device = devices[place_of(devices, number)]
+    if not isinstance(device, kind):
+        raise FaultRefused(f"slave {number} ({device.identity.name}) is no {words}")
+    return device
+
+
+class TerminalsFault(DeviceFault):
+    """Base of the faults of the first IO box's input terminals."""
+
+    def begin(self, devices: Sequence[DeviceModel]) -> End:
+        """Break the terminals."""
+        box = next((device for device in devices if isinstance(device, DiewuIoBox)), None)
+        if box is None:
+            raise FaultRefused(f"there is no IO box on the segment: {self.name} is a fault of its inputs")
+        broken = self.broken(box.inputs)
+        box.broken.append(broken)
+        return lambda _: box.broken.remove(broken)
+
+    def broken(self, inputs: int) -> BrokenTerminals:
+        """Return which terminals are broken, and how; `inputs` are the levels of now."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class TerminalFault(TerminalsFault):
+    """An input terminal of the IO box is stuck `high` or `low`, or bounces with a half period of `ms`."""
+
+    name = "input"
+    number: Annotated[int, Ge(1), Le(16)]
+    how: Literal["high", "low", "bounce"]
+    ms: Annotated[float, Gt(0), Le(1000)] = 2.0
+
+    def broken(self, inputs: int) -> BrokenTerminals:
+        """Return one terminal; the first thing that is seen of one that bounces is the other level."""
+        mask = 1 << self.number - 1
+        if self.how == "bounce":
+            return BrokenTerminals(mask, ~inputs, self.ms * 1e-3)
+        return BrokenTerminals(mask, mask if self.how == "high" else 0)
+
+
+@dataclass(frozen=True)
+class StickCode(TerminalsFault):
+    """The joystick's six inputs show `value`, whatever the stick does; 63 is neutral, most values mean nothing."""
+
+    name = "stick_code"
+    value: Annotated[int, Ge(0), Le(63)]
+
+    def broken(self, inputs: int) -> BrokenTerminals:
+        """Return the joystick's terminals."""
+        return BrokenTerminals(STICK, self.value)

@@ -8,21 +8,21 @@ from typing import ClassVar
 
 from rtcp.virtual.device import DeviceModel, Option, number
 from rtcp.virtual.models.cia402 import STATE_BITS, State, StateMachine, Status
-from rtcp.virtual.models.cyclic_modes import CyclicPosition, CyclicTorque, CyclicVelocity, Hold, Motion, Stop
+from rtcp.virtual.models.cyclic_modes import (
+    ERROR,
+    LIMIT,
+    CyclicPosition,
+    CyclicTorque,
+    CyclicVelocity,
+    Hold,
+    Motion,
+    Profile,
+    Stop,
+)
 from rtcp.virtual.models.drive_objects import UNIT, define_objects
 from rtcp.virtual.models.mechanics import SIZES, ActuatorSize, Axis, Mechanics
-from rtcp.virtual.models.profile_modes import Homing, Profile, ProfilePosition, ProfileVelocity
-from rtcp.virtual.models.protection import (
-    COMMUNICATION,
-    ENCODER_RANGE,
-    FAULTS,
-    FOLLOWING_ERROR,
-    OVER_SPEED,
-    POSITION_RANGE,
-    Condition,
-    ErrorLog,
-    Feedback,
-)
+from rtcp.virtual.models.profile_modes import Homing, ProfilePosition, ProfileVelocity
+from rtcp.virtual.models.protection import AT_ONCE, ENCODER_RANGE, Condition, ErrorCode, ErrorLog, Feedback
 from rtcp.virtual.objects import ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
 
@@ -32,8 +32,6 @@ TX_PDO = ((0x6041, 0, 16), (0x6064, 0, 32), (0x606C, 0, 32), (0x6077, 0, 32), (0
 _SELF_TEST = 0.1
 """How long (s) the drive stays in Not Ready To Switch On after power-on."""
 _HALT = 0x100
-_LIMIT = int(Status.INTERNAL_LIMIT)
-_ERROR = int(Status.MODE_ERROR)
 _LONGEST = Axis.LONGEST_STEP * 1.000001
 
 
@@ -162,12 +160,12 @@ class CubemarsDrive(DeviceModel):
         Losing them with the power stage on is fault 0x8130.
         """
         if self.outputs_valid and not valid and self._motion is not None:
-            self._fail(COMMUNICATION)
+            self._fail(ErrorCode.COMMUNICATION)
         self.outputs_valid = valid
         self._compose()
 
     def inject_fault(self, code: int) -> None:
-        """Let the fault `code` (0x603F) happen now; codes outside the table `FAULTS` react as 0x605E says.
+        """Let the fault `code` (0x603F) happen now; codes outside `AT_ONCE` react as 0x605E says.
 
         Raises:
             ValueError: `code` is no error code.
@@ -218,15 +216,15 @@ class CubemarsDrive(DeviceModel):
             motion.update(controlword, h, count)
             bits = motion.bits
             if axis.saturated:
-                bits |= _LIMIT
+                bits |= LIMIT
             if motion.closed:
                 following = axis.demand - axis.mechanics.position - axis.offset
                 window = self._window.value * UNIT
                 if following > window or following < -window:
-                    bits |= _ERROR
+                    bits |= ERROR
                     self._following_time += dt
                     if self._following_time * 1000.0 >= self._window_time.value:
-                        self._fail(FOLLOWING_ERROR)
+                        self._fail(ErrorCode.FOLLOWING_ERROR)
                 else:
                     self._following_time = 0.0
         self._protect(dt)
@@ -245,9 +243,9 @@ class CubemarsDrive(DeviceModel):
         mechanics = self.mechanics
         fastest = self._max_speed.value * UNIT
         if not -fastest <= mechanics.velocity <= fastest:
-            self._fail(OVER_SPEED)
+            self._fail(ErrorCode.OVER_SPEED)
         if not -ENCODER_RANGE <= mechanics.position <= ENCODER_RANGE:
-            self._fail(POSITION_RANGE)
+            self._fail(ErrorCode.POSITION_RANGE)
         if self.condition.wear(self.axis.torque, dt):
             self._report_condition()
             code = self.condition.fault()
@@ -374,7 +372,7 @@ class CubemarsDrive(DeviceModel):
     def _fail(self, code: int) -> None:
         """Transition 13: tell the fault and begin the reaction to it (0x605E)."""
         state = self._machine.state
-        at_once = code in FAULTS and FAULTS[code].at_once
+        at_once = code in AT_ONCE
         if state is State.FAULT or (state is State.FAULT_REACTION_ACTIVE and not at_once):
             return
         self._errors.add(code)

@@ -6,19 +6,19 @@ statusword that the mode owns.
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import ClassVar
 
 from rtcp.virtual.device import number
 from rtcp.virtual.models.cia402 import Status
 from rtcp.virtual.models.drive_objects import UNIT
 from rtcp.virtual.models.mechanics import Axis
-from rtcp.virtual.models.profile_modes import ramp
 from rtcp.virtual.objects import ObjectDictionary
 
 # Plain ints: flag arithmetic is too slow for every step.
-_REACHED = int(Status.TARGET_REACHED)
-_LIMIT = int(Status.INTERNAL_LIMIT)
-_FOLLOWS = int(Status.MODE_SPECIFIC)
+REACHED = int(Status.TARGET_REACHED)
+LIMIT = int(Status.INTERNAL_LIMIT)
+SPECIFIC = int(Status.MODE_SPECIFIC)
+ERROR = int(Status.MODE_ERROR)
 _CATCHING_UP = 1.02
 _CREEP = 0.005
 """What the position loop may add to the speed limit to make good what it lags behind: a factor, and rad/s."""
@@ -28,38 +28,74 @@ _STOP_PATIENCE = 0.5
 """A joint that still moves so long (s) after its ramp has ended is moved by something else: the stop is over."""
 
 
-class Motion(Protocol):
-    """What moves the axis while the power stage is on."""
+class Motion:
+    """What moves the axis while the power stage is on. Base of the modes."""
 
-    bits: int
-    closed: bool
+    closed: ClassVar[bool] = True
     """Whether the position loop is closed: only then is the following error watched."""
-
-    def enter(self) -> None:
-        """Begin anew: nothing is left of an earlier target."""
-
-    def resume(self) -> None:
-        """Go on after a halt."""
-
-    def update(self, controlword: int, h: float, count: int) -> None:
-        """Let `count` times `h` seconds pass."""
-
-
-class Hold:
-    """No mode chosen yet (0x6061 = 0): the joint is held where it is."""
-
-    closed = True
 
     def __init__(self, axis: Axis) -> None:
         self.bits = 0
         self._axis = axis
 
     def enter(self) -> None:
+        """Begin anew: nothing is left of an earlier target."""
+        self.bits = 0
+
+    def resume(self) -> None:
+        """Go on after a halt."""
+        self.enter()
+
+    def update(self, controlword: int, h: float, count: int) -> None:
+        """Let `count` times `h` seconds pass."""
+        raise NotImplementedError
+
+
+class Profile:
+    """The objects that shape a profile, in SI units; 0x60C5 and 0x607F bound what the master asks for."""
+
+    def __init__(self, objects: ObjectDictionary) -> None:
+        self._velocity = number(objects, 0x6081)
+        self._acceleration = number(objects, 0x6083)
+        self._deceleration = number(objects, 0x6084)
+        self._most = number(objects, 0x60C5)
+        self._top = number(objects, 0x607F)
+        self._low = number(objects, 0x607D, 1)
+        self._high = number(objects, 0x607D, 2)
+
+    @property
+    def velocity(self) -> float:
+        """Profile velocity, rad/s."""
+        return min(self._velocity.value, self._top.value) * UNIT
+
+    @property
+    def top(self) -> float:
+        """Largest velocity of any profile, rad/s."""
+        return self._top.value * UNIT
+
+    @property
+    def acceleration(self) -> float:
+        """Profile acceleration, rad/s^2, never zero."""
+        return max(1, min(self._acceleration.value, self._most.value)) * UNIT
+
+    @property
+    def deceleration(self) -> float:
+        """Profile deceleration, rad/s^2, never zero."""
+        return max(1, min(self._deceleration.value, self._most.value)) * UNIT
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The software position limits, rad."""
+        return self._low.value * UNIT, self._high.value * UNIT
+
+
+class Hold(Motion):
+    """No mode chosen yet (0x6061 = 0): the joint is held where it is."""
+
+    def enter(self) -> None:
         """Hold here."""
         self._axis.synchronise()
         self._axis.reference_velocity = 0.0
-
-    resume = enter
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Stay."""
@@ -67,14 +103,11 @@ class Hold:
             self._axis.follow(h)
 
 
-class CyclicPosition:
+class CyclicPosition(Motion):
     """CSP (8): interpolates from set-point to set-point over 0x60C2; 0x60FF limits its speed, 0 means no motion."""
 
-    closed = True
-
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
-        self.bits = 0
-        self._axis = axis
+        super().__init__(axis)
         self._target = number(objects, 0x607A)
         self._offset = number(objects, 0x60B0)
         self._speed = number(objects, 0x60FF)
@@ -94,10 +127,8 @@ class CyclicPosition:
 
     def enter(self) -> None:
         """Start from where the joint is; after a halt, on to the set-point again."""
+        super().enter()
         self._set_point = None
-        self.bits = 0
-
-    resume = enter
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Move the demand along the line to the set-point, and the joint after it."""
@@ -107,9 +138,9 @@ class CyclicPosition:
         if counts != self._set_point or limit != self._limit:
             self._take(counts, limit, h * count)
         self._slope = axis.glide(self._goal, self._slope, self._fastest, h, count)
-        bits = _FOLLOWS
+        bits = SPECIFIC
         if self._clamped or (self._held_back and axis.demand != self._goal):
-            bits |= _LIMIT
+            bits |= LIMIT
         self.bits = bits
 
     def _take(self, counts: int, limit: int, step: float) -> None:
@@ -134,32 +165,24 @@ class CyclicPosition:
         self._fastest = top * _CATCHING_UP + _CREEP
 
 
-class _WithoutPosition:
+class _WithoutPosition(Motion):
     """What CSV and CST share: a target, an offset added to it, and the software position limits that stop the joint."""
 
     closed = False
 
     def __init__(self, axis: Axis, objects: ObjectDictionary, target: int, offset: int) -> None:
-        self.bits = 0
-        self._axis = axis
+        super().__init__(axis)
         self._target = number(objects, target)
         self._offset = number(objects, offset)
-        self._low = number(objects, 0x607D, 1)
-        self._high = number(objects, 0x607D, 2)
+        self._profile = Profile(objects)
         self._deceleration = number(objects, 0x6085)
-
-    def enter(self) -> None:
-        """Begin with the next target."""
-        self.bits = 0
-
-    resume = enter
 
     def _wanted(self) -> float:
         return (self._target.value + self._offset.value) * UNIT
 
     def _limits(self) -> tuple[float, float, float]:
         """Return the lowest and the highest position and the deceleration before them."""
-        return self._low.value * UNIT, self._high.value * UNIT, self._deceleration.value * UNIT
+        return *self._profile.range, self._deceleration.value * UNIT
 
 
 class CyclicVelocity(_WithoutPosition):
@@ -167,13 +190,12 @@ class CyclicVelocity(_WithoutPosition):
 
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
         super().__init__(axis, objects, 0x60FF, 0x60B1)
-        self._top = number(objects, 0x607F)
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Run at the velocity commanded."""
         axis = self._axis
         allowed = wanted = self._wanted()
-        top = self._top.value * UNIT
+        top = self._profile.top
         low, high, deceleration = self._limits()
         for _ in range(count):
             slowest, fastest = axis.velocity_range(low, high, deceleration)
@@ -181,7 +203,7 @@ class CyclicVelocity(_WithoutPosition):
             axis.run(allowed, h)
         axis.synchronise()
         axis.reference_velocity = allowed
-        self.bits = _FOLLOWS if allowed == wanted else _FOLLOWS | _LIMIT
+        self.bits = SPECIFIC if allowed == wanted else SPECIFIC | LIMIT
 
 
 class CyclicTorque(_WithoutPosition):
@@ -199,45 +221,34 @@ class CyclicTorque(_WithoutPosition):
             slowest, fastest = axis.velocity_range(low, high, deceleration)
             axis.push(wanted, slowest, fastest, h)
         axis.synchronise()
-        self.bits = _FOLLOWS | _LIMIT if axis.saturated else _FOLLOWS
+        self.bits = SPECIFIC | LIMIT if axis.saturated else SPECIFIC
 
 
-class Stop:
+class Stop(Motion):
     """A ramp to rest, then the joint is held: halt, quick stop, disabling and fault reaction, in every mode alike.
 
     `deceleration` (rad/s^2) is set before `enter`; `done` tells that the joint stands.
     """
 
-    closed = True
-
     def __init__(self, axis: Axis) -> None:
-        self.bits = 0
+        super().__init__(axis)
         self.done = False
         self.deceleration = 1.0
-        self._axis = axis
         self._waited = 0.0
 
     def enter(self) -> None:
         """Begin to slow down from the joint's own position and velocity."""
-        self.bits = 0
+        super().enter()
         self.done = False
         self._waited = 0.0
         self._axis.synchronise()
 
-    resume = enter
-
     def update(self, controlword: int, h: float, count: int) -> None:
         """Slow down, then hold."""
         axis = self._axis
-        deceleration = self.deceleration
         for _ in range(count):
-            velocity = axis.reference_velocity
-            if velocity:
-                velocity = ramp(velocity, 0.0, deceleration, deceleration, h)
-                axis.reference_velocity = velocity
-                axis.demand = axis.reference = axis.reference + velocity * h
-            axis.follow(h)
+            axis.ramp(0.0, self.deceleration, h)
         if not self.done and axis.reference_velocity == 0.0:
             self._waited += h * count
             self.done = abs(axis.mechanics.velocity) < _STANDSTILL or self._waited > _STOP_PATIENCE
-        self.bits = _REACHED if self.done else 0
+        self.bits = REACHED if self.done else 0

@@ -41,8 +41,10 @@ class DiewuIoBox(DeviceModel):
         self.counter_rate = self.option("counter_rate")
         self._inputs = int(self.option("inputs"))
         self._turned = 0.0
-        self._broken: list[BrokenTerminals] = []
-        self._freezes = 0
+        self.broken: list[BrokenTerminals] = []
+        """Input terminals that do not show their level, also where it is forced."""
+        self.freezes = 0
+        """Above 0: inputs and counter keep their values."""
         self._held_s = 0.0
         self._input_entry = number(objects, 0x6000, 1)
         self._counter_entry = number(objects, 0x6010, 1)
@@ -101,22 +103,6 @@ class DiewuIoBox(DeviceModel):
         """Turn the AB encoder by `edges`, negative for backwards; the next step counts whole ones."""
         self._turned += edges
 
-    def break_terminals(self, broken: BrokenTerminals) -> None:
-        """Make input terminals show the levels of `broken`, also over forced ones, until `release_terminals`."""
-        self._broken.append(broken)
-
-    def release_terminals(self, broken: BrokenTerminals) -> None:
-        """End the fault of `break_terminals`."""
-        self._broken.remove(broken)
-
-    def freeze_inputs(self) -> None:
-        """Keep inputs and counter at their values; counted, each call needs one `thaw_inputs`."""
-        self._freezes += 1
-
-    def thaw_inputs(self) -> None:
-        """End one `freeze_inputs`."""
-        self._freezes -= 1
-
     def set_outputs_valid(self, valid: bool) -> None:
         """Outputs become valid, or go to 0 (the safe state)."""
         super().set_outputs_valid(valid)
@@ -132,9 +118,9 @@ class DiewuIoBox(DeviceModel):
                 self._mask_entry.value = 0
         mask = self._mask_entry.value
         levels = self._inputs & ~mask | self._levels_entry.value & mask
-        for broken in self._broken:
+        for broken in self.broken:
             levels = broken.shown(levels, dt)
-        if self._freezes:
+        if self.freezes:
             return
         self._input_entry.value = levels
         turned = self._turned + self.counter_rate * dt

@@ -114,6 +114,15 @@ class Mechanics:
         self.position += 0.5 * (velocity + after) * h
 
 
+def ramp(velocity: float, target: float, acceleration: float, deceleration: float, h: float) -> float:
+    """Return the velocity after `h` seconds on the way to `target`, by `deceleration` when slowing."""
+    slowing = abs(target) < abs(velocity) or target * velocity < 0.0
+    change = (deceleration if slowing else acceleration) * h
+    if velocity < target:
+        return min(target, velocity + change)
+    return max(target, velocity - change)
+
+
 _POSITION_GAIN = 50.0
 _VELOCITY_BANDWIDTH = 300.0
 _VELOCITY_INTEGRAL = 40.0
@@ -240,6 +249,12 @@ class Axis:
         # The reference is where the joint shall be after this step: compare what was before it.
         error = self.reference - velocity * h - self.mechanics.position - self.offset
         self.run(velocity + _POSITION_GAIN * error, h)
+
+    def ramp(self, velocity: float, acceleration: float, h: float) -> None:
+        """Lead the demand at a speed that comes nearer to `velocity` by `acceleration` (rad/s^2), and follow it."""
+        self.reference_velocity = ramp(self.reference_velocity, velocity, acceleration, acceleration, h)
+        self.demand = self.reference = self.reference + self.reference_velocity * h
+        self.follow(h)
 
     def run(self, velocity: float, h: float) -> None:
         """Close the velocity loop on `velocity` rad/s."""

@@ -7,9 +7,9 @@ from enum import Enum
 from math import floor, pi, sqrt
 
 from rtcp.virtual.device import number
-from rtcp.virtual.models.cia402 import Status
+from rtcp.virtual.models.cyclic_modes import ERROR, LIMIT, REACHED, SPECIFIC, Motion, Profile
 from rtcp.virtual.models.drive_objects import HOMING_METHODS, UNIT
-from rtcp.virtual.models.mechanics import GEAR_RATIO, Axis
+from rtcp.virtual.models.mechanics import GEAR_RATIO, Axis, ramp
 from rtcp.virtual.objects import ObjectDictionary
 
 
@@ -40,20 +40,6 @@ def approach(
     return position + direction * along * h, direction * along
 
 
-def ramp(velocity: float, target: float, acceleration: float, deceleration: float, h: float) -> float:
-    """Return the velocity after `h` seconds on the way to `target`, by `deceleration` when slowing."""
-    slowing = abs(target) < abs(velocity) or target * velocity < 0.0
-    change = (deceleration if slowing else acceleration) * h
-    if velocity < target:
-        return min(target, velocity + change)
-    return max(target, velocity - change)
-
-
-_REACHED = int(Status.TARGET_REACHED)
-_LIMIT = int(Status.INTERNAL_LIMIT)
-_SPECIFIC = int(Status.MODE_SPECIFIC)
-_ERROR = int(Status.MODE_ERROR)
-
 _START = 0x10
 """Controlword bit 4: new set-point, homing operation start."""
 _CHANGE_IMMEDIATELY = 0x20
@@ -71,52 +57,11 @@ class SetPoint:
     limited: bool
 
 
-class Profile:
-    """The objects that shape a profile, in SI units; 0x60C5 and 0x607F bound what the master asks for."""
-
-    def __init__(self, objects: ObjectDictionary) -> None:
-        self._velocity = number(objects, 0x6081)
-        self._acceleration = number(objects, 0x6083)
-        self._deceleration = number(objects, 0x6084)
-        self._most = number(objects, 0x60C5)
-        self._top = number(objects, 0x607F)
-        self._low = number(objects, 0x607D, 1)
-        self._high = number(objects, 0x607D, 2)
-
-    @property
-    def velocity(self) -> float:
-        """Profile velocity, rad/s."""
-        return min(self._velocity.value, self._top.value) * UNIT
-
-    @property
-    def top(self) -> float:
-        """Largest velocity of any profile, rad/s."""
-        return self._top.value * UNIT
-
-    @property
-    def acceleration(self) -> float:
-        """Profile acceleration, rad/s^2, never zero."""
-        return max(1, min(self._acceleration.value, self._most.value)) * UNIT
-
-    @property
-    def deceleration(self) -> float:
-        """Profile deceleration, rad/s^2, never zero."""
-        return max(1, min(self._deceleration.value, self._most.value)) * UNIT
-
-    @property
-    def range(self) -> tuple[float, float]:
-        """The software position limits, rad."""
-        return self._low.value * UNIT, self._high.value * UNIT
-
-
-class ProfilePosition:
+class ProfilePosition(Motion):
     """Profile position (1): set-points by the handshake of controlword bit 4 and statusword bit 12; one is buffered."""
 
-    closed = True
-
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
-        self.bits = 0
-        self._axis = axis
+        super().__init__(axis)
         self._profile = Profile(objects)
         self._target = number(objects, 0x607A)
         self._window = number(objects, 0x6067)
@@ -146,16 +91,14 @@ class ProfilePosition:
         for _ in range(count):
             point = self._active
             if point is None:
-                deceleration = self._profile.deceleration
-                axis.reference_velocity = ramp(axis.reference_velocity, 0.0, deceleration, deceleration, h)
-                axis.reference += axis.reference_velocity * h
-            else:
-                axis.reference, axis.reference_velocity = approach(
-                    axis.reference, axis.reference_velocity, point.position, point.velocity, point.acceleration,
-                    point.deceleration, h,
-                )  # fmt: skip
-                if axis.reference == point.position and self._queued is not None:
-                    self._active, self._queued = self._queued, None
+                axis.ramp(0.0, self._profile.deceleration, h)
+                continue
+            axis.reference, axis.reference_velocity = approach(
+                axis.reference, axis.reference_velocity, point.position, point.velocity, point.acceleration,
+                point.deceleration, h,
+            )  # fmt: skip
+            if axis.reference == point.position and self._queued is not None:
+                self._active, self._queued = self._queued, None
             axis.demand = axis.reference
             axis.follow(h)
         self._report(h * count)
@@ -170,9 +113,9 @@ class ProfilePosition:
                 self._active, self._queued = self._set_point(controlword), None
             elif self._queued is None:
                 self._queued = self._set_point(controlword)
-            self.bits |= _SPECIFIC
+            self.bits |= SPECIFIC
         elif not start and self._queued is None:
-            self.bits &= ~_SPECIFIC
+            self.bits &= ~SPECIFIC
         self._start = start
 
     def _set_point(self, controlword: int) -> SetPoint:
@@ -188,7 +131,7 @@ class ProfilePosition:
 
     def _report(self, dt: float) -> None:
         point = self._active
-        bits = self.bits & _SPECIFIC
+        bits = self.bits & SPECIFIC
         if point is not None:
             arrived = self._queued is None and self._axis.reference == point.position
             if arrived and abs(point.position - self._axis.position) <= self._window.value * UNIT:
@@ -196,20 +139,19 @@ class ProfilePosition:
             else:
                 self._inside = 0.0
             if self._inside * 1000.0 >= self._window_time.value and arrived:
-                bits |= _REACHED
+                bits |= REACHED
             if point.limited:
-                bits |= _LIMIT
+                bits |= LIMIT
         self.bits = bits
 
 
-class ProfileVelocity:
+class ProfileVelocity(Motion):
     """Profile velocity (3): 0x60FF by ramps of 0x6083 and 0x6084, stopping at the software position limits."""
 
     closed = False
 
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
-        self.bits = 0
-        self._axis = axis
+        super().__init__(axis)
         self._profile = Profile(objects)
         self._target = number(objects, 0x60FF)
         self._window = number(objects, 0x606D)
@@ -222,8 +164,6 @@ class ProfileVelocity:
         """Ramp from the joint's own velocity."""
         self._inside = self._still = 0.0
         self.bits = 0
-
-    resume = enter
 
     def update(self, controlword: int, h: float, count: int) -> None:
         """Ramp towards the target velocity and keep it."""
@@ -244,36 +184,33 @@ class ProfileVelocity:
         actual, dt = axis.mechanics.velocity, h * count
         self._inside = self._inside + dt if abs(wanted - actual) <= self._window.value * UNIT else 0.0
         self._still = self._still + dt if abs(actual) <= self._threshold.value * UNIT else 0.0
-        bits = _LIMIT if limited else 0
+        bits = LIMIT if limited else 0
         if self._inside and self._inside * 1000.0 >= self._window_time.value:
-            bits |= _REACHED
+            bits |= REACHED
         if self._still and self._still * 1000.0 >= self._threshold_time.value:
-            bits |= _SPECIFIC
+            bits |= SPECIFIC
         self.bits = bits
 
 
 class Phase(Enum):
     """How far a homing procedure is (statusword bits 10, 12 and 13 of CiA 402-2)."""
 
-    IDLE = _REACHED
+    IDLE = REACHED
     SEARCHING = 0
-    STOPPING = _SPECIFIC
-    ATTAINED = _SPECIFIC | _REACHED
-    FAILED = _ERROR | _REACHED
+    STOPPING = SPECIFIC
+    ATTAINED = SPECIFIC | REACHED
+    FAILED = ERROR | REACHED
 
 
 _INDEX_PITCH = 2 * pi / GEAR_RATIO
 """The index pulse comes once a turn of the motor: so far apart (rad) at the output."""
 
 
-class Homing:
+class Homing(Motion):
     """Homing (6) by methods 33, 34 (next index pulse), 35 and 37 (where it stands): home then reads 0x607C."""
 
-    closed = True
-
     def __init__(self, axis: Axis, objects: ObjectDictionary) -> None:
-        self.bits = 0
-        self._axis = axis
+        super().__init__(axis)
         self._method = number(objects, 0x6098)
         self._home_offset = number(objects, 0x607C)
         self._speed = number(objects, 0x6099, 2)
@@ -305,17 +242,13 @@ class Homing:
         axis = self._axis
         acceleration = max(1, self._acceleration.value) * UNIT
         for _ in range(count):
-            wanted = self._velocity if self._phase is Phase.SEARCHING else 0.0
-            axis.reference_velocity = ramp(axis.reference_velocity, wanted, acceleration, acceleration, h)
-            axis.reference += axis.reference_velocity * h
-            axis.demand = axis.reference
-            axis.follow(h)
+            axis.ramp(self._velocity if self._phase is Phase.SEARCHING else 0.0, acceleration, h)
             if self._phase is Phase.SEARCHING:
                 self._search()
         standing = axis.reference_velocity == 0.0 and abs(axis.mechanics.velocity) < 0.01
         if self._phase is Phase.STOPPING and standing:
             self._phase = Phase.ATTAINED
-        self.bits = self._phase.value if standing else self._phase.value & ~_REACHED
+        self.bits = self._phase.value if standing else self._phase.value & ~REACHED
 
     def _begin(self) -> None:
         method, position = self._method.value, self._axis.mechanics.position

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from enum import IntEnum
 from math import pi
 from types import MappingProxyType
 
@@ -12,41 +12,36 @@ from rtcp.virtual.models.drive_objects import COUNTS, HISTORY_LENGTH, TEMPERATUR
 from rtcp.virtual.models.mechanics import INCREMENTS_PER_RAD, ActuatorSize, Axis
 from rtcp.virtual.objects import ObjectDictionary
 
-OVER_CURRENT = 0x2310
-OVER_VOLTAGE = 0x3210
-UNDER_VOLTAGE = 0x3220
-OVER_TEMPERATURE = 0x4310
-COMMUNICATION = 0x8130
-ENCODER = 0x7305
-OVER_SPEED = 0x8400
-FOLLOWING_ERROR = 0x8611
-POSITION_RANGE = 0x8612
+
+class ErrorCode(IntEnum):
+    """Error codes 0x603F (CiA 402-2; 0x8130: CiA 301)."""
+
+    OVER_CURRENT = 0x2310
+    """Continuous over-current: the overload integrator is full."""
+    OVER_VOLTAGE = 0x3210
+    """Over-voltage of the DC link."""
+    UNDER_VOLTAGE = 0x3220
+    OVER_TEMPERATURE = 0x4310
+    ENCODER = 0x7305
+    """The position is unknown, no ramp can be kept."""
+    COMMUNICATION = 0x8130
+    """Life guard: outputs became invalid while the drive was enabled.
+
+    EtherCAT has no life guarding of CANopen's; its watchdog is the sync manager's, and this code says the same: the
+    master's cyclic sign of life is missing. 0x7510 would be a fault of a serial interface inside the drive.
+    """
+    OVER_SPEED = 0x8400
+    FOLLOWING_ERROR = 0x8611
+    POSITION_RANGE = 0x8612
+    """Position outside the range of the encoder."""
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A fault: what it is, its bits of the error register 0x1001, and whether torque must go at once."""
-
-    name: str
-    register: int
-    at_once: bool = False
-
-
-FAULTS = MappingProxyType({
-    OVER_CURRENT: Fault("continuous over-current: the overload integrator is full", 0x03, at_once=True),
-    OVER_VOLTAGE: Fault("over-voltage of the DC link", 0x05, at_once=True),
-    UNDER_VOLTAGE: Fault("under-voltage of the DC link", 0x05, at_once=True),
-    OVER_TEMPERATURE: Fault("over-temperature of the drive", 0x09),
-    # EtherCAT has no life guarding of CANopen's; its watchdog is the sync manager's, and this code says the same:
-    # the master's cyclic sign of life is missing. 0x7510 would be a fault of a serial interface inside the drive.
-    COMMUNICATION: Fault("life guard: outputs became invalid while the drive was enabled", 0x11),
-    ENCODER: Fault("encoder: the position is unknown, no ramp can be kept", 0x21, at_once=True),
-    OVER_SPEED: Fault("over-speed", 0x21),
-    FOLLOWING_ERROR: Fault("following error", 0x21),
-    POSITION_RANGE: Fault("position outside the range of the encoder", 0x21),
+AT_ONCE = frozenset({ErrorCode.OVER_CURRENT, ErrorCode.OVER_VOLTAGE, ErrorCode.UNDER_VOLTAGE, ErrorCode.ENCODER})
+"""Faults in which torque must go at once."""
+REGISTER_BITS = MappingProxyType({
+    0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0xF: 0x81, 0x81: 0x11, 0x84: 0x21, 0x86: 0x21,
 })  # fmt: skip
-"""Faults by error code 0x603F (CiA 402-2; 0x8130: CiA 301)."""
-
+"""Bits of the error register 0x1001 by the class of an error code, its first digit or its first two (CiA 301)."""
 ENCODER_RANGE = 4 * pi
 """The multi-turn encoder counts two turns each way, rad; the firmware's position range of 12.5 rad ends just inside."""
 
@@ -90,13 +85,13 @@ class Condition:
     def fault(self) -> int:
         """Return the error code of what is wrong now, 0 for nothing."""
         if self.bus_voltage > VOLTAGE_LOCK:
-            return OVER_VOLTAGE
+            return ErrorCode.OVER_VOLTAGE
         if self.bus_voltage < _UNDER_VOLTAGE_LOCK:
-            return UNDER_VOLTAGE
+            return ErrorCode.UNDER_VOLTAGE
         if self.temperature >= TEMPERATURE_LOCK:
-            return OVER_TEMPERATURE
+            return ErrorCode.OVER_TEMPERATURE
         if self.overload >= 1.0:
-            return OVER_CURRENT
+            return ErrorCode.OVER_CURRENT
         return 0
 
     @property
@@ -110,11 +105,8 @@ class Condition:
 
 
 def error_register(code: int) -> int:
-    """Return the bits of the error register that go with an error code (CiA 301, object 0x1001), by its class."""
-    if code in FAULTS:
-        return FAULTS[code].register
-    classes = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0xF: 0x81}
-    return 0x11 if code >> 8 == 0x81 else classes.get(code >> 12, 0x01)
+    """Return the bits of the error register that go with an error code, by its class."""
+    return REGISTER_BITS.get(code >> 8) or REGISTER_BITS.get(code >> 12, 0x01)
 
 
 class Feedback:

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
-from rtcp.config.faults import Delay, Duplicate, Garble, Loss, Noise, Reorder
-from rtcp.virtual.faults import noise
-from rtcp.virtual.faults.frames import FOR_EVER, Frames, FrameUndo
-from tests.virtual.line import MS
+from rtcp.virtual.faults.fault import FOR_EVER, Frames
+from rtcp.virtual.faults.frames import MAKERS, Delay, Duplicate, Garble, Loss, Noise, Reorder
+from rtcp.virtual.faults.registry import ActiveFault, Planned
+from tests.virtual.line import MS, Line, TinyDevice
 
 
 class Cable:
@@ -18,9 +18,10 @@ class Cable:
     def __init__(self) -> None:
         self.came: list[bytes] = []
         self.frames = Frames(self.came.append)
+        self._segment = Line([TinyDevice()]).segment
 
-    def begin(self, fault: Any, t: int = 0) -> FrameUndo:
-        return self.frames.begin(fault, t)
+    def begin(self, fault: Any, t: int = 0) -> ActiveFault:
+        return ActiveFault(Planned(fault), self._segment, self.frames, t)
 
     def send(self, *numbers: int, t: int = 0) -> list[int]:
         """Send frames; return those that reached the segment."""
@@ -207,4 +208,4 @@ def test_the_same_seed_makes_the_same_noise() -> None:
         return cable.came
 
     assert heard(1) == heard(1) != heard(2)
-    assert set(noise.MAKERS) == {"arp", "ip", "lldp", "ethercat"}
+    assert set(MAKERS) == {"arp", "ip", "lldp", "ethercat"}

@@ -10,11 +10,9 @@ from typing import Any
 
 import pytest
 
-from rtcp.config.faults import FAULTS, ONCE, load_script, parse
-from rtcp.virtual.faults.control import Control, control_socket
-from rtcp.virtual.faults.ground_truth import GroundTruth
-from rtcp.virtual.faults.registry import FaultRegistry
-from rtcp.virtual.faults.slaves import FaultRefused
+from rtcp.virtual.faults.control import Control, GroundTruth, control_socket
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.registry import FAULTS, FaultRegistry, load_script, parse
 from rtcp.virtual.protocol import Command
 from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
 from tests.virtual.frames import Datagram, build
@@ -126,7 +124,7 @@ def test_every_kind_of_fault_is_tried_here() -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_fault_that_is_mended_or_ends_at_its_time_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
-    once = FAULTS[name] in ONCE
+    once = FAULTS[name].once
 
     def play() -> None:
         bench.again_in_op()

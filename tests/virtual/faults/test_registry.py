@@ -6,10 +6,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.config.faults import Planned, parse
-from rtcp.virtual.faults.frames import FOR_EVER
-from rtcp.virtual.faults.registry import MOST_ACTIVE, FaultRegistry
-from rtcp.virtual.faults.slaves import FaultRefused
+from rtcp.virtual.faults.fault import FOR_EVER, FaultRefused
+from rtcp.virtual.faults.registry import MOST_ACTIVE, FaultRegistry, Planned, parse
 from tests.virtual.line import MS, Line
 
 S = 1000 * MS

@@ -6,15 +6,16 @@ import gc
 
 import pytest
 
-from rtcp.config.faults import CableFault, PowerFault
 from rtcp.virtual import coe as sdo_access
 from rtcp.virtual.device import DeviceModel
-from rtcp.virtual.faults.slaves import FaultRefused, SlaveUndo, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.registry import ActiveFault
+from rtcp.virtual.faults.slaves import CableFault, PowerFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from rtcp.virtual.objects import Value
 from rtcp.virtual.protocol import Command
 from tests.virtual.frames import Datagram, build
-from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, STATION, Line, TinyDevice, start_sync0
+from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
 
 DL_STATUS, LOST_LINKS = 0x0110, 0x0310
 LINK_0, LINK_1, CLOSED_0, CLOSED_1 = 0x10, 0x20, 0x100, 0x400
@@ -27,7 +28,7 @@ def in_op(count: int = 4) -> Line:
     return line
 
 
-def cut(line: Line, after: int) -> SlaveUndo:
+def cut(line: Line, after: int) -> ActiveFault:
     return begin(line.segment, CableFault(after), line.now)
 
 

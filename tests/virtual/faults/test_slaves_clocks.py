@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.faults import ClockDrift, ClockJump, PowerFault, Sync0Lost
-from rtcp.virtual.faults.slaves import FaultRefused, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.slaves import ClockDrift, ClockJump, PowerFault, Sync0Lost
 from rtcp.virtual.protocol import Command
 from tests.virtual.frames import Datagram
-from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, start_sync0
+from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
 
 
 def by_sync0() -> Line:

@@ -6,12 +6,11 @@ from itertools import pairwise
 
 import pytest
 
-from rtcp.config.faults import DriveFault, InputsFrozen, PowerFault, StickCode, TerminalFault
 from rtcp.launch.inprocess import InProcessBus
-from rtcp.virtual.faults import devices
-from rtcp.virtual.faults.slaves import FaultRefused, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, PowerFault, StickCode, TerminalFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
-from tests.virtual.line import MS, Line
+from tests.virtual.line import MS, Line, begin
 
 CODES = {
     "over-current": 0x2310,
@@ -222,8 +221,8 @@ def test_without_an_io_box_no_input_can_be_broken() -> None:
 def test_on_the_bus_inprocess_drives_and_inputs_fail_alike() -> None:
     bus = InProcessBus([create("diewu-io"), create("cubemars-orh70")])
     models = [slave.device for slave in bus.slaves]
-    undo = devices.begin(models, StickCode(0))
-    devices.begin(models, DriveFault(2, "over-voltage"))
+    undo = StickCode(0).begin(models)
+    DriveFault(2, "over-voltage").begin(models)
     for model in models:
         for _ in range(120):
             model.step(0.001)

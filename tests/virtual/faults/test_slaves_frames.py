@@ -6,13 +6,13 @@ from typing import Literal
 
 import pytest
 
-from rtcp.config.faults import CableFault, Corrupt, WorkingCounter
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import Answer, RegisterPort
-from rtcp.virtual.faults.slaves import FaultRefused, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.slaves import CableFault, Corrupt, WorkingCounter
 from rtcp.virtual.protocol import Command
 from tests.virtual.frames import Datagram, build
-from tests.virtual.line import MS, STATION, Line, TinyDevice
+from tests.virtual.line import MS, STATION, Line, TinyDevice, begin
 
 COUNTERS = 0x0300
 

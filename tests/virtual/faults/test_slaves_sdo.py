@@ -6,11 +6,11 @@ import struct
 
 import pytest
 
-from rtcp.config.faults import PowerFault, SdoAbort, SdoLate
 from rtcp.virtual.device import Emergency
-from rtcp.virtual.faults.slaves import FaultRefused, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.slaves import PowerFault, SdoAbort, SdoLate
 from rtcp.virtual.protocol import Command
-from tests.virtual.line import MS, PRE_OP, SM_MAILBOXES, STATION, Line, TinyDevice
+from tests.virtual.line import MS, PRE_OP, SM_MAILBOXES, STATION, Line, TinyDevice, begin
 
 OUT, IN, SIZE = 0x1000, 0x1080, 0x80
 

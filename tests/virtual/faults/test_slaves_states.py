@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.config.faults import AlFall, AlHang, AlRefuse, PowerFault
-from rtcp.virtual.faults.slaves import FaultRefused, begin
+from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.faults.slaves import AlFall, AlHang, AlRefuse, PowerFault
 from rtcp.virtual.protocol import Command
-from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, STATION, Line, TinyDevice
+from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, STATION, Line, TinyDevice, begin
 
 REFUSED = 0x0042
 

@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from rtcp.config.fault_kinds import PluginFault, Position
 from rtcp.virtual.device import DeviceModel, Option, number
-from rtcp.virtual.faults.devices import FaultRefused
+from rtcp.virtual.faults.fault import DeviceFault, FaultRefused, Position
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
 
@@ -37,7 +36,7 @@ class ThermometerModel(DeviceModel):
 
 
 @dataclass(frozen=True)
-class WireBreak(PluginFault):
+class WireBreak(DeviceFault):
     """The sensors of a thermometer are cut off."""
 
     name = "wire_break"
