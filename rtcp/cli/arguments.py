@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.errors import CommandError
+from rtcp.cli.output import CommandError
 from rtcp.config.numbers import angle, plain_number
 
 

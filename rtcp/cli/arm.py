@@ -19,8 +19,7 @@ from rtcp.cli.arguments import (
     pose_values,
     refuse_options,
 )
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit, emit_json, report, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -39,17 +38,11 @@ Positions = Annotated[
     list[str], typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool.")
 ]
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    arm = typer.Typer(help="Compute with an arm: forward and inverse kinematics, picture, URDF.", no_args_is_help=True)
-    arm.command("fk", context_settings=NUMBERS_AS_WRITTEN)(_fk)
-    arm.command("ik", context_settings=NUMBERS_AS_WRITTEN)(_ik)
-    arm.command("plot", context_settings=NUMBERS_AS_WRITTEN)(_plot)
-    arm.command("urdf")(_urdf)
-    app.add_typer(arm, name="arm")
+HELP = "Compute with an arm: forward and inverse kinematics, picture, URDF."
+commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
 
 
+@commands.command("fk", context_settings=NUMBERS_AS_WRITTEN)
 def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> None:
     """Show the pose of the tool and of every frame at joint positions."""
     q = _joints(positions, ("--arm", "--json"))
@@ -64,6 +57,7 @@ def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> N
     show(*_forward_tables(model, q))
 
 
+@commands.command("ik", context_settings=NUMBERS_AS_WRITTEN)
 def _ik(
     pose: Annotated[
         list[str],
@@ -99,6 +93,7 @@ def _ik(
         show(*_inverse_tables(model, found.solutions))
 
 
+@commands.command("plot", context_settings=NUMBERS_AS_WRITTEN)
 def _plot(
     positions: Positions,
     out: Annotated[Path, option("--out", "FILE", f"Picture: {', '.join(PICTURES)}.")] = (Path("arm.png")),
@@ -113,6 +108,7 @@ def _plot(
     _write(out, lambda: draw(model, q, out))
 
 
+@commands.command("urdf")
 def _urdf(
     out: Annotated[Path | None, option("--out", "FILE", "File to write. Default: standard output.")] = None,
     arm: ArmFile = None,

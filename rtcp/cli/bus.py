@@ -14,10 +14,8 @@ import typer
 
 from rtcp.api import NotRunning, Robot
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
-from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, interruption_code, signals_raise
-from rtcp.cli.output import emit, emit_json, facts, report, show, table
-from rtcp.cli.platform import refuse_second_platform
+from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
+from rtcp.cli.platform import connect, refuse_second_platform
 from rtcp.config.model import VIRTUAL
 from rtcp.config.numbers import plain_number
 from rtcp.launch import offline
@@ -39,16 +37,12 @@ ObjectIndex = Annotated[
     str, typer.Argument(metavar="INDEX[:SUB]", help="Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")
 ]
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("scan")(_scan)
-    sdo = typer.Typer(help="Read and write objects of a slave.", no_args_is_help=True)
-    sdo.command("read")(_sdo_read)
-    sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)(_sdo_write)
-    app.add_typer(sdo, name="sdo")
+commands = typer.Typer()
+sdo = typer.Typer(name="sdo", help="Read and write objects of a slave.", no_args_is_help=True)
+commands.add_typer(sdo)
 
 
+@commands.command("scan")
 def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
     """Show the slaves: identity, state, PDO map, clocks and delays."""
     with _bus("scan", bus, config) as asked:
@@ -59,6 +53,7 @@ def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = Fals
         show(*_scan_tables(asked.name, slaves))
 
 
+@sdo.command("read")
 def _sdo_read(
     slave: SlaveName,
     where: ObjectIndex,
@@ -74,6 +69,7 @@ def _sdo_read(
     emit(interpretations(data) if known is None else decode(data, known))
 
 
+@sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)
 def _sdo_write(
     slave: SlaveName,
     where: ObjectIndex,
@@ -143,23 +139,20 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
         RtcpError: as the platform or the offline bus answers.
         ConfigError: the configuration is wrong.
     """
-    try:
-        with signals_raise():
-            try:
-                robot = connect(command)
-            except NotRunning:
-                refuse_second_platform()
+    with interruptible("interrupted: nothing is left running"):
+        try:
+            robot = connect(command)
+        except NotRunning:
+            refuse_second_platform()
+            yield _offline(name, config)
+            return
+        with robot:
+            status = robot.status().raw
+            if name in (None, status["bus"]):
+                positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
+                yield Bus(status["bus"], positions, robot)
+            else:
                 yield _offline(name, config)
-                return
-            with robot:
-                status = robot.status().raw
-                if name in (None, status["bus"]):
-                    positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
-                    yield Bus(status["bus"], positions, robot)
-                else:
-                    yield _offline(name, config)
-    except KeyboardInterrupt as interruption:
-        raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
 
 
 def _offline(name: str | None, config: Path | None) -> Bus:

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.cli.bus import INTEGER_TYPES, decode, encode, parse_object
-from rtcp.cli.errors import CommandError
+from rtcp.cli.output import CommandError
 
 
 def test_a_scan_shows_identity_state_pdo_map_clock_and_delay(platform: Any, rtcp: Callable[..., Any]) -> None:
