@@ -16,7 +16,7 @@ from rtcp.api import NotRunning, Robot
 from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
 from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
 from rtcp.cli.platform import connect, refuse_second_platform
-from rtcp.config.model import VIRTUAL
+from rtcp.config.model import VIRTUAL, integer_range
 from rtcp.config.numbers import plain_number
 from rtcp.launch import offline
 
@@ -24,10 +24,14 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-INTEGER_TYPES = {f"{sign}int{bits}": (bits // 8, sign == "") for bits in (8, 16, 32, 64) for sign in ("u", "")}
-"""Name -> bytes, signed."""
-FLOAT_TYPES = {"float32": struct.Struct("<f"), "float64": struct.Struct("<d")}
-TYPES = ("bool", *INTEGER_TYPES, *FLOAT_TYPES, "string", "bytes")
+STRUCTS = {
+    name: struct.Struct(f"<{code}")
+    for name, code in {
+        "bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
+        "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
+    }.items()
+}  # fmt: skip
+TYPES = (*STRUCTS, "string", "bytes")
 _OBJECT = re.compile(r"(?:0x(?P<prefixed>[0-9a-f]+)|(?P<suffixed>[0-9][0-9a-f]*)h)(?::(?P<sub>\w+))?", re.IGNORECASE)
 
 SlaveName = Annotated[
@@ -93,32 +97,12 @@ def _sdo_write(
 # -- access ---------------------------------------------------------------------------------------------------------
 
 
-class OfflineBus:
-    """A bus that is opened for each request and closed again; methods as those of `rtcp.api.Robot`."""
-
-    def __init__(self, bus: str, config: Path | None) -> None:
-        self._bus = bus
-        self._config = config
-
-    def scan(self) -> list[dict[str, Any]]:
-        """Return what each slave reports."""
-        return offline.scan(self._bus, self._config)
-
-    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
-        """Return the bytes of an object."""
-        return offline.sdo_read(self._bus, self._config, slave, index, subindex)
-
-    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
-        """Write the bytes of an object."""
-        offline.sdo_write(self._bus, self._config, slave, index, subindex, data)
-
-
 class Bus(NamedTuple):
     """A bus that can be asked: its name, the position of each slave by configured name, and who asks it."""
 
     name: str
     positions: dict[str, int]
-    access: Robot | OfflineBus
+    access: Robot | offline.OfflineBus
 
     def position(self, slave: str) -> int:
         """Return the position of a slave given by position or configured name; raises CommandError."""
@@ -163,7 +147,7 @@ def _offline(name: str | None, config: Path | None) -> Bus:
     name = arm.bus.interface if name is None else name
     if name == VIRTUAL:
         check_segment(segment_path(arm))
-    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, OfflineBus(name, config))
+    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, offline.OfflineBus(name, config))
 
 
 # -- objects as text (little endian on the wire) --------------------------------------------------------------------
@@ -200,18 +184,15 @@ def encode(text: str, type_name: str) -> bytes:
             return bytes.fromhex(text.removeprefix("0x"))
         except ValueError as error:
             raise CommandError(f"{text!r} is not bytes in hex, as 01ff") from error
-    if type_name in FLOAT_TYPES:
-        return _encode_float(text, type_name)
     if type_name == "bool":
         if text.lower() not in ("0", "1", "true", "false"):
             raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
-        return b"\x01" if text.lower() in ("1", "true") else b"\x00"
-    size, signed = INTEGER_TYPES[type_name]
-    number = _integer(text, type_name)
-    lowest, highest = (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1) if signed else (0, (1 << 8 * size) - 1)
-    if not lowest <= number <= highest:
-        raise CommandError(f"{text} does not fit {type_name}: {lowest} to {highest}")
-    return number.to_bytes(size, "little", signed=signed)
+        return STRUCTS[type_name].pack(text.lower() in ("1", "true"))
+    try:
+        return STRUCTS[type_name].pack(_finite(text, type_name) if "float" in type_name else _integer(text, type_name))
+    except (struct.error, OverflowError) as error:
+        span = "" if "float" in type_name else ": {} to {}".format(*integer_range(type_name))
+        raise CommandError(f"{text} does not fit {type_name}{span}") from error
 
 
 def decode(data: bytes, type_name: str) -> str:
@@ -220,26 +201,21 @@ def decode(data: bytes, type_name: str) -> str:
         return data.rstrip(b"\0").decode(errors="replace")
     if type_name == "bytes":
         return data.hex()
-    size = FLOAT_TYPES[type_name].size if type_name in FLOAT_TYPES else INTEGER_TYPES.get(type_name, (1, False))[0]
-    if len(data) != size:
+    if len(data) != (size := STRUCTS[type_name].size):
         raise CommandError(
             f"the object has {len(data)} bytes ({data.hex() or 'none'}), {type_name} has {size}: choose another --type"
         )
-    if type_name in FLOAT_TYPES:
-        return repr(float(FLOAT_TYPES[type_name].unpack(data)[0]))
-    if type_name == "bool":
-        return "true" if data[0] else "false"
-    return str(int.from_bytes(data, "little", signed=INTEGER_TYPES[type_name][1]))
+    return repr(*STRUCTS[type_name].unpack(data)).lower()
 
 
 def interpretations(data: bytes) -> str:
     """Return the bytes in hex, as integers of that size, and as text where all of it is printable."""
     parts = [data.hex(" ") or "(empty)"]
-    for name, (size, signed) in INTEGER_TYPES.items():
-        if size == len(data):
-            number = int.from_bytes(data, "little", signed=signed)
-            if not signed:
-                parts.append(f"{name} {number} (0x{number:0{2 * size}X})")
+    for name, packing in STRUCTS.items():
+        if "int" in name and packing.size == len(data):
+            (number,) = packing.unpack(data)
+            if name.startswith("u"):
+                parts.append(f"{name} {number} (0x{number:0{2 * len(data)}X})")
             elif number < 0:
                 parts.append(f"{name} {number}")
     text = data.rstrip(b"\0")
@@ -248,17 +224,14 @@ def interpretations(data: bytes) -> str:
     return "   ".join(parts)
 
 
-def _encode_float(text: str, type_name: str) -> bytes:
+def _finite(text: str, type_name: str) -> float:
     try:
         number = plain_number(text)
-        packed = FLOAT_TYPES[type_name].pack(number)
     except ValueError as error:
         raise CommandError(f"{text!r} is not a number ({type_name})") from error
-    except OverflowError as error:
-        raise CommandError(f"{text} does not fit {type_name}") from error
     if not math.isfinite(number):
         raise CommandError(f"{text} is not finite; a finite {type_name} is needed")
-    return packed
+    return number
 
 
 def _integer(text: str, what: str) -> int:
