@@ -12,7 +12,7 @@ import sys
 import termios
 import time
 import tty
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Annotated
 
@@ -219,20 +219,31 @@ def _axis(axis: str) -> tuple[int, bool]:
 
 
 def _jog_for(robot: Robot, jog: Jog, seconds: float) -> None:
+    try:
+        for now in _renewals("jog", JOG_INTERVAL_S, JOG_HOLD_S, seconds, "the arm had stopped and stays stopped"):
+            jog(1.0, now)
+    except CommandError:
+        robot.halt()
+        raise
+    robot.halt()
+
+
+def _renewals(what: str, interval_s: float, hold_s: float, seconds: float, lapsed: str) -> Iterator[float]:
+    """Yield the instants, s of CLOCK_MONOTONIC, at which a command is renewed.
+
+    Raises:
+        CommandError: a renewal came too late; `lapsed` says what has become of the command.
+    """
     until = time.monotonic() + seconds
-    renewal = RenewalCheck(JOG_HOLD_S)
+    renewal = RenewalCheck(hold_s)
     while True:
         now = time.monotonic()
         if late_s := renewal.overdue(now):
-            robot.halt()
-            raise CommandError(
-                f"the jog was not renewed for {late_s:.1f} s: the arm had stopped and stays stopped", ExitCode.FAULT
-            )
+            raise CommandError(f"the {what} was not renewed for {late_s:.1f} s: {lapsed}", ExitCode.FAULT)
         if now >= until:
             break
-        jog(1.0, now)
-        time.sleep(max(0.0, min(JOG_INTERVAL_S, until - now)))
-    robot.halt()
+        yield now
+        time.sleep(max(0.0, min(interval_s, until - now)))
 
 
 def _jog_by_keys(robot: Robot, jog: Jog) -> None:
@@ -322,15 +333,9 @@ def _force(robot: Robot, pressed: Sequence[str], byte: int | None, now: float) -
 
 
 def _force_for(robot: Robot, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    renewal = RenewalCheck(JOYSTICK_HOLD_S)
-    while (now := time.monotonic()) < until:
-        if late_s := renewal.overdue(now):
-            raise CommandError(
-                f"the joystick was not renewed for {late_s:.1f} s: it was released and stays released", ExitCode.FAULT
-            )
+    lapsed = "it was released and stays released"
+    for now in _renewals("joystick", JOYSTICK_INTERVAL_S, JOYSTICK_HOLD_S, seconds, lapsed):
         _force(robot, pressed, byte, now)
-        time.sleep(max(0.0, min(JOYSTICK_INTERVAL_S, until - now)))
 
 
 def _force_by_keys(robot: Robot) -> None:
