@@ -13,11 +13,11 @@ from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
     PICTURES,
     AsJson,
+    as_written,
     check_picture,
     joint_values,
     option,
     pose_values,
-    refuse_options,
 )
 from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
 
@@ -34,9 +34,7 @@ ArmFile = Annotated[
     str | None,
     option("--arm", "FILE", "File of an arm, or name of a packaged one. Default: the platform's."),
 ]
-Positions = Annotated[
-    list[str], typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool.")
-]
+Positions = Annotated[list[str], as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool.")]
 
 HELP = "Compute with an arm: forward and inverse kinematics, picture, URDF."
 commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
@@ -45,7 +43,7 @@ commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
 @commands.command("fk", context_settings=NUMBERS_AS_WRITTEN)
 def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> None:
     """Show the pose of the tool and of every frame at joint positions."""
-    q = _joints(positions, ("--arm", "--json"))
+    q = _joints(positions)
     model = _model(arm)
     from kinematics.forward import forward
 
@@ -61,9 +59,7 @@ def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> N
 def _ik(
     pose: Annotated[
         list[str],
-        typer.Argument(
-            metavar="X Y Z RX RY RZ", help="Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."
-        ),
+        as_written("X Y Z RX RY RZ", "Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."),
     ],
     near: Annotated[
         tuple[str, str, str, str, str, str] | None,
@@ -73,7 +69,6 @@ def _ik(
     as_json: AsJson = False,
 ) -> None:
     """Show all joint positions that reach a pose; exit code 3 where there are none."""
-    refuse_options(pose, ("--near", "--arm", "--json"))
     wanted = pose_values(pose)
     q_near = None if near is None else joint_values(near, "--near, ")
     model = _model(arm)
@@ -100,7 +95,7 @@ def _plot(
     arm: ArmFile = None,
 ) -> None:
     """Draw the arm and its frames."""
-    q = _joints(positions, ("--out", "--arm"))
+    q = _joints(positions)
     check_picture("--out", out)
     model = _model(arm)
     from rtcp.cli.arm_plot import draw
@@ -132,8 +127,7 @@ def _model(arm: str | None) -> ArmModel:
     return load_kinematics(find_arm(arm))
 
 
-def _joints(positions: Sequence[str], options: Sequence[str]) -> list[float]:
-    refuse_options(positions, options)
+def _joints(positions: Sequence[str]) -> list[float]:
     if len(positions) != JOINTS:
         raise CommandError(f"{len(positions)} positions for an arm of {JOINTS} joints: give {JOINTS} numbers, rad")
     return joint_values(positions)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rtcp.api import NotRunning, Robot
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, as_written, option
 from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
 from rtcp.cli.platform import connect, refuse_second_platform
 from rtcp.config.model import VIRTUAL, integer_range
@@ -34,12 +34,8 @@ STRUCTS = {
 TYPES = (*STRUCTS, "string", "bytes")
 _OBJECT = re.compile(r"(?:0x(?P<prefixed>[0-9a-f]+)|(?P<suffixed>[0-9][0-9a-f]*)h)(?::(?P<sub>\w+))?", re.IGNORECASE)
 
-SlaveName = Annotated[
-    str, typer.Argument(metavar="SLAVE", help="Position on the cable, from 1, or the configured name.")
-]
-ObjectIndex = Annotated[
-    str, typer.Argument(metavar="INDEX[:SUB]", help="Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")
-]
+SlaveName = Annotated[str, as_written("SLAVE", "Position on the cable, from 1, or the configured name.")]
+ObjectIndex = Annotated[str, as_written("INDEX[:SUB]", "Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")]
 
 commands = typer.Typer()
 sdo = typer.Typer(name="sdo", help="Read and write objects of a slave.", no_args_is_help=True)
@@ -77,13 +73,12 @@ def _sdo_read(
 def _sdo_write(
     slave: SlaveName,
     where: ObjectIndex,
-    value: Annotated[list[str], typer.Argument(metavar="VALUE")],
+    value: Annotated[list[str], as_written("VALUE")],
     type_name: Annotated[str, option("--type", "TYPE", f"{', '.join(TYPES)}.")],
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Write an object."""
-    refuse_options([slave, where, *value], ("--type", "--bus", "--config"))
     if len(value) != 1:
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)

@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 
 from rtcp.api import Robot, Status
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, number, option, positive, refuse_old_name, refuse_options
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, as_written, number, option, positive, refuse_old_name
 from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, emit, interruptible, report
 from rtcp.cli.platform import connect, stoppable
 
@@ -172,13 +172,12 @@ class RenewalCheck:
 
 @commands.command("jog", context_settings=NUMBERS_AS_WRITTEN)
 def _jog(
-    axis: Annotated[str, typer.Argument(metavar="AXIS", help="x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
-    speed: Annotated[str, typer.Argument(metavar="SPEED", help="m/s; rad/s of rotations and joints; may be negative.")],
+    axis: Annotated[str, as_written("AXIS", "x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
+    speed: Annotated[str, as_written("SPEED", "m/s; rad/s of rotations and joints; may be negative.")],
     frame: Annotated[str, option("--frame", "base|tool", "Frame of x, y, z.")] = "base",
     seconds: Annotated[float | None, option("--seconds", "N", "Move for N seconds, without keys.")] = None,
 ) -> None:
     """Move while a key is held (down, left and - move backward, q ends); Ctrl-C stops the arm."""
-    refuse_options([axis, speed], ("--frame", "--seconds"))
     at, of_joint = _axis(axis)
     wanted = number(speed, "SPEED", "rad/s" if of_joint or at >= 3 else "m/s")
     if wanted == 0:

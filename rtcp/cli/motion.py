@@ -12,13 +12,13 @@ from rtcp.api import Arrival, State
 from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
     AsJson,
+    as_written,
     finite,
     joint_values,
     number,
     option,
     pose_values,
     positive,
-    refuse_options,
 )
 from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
@@ -142,7 +142,7 @@ def _home(joint: Joint) -> None:
 def _move(
     numbers: Annotated[
         list[str],
-        typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool; see --pose."),
+        as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool; see --pose."),
     ],
     pose: Annotated[bool, option("--pose", "The numbers are a tool pose, X Y Z RX RY RZ: m, and rad of Rx Ry Rz.")] = (
         False
@@ -162,7 +162,6 @@ def _move(
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
     if unsynchronized and pose:
         raise CommandError("--unsynchronized is for joint positions, not for --pose")
-    refuse_options(numbers, ("--pose", "--line", "--unsynchronized", "--speed"))
     target = pose_values(numbers) if pose else joint_values(numbers)
     with stoppable("move") as robot, progress() as shown:
         if pose:
@@ -216,15 +215,14 @@ def _show(as_json: AsJson = False) -> None:
 def _set(
     pairs: Annotated[
         list[str],
-        typer.Argument(
-            metavar="KEY VALUE..",
-            help="joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all apply, or none.",
+        as_written(
+            "KEY VALUE..",
+            "joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all apply, or none.",
         ),
     ],
     as_json: AsJson = False,
 ) -> None:
     """Change limits within the configured ones; refused as a whole where the arm would be outside."""
-    refuse_options(pairs, ("--json",))
     changes = _changes(pairs)
     with connect("limits set") as robot:
         found = robot.set_limits(changes)
