@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from rtcp.api.results import Progress
+from rtcp.api.results import Progress, result
 from rtcp.api.robot import Call, Methods
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
@@ -130,7 +130,7 @@ class _Pending:
             if progress is None:
                 self.answer.set_result(reply)
             elif self._call.progress is not None:
-                self._call.progress(Progress.from_json(progress))
+                self._call.progress(result(Progress, progress))
         except Exception as error:  # a callback's own: it ends its request, not the connection
             self.answer.set_exception(error)
 

@@ -10,11 +10,12 @@ import inspect
 import time
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero
+from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero, result
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -86,6 +87,9 @@ def _as_is(answer: Json) -> Json:
     return answer
 
 
+_arrival, _streamed = partial(result, Arrival), partial(result, Streamed)
+
+
 def _held(hold_s: float, sent_s: float | None) -> Json:
     return {"hold_s": hold_s, "sent_s": time.monotonic() if sent_s is None else sent_s}
 
@@ -109,7 +113,7 @@ class Methods:
     @Method
     def events(self, since: int = 0) -> Call[list[EventRecord]]:
         """Return the events after the number `since`, oldest first; the last 256 are kept."""
-        return Call("events", {"since": since}, lambda answer: [EventRecord(**one) for one in answer["events"]])
+        return Call("events", {"since": since}, lambda answer: [result(EventRecord, one) for one in answer["events"]])
 
     @Method
     def scan(self) -> Call[list[Json]]:
@@ -181,7 +185,7 @@ class Methods:
             Faulted: it ended before it arrived.
         """
         params = {"q": list(q), "speed": speed, "synchronized": synchronized}
-        return Call("move_joints", params, Arrival.from_json, progress)
+        return Call("move_joints", params, _arrival, progress)
 
     @Method
     def move_pose(
@@ -200,7 +204,7 @@ class Methods:
             progress: called about ten times a second meanwhile.
         """
         params = {"pose": list(pose), "speed": speed, "line": line}
-        return Call("move_pose", params, Arrival.from_json, progress)
+        return Call("move_pose", params, _arrival, progress)
 
     @Method
     def move_line(
@@ -208,7 +212,7 @@ class Methods:
     ) -> Call[Arrival]:
         """Move the tool on straight lines through poses (m, rad), at `speed`, m/s; None: its limit."""
         params = {"poses": [list(pose) for pose in poses], "speed": speed}
-        return Call("move_line", params, Arrival.from_json, progress)
+        return Call("move_line", params, _arrival, progress)
 
     @Method
     def run(self, file: str, approach: bool = False, progress: OnProgress | None = None) -> Call[Arrival]:
@@ -219,7 +223,7 @@ class Methods:
             approach: move by the joints to where it begins.
             progress: called about ten times a second meanwhile.
         """
-        return Call("run", {"file": str(file), "approach": approach}, Arrival.from_json, progress)
+        return Call("run", {"file": str(file), "approach": approach}, _arrival, progress)
 
     @Method
     def run_trajectory(
@@ -230,7 +234,7 @@ class Methods:
         A point may also have velocities `v` and accelerations `a`.
         """
         params = {"points": [dict(point) for point in points], "approach": approach}
-        return Call("run_trajectory", params, Arrival.from_json, progress)
+        return Call("run_trajectory", params, _arrival, progress)
 
     @Method
     def run_path(
@@ -245,7 +249,7 @@ class Methods:
         `speed`: of the tool, m/s, where a stop has none. With `approach` the joints first move to the first stop.
         """
         params = {"stops": [dict(stop) for stop in stops], "speed": speed, "approach": approach}
-        return Call("run_path", params, Arrival.from_json, progress)
+        return Call("run_path", params, _arrival, progress)
 
     # -- streaming commands -------------------------------------------------------------------------------------------
 
@@ -269,14 +273,14 @@ class Methods:
             TimedOut: it came later than `hold_s` after `sent_s`.
         """
         name = frame if isinstance(frame, str) else frame.name.lower()
-        return Call("jog", {"velocity": list(velocity), "frame": name, **_held(hold_s, sent_s)}, Streamed.from_json)
+        return Call("jog", {"velocity": list(velocity), "frame": name, **_held(hold_s, sent_s)}, _streamed)
 
     @Method
     def move_at_velocity(
         self, velocity: Sequence[float], hold_s: float = 0.25, sent_s: float | None = None
     ) -> Call[Streamed]:
         """Move the joints with velocities, rad/s, in control mode `velocity`; `hold_s` and `sent_s` as for `jog`."""
-        return Call("move_at_velocity", {"velocity": list(velocity), **_held(hold_s, sent_s)}, Streamed.from_json)
+        return Call("move_at_velocity", {"velocity": list(velocity), **_held(hold_s, sent_s)}, _streamed)
 
     @Method
     def apply_torque(
@@ -297,12 +301,12 @@ class Methods:
             sent_s: as for `jog`.
         """
         params = {"torque": list(torque), "stiffness": stiffness, "damping": damping, **_held(hold_s, sent_s)}
-        return Call("apply_torque", params, Streamed.from_json)
+        return Call("apply_torque", params, _streamed)
 
     @Method
     def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:
         """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
-        return Call("stream_position", {"q": list(q), "stamp_s": t}, Streamed.from_json)
+        return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)
 
     # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
 
@@ -340,7 +344,7 @@ class Methods:
             joint: its configured name, or its number from 1, as text.
             at: rad
         """
-        return Call("zero", {"joint": joint, "at": at}, lambda found: Zero(**found))
+        return Call("zero", {"joint": joint, "at": at}, partial(result, Zero))
 
     @Method
     def home(self, joint: str, progress: OnProgress | None = None) -> Call[float]:
@@ -428,7 +432,7 @@ class Robot(Methods):
 
 def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], None] | None:
     report = call.progress
-    return None if report is None else lambda found: report(Progress.from_json(found))
+    return None if report is None else lambda found: report(result(Progress, found))
 
 
 def connect(name: str = "", path: Path | None = None) -> Robot:
