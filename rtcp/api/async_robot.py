@@ -5,38 +5,25 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
-from rtcp.api import methods
-from rtcp.api.methods import Call
-from rtcp.api.results import Progress
-from rtcp.api.robot import documented
+from rtcp.api.results import Progress, result
+from rtcp.api.robot import Call, Methods
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.client import ANSWER_TIMEOUT_S, client_name, connection_error
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import control_socket, runtime_directory
 from rtcp.ipc.states import State
 
-P = ParamSpec("P")
 T = TypeVar("T")
 _REPLY_LIMIT = 1 << 24
 """Bytes of an answer."""
 
 
-def _awaited(
-    method: Callable[Concatenate[Any, P], Call[T]],
-) -> Callable[Concatenate[AsyncRobot, P], Coroutine[Any, Any, T]]:
-    @documented(method)
-    async def call(self: AsyncRobot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return await self._carry_out(method(self, *args, **kwargs))
-
-    return call
-
-
-class AsyncRobot:
+class AsyncRobot(Methods):
     """A connection to the running platform: `async with rtcp.connect_async() as robot: await robot.enable()`.
 
     A call that is cancelled ends its motion. Motions of one connection wait for each other; `halt`, `disable`, `status`
@@ -116,36 +103,6 @@ class AsyncRobot:
         if self._writer is not None:
             self._writer.close()
 
-    status = _awaited(methods.status)
-    events = _awaited(methods.events)
-    scan = _awaited(methods.scan)
-    enable = _awaited(methods.enable)
-    disable = _awaited(methods.disable)
-    reset = _awaited(methods.reset)
-    halt = _awaited(methods.halt)
-    mode = _awaited(methods.mode)
-    stop = _awaited(methods.stop)
-    move_joints = _awaited(methods.move_joints)
-    move_pose = _awaited(methods.move_pose)
-    move_line = _awaited(methods.move_line)
-    run = _awaited(methods.run)
-    run_trajectory = _awaited(methods.run_trajectory)
-    run_path = _awaited(methods.run_path)
-    jog = _awaited(methods.jog)
-    move_at_velocity = _awaited(methods.move_at_velocity)
-    apply_torque = _awaited(methods.apply_torque)
-    stream = _awaited(methods.stream)
-    set_output = _awaited(methods.set_output)
-    gripper = _awaited(methods.gripper)
-    limits = _awaited(methods.limits)
-    set_limits = _awaited(methods.set_limits)
-    zero = _awaited(methods.zero)
-    home = _awaited(methods.home)
-    sdo_read = _awaited(methods.sdo_read)
-    sdo_write = _awaited(methods.sdo_write)
-    joystick = _awaited(methods.joystick)
-    command = _awaited(methods.command)
-
 
 class _Pending:
     """A request whose answer has not come."""
@@ -173,7 +130,7 @@ class _Pending:
             if progress is None:
                 self.answer.set_result(reply)
             elif self._call.progress is not None:
-                self._call.progress(Progress.from_json(progress))
+                self._call.progress(result(Progress, progress))
         except Exception as error:  # a callback's own: it ends its request, not the connection
             self.answer.set_exception(error)
 

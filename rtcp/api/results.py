@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
 
 from rtcp.ipc.states import ControlMode, DriveMode, State
 
+T = TypeVar("T")
 Positions = tuple[float, ...]
 """rad, or rad/s, or Nm: one number a joint."""
+
+
+def result(kind: type[T], found: Mapping[str, Any]) -> T:
+    """Return a result of this type from an answer's keys: lists as tuples, a state by its name."""
+    values: dict[str, Any] = {}
+    for name in (one.name for one in fields(kind)):  # type: ignore[arg-type]
+        if name in found:
+            value = found[name]
+            values[name] = (
+                tuple(value) if isinstance(value, list) else State[value.upper()] if name == "state" else value
+            )
+    return kind(**values)
 
 
 @dataclass(frozen=True)
@@ -67,18 +80,11 @@ def _mode(kind: Any, name: str) -> Any:
 class Progress:
     """How far a motion is."""
 
-    fraction: float
+    fraction: float = 0.0
     """0 to 1."""
-    remaining_s: float
-    positions: Positions
+    remaining_s: float = 0.0
+    positions: Positions = ()
     """Actual positions, rad."""
-
-    @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Progress:
-        """Read the parameters of the notification `progress`."""
-        return cls(
-            float(found.get("fraction", 0.0)), float(found.get("remaining_s", 0.0)), tuple(found.get("positions", ()))
-        )
 
 
 @dataclass(frozen=True)
@@ -96,17 +102,6 @@ class Arrival:
     slowed: float | None = None
     """Fraction of the wanted speed that the joints' limits allowed."""
 
-    @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Arrival:
-        """Read the answer of a motion."""
-        return cls(
-            tuple(found["positions"]),
-            found["error"],
-            found.get("duration_s"),
-            found.get("length_m"),
-            found.get("slowed"),
-        )
-
 
 @dataclass(frozen=True)
 class Streamed:
@@ -116,19 +111,14 @@ class Streamed:
     positions: Positions
     """Actual positions, rad."""
 
-    @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Streamed:
-        """Read the answer of a streaming command."""
-        return cls(State[found["state"].upper()], tuple(found["positions"]))
-
 
 @dataclass(frozen=True)
 class GripperRest:
     """Where the gripper came to rest; both fields are None for a gripper on a digital output."""
 
-    position: float | None
+    position: float | None = None
     """rad"""
-    holds: bool | None
+    holds: bool | None = None
     """Something keeps it from its end position."""
 
 

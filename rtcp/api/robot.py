@@ -1,48 +1,398 @@
-"""A robot, commanded by blocking calls."""
+"""A robot, commanded by blocking calls; and every method of a robot, once: what it sends, what becomes of the answer.
+
+Each method raises `RtcpError` as described there; what a method raises in particular stands in its docstring.
+"""
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-from rtcp.api import methods
-from rtcp.api.methods import Call
-from rtcp.api.results import Progress
+from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero, result
 from rtcp.ipc.client import ControlClient
-from rtcp.ipc.states import State
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 P = ParamSpec("P")
 T = TypeVar("T")
-F = TypeVar("F", bound=Callable[..., Any])
+OnProgress = Callable[[Progress], None]
+Json = dict[str, Any]
 
 
-def documented(method: Callable[..., Call[Any]]) -> Callable[[F], F]:
-    """Give a method the name, signature and docstring of its description in `methods`, whose `Call` users never see."""
+@dataclass(frozen=True)
+class Call(Generic[T]):
+    """One request of the control socket (`docs/protocol.md`)."""
 
-    def document(call: F) -> F:
-        functools.update_wrapper(call, method)
-        found = inspect.signature(method)
-        call.__signature__ = found.replace(  # type: ignore[attr-defined]
+    method: str
+    params: Mapping[str, Any]
+    result: Callable[[Json], T]
+    progress: OnProgress | None = None
+
+
+class _Blocking(Protocol):
+    def _carry_out(self, call: Call[T]) -> T: ...
+
+
+class _Awaited(Protocol):
+    def _carry_out(self, call: Call[T]) -> Coroutine[Any, Any, T]: ...
+
+
+class Method(Generic[P, T]):
+    """A method by the `Call` that it makes, which its users never see: a robot returns the result, or awaits it."""
+
+    def __init__(self, describe: Callable[Concatenate[Any, P], Call[T]]) -> None:
+        self.describe = describe
+
+    @overload
+    def __get__(self, robot: _Blocking, kind: object) -> Callable[P, T]: ...
+
+    @overload
+    def __get__(self, robot: _Awaited, kind: object) -> Callable[P, Coroutine[Any, Any, T]]: ...
+
+    def __get__(self, robot: Any, kind: object) -> Any:
+        """Never called: `Methods` puts functions in the place of its methods. For type checkers."""
+        raise NotImplementedError
+
+    def function(self, awaited: bool) -> object:
+        """Return the function that carries the call out, with name, signature and docstring of the description."""
+        describe = self.describe
+
+        @functools.wraps(describe)
+        def call(self: Any, /, *args: Any, **kwargs: Any) -> Any:
+            return self._carry_out(describe(self, *args, **kwargs))
+
+        @functools.wraps(describe)
+        async def call_awaited(self: Any, /, *args: Any, **kwargs: Any) -> Any:
+            return await self._carry_out(describe(self, *args, **kwargs))
+
+        found = inspect.signature(describe)
+        made: Any = call_awaited if awaited else call
+        made.__signature__ = found.replace(
             return_annotation=str(found.return_annotation).removeprefix("Call[").removesuffix("]")
         )
-        return call
-
-    return document
+        return made
 
 
-def _blocking(method: Callable[Concatenate[Any, P], Call[T]]) -> Callable[Concatenate[Robot, P], T]:
-    @documented(method)
-    def call(self: Robot, /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return self._carry_out(method(self, *args, **kwargs))
-
-    return call
+def _nothing(answer: Json) -> None:
+    return None
 
 
-class Robot:
+def _as_is(answer: Json) -> Json:
+    return answer
+
+
+_arrival, _streamed = partial(result, Arrival), partial(result, Streamed)
+
+
+def _held(hold_s: float, sent_s: float | None) -> Json:
+    return {"hold_s": hold_s, "sent_s": time.monotonic() if sent_s is None else sent_s}
+
+
+class Methods:
+    """The methods of every robot; a subclass has `_carry_out`, which a coroutine function makes awaited methods."""
+
+    def __init_subclass__(cls) -> None:
+        awaited = inspect.iscoroutinefunction(cls._carry_out)  # type: ignore[attr-defined]
+        for name, method in vars(Methods).items():
+            if isinstance(method, Method):
+                setattr(cls, name, method.function(awaited))
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    @Method
+    def status(self) -> Call[Status]:
+        """Return the state of the machine, the joints and the bus."""
+        return Call("status", {}, Status.from_json)
+
+    @Method
+    def events(self, since: int = 0) -> Call[list[EventRecord]]:
+        """Return the events after the number `since`, oldest first; the last 256 are kept."""
+        return Call("events", {"since": since}, lambda answer: [result(EventRecord, one) for one in answer["events"]])
+
+    @Method
+    def scan(self) -> Call[list[Json]]:
+        """Return the slaves as the start found them: identity, PDO entries, and their AL states now."""
+        return Call("scan", {}, lambda answer: list(answer["slaves"]))
+
+    @Method
+    def enable(self) -> Call[None]:
+        """Enable all drives; return when the arm holds where it stands."""
+        return Call("enable", {}, _nothing)
+
+    @Method
+    def disable(self) -> Call[tuple[str, ...]]:
+        """Stop, remove the torque and return when the drives show that it is gone. Needs no lease.
+
+        Returns:
+            drives that were told to, and that no record shows: a gripper's during a fault.
+        """
+        return Call("disable", {}, lambda answer: tuple(answer["unconfirmed"]))
+
+    @Method
+    def reset(self) -> Call[State]:
+        """Leave a fault or an emergency stop (drives are disabled then), or a stop by a limit (the arm holds).
+
+        Returns:
+            the state that was left; `READY` or `HOLDING`: there was nothing to reset.
+        """
+        return Call("reset", {}, lambda answer: State[answer["from"].upper()])
+
+    @Method
+    def halt(self) -> Call[None]:
+        """Stop every motion, whoever began it; return when the arm holds. Needs no lease."""
+        return Call("halt", {}, _nothing)
+
+    @Method
+    def mode(self, name: ControlMode | DriveMode | str) -> Call[None]:
+        """Change the control mode (`joint`, `cartesian`, ...) or the drive mode (`csp`, `csv`, `cst`) at standstill."""
+        return Call("mode", {"name": name if isinstance(name, str) else name.name.lower()}, _nothing)
+
+    @Method
+    def stop(self) -> Call[tuple[str, ...]]:
+        """End the platform: stop the arm, disable the drives, leave the bus.
+
+        Returns:
+            what could not be left in order, a sentence each.
+        """
+        return Call("stop", {}, lambda answer: tuple(answer["problems"]))
+
+    # -- motions with an end ------------------------------------------------------------------------------------------
+
+    @Method
+    def move_joints(
+        self,
+        q: Sequence[float],
+        speed: float | None = None,
+        synchronized: bool = True,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Move to joint positions and return when the arm is there.
+
+        Args:
+            q: rad, base to tool.
+            speed: of the fastest joint, rad/s; None: its limit.
+            synchronized: all joints arrive together; else each as soon as it can.
+            progress: called about ten times a second meanwhile.
+
+        Raises:
+            Refused: a target outside the limits, the wrong state, another commander.
+            Faulted: it ended before it arrived.
+        """
+        params = {"q": list(q), "speed": speed, "synchronized": synchronized}
+        return Call("move_joints", params, _arrival, progress)
+
+    @Method
+    def move_pose(
+        self,
+        pose: Sequence[float],
+        speed: float | None = None,
+        line: bool = False,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Move the tool to a pose, by the nearest solution of the joints, and return when it is there.
+
+        Args:
+            pose: x y z, m, and rx ry rz, rad, with R = Rx Ry Rz.
+            speed: of the fastest joint, rad/s, or with `line` of the tool, m/s; None: the limit.
+            line: on a straight line, as always in control mode `cartesian`.
+            progress: called about ten times a second meanwhile.
+        """
+        params = {"pose": list(pose), "speed": speed, "line": line}
+        return Call("move_pose", params, _arrival, progress)
+
+    @Method
+    def move_line(
+        self, poses: Sequence[Sequence[float]], speed: float | None = None, progress: OnProgress | None = None
+    ) -> Call[Arrival]:
+        """Move the tool on straight lines through poses (m, rad), at `speed`, m/s; None: its limit."""
+        params = {"poses": [list(pose) for pose in poses], "speed": speed}
+        return Call("move_line", params, _arrival, progress)
+
+    @Method
+    def run(self, file: str, approach: bool = False, progress: OnProgress | None = None) -> Call[Arrival]:
+        """Run a motion file (`docs/motion.md`), checked as a whole first.
+
+        Args:
+            file: absolute path.
+            approach: move by the joints to where it begins.
+            progress: called about ten times a second meanwhile.
+        """
+        return Call("run", {"file": str(file), "approach": approach}, _arrival, progress)
+
+    @Method
+    def run_trajectory(
+        self, points: Sequence[Mapping[str, Any]], approach: bool = False, progress: OnProgress | None = None
+    ) -> Call[Arrival]:
+        """Run a trajectory through points `{"t": s, "q": [rad]}`; `approach`: the joints first move to the first point.
+
+        A point may also have velocities `v` and accelerations `a`.
+        """
+        params = {"points": [dict(point) for point in points], "approach": approach}
+        return Call("run_trajectory", params, _arrival, progress)
+
+    @Method
+    def run_path(
+        self,
+        stops: Sequence[Mapping[str, Any]],
+        speed: float | None = None,
+        approach: bool = False,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Run a path of straight lines through stops `{"pose": [...]}` or `{"q": [...]}`, each with or without `speed`.
+
+        `speed`: of the tool, m/s, where a stop has none. With `approach` the joints first move to the first stop.
+        """
+        params = {"stops": [dict(stop) for stop in stops], "speed": speed, "approach": approach}
+        return Call("run_path", params, _arrival, progress)
+
+    # -- streaming commands -------------------------------------------------------------------------------------------
+
+    @Method
+    def jog(
+        self,
+        velocity: Sequence[float],
+        frame: JogFrame | str = "base",
+        hold_s: float = 0.25,
+        sent_s: float | None = None,
+    ) -> Call[Streamed]:
+        """Move with a velocity for `hold_s`; call it again meanwhile to go on. The arm stops by itself.
+
+        Args:
+            velocity: of the tool along and about the axes of `frame`, 6 numbers, m/s and rad/s; of the joints, rad/s.
+            frame: `base`, `tool` or `joints`.
+            hold_s: s
+            sent_s: CLOCK_MONOTONIC, s, of the operator's input; a command older than `hold_s` has no effect. None: now.
+
+        Raises:
+            TimedOut: it came later than `hold_s` after `sent_s`.
+        """
+        name = frame if isinstance(frame, str) else frame.name.lower()
+        return Call("jog", {"velocity": list(velocity), "frame": name, **_held(hold_s, sent_s)}, _streamed)
+
+    @Method
+    def move_at_velocity(
+        self, velocity: Sequence[float], hold_s: float = 0.25, sent_s: float | None = None
+    ) -> Call[Streamed]:
+        """Move the joints with velocities, rad/s, in control mode `velocity`; `hold_s` and `sent_s` as for `jog`."""
+        return Call("move_at_velocity", {"velocity": list(velocity), **_held(hold_s, sent_s)}, _streamed)
+
+    @Method
+    def apply_torque(
+        self,
+        torque: Sequence[float],
+        stiffness: float = 0.0,
+        damping: float = 0.0,
+        hold_s: float = 0.25,
+        sent_s: float | None = None,
+    ) -> Call[Streamed]:
+        """Add joint torques, Nm, to what carries the weight of the arm, in control mode `torque`.
+
+        Args:
+            torque: Nm, one a joint.
+            stiffness: fraction, 0 to 1, of each joint's `cst_stiffness`.
+            damping: fraction, 0 to 1, of each joint's `cst_damping`.
+            hold_s: as for `jog`.
+            sent_s: as for `jog`.
+        """
+        params = {"torque": list(torque), "stiffness": stiffness, "damping": damping, **_held(hold_s, sent_s)}
+        return Call("apply_torque", params, _streamed)
+
+    @Method
+    def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:
+        """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
+        return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)
+
+    # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
+
+    @Method
+    def set_output(self, output: int, value: bool) -> Call[None]:
+        """Set a digital output of the IO box, counted from 1."""
+        return Call("set_output", {"output": output, "value": value}, _nothing)
+
+    @Method
+    def gripper(self, open: bool) -> Call[GripperRest]:
+        """Open or close the gripper; one with a drive has come to rest when this returns."""
+        return Call(
+            "move_gripper", {"open": open}, lambda found: GripperRest(found.get("position"), found.get("holds"))
+        )
+
+    @Method
+    def limits(self) -> Call[Json]:
+        """Return the limits in force beside the configured ones, as `rtcp limits show --json` prints them."""
+        return Call("limits", {}, _as_is)
+
+    @Method
+    def set_limits(self, changes: Mapping[str, float]) -> Call[Json]:
+        """Narrow limits, all or none, until the platform ends; return them.
+
+        Args:
+            changes: by key: `joint2.max`, `joints.velocity`, `box.min.x`, `user.max.z`, ...
+        """
+        return Call("set_limits", {"changes": dict(changes)}, _as_is)
+
+    @Method
+    def zero(self, joint: str, at: float = 0.0) -> Call[Zero]:
+        """Define the present position of a joint as `at`, rad, now and in the file of offsets; drives have no torque.
+
+        Args:
+            joint: its configured name, or its number from 1, as text.
+            at: rad
+        """
+        return Call("zero", {"joint": joint, "at": at}, partial(result, Zero))
+
+    @Method
+    def home(self, joint: str, progress: OnProgress | None = None) -> Call[float]:
+        """Run the homing of a joint's drive; return its position afterwards, rad."""
+        return Call("home", {"joint": joint}, lambda found: float(found["position"]), progress)
+
+    @Method
+    def sdo_read(self, slave: int, index: int, subindex: int = 0) -> Call[bytes]:
+        """Read an object of the slave at position `slave`, from 1."""
+        params = {"slave": slave, "index": index, "subindex": subindex}
+        return Call("sdo_read", params, lambda found: bytes.fromhex(found["hex"]))
+
+    @Method
+    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> Call[None]:
+        """Write an object of the slave at position `slave`, from 1; only while no drive has torque."""
+        params = {"slave": slave, "index": index, "subindex": subindex, "hex": data.hex()}
+        return Call("sdo_write", params, _nothing)
+
+    @Method
+    def joystick(
+        self, *pressed: str, byte: int | None = None, hold_s: float = 1.0, sent_s: float | None = None
+    ) -> Call[None]:
+        """Hold the joystick of the virtual IO box for `hold_s`, at most 1 s; nothing pressed: neutral.
+
+        Args:
+            pressed: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.
+            byte: the joystick's byte instead.
+            hold_s: s
+            sent_s: as for `jog`.
+        """
+        return Call("joystick", {"pressed": list(pressed), "byte": byte, **_held(hold_s, sent_s)}, _nothing)
+
+    @Method
+    def command(self, name: str, /, progress: OnProgress | None = None, **fields: Any) -> Call[Json]:
+        """Send a command by its name, also one that a package outside registers (`docs/extending.md`).
+
+        Args:
+            name: of the command or of any other method (`docs/protocol.md`).
+            progress: called about ten times a second meanwhile.
+            fields: its fields; enums by their names in lower case.
+
+        Returns:
+            the answer as JSON has it.
+        """
+        return Call(name, fields, _as_is, progress)
+
+
+class Robot(Methods):
     """A connection to the running platform; one call at a time, from one thread.
 
     Closing it stops what it moves: its lease ends, and the arm comes to a controlled stop.
@@ -79,40 +429,10 @@ class Robot:
     def _carry_out(self, call: Call[T]) -> T:
         return call.result(self._client.call(call.method, call.params, _reader(call)))
 
-    status = _blocking(methods.status)
-    events = _blocking(methods.events)
-    scan = _blocking(methods.scan)
-    enable = _blocking(methods.enable)
-    disable = _blocking(methods.disable)
-    reset = _blocking(methods.reset)
-    halt = _blocking(methods.halt)
-    mode = _blocking(methods.mode)
-    stop = _blocking(methods.stop)
-    move_joints = _blocking(methods.move_joints)
-    move_pose = _blocking(methods.move_pose)
-    move_line = _blocking(methods.move_line)
-    run = _blocking(methods.run)
-    run_trajectory = _blocking(methods.run_trajectory)
-    run_path = _blocking(methods.run_path)
-    jog = _blocking(methods.jog)
-    move_at_velocity = _blocking(methods.move_at_velocity)
-    apply_torque = _blocking(methods.apply_torque)
-    stream = _blocking(methods.stream)
-    set_output = _blocking(methods.set_output)
-    gripper = _blocking(methods.gripper)
-    limits = _blocking(methods.limits)
-    set_limits = _blocking(methods.set_limits)
-    zero = _blocking(methods.zero)
-    home = _blocking(methods.home)
-    sdo_read = _blocking(methods.sdo_read)
-    sdo_write = _blocking(methods.sdo_write)
-    joystick = _blocking(methods.joystick)
-    command = _blocking(methods.command)
-
 
 def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], None] | None:
     report = call.progress
-    return None if report is None else lambda found: report(Progress.from_json(found))
+    return None if report is None else lambda found: report(result(Progress, found))
 
 
 def connect(name: str = "", path: Path | None = None) -> Robot:

@@ -12,9 +12,8 @@ import typer
 
 import rtcp
 from rtcp.api import RtcpError
-from rtcp.cli import arm, bus, demo, doctor, faults, jog, limits, motion, platform, segment, service, soak, status
-from rtcp.cli.errors import CommandError, ExitCode, code_of, interruption_code
-from rtcp.cli.output import complain, emit, mute
+from rtcp.cli import arm, bus, demo, doctor, faults, jog, motion, platform, segment, service, soak, status
+from rtcp.cli.output import CommandError, ExitCode, code_of, complain, emit, interruption_code, mute
 from rtcp.config.model import ConfigError
 
 app = typer.Typer(
@@ -46,8 +45,8 @@ def _root(
             emit(text.rstrip())
 
 
-for _group in (platform, status, motion, jog, limits, arm, bus, segment, demo, service, doctor, soak, faults):
-    _group.register(app)
+for _group in (platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults):
+    app.add_typer(_group.commands)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

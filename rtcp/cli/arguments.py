@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rtcp.cli.errors import CommandError
+from rtcp.cli.output import CommandError
 from rtcp.config.numbers import angle, plain_number
 
 
@@ -20,6 +20,33 @@ def option(name: str, metavar_or_help: str = "", help: str = "") -> Any:
     if not help:
         return typer.Option(name, help=metavar_or_help)
     return typer.Option(name, metavar=metavar_or_help or None, help=help)
+
+
+def as_written(metavar: str, help: str = "") -> Any:
+    """Declare an argument of a command with `NUMBERS_AS_WRITTEN`; an option that was misspelt is refused there."""
+    return typer.Argument(metavar=metavar, help=help, callback=_refuse_options)
+
+
+def _refuse_options(context: typer.Context, values: Any) -> Any:
+    """Refuse an option that was passed among numbers.
+
+    Raises:
+        CommandError: names the option and the command's own that is nearest.
+    """
+    options = [name for parameter in context.command.params for name in parameter.opts if name.startswith("-")]
+    known = [*options, *context.help_option_names]
+    for value in [values] if isinstance(values, str) else values:
+        if not value.startswith("-") or _NUMBER.match(value):
+            continue
+        option = value.split("=", 1)[0]
+        if option in known:
+            raise CommandError(f"{option} is after --, which ends the options: put it before --")
+        if option in RENAMED_OPTIONS:
+            raise CommandError(f"{option} is now {RENAMED_OPTIONS[option]}")
+        near = difflib.get_close_matches(option, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
+        raise CommandError(f"no such option: {option} ({hint})")
+    return values
 
 
 ConfigFile = Annotated[
@@ -33,7 +60,7 @@ Poll = Annotated[bool, option("--poll", "The virtual segment polls: it answers f
 AsJson = Annotated[bool, option("--json", "Print JSON, SI units.")]
 
 NUMBERS_AS_WRITTEN = {"ignore_unknown_options": True}
-"""Passes `-0.5` through to the arguments; `refuse_options` then finds misspelt options among them."""
+"""Passes `-0.5` through to the arguments, which are declared by `as_written`."""
 JOINTS = 6
 POSE = ("x", "y", "z", "rx", "ry", "rz")
 PICTURES = (".png", ".svg", ".pdf")
@@ -49,26 +76,6 @@ def refuse_old_name(app: typer.Typer, old: str, new: str) -> None:
         raise CommandError(f"{old} is now `{new}`")
 
     app.command(old, hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True})(refuse)
-
-
-def refuse_options(values: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse an option that was passed among numbers.
-
-    Raises:
-        CommandError: names the option and the known one that is nearest.
-    """
-    known = (*known, "--help", "-h")
-    for value in values:
-        if not value.startswith("-") or _NUMBER.match(value):
-            continue
-        option = value.split("=", 1)[0]
-        if option in known:
-            raise CommandError(f"{option} is after --, which ends the options: put it before --")
-        if option in RENAMED_OPTIONS:
-            raise CommandError(f"{option} is now {RENAMED_OPTIONS[option]}")
-        near = difflib.get_close_matches(option, known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(known)}"
-        raise CommandError(f"no such option: {option} ({hint})")
 
 
 def joint_values(values: Sequence[str], option: str = "") -> list[float]:

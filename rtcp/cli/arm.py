@@ -13,14 +13,13 @@ from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
     PICTURES,
     AsJson,
+    as_written,
     check_picture,
     joint_values,
     option,
     pose_values,
-    refuse_options,
 )
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit, emit_json, report, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -35,24 +34,16 @@ ArmFile = Annotated[
     str | None,
     option("--arm", "FILE", "File of an arm, or name of a packaged one. Default: the platform's."),
 ]
-Positions = Annotated[
-    list[str], typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool.")
-]
+Positions = Annotated[list[str], as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool.")]
+
+HELP = "Compute with an arm: forward and inverse kinematics, picture, URDF."
+commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    arm = typer.Typer(help="Compute with an arm: forward and inverse kinematics, picture, URDF.", no_args_is_help=True)
-    arm.command("fk", context_settings=NUMBERS_AS_WRITTEN)(_fk)
-    arm.command("ik", context_settings=NUMBERS_AS_WRITTEN)(_ik)
-    arm.command("plot", context_settings=NUMBERS_AS_WRITTEN)(_plot)
-    arm.command("urdf")(_urdf)
-    app.add_typer(arm, name="arm")
-
-
+@commands.command("fk", context_settings=NUMBERS_AS_WRITTEN)
 def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> None:
     """Show the pose of the tool and of every frame at joint positions."""
-    q = _joints(positions, ("--arm", "--json"))
+    q = _joints(positions)
     model = _model(arm)
     from kinematics.forward import forward
 
@@ -64,12 +55,11 @@ def _fk(positions: Positions, arm: ArmFile = None, as_json: AsJson = False) -> N
     show(*_forward_tables(model, q))
 
 
+@commands.command("ik", context_settings=NUMBERS_AS_WRITTEN)
 def _ik(
     pose: Annotated[
         list[str],
-        typer.Argument(
-            metavar="X Y Z RX RY RZ", help="Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."
-        ),
+        as_written("X Y Z RX RY RZ", "Tool pose: m, and rad (or as -pi/2) of R = Rx(rx) Ry(ry) Rz(rz)."),
     ],
     near: Annotated[
         tuple[str, str, str, str, str, str] | None,
@@ -79,7 +69,6 @@ def _ik(
     as_json: AsJson = False,
 ) -> None:
     """Show all joint positions that reach a pose; exit code 3 where there are none."""
-    refuse_options(pose, ("--near", "--arm", "--json"))
     wanted = pose_values(pose)
     q_near = None if near is None else joint_values(near, "--near, ")
     model = _model(arm)
@@ -99,13 +88,14 @@ def _ik(
         show(*_inverse_tables(model, found.solutions))
 
 
+@commands.command("plot", context_settings=NUMBERS_AS_WRITTEN)
 def _plot(
     positions: Positions,
     out: Annotated[Path, option("--out", "FILE", f"Picture: {', '.join(PICTURES)}.")] = (Path("arm.png")),
     arm: ArmFile = None,
 ) -> None:
     """Draw the arm and its frames."""
-    q = _joints(positions, ("--out", "--arm"))
+    q = _joints(positions)
     check_picture("--out", out)
     model = _model(arm)
     from rtcp.cli.arm_plot import draw
@@ -113,6 +103,7 @@ def _plot(
     _write(out, lambda: draw(model, q, out))
 
 
+@commands.command("urdf")
 def _urdf(
     out: Annotated[Path | None, option("--out", "FILE", "File to write. Default: standard output.")] = None,
     arm: ArmFile = None,
@@ -136,8 +127,7 @@ def _model(arm: str | None) -> ArmModel:
     return load_kinematics(find_arm(arm))
 
 
-def _joints(positions: Sequence[str], options: Sequence[str]) -> list[float]:
-    refuse_options(positions, options)
+def _joints(positions: Sequence[str]) -> list[float]:
     if len(positions) != JOINTS:
         raise CommandError(f"{len(positions)} positions for an arm of {JOINTS} joints: give {JOINTS} numbers, rad")
     return joint_values(positions)

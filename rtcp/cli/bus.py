@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from rtcp.api import NotRunning, Robot
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, option, refuse_options
-from rtcp.cli.connection import connect
-from rtcp.cli.errors import CommandError, interruption_code, signals_raise
-from rtcp.cli.output import emit, emit_json, facts, report, show, table
-from rtcp.cli.platform import refuse_second_platform
-from rtcp.config.model import VIRTUAL
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, AsJson, BusName, ConfigFile, as_written, option
+from rtcp.cli.output import CommandError, emit, emit_json, facts, interruptible, report, show, table
+from rtcp.cli.platform import connect, refuse_second_platform
+from rtcp.config.model import VIRTUAL, integer_range
 from rtcp.config.numbers import plain_number
 from rtcp.launch import offline
 
@@ -26,29 +24,25 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-INTEGER_TYPES = {f"{sign}int{bits}": (bits // 8, sign == "") for bits in (8, 16, 32, 64) for sign in ("u", "")}
-"""Name -> bytes, signed."""
-FLOAT_TYPES = {"float32": struct.Struct("<f"), "float64": struct.Struct("<d")}
-TYPES = ("bool", *INTEGER_TYPES, *FLOAT_TYPES, "string", "bytes")
+STRUCTS = {
+    name: struct.Struct(f"<{code}")
+    for name, code in {
+        "bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i",
+        "uint64": "Q", "int64": "q", "float32": "f", "float64": "d",
+    }.items()
+}  # fmt: skip
+TYPES = (*STRUCTS, "string", "bytes")
 _OBJECT = re.compile(r"(?:0x(?P<prefixed>[0-9a-f]+)|(?P<suffixed>[0-9][0-9a-f]*)h)(?::(?P<sub>\w+))?", re.IGNORECASE)
 
-SlaveName = Annotated[
-    str, typer.Argument(metavar="SLAVE", help="Position on the cable, from 1, or the configured name.")
-]
-ObjectIndex = Annotated[
-    str, typer.Argument(metavar="INDEX[:SUB]", help="Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")
-]
+SlaveName = Annotated[str, as_written("SLAVE", "Position on the cable, from 1, or the configured name.")]
+ObjectIndex = Annotated[str, as_written("INDEX[:SUB]", "Index in hex, as 0x6041 or 6041h; 0x1018:1 for a subindex.")]
+
+commands = typer.Typer()
+sdo = typer.Typer(name="sdo", help="Read and write objects of a slave.", no_args_is_help=True)
+commands.add_typer(sdo)
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("scan")(_scan)
-    sdo = typer.Typer(help="Read and write objects of a slave.", no_args_is_help=True)
-    sdo.command("read")(_sdo_read)
-    sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)(_sdo_write)
-    app.add_typer(sdo, name="sdo")
-
-
+@commands.command("scan")
 def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
     """Show the slaves: identity, state, PDO map, clocks and delays."""
     with _bus("scan", bus, config) as asked:
@@ -59,6 +53,7 @@ def _scan(bus: BusName = None, config: ConfigFile = None, as_json: AsJson = Fals
         show(*_scan_tables(asked.name, slaves))
 
 
+@sdo.command("read")
 def _sdo_read(
     slave: SlaveName,
     where: ObjectIndex,
@@ -74,16 +69,16 @@ def _sdo_read(
     emit(interpretations(data) if known is None else decode(data, known))
 
 
+@sdo.command("write", context_settings=NUMBERS_AS_WRITTEN)
 def _sdo_write(
     slave: SlaveName,
     where: ObjectIndex,
-    value: Annotated[list[str], typer.Argument(metavar="VALUE")],
+    value: Annotated[list[str], as_written("VALUE")],
     type_name: Annotated[str, option("--type", "TYPE", f"{', '.join(TYPES)}.")],
     bus: BusName = None,
     config: ConfigFile = None,
 ) -> None:
     """Write an object."""
-    refuse_options([slave, where, *value], ("--type", "--bus", "--config"))
     if len(value) != 1:
         raise CommandError(f"found {len(value)} values: {' '.join(value)}; give one (quote a string)")
     index, subindex = parse_object(where)
@@ -97,32 +92,12 @@ def _sdo_write(
 # -- access ---------------------------------------------------------------------------------------------------------
 
 
-class OfflineBus:
-    """A bus that is opened for each request and closed again; methods as those of `rtcp.api.Robot`."""
-
-    def __init__(self, bus: str, config: Path | None) -> None:
-        self._bus = bus
-        self._config = config
-
-    def scan(self) -> list[dict[str, Any]]:
-        """Return what each slave reports."""
-        return offline.scan(self._bus, self._config)
-
-    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
-        """Return the bytes of an object."""
-        return offline.sdo_read(self._bus, self._config, slave, index, subindex)
-
-    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
-        """Write the bytes of an object."""
-        offline.sdo_write(self._bus, self._config, slave, index, subindex, data)
-
-
 class Bus(NamedTuple):
     """A bus that can be asked: its name, the position of each slave by configured name, and who asks it."""
 
     name: str
     positions: dict[str, int]
-    access: Robot | OfflineBus
+    access: Robot | offline.OfflineBus
 
     def position(self, slave: str) -> int:
         """Return the position of a slave given by position or configured name; raises CommandError."""
@@ -143,23 +118,20 @@ def _bus(command: str, name: str | None, config: Path | None) -> Iterator[Bus]:
         RtcpError: as the platform or the offline bus answers.
         ConfigError: the configuration is wrong.
     """
-    try:
-        with signals_raise():
-            try:
-                robot = connect(command)
-            except NotRunning:
-                refuse_second_platform()
+    with interruptible("interrupted: nothing is left running"):
+        try:
+            robot = connect(command)
+        except NotRunning:
+            refuse_second_platform()
+            yield _offline(name, config)
+            return
+        with robot:
+            status = robot.status().raw
+            if name in (None, status["bus"]):
+                positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
+                yield Bus(status["bus"], positions, robot)
+            else:
                 yield _offline(name, config)
-                return
-            with robot:
-                status = robot.status().raw
-                if name in (None, status["bus"]):
-                    positions = {slave["name"]: slave["position"] for slave in status["slaves"]}
-                    yield Bus(status["bus"], positions, robot)
-                else:
-                    yield _offline(name, config)
-    except KeyboardInterrupt as interruption:
-        raise CommandError("interrupted: nothing is left running", interruption_code(interruption)) from None
 
 
 def _offline(name: str | None, config: Path | None) -> Bus:
@@ -170,7 +142,7 @@ def _offline(name: str | None, config: Path | None) -> Bus:
     name = arm.bus.interface if name is None else name
     if name == VIRTUAL:
         check_segment(segment_path(arm))
-    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, OfflineBus(name, config))
+    return Bus(name, {slave.name: at for at, slave in enumerate(arm.slaves, 1)}, offline.OfflineBus(name, config))
 
 
 # -- objects as text (little endian on the wire) --------------------------------------------------------------------
@@ -207,18 +179,15 @@ def encode(text: str, type_name: str) -> bytes:
             return bytes.fromhex(text.removeprefix("0x"))
         except ValueError as error:
             raise CommandError(f"{text!r} is not bytes in hex, as 01ff") from error
-    if type_name in FLOAT_TYPES:
-        return _encode_float(text, type_name)
     if type_name == "bool":
         if text.lower() not in ("0", "1", "true", "false"):
             raise CommandError(f"{text!r} does not fit bool: 0, 1, true or false")
-        return b"\x01" if text.lower() in ("1", "true") else b"\x00"
-    size, signed = INTEGER_TYPES[type_name]
-    number = _integer(text, type_name)
-    lowest, highest = (-(1 << 8 * size - 1), (1 << 8 * size - 1) - 1) if signed else (0, (1 << 8 * size) - 1)
-    if not lowest <= number <= highest:
-        raise CommandError(f"{text} does not fit {type_name}: {lowest} to {highest}")
-    return number.to_bytes(size, "little", signed=signed)
+        return STRUCTS[type_name].pack(text.lower() in ("1", "true"))
+    try:
+        return STRUCTS[type_name].pack(_finite(text, type_name) if "float" in type_name else _integer(text, type_name))
+    except (struct.error, OverflowError) as error:
+        span = "" if "float" in type_name else ": {} to {}".format(*integer_range(type_name))
+        raise CommandError(f"{text} does not fit {type_name}{span}") from error
 
 
 def decode(data: bytes, type_name: str) -> str:
@@ -227,26 +196,21 @@ def decode(data: bytes, type_name: str) -> str:
         return data.rstrip(b"\0").decode(errors="replace")
     if type_name == "bytes":
         return data.hex()
-    size = FLOAT_TYPES[type_name].size if type_name in FLOAT_TYPES else INTEGER_TYPES.get(type_name, (1, False))[0]
-    if len(data) != size:
+    if len(data) != (size := STRUCTS[type_name].size):
         raise CommandError(
             f"the object has {len(data)} bytes ({data.hex() or 'none'}), {type_name} has {size}: choose another --type"
         )
-    if type_name in FLOAT_TYPES:
-        return repr(float(FLOAT_TYPES[type_name].unpack(data)[0]))
-    if type_name == "bool":
-        return "true" if data[0] else "false"
-    return str(int.from_bytes(data, "little", signed=INTEGER_TYPES[type_name][1]))
+    return repr(*STRUCTS[type_name].unpack(data)).lower()
 
 
 def interpretations(data: bytes) -> str:
     """Return the bytes in hex, as integers of that size, and as text where all of it is printable."""
     parts = [data.hex(" ") or "(empty)"]
-    for name, (size, signed) in INTEGER_TYPES.items():
-        if size == len(data):
-            number = int.from_bytes(data, "little", signed=signed)
-            if not signed:
-                parts.append(f"{name} {number} (0x{number:0{2 * size}X})")
+    for name, packing in STRUCTS.items():
+        if "int" in name and packing.size == len(data):
+            (number,) = packing.unpack(data)
+            if name.startswith("u"):
+                parts.append(f"{name} {number} (0x{number:0{2 * len(data)}X})")
             elif number < 0:
                 parts.append(f"{name} {number}")
     text = data.rstrip(b"\0")
@@ -255,17 +219,14 @@ def interpretations(data: bytes) -> str:
     return "   ".join(parts)
 
 
-def _encode_float(text: str, type_name: str) -> bytes:
+def _finite(text: str, type_name: str) -> float:
     try:
         number = plain_number(text)
-        packed = FLOAT_TYPES[type_name].pack(number)
     except ValueError as error:
         raise CommandError(f"{text!r} is not a number ({type_name})") from error
-    except OverflowError as error:
-        raise CommandError(f"{text} does not fit {type_name}") from error
     if not math.isfinite(number):
         raise CommandError(f"{text} is not finite; a finite {type_name} is needed")
-    return packed
+    return number
 
 
 def _integer(text: str, what: str) -> int:

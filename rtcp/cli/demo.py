@@ -14,11 +14,9 @@ import typer
 
 from rtcp.api import Robot
 from rtcp.cli.arguments import BusName, ConfigFile, check_picture, option, positive
-from rtcp.cli.connection import connect
-from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, signals_raise
 from rtcp.cli.motion import arrival
-from rtcp.cli.output import report, show, table
-from rtcp.cli.platform import launch, refuse_second_platform
+from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, interruptible, report, show, table
+from rtcp.cli.platform import connect, launch, refuse_second_platform
 from rtcp.cli.status import CYCLE_TIMES, clock_state, quantiles, realtime_line
 from rtcp.launch import offline
 
@@ -39,12 +37,10 @@ LOCK_TIMEOUT_S = 10.0
 LONGEST_S = 3600.0
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *SUSPENDING)
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("demo")(_demo)
+commands = typer.Typer()
 
 
+@commands.command("demo")
 def _demo(
     config: ConfigFile = None,
     bus: BusName = None,
@@ -68,11 +64,9 @@ def _demo(
     from rtcp.launch.launcher import StartOptions
 
     options = StartOptions(config=config, bus=bus, mode="csp")
-    try:
-        with signals_raise(*SUSPENDING), _platform(options) as started_s, connect("demo") as robot:
-            status, mean_ns = _run(robot, arm.joints, seconds, drive)
-    except KeyboardInterrupt as interruption:
-        raise CommandError("interrupted: the platform has been stopped", interruption_code(interruption)) from None
+    stoppable = interruptible("interrupted: the platform has been stopped", *SUSPENDING)
+    with stoppable, _platform(options) as started_s, connect("demo") as robot:
+        status, mean_ns = _run(robot, arm.joints, seconds, drive)
     show(figures(status, started_s, mean_ns))
     if drive is not None:
         drive.report()

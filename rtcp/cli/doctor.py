@@ -10,8 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit, emit_json, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, show, table
 from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
@@ -31,12 +30,10 @@ Bus = Annotated[
     option("--bus", "virtual|NAME", "virtual, or a network interface. Default: the configured one."),
 ]
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("doctor")(_doctor)
+commands = typer.Typer()
 
 
+@commands.command("doctor")
 def _doctor(bus: Bus = None, config: ConfigFile = None, as_json: AsJson = False) -> None:
     """Show what on this host prevents real time, why, and how to fix it; changes nothing.
 

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rtcp.cli.arguments import AsJson, check_picture, option
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit_json, facts, report, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit_json, facts, report, show, table
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -25,15 +24,10 @@ SERVICE_FAULTS = Path("/var/lib/rtcp/faults")
 JOINT_COLUMNS = {"position rad": "actual_position", "target rad": "sent_position", "velocity rad/s": "actual_velocity",
                  "torque Nm": "actual_torque"}  # fmt: skip
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    faults = typer.Typer(help="List the recorded faults, show one.", invoke_without_command=True)
-    faults.callback()(_list)
-    faults.command("show")(_show)
-    app.add_typer(faults, name="faults")
+commands = typer.Typer(name="faults", help="List the recorded faults, show one.", invoke_without_command=True)
 
 
+@commands.callback()
 def _list(context: typer.Context, as_json: AsJson = False) -> None:
     """List the recorded faults, the newest last."""
     if context.invoked_subcommand is not None:
@@ -50,6 +44,7 @@ def _list(context: typer.Context, as_json: AsJson = False) -> None:
         report(f"no fault has been recorded in {faults_directory()}{_service_hint()}")
 
 
+@commands.command("show")
 def _show(
     number: Annotated[int, typer.Argument(metavar="N", help="Number of a fault, as `rtcp faults` lists it.")],
     plot: Annotated[

@@ -1,21 +1,27 @@
-"""`rtcp jog` and `rtcp joystick`: motion while a key is held, or for a time; both renew a command that expires."""
+"""`rtcp jog` and `rtcp joystick`: motion while a key is held, or for a time; both renew a command that expires.
+
+A terminal reports presses of keys and no releases: a held key shows only by its repetition.
+"""
 
 from __future__ import annotations
 
+import os
 import re
+import select
 import sys
+import termios
 import time
-from collections.abc import Callable, Sequence
+import tty
+from collections.abc import Callable, Iterator, Sequence
+from types import TracebackType
 from typing import Annotated
 
 import typer
 
 from rtcp.api import Robot, Status
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, number, option, positive, refuse_old_name, refuse_options
-from rtcp.cli.connection import connect, stoppable
-from rtcp.cli.errors import SUSPENDING, CommandError, ExitCode, interruption_code, signals_raise
-from rtcp.cli.keyboard import QUIT, HeldKey, Keyboard, RenewalCheck
-from rtcp.cli.output import emit, report
+from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, POSE, as_written, number, option, positive, refuse_old_name
+from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, emit, interruptible, report
+from rtcp.cli.platform import connect, stoppable
 
 JOG_INTERVAL_S, JOG_HOLD_S = 0.05, 0.25
 """Interval of jog commands, and how long one is valid: a client that stalls moves the arm no longer than that."""
@@ -45,26 +51,133 @@ INPUTS = {
 ARROWS = {"up": "forward", "down": "backward", "left": "left", "right": "right"}
 PADDLES = {"+": "mode_up", "-": "mode_down"}
 SWITCHES = {"t": "chair", "e": "emergency_stop"}
+REPEATS_WITHIN_S = 1.0
+"""Longest time to a keyboard's first repetition (250 to 660 ms is usual)."""
+RELEASED_AFTER_S = 0.2
+"""A key without another repetition for this long is released."""
+ESCAPE = "escape"
+QUIT = frozenset({"q", ESCAPE, "\x04"})
+_ESCAPE_S = 0.02
+_ARROWS = {b"A": "up", b"B": "down", b"C": "right", b"D": "left"}
+_SEQUENCES = {start + end: name for start in (b"\x1b[", b"\x1bO") for end, name in _ARROWS.items()}
+
+commands = typer.Typer()
+refuse_old_name(commands, "stick", "rtcp joystick")
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("jog", context_settings=NUMBERS_AS_WRITTEN)(_jog)
-    app.command("joystick")(_joystick)
-    refuse_old_name(app, "stick", "rtcp joystick")
+# -- the keyboard ---------------------------------------------------------------------------------------------------
+
+
+class Keyboard:
+    """The terminal on standard input, read key by key without echo; its settings are restored on exit."""
+
+    def __init__(self) -> None:
+        self._descriptor = sys.stdin.fileno()
+        self._pending = b""
+
+    def __enter__(self) -> Keyboard:
+        self._settings = termios.tcgetattr(self._descriptor)
+        tty.setcbreak(self._descriptor)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._settings)
+
+    def read(self, timeout_s: float) -> str:
+        """Return the next key within `timeout_s`: a letter, the name of an arrow, `escape`; or an empty string.
+
+        Raises:
+            EOFError: the terminal was closed.
+        """
+        if not self._pending:
+            if not select.select([self._descriptor], [], [], max(timeout_s, 0.0))[0]:
+                return ""
+            self._pending = os.read(self._descriptor, 256)
+            if not self._pending:
+                raise EOFError
+        if self._pending == b"\x1b" and select.select([self._descriptor], [], [], _ESCAPE_S)[0]:
+            self._pending += os.read(self._descriptor, 256)
+        for sequence, name in _SEQUENCES.items():
+            if self._pending.startswith(sequence):
+                self._pending = self._pending[len(sequence) :]
+                return name
+        first, self._pending = self._pending[:1], self._pending[1:]
+        if first == b"\x1b":
+            self._pending = b""  # an unknown sequence is one key, not several letters
+            return ESCAPE
+        return first.decode("latin-1")
+
+    def drain(self) -> set[str]:
+        """Return the keys typed and not read so far: those pressed before a stall are ignored."""
+        typed = set()
+        while key := self.read(0.0):
+            typed.add(key)
+        return typed
+
+
+class HeldKey:
+    """Detects by its repetition that a key is held.
+
+    Until its first repetition a key does not count: a tap must not move the arm until the keyboard would repeat.
+    """
+
+    def __init__(self) -> None:
+        self._key = ""
+        self._last_s = float("-inf")
+        self._repeats = False
+
+    def press(self, key: str, now_s: float) -> None:
+        """Register a key that arrived at `now_s`."""
+        within_s = RELEASED_AFTER_S if self._repeats else REPEATS_WITHIN_S
+        self._repeats = key == self._key and now_s - self._last_s <= within_s
+        self._key, self._last_s = key, now_s
+
+    def held(self, now_s: float) -> str:
+        """Return the key that is held at `now_s`, or an empty string."""
+        return self._key if self._repeats and now_s - self._last_s <= RELEASED_AFTER_S else ""
+
+    def release(self) -> None:
+        """Forget the key."""
+        self._repeats = False
+        self._key = ""
+
+
+class RenewalCheck:
+    """Detects that a command was not renewed in time, because its process was suspended or its host stalled.
+
+    The arm has stopped by then and a person may have come near: the command must not continue.
+
+    Args:
+        hold_s: how long a command is valid, s.
+    """
+
+    def __init__(self, hold_s: float) -> None:
+        self._hold_s = hold_s
+        self._last_s: float | None = None
+
+    def overdue(self, now_s: float) -> float:
+        """Register a renewal at `now_s`; return the time since the last one, s, where it is too long, else 0.
+
+        `now_s` is an instant before the command is sent, so that a stall during its answer is detected too.
+        """
+        passed_s = 0.0 if self._last_s is None else now_s - self._last_s
+        self._last_s = now_s
+        return passed_s if passed_s > self._hold_s else 0.0
 
 
 # -- jog ------------------------------------------------------------------------------------------------------------
 
 
+@commands.command("jog", context_settings=NUMBERS_AS_WRITTEN)
 def _jog(
-    axis: Annotated[str, typer.Argument(metavar="AXIS", help="x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
-    speed: Annotated[str, typer.Argument(metavar="SPEED", help="m/s; rad/s of rotations and joints; may be negative.")],
+    axis: Annotated[str, as_written("AXIS", "x, y, z, rx, ry, rz of the tool; joint1 .. joint6.")],
+    speed: Annotated[str, as_written("SPEED", "m/s; rad/s of rotations and joints; may be negative.")],
     frame: Annotated[str, option("--frame", "base|tool", "Frame of x, y, z.")] = "base",
     seconds: Annotated[float | None, option("--seconds", "N", "Move for N seconds, without keys.")] = None,
 ) -> None:
     """Move while a key is held (down, left and - move backward, q ends); Ctrl-C stops the arm."""
-    refuse_options([axis, speed], ("--frame", "--seconds"))
     at, of_joint = _axis(axis)
     wanted = number(speed, "SPEED", "rad/s" if of_joint or at >= 3 else "m/s")
     if wanted == 0:
@@ -105,20 +218,31 @@ def _axis(axis: str) -> tuple[int, bool]:
 
 
 def _jog_for(robot: Robot, jog: Jog, seconds: float) -> None:
+    try:
+        for now in _renewals("jog", JOG_INTERVAL_S, JOG_HOLD_S, seconds, "the arm had stopped and stays stopped"):
+            jog(1.0, now)
+    except CommandError:
+        robot.halt()
+        raise
+    robot.halt()
+
+
+def _renewals(what: str, interval_s: float, hold_s: float, seconds: float, lapsed: str) -> Iterator[float]:
+    """Yield the instants, s of CLOCK_MONOTONIC, at which a command is renewed.
+
+    Raises:
+        CommandError: a renewal came too late; `lapsed` says what has become of the command.
+    """
     until = time.monotonic() + seconds
-    renewal = RenewalCheck(JOG_HOLD_S)
+    renewal = RenewalCheck(hold_s)
     while True:
         now = time.monotonic()
         if late_s := renewal.overdue(now):
-            robot.halt()
-            raise CommandError(
-                f"the jog was not renewed for {late_s:.1f} s: the arm had stopped and stays stopped", ExitCode.FAULT
-            )
+            raise CommandError(f"the {what} was not renewed for {late_s:.1f} s: {lapsed}", ExitCode.FAULT)
         if now >= until:
             break
-        jog(1.0, now)
-        time.sleep(max(0.0, min(JOG_INTERVAL_S, until - now)))
-    robot.halt()
+        yield now
+        time.sleep(max(0.0, min(interval_s, until - now)))
 
 
 def _jog_by_keys(robot: Robot, jog: Jog) -> None:
@@ -160,6 +284,7 @@ def _jog_by_keys(robot: Robot, jog: Jog) -> None:
 # -- joystick -------------------------------------------------------------------------------------------------------
 
 
+@commands.command("joystick")
 def _joystick(
     words: Annotated[
         list[str] | None,
@@ -181,14 +306,11 @@ def _joystick(
             _force_by_keys(robot)
         return
     pressed, byte = _position(words)
-    try:
-        with signals_raise(*SUSPENDING), connect("joystick") as robot:
-            if words == ["release"]:
-                robot.joystick()
-            else:
-                _force_for(robot, pressed, byte, seconds)
-    except KeyboardInterrupt as interruption:
-        raise CommandError("interrupted: the joystick is released", interruption_code(interruption)) from None
+    with interruptible("interrupted: the joystick is released", *SUSPENDING), connect("joystick") as robot:
+        if words == ["release"]:
+            robot.joystick()
+        else:
+            _force_for(robot, pressed, byte, seconds)
     report("the joystick is released")
 
 
@@ -210,15 +332,9 @@ def _force(robot: Robot, pressed: Sequence[str], byte: int | None, now: float) -
 
 
 def _force_for(robot: Robot, pressed: Sequence[str], byte: int | None, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    renewal = RenewalCheck(JOYSTICK_HOLD_S)
-    while (now := time.monotonic()) < until:
-        if late_s := renewal.overdue(now):
-            raise CommandError(
-                f"the joystick was not renewed for {late_s:.1f} s: it was released and stays released", ExitCode.FAULT
-            )
+    lapsed = "it was released and stays released"
+    for now in _renewals("joystick", JOYSTICK_INTERVAL_S, JOYSTICK_HOLD_S, seconds, lapsed):
         _force(robot, pressed, byte, now)
-        time.sleep(max(0.0, min(JOYSTICK_INTERVAL_S, until - now)))
 
 
 def _force_by_keys(robot: Robot) -> None:

@@ -1,29 +1,42 @@
-"""Commands that reach the arm: `enable` to `halt`, `move`, `run`, `mode`, `output`, `gripper`, `zero`, `home`."""
+"""Commands that reach the arm, from `enable` and `move` to `home`; `rtcp limits`, changed as one transaction."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from rtcp.api import Arrival, State
-from rtcp.cli.arguments import NUMBERS_AS_WRITTEN, finite, joint_values, option, pose_values, positive, refuse_options
-from rtcp.cli.connection import connect, stoppable
-from rtcp.cli.errors import CommandError
-from rtcp.cli.output import progress, report
+from rtcp.cli.arguments import (
+    NUMBERS_AS_WRITTEN,
+    AsJson,
+    as_written,
+    finite,
+    joint_values,
+    number,
+    option,
+    pose_values,
+    positive,
+)
+from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
+from rtcp.cli.platform import connect, stoppable
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
+COLUMNS = (
+    ("min", "rad"), ("max", "rad"), ("velocity", "rad/s"), ("acceleration", "rad/s^2"), ("jerk", "rad/s^3"),
+    ("torque", "Nm"),
+)  # fmt: skip
+UNITS = {"speed": "m/s", "acceleration": "m/s^2", "jerk": "m/s^3", "angular_speed": "rad/s",
+         "angular_acceleration": "rad/s^2", "angular_jerk": "rad/s^3"}  # fmt: skip
+
+commands = typer.Typer()
+limits = typer.Typer(name="limits", help="Show and narrow the limits while the platform runs.", no_args_is_help=True)
+commands.add_typer(limits)
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("enable")(_enable)
-    app.command("move", context_settings=NUMBERS_AS_WRITTEN)(_move)
-    for command in (_run, _halt, _disable, _reset, _mode, _output, _gripper, _zero, _home):
-        app.command(command.__name__[1:])(command)
-
-
+@commands.command("enable")
 def _enable() -> None:
     """Enable the drives; the arm holds where it is."""
     with connect("enable") as robot:
@@ -31,6 +44,7 @@ def _enable() -> None:
     report("enabled: the drives hold the arm where it is")
 
 
+@commands.command("disable")
 def _disable() -> None:
     """Disable the drives; returns when they report no torque."""
     with connect("disable") as robot:
@@ -39,6 +53,7 @@ def _disable() -> None:
     report(f"disabled: the drives are without torque{others}")
 
 
+@commands.command("reset")
 def _reset() -> None:
     """Reset a fault, an emergency stop or a stop by a limit; does not enable the drives."""
     with connect("reset") as robot:
@@ -51,6 +66,7 @@ def _reset() -> None:
         report("reset: no fault is left; next: `rtcp enable`")
 
 
+@commands.command("halt")
 def _halt() -> None:
     """Stop the motion in a controlled way, whoever commands it; returns when the arm holds."""
     with connect("halt") as robot:
@@ -58,6 +74,7 @@ def _halt() -> None:
     report("halted: the arm holds where it stopped")
 
 
+@commands.command("mode")
 def _mode(
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="joint, cartesian, joystick, velocity, torque; or csp, csv, cst.")
@@ -69,6 +86,7 @@ def _mode(
     report(f"mode {name.lower()}")
 
 
+@commands.command("output")
 def _output(
     number: Annotated[int, typer.Argument(metavar="N", help="Output of the IO box, from 1.")],
     value: Annotated[str, typer.Argument(metavar="on|off")],
@@ -82,6 +100,7 @@ def _output(
     report(f"output {number} is {'on' if level else 'off'}")
 
 
+@commands.command("gripper")
 def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> None:
     """Open or close the gripper; one with a drive is at rest on return. Ctrl-C stops it."""
     opened = {"open": True, "close": False}.get(value.lower())
@@ -97,6 +116,7 @@ def _gripper(value: Annotated[str, typer.Argument(metavar="open|close")]) -> Non
         report(f"the gripper is {'open' if opened else 'closed'}: it rests at {rest.position:.4f} rad")
 
 
+@commands.command("zero")
 def _zero(
     joint: Joint, at: Annotated[float, option("--at", "RAD", "Position of the joint where it is now, rad.")] = 0.0
 ) -> None:
@@ -110,6 +130,7 @@ def _zero(
     )
 
 
+@commands.command("home")
 def _home(joint: Joint) -> None:
     """Run the homing of a joint's drive, as its start-up SDOs configure it. Ctrl-C stops it."""
     with stoppable("home") as robot:
@@ -117,10 +138,11 @@ def _home(joint: Joint) -> None:
     report(f"{f'joint {joint}' if joint.isdecimal() else joint} is homed and stands at {position:.6f} rad")
 
 
+@commands.command("move", context_settings=NUMBERS_AS_WRITTEN)
 def _move(
     numbers: Annotated[
         list[str],
-        typer.Argument(metavar="Q1..Q6", help="Joint positions, rad or as -pi/2, base to tool; see --pose."),
+        as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool; see --pose."),
     ],
     pose: Annotated[bool, option("--pose", "The numbers are a tool pose, X Y Z RX RY RZ: m, and rad of Rx Ry Rz.")] = (
         False
@@ -140,7 +162,6 @@ def _move(
         raise CommandError("--line is for a pose: give --pose X Y Z RX RY RZ --line")
     if unsynchronized and pose:
         raise CommandError("--unsynchronized is for joint positions, not for --pose")
-    refuse_options(numbers, ("--pose", "--line", "--unsynchronized", "--speed"))
     target = pose_values(numbers) if pose else joint_values(numbers)
     with stoppable("move") as robot, progress() as shown:
         if pose:
@@ -150,6 +171,7 @@ def _move(
     report(arrival(arrived))
 
 
+@commands.command("run")
 def _run(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A trajectory or a path, in YAML or CSV.")],
     approach: Annotated[bool, option("--approach", "First move to the start of the motion, by the joints.")] = False,
@@ -173,3 +195,82 @@ def arrival(arrived: Arrival) -> str:
     if arrived.slowed is not None and arrived.slowed < 0.995:
         line += f", slowed to {arrived.slowed:.0%} of its speed by the joints' limits"
     return line
+
+
+# -- limits ---------------------------------------------------------------------------------------------------------
+
+
+@limits.command("show")
+def _show(as_json: AsJson = False) -> None:
+    """Show the limits of joints, tool and boxes; a star marks a changed value."""
+    with connect("limits show") as robot:
+        found = robot.limits()
+    if as_json:
+        emit_json(found)
+    else:
+        show(*_tables(found))
+
+
+@limits.command("set", context_settings=NUMBERS_AS_WRITTEN)
+def _set(
+    pairs: Annotated[
+        list[str],
+        as_written(
+            "KEY VALUE..",
+            "joint2.max, joints.velocity, box.min.x, user.max.z, ...: rad, m, s, Nm; all apply, or none.",
+        ),
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Change limits within the configured ones; refused as a whole where the arm would be outside."""
+    changes = _changes(pairs)
+    with connect("limits set") as robot:
+        found = robot.set_limits(changes)
+    if as_json:
+        emit_json(found)
+    else:
+        report(f"{len(changes)} {'limit is' if len(changes) == 1 else 'limits are'} changed until `rtcp stop`")
+
+
+def _changes(pairs: Sequence[str]) -> dict[str, float]:
+    if len(pairs) % 2:
+        raise CommandError(f"{pairs[-1]!r} has no value: give KEY VALUE, as joint2.max 1.2")
+    changes: dict[str, float] = {}
+    wrong = []
+    for key, value in zip(pairs[::2], pairs[1::2], strict=True):
+        if key in changes:
+            wrong.append(f"{key} is given twice")
+        try:
+            changes[key] = number(value, key)
+        except CommandError as error:
+            wrong.append(error.message)
+    if wrong:
+        raise CommandError("\n".join(wrong))
+    return changes
+
+
+def _tables(found: Mapping[str, Any]) -> list[Any]:
+    from rich.table import Table
+
+    now, configured = found["limits"], found["configured"]
+    joints = table(("joint", *(f"{name}\n{unit}" for name, unit in COLUMNS)), ("joint",))
+    for at, joint in enumerate(found["joint_names"]):
+        joints.add_row(joint, *(_marked(now[name][at], configured[name][at]) for name, _ in COLUMNS))
+    boxes = table(("box", "x m", "y m", "z m"), ("box",))
+    rows = [("tool inside", now["box"], configured["box"])]
+    rows += [(f"keep out: {name}", box, configured["keep_out"].get(name)) for name, box in now["keep_out"].items()]
+    for name, box, before in rows:
+        if box is not None:
+            before = before or box  # noqa: PLW2901
+            spans = zip(box["min"], box["max"], before["min"], before["max"], strict=True)
+            boxes.add_row(name, *(f"{_marked(low, was)} to {_marked(high, had)}" for low, high, was, had in spans))
+    tool = Table.grid(padding=(0, 2))
+    for name, unit in UNITS.items():
+        tool.add_row(f"tool: {name.replace('_', ' ')}", f"{found['cartesian'][name]:g} {unit}")
+    for name, value in found["cartesian"]["singularity"].items():
+        tool.add_row(f"singularity: {name}", f"{value:g} {'m' if name == 'shoulder' else 'rad'}")
+    return [joints, "", boxes, "", tool]
+
+
+def _marked(value: float, configured: float) -> str:
+    return f"{value:g}" if value == configured else f"{value:g} *"

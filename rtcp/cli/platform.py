@@ -1,18 +1,30 @@
-"""`rtcp start` and `rtcp stop`: the platform's processes, in the foreground or detached."""
+"""`rtcp start` and `rtcp stop`, in the foreground or detached; and how commands reach the running platform."""
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.api import RtcpError, State
+from rtcp.api import NotRunning, Robot, RtcpError, State
 from rtcp.cli.arguments import BusName, ConfigFile, Poll, option, positive
-from rtcp.cli.connection import connect, loop_process
-from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
-from rtcp.cli.output import report
+from rtcp.cli.output import (
+    SUSPENDING,
+    CommandError,
+    ExitCode,
+    complain,
+    interruptible,
+    interruption_code,
+    report,
+    signals_raise,
+)
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import is_running, read_processes
 
 if TYPE_CHECKING:
     from rtcp.launch.launcher import StartOptions
@@ -22,14 +34,13 @@ READY_TIMEOUT_S = 5.0
 """Time for the machine to leave `starting`: its frames must return first, or be missing for long enough."""
 _NOT_READY = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP})
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
+_TIMEOUT_S = 10.0
+"""Time for another command to start the gateway."""
+
+commands = typer.Typer()
 
 
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("start")(_start)
-    app.command("stop")(_stop)
-
-
+@commands.command("start")
 def _start(
     config: ConfigFile = None,
     bus: BusName = None,
@@ -80,6 +91,7 @@ def _wait_ready(hint: str) -> tuple[str, bool]:
     return f"{state.name.lower().replace('_', ' ')}: {message}", True
 
 
+@commands.command("stop")
 def _stop() -> None:
     """Stop the platform: drives disabled, slaves in INIT, processes ended."""
     from rtcp.launch import launcher
@@ -110,13 +122,8 @@ def launch(options: StartOptions, log: Callable[[str], None] = report) -> Platfo
     from rtcp.launch import launcher
     from rtcp.virtual.segment import check_segment
 
-    try:
-        with signals_raise():
-            return launcher.start(options, log, check_segment)
-    except KeyboardInterrupt as interruption:
-        raise CommandError(
-            "interrupted while starting: nothing is left running", interruption_code(interruption)
-        ) from None
+    with interruptible("interrupted while starting: nothing is left running"):
+        return launcher.start(options, log, check_segment)
 
 
 def serve(options: StartOptions, announce: Callable[[], None]) -> int:
@@ -130,3 +137,69 @@ def serve(options: StartOptions, announce: Callable[[], None]) -> int:
             return supervise(running, report)
         except KeyboardInterrupt:  # a signal before `supervise` has installed its handlers
             return ExitCode.FAULT if running.stop(report) else ExitCode.DONE
+
+
+# -- the running platform -------------------------------------------------------------------------------------------
+
+
+def connect(command: str) -> Robot:
+    """Connect under the command's name, which other clients see when they are refused.
+
+    A loop that has lost its gateway gets a new one first; standard error reports it.
+
+    Raises:
+        NotRunning: there is no platform.
+        RtcpError: as `Robot`.
+    """
+    name = f"rtcp {command} (pid {os.getpid()})"
+    directory = runtime_directory()
+    until = time.monotonic() + _TIMEOUT_S
+    while True:
+        try:
+            return Robot(name)
+        except NotRunning as error:
+            # A gateway started by this user is of no use to another user's loop.
+            mine = loop_process() and directory.stat().st_uid == os.geteuid()
+            if time.monotonic() > until or not mine:
+                raise
+            _replace_gateway(directory, error)
+        time.sleep(0.05)
+
+
+def loop_process() -> int:
+    """Return the process id of the running loop, with or without a gateway; 0 where there is none."""
+    loop = read_processes(runtime_directory()).loop
+    return loop if is_running(loop) else 0
+
+
+@contextmanager
+def stoppable(command: str) -> Iterator[Robot]:
+    """Connect; on Ctrl-C, SIGTERM and SIGHUP close the connection, which stops the arm.
+
+    Signals that suspend do the same: otherwise the arm would move on while Ctrl-C does not reach the command.
+
+    Raises:
+        CommandError: the command was interrupted.
+        RtcpError: as `connect`.
+    """
+    with signals_raise(*SUSPENDING), connect(command) as robot:
+        try:
+            yield robot
+        except KeyboardInterrupt as interruption:
+            robot.close()
+            code = interruption_code(interruption)
+            what = "ended, not suspended" if code - 128 in SUSPENDING else "interrupted"
+            raise CommandError(f"{what}: the connection is closed, the arm comes to a controlled stop", code) from None
+
+
+def _replace_gateway(directory: Path, error: RtcpError) -> None:
+    from rtcp.launch.launcher import replace_gateway  # seldom needed, loads slowly
+
+    try:
+        if process := replace_gateway(directory):
+            complain(f"the gateway had ended; a new one was started (process {process}), nothing was enabled")
+    except RtcpError as refused:
+        if refused.kind != "refused":
+            raise NotRunning("not running", f"{error.message}; {refused}") from refused
+    except (OSError, TypeError):
+        raise error from None  # the session file cannot be read: not a platform of this version

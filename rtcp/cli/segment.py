@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from rtcp.cli.arguments import AsJson, Poll, option, refuse_old_name
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit, emit_json, report
+from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report
 from rtcp.ipc.runtime_directory import (
     RuntimeDirectoryError,
     free_segment_control,
@@ -34,22 +33,14 @@ ControlPath = Annotated[
 ]
 _IN_HEX = ("code", "index")
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    segment = typer.Typer(invoke_without_command=True)
-    segment.callback()(_segment)
-    segment.command("fault")(_fault)
-    segment.command("clear")(_clear)
-    segment.command("faults")(_faults)
-    segment.command("kinds")(_kinds)
-    refuse_old_name(segment, "mend", "rtcp segment clear")
-    app.add_typer(segment, name="segment")
+commands = typer.Typer(name="segment", invoke_without_command=True)
+refuse_old_name(commands, "mend", "rtcp segment clear")
 
 
 # -- a segment in this process --------------------------------------------------------------------------------------
 
 
+@commands.callback()
 def _segment(
     context: typer.Context,
     config: Annotated[Path | None, option("--config", "FILE", "The slaves in the order of the cable.")] = None,
@@ -118,6 +109,7 @@ def _user_namespace() -> str:
 # -- faults of a running segment ------------------------------------------------------------------------------------
 
 
+@commands.command("fault")
 def _fault(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Kind of the fault: `rtcp segment kinds` lists them.")],
     pairs: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE..", help="As after=3, code=0x1A.")] = None,
@@ -146,6 +138,7 @@ def _fault(
     report(f"{fault}, {until}; to clear it: rtcp segment clear {number}{where}")
 
 
+@commands.command("clear")
 def _clear(
     number: Annotated[int | None, typer.Argument(metavar="ID", help="Number of a fault. Default: all.")] = None,
     segment: ControlPath = None,
@@ -156,6 +149,7 @@ def _clear(
     report(f"cleared: {', '.join(f'fault {each}' for each in cleared)}" if cleared else "no fault is active")
 
 
+@commands.command("faults")
 def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
     """Show the active faults, since when, and how many frames they have changed."""
     with _client(segment) as client:
@@ -171,6 +165,7 @@ def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
         emit("no fault is active")
 
 
+@commands.command("kinds")
 def _kinds() -> None:
     """List the kinds of faults, their keys and the allowed values."""
     for kind in kinds():

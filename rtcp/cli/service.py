@@ -17,8 +17,7 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.arguments import option
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import emit
+from rtcp.cli.output import CommandError, ExitCode, emit
 
 UNIT = "rtcp@.service"
 PLACES = {
@@ -41,13 +40,8 @@ nothing has been started. Next, as root:
 Root = Annotated[Path, option("--root", "DIR", "Root of the file system: for packages and images.")]
 DryRun = Annotated[bool, option("--dry-run", "Show what would be done; change nothing.")]
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    group = typer.Typer(help="Run the platform under systemd: rtcp@eth0, rtcp@virtual.", no_args_is_help=True)
-    group.command("install")(_install)
-    group.command("uninstall")(_uninstall)
-    app.add_typer(group, name="service")
+HELP = "Run the platform under systemd: rtcp@eth0, rtcp@virtual."
+commands = typer.Typer(name="service", help=HELP, no_args_is_help=True)
 
 
 class Found(Enum):
@@ -107,6 +101,7 @@ def service_files(root: Path, program: Path) -> list[ServiceFile]:
     return made
 
 
+@commands.command("install")
 def _install(
     root: Root = Path("/"),
     program: Annotated[Path | None, option("--program", "FILE", "The rtcp to start. Default: the running one.")] = None,
@@ -137,6 +132,7 @@ def _install(
         emit(_NEXT)
 
 
+@commands.command("uninstall")
 def _uninstall(root: Root = Path("/"), dry_run: DryRun = False) -> None:
     """Remove what `install` wrote and nobody edited; list what stays."""
     root = root.absolute()

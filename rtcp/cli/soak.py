@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtcp.cli.arguments import AsJson, ConfigFile, option, positive
-from rtcp.cli.errors import CommandError, ExitCode, interruption_code, signals_raise
-from rtcp.cli.output import emit, report, show, table
+from rtcp.cli.output import CommandError, ExitCode, emit, interruption_code, report, show, signals_raise, table
 from rtcp.cli.platform import launch, refuse_second_platform
 from rtcp.config.model import VIRTUAL
 
@@ -21,12 +20,10 @@ if TYPE_CHECKING:
 
 LONGEST_MIN = 10_080.0
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("soak")(_soak)
+commands = typer.Typer()
 
 
+@commands.command("soak")
 def _soak(
     minutes: Annotated[float, option("--minutes", "N", "Duration.")] = 60.0,
     seed: Annotated[int, option("--seed", "N", "Seed of all random choices.")] = 1,

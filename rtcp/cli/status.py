@@ -15,9 +15,8 @@ import typer
 
 from rtcp.api import ConnectionLost, NotRunning, Robot
 from rtcp.cli.arguments import option
-from rtcp.cli.connection import connect, loop_process
-from rtcp.cli.errors import CommandError, ExitCode
-from rtcp.cli.output import console, emit, emit_json, facts, show, table
+from rtcp.cli.output import CommandError, ExitCode, console, emit, emit_json, facts, show, table
+from rtcp.cli.platform import connect, loop_process
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -47,12 +46,10 @@ _DIFFERENT_RAD = 1e-6
 _MESSAGES = 5
 """Number of recent messages."""
 
-
-def register(app: typer.Typer) -> None:
-    """Add this group's commands."""
-    app.command("status")(_status)
+commands = typer.Typer()
 
 
+@commands.command("status")
 def _status(
     as_json: Annotated[bool, option("--json", "One JSON object a line, SI units.")] = False,
     watch: Annotated[bool, option("--watch", "Refresh until Ctrl-C.")] = False,

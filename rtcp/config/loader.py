@@ -108,10 +108,7 @@ def load_device(path: Path, period_us: float | None = None) -> DeviceDescription
     document = read(path)
     timing = partial(rules.period_findings, period_us=period_us or 0.0)
     more = [FileRule(("kind", "watchdog_ms", "sync0_shift_us"), timing)] if period_us is not None else []
-    device, findings = _DEVICE.check(document.data, *more)
-    if device is None:
-        raise ConfigError(document.sentences(findings))
-    return device
+    return _DEVICE.read(document, *more)
 
 
 def load_kinematics(path: Path) -> ArmModel:
@@ -130,9 +127,7 @@ def load_kinematics(path: Path) -> ArmModel:
             told = f"the key kinematics is missing; it must be {allowed(Kinematics)}"
             raise ConfigError(document.sentences([((), told)]))
         return arm
-    file, findings = _KINEMATICS.check(document.data)
-    if file is None:
-        raise ConfigError(document.sentences(findings))
+    file = _KINEMATICS.read(document)
     return _arm_model(document, file.name, file.kinematics, ())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
@@ -10,9 +11,8 @@ from typing import Annotated
 from annotated_types import Ge, Le, MinLen
 
 from rtcp.config.document import Finding, read, shown
-from rtcp.config.model import ConfigError
 from rtcp.config.numbers import U16, Name
-from rtcp.config.validation import Checker
+from rtcp.config.validation import Checker, rule
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,22 @@ class _SegmentFile:
     slaves: Annotated[tuple[SegmentSlave, ...], MinLen(1)]
 
 
+@rule(SegmentSlave)
+def _options(slave: SegmentSlave) -> Iterator[Finding]:
+    for name, value in slave.options.items():
+        if not isinstance(value, str) and not (isinstance(value, int | float) and isfinite(value)):
+            yield ("options", name), f"found {shown(value)}, allowed is a text, a number, true or false"
+
+
+@rule(_SegmentFile, "slaves")
+def _aliases(segment: _SegmentFile) -> Iterator[Finding]:
+    first: dict[int, int] = {}
+    for i, slave in enumerate(segment.slaves):
+        if slave.alias and first.setdefault(slave.alias, i) != i:
+            text = f"found {slave.alias}, the alias of slaves[{first[slave.alias]}]; each needs its own, or 0 for none"
+            yield ("slaves", i, "alias"), text
+
+
 _SEGMENT = Checker(_SegmentFile)
 
 
@@ -53,24 +69,4 @@ def load_segment(path: Path) -> SegmentConfig:
     Raises:
         ConfigError: with one sentence for every mistake.
     """
-    document = read(path)
-    segment, findings = _SEGMENT.check(document.data)
-    if segment is not None:
-        findings += _rules(segment)
-    if findings or segment is None:
-        raise ConfigError(document.sentences(findings))
-    return SegmentConfig(segment.slaves, path)
-
-
-def _rules(segment: _SegmentFile) -> list[Finding]:
-    findings: list[Finding] = []
-    first: dict[int, int] = {}
-    for i, slave in enumerate(segment.slaves):
-        if slave.alias and first.setdefault(slave.alias, i) != i:
-            text = f"found {slave.alias}, the alias of slaves[{first[slave.alias]}]; each needs its own, or 0 for none"
-            findings.append((("slaves", i, "alias"), text))
-        for name, value in slave.options.items():
-            if not isinstance(value, str) and not (isinstance(value, int | float) and isfinite(value)):
-                where = ("slaves", i, "options", name)
-                findings.append((where, f"found {shown(value)}, allowed is a text, a number, true or false"))
-    return findings
+    return SegmentConfig(_SEGMENT.read(read(path)).slaves, path)

@@ -18,7 +18,8 @@ from annotated_types import Ge, Gt, Le, Lt, MaxLen, MinLen
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError, core_schema
 
-from rtcp.config.document import Finding, KeyPath, dotted, shown
+from rtcp.config.document import Document, Finding, KeyPath, dotted, shown
+from rtcp.config.model import ConfigError
 from rtcp.config.numbers import FractionOfPi
 
 T = TypeVar("T")
@@ -115,6 +116,17 @@ class Checker(Generic[T]):
             invalid = {detail["loc"][1] for detail in found if len(detail["loc"]) > 1}
         findings += self._file_findings(made, data, invalid, more)
         return (None if findings else made), findings
+
+    def read(self, document: Document, *more: FileRule) -> T:
+        """Return the object of a file; `more` rules as of `check`.
+
+        Raises:
+            ConfigError: with one sentence for every mistake.
+        """
+        made, findings = self.check(document.data, *more)
+        if made is None:
+            raise ConfigError(document.sentences(findings))
+        return made
 
     def _file_findings(
         self, made: T | None, data: object, invalid: set[object], more: Iterable[FileRule]

@@ -7,6 +7,7 @@ writer -> limiter) -> encode -> publish -> clock discipline. Nothing in here log
 from __future__ import annotations
 
 from collections.abc import Callable
+from time import monotonic_ns
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.control.arm import Arm
@@ -33,8 +34,8 @@ from rtcp.ipc.layout import (
     PER_JOINT,
     SCALARS,
 )
-from rtcp.realtime.clock import Sleeper, monotonic_ns
 from rtcp.realtime.discipline import Discipline
+from rtcp.realtime.scheduling import Sleeper
 
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""

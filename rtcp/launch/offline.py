@@ -43,38 +43,35 @@ def configuration(config: Path | None) -> ArmConfig:
     return load(find_config(config))
 
 
-def scan(bus: str, config: Path | None) -> list[dict[str, Any]]:
-    """Return what each slave reports of itself, as `rtcp.fieldbus.bus.SlaveInfo` has it, bytes as hex.
+class OfflineBus:
+    """A bus that is opened for each question and closed again; methods as those of `rtcp.api.Robot`.
+
+    Each raises RtcpError where the segment or the bus cannot be opened or does not answer, with a slave's abort code in
+    words, and ConfigError where the configuration of the virtual segment has mistakes.
 
     Args:
         bus: `virtual` or a network interface.
         config: the arm's file, which names the virtual segment's; None: found as usual.
-
-    Raises:
-        RtcpError: the segment or the bus cannot be opened or does not answer.
-        ConfigError: the configuration of the virtual segment has mistakes.
     """
-    return list(_ask(bus, config, {"do": "scan"})["slaves"])
 
+    def __init__(self, bus: str, config: Path | None) -> None:
+        self._bus = bus
+        self._config = config
 
-def sdo_read(bus: str, config: Path | None, slave: int, index: int, subindex: int) -> bytes:
-    """Return the object's bytes as they came over the wire; `slave` counts from 1.
+    def scan(self) -> list[dict[str, Any]]:
+        """Return what each slave reports of itself, as `rtcp.fieldbus.bus.SlaveInfo` has it, bytes as hex."""
+        return list(self._ask("scan")["slaves"])
 
-    Raises:
-        RtcpError: as `scan`, or with the slave's abort code in words.
-    """
-    answer = _ask(bus, config, {"do": "sdo_read", "slave": slave, "index": index, "subindex": subindex})
-    return bytes.fromhex(answer["hex"])
+    def sdo_read(self, slave: int, index: int, subindex: int) -> bytes:
+        """Return the object's bytes as they came over the wire; `slave` counts from 1."""
+        return bytes.fromhex(self._ask("sdo_read", slave=slave, index=index, subindex=subindex)["hex"])
 
+    def sdo_write(self, slave: int, index: int, subindex: int, data: bytes) -> None:
+        """Write the object; `slave` counts from 1."""
+        self._ask("sdo_write", slave=slave, index=index, subindex=subindex, hex=data.hex())
 
-def sdo_write(bus: str, config: Path | None, slave: int, index: int, subindex: int, data: bytes) -> None:
-    """Write the object; `slave` counts from 1.
-
-    Raises:
-        RtcpError: as `scan`, or with the slave's abort code in words.
-    """
-    request = {"do": "sdo_write", "slave": slave, "index": index, "subindex": subindex, "hex": data.hex()}
-    _ask(bus, config, request)
+    def _ask(self, do: str, **arguments: int | str) -> dict[str, Any]:
+        return _ask(self._bus, self._config, {"do": do, **arguments})
 
 
 def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str, Any]:

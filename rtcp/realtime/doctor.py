@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -287,10 +288,8 @@ def _governor(case: Case) -> Result:
     found = f"CPU {case.cpu} is governed by {(chosen := case.host.word(file))}"
     if chosen == "performance":
         return _ok(found)
-    try:
+    with suppress(NotKnown):  # the governor is what matters
         found += ", {} to {} MHz".format(*_frequencies(case))
-    except NotKnown:
-        pass  # the governor is what matters
     return _warning(found, f"echo performance > {file}", _at_boot(file, "performance"))
 
 
@@ -424,10 +423,8 @@ def _of_the_card(case: Case) -> list[_Interrupt]:
         return []
     device = f"{_NET}/{case.interface}/device"
     listed, names = set(case.host.names(f"{device}/msi_irqs")), [case.interface]
-    try:
+    with suppress(NotKnown):  # an interface without a device, as of a bridge
         names.append(case.host.target(device))
-    except NotKnown:
-        pass  # an interface without a device, as of a bridge
     # The name, or the name and a queue: eth0, eth0-TxRx-1; not eth01.
     name = re.compile(rf"(?<!\S)(?:{'|'.join(map(re.escape, names))})(?![^\W_])")
     return [each for each in _interrupts(case) if str(each.number) in listed or name.search(each.owner)]
@@ -536,10 +533,9 @@ def _coalescing(case: Case, name: str) -> Result:
         f"ethtool -C {name}{adaptive} rx-usecs 0 tx-usecs 0",
         f"printf '{link}' > /etc/systemd/network/50-{name}.link{_KEPT}",
     )
-    try:
+    kind = ""
+    with suppress(NotKnown):
         kind = case.host.target(f"{_NET}/{name}/device/driver")
-    except NotKnown:
-        kind = ""
     if held.receive_us in _DYNAMIC.get(kind, ()):
         return _warning(f"{name} holds frames back for a time that follows the traffic ({times}, {kind})", *remedy)
     total_us = held.receive_us + held.send_us

@@ -10,18 +10,18 @@ import re
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 _LARGEST, _PIECE = 4 << 20, 64 << 10
 """Bytes read of a file, and at once: the kernel refuses to print a setting of /proc/sys into a large buffer."""
-_SIOCGIFADDR, _SIOCETHTOOL = 0x8915, 0x8946
+_SIOCETHTOOL = 0x8946
 _ETHTOOL_GCOALESCE = 0x0E
 _COALESCE_WORDS = 23
 """`struct ethtool_coalesce` of linux/ethtool.h: the command and 22 settings, 32 bits each."""
 _ETHTOOL_REQUEST = struct.Struct("16sP16x")
-_ADDRESS_REQUEST = struct.Struct("16sHH4s16x")
 
 
 class NotKnown(Exception):
@@ -51,7 +51,7 @@ class Host:
 
     def text(self, path: str) -> str:
         """Return a file's text without the white space around it."""
-        try:
+        with _not_known(path):
             # Not blocking: the path may be a pipe that nobody writes to.
             descriptor = os.open(self._at(path), os.O_RDONLY | os.O_NONBLOCK)
             try:
@@ -61,8 +61,6 @@ class Host:
                 return pieces.decode(errors="replace").strip()
             finally:
                 os.close(descriptor)
-        except OSError as error:
-            raise _not_known(path, error) from error
 
     def text_or(self, path: str, default: str) -> str:
         """Return a file's text, or `default` where it cannot be read."""
@@ -102,17 +100,13 @@ class Host:
 
     def target(self, path: str) -> str:
         """Return the last part of a symbolic link's target."""
-        try:
+        with _not_known(path):
             return os.path.basename(os.readlink(self._at(path)))
-        except OSError as error:
-            raise _not_known(path, error) from error
 
     def check_writable(self, path: str) -> None:
         """Open a file for writing and close it; nothing is written."""
-        try:
+        with _not_known(path):
             os.close(os.open(self._at(path), os.O_WRONLY | os.O_NONBLOCK))
-        except OSError as error:
-            raise _not_known(path, error) from error
 
     def fields(self, path: str) -> dict[str, str]:
         """Return the "name: value" lines of a file, as of /proc/self/status."""
@@ -131,36 +125,32 @@ class Host:
         """Return the coalescing of a network card, None where its driver has none; asks the running kernel."""
         words = array.array("I", [_ETHTOOL_GCOALESCE] + [0] * (_COALESCE_WORDS - 1))
         request = bytearray(_ETHTOOL_REQUEST.pack(interface.encode(), words.buffer_info()[0]))
-        try:
-            _ioctl(_SIOCETHTOOL, request)
-        except OSError as error:
-            if error.errno == errno.EOPNOTSUPP:
-                return None
-            raise _not_known(f"ethtool -c {interface}", error) from error
+        with _not_known(f"ethtool -c {interface}"), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
+            try:
+                fcntl.ioctl(asking, _SIOCETHTOOL, request, True)
+            except OSError as error:
+                if error.errno == errno.EOPNOTSUPP:
+                    return None
+                raise
         return Coalescing(words[1], words[5], bool(words[10] or words[11]))
 
     def ipv4_address(self, interface: str) -> str | None:
         """Return an interface's IPv4 address, None where it has none; asks the running kernel."""
-        request = bytearray(_ADDRESS_REQUEST.pack(interface.encode(), socket.AF_INET, 0, bytes(4)))
-        try:
-            _ioctl(_SIOCGIFADDR, request)
-        except OSError as error:
-            if error.errno == errno.EADDRNOTAVAIL:
-                return None
-            raise _not_known(f"the address of {interface}", error) from error
-        return socket.inet_ntoa(_ADDRESS_REQUEST.unpack(request)[3])
+        import psutil  # here: it loads slowly
+
+        found = psutil.net_if_addrs().get(interface, ())
+        return next((each.address for each in found if each.family == socket.AF_INET), None)
 
     def _at(self, path: str) -> str:
         return os.path.join(self.root, path.lstrip("/"))
 
 
-def _not_known(what: str, error: OSError) -> NotKnown:
-    return NotKnown(f"{what}: {os.strerror(error.errno) if error.errno else error}")
-
-
-def _ioctl(number: int, request: bytearray) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
-        fcntl.ioctl(asking, number, request, True)
+@contextmanager
+def _not_known(what: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise NotKnown(f"{what}: {os.strerror(error.errno) if error.errno else error}") from error
 
 
 def whole(text: str, where: str, base: int = 10) -> int:

@@ -1,4 +1,4 @@
-"""Real-time scheduling of the cycle: SCHED_FIFO, a CPU, locked memory, shallow idle states, no garbage collection.
+"""Real-time scheduling of the cycle: its sleep, SCHED_FIFO, a CPU, locked memory, idle states, no garbage collection.
 
 The loop runs without any of it: what the host refuses becomes a note in `rtcp status`.
 """
@@ -7,18 +7,48 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import gc
 import os
 import resource
 import struct
 import sys
+import time
 from dataclasses import dataclass, field
 
+_TIMER_ABSTIME = 1
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 _PR_SET_TIMERSLACK = 29
 _M_TRIM_THRESHOLD, _M_MMAP_MAX = -1, -4
 _PREFAULT_BYTES = 4 << 20
 _STACK_BYTES = 256 << 10
+
+
+class _Timespec(ctypes.Structure):
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class Sleeper:
+    """Sleeps until an instant of CLOCK_MONOTONIC; everything it needs is allocated once.
+
+    The call goes through ctypes, which lets go of the interpreter while it sleeps.
+    """
+
+    def __init__(self) -> None:
+        libc = ctypes.CDLL(None, use_errno=False)
+        self._call = libc.clock_nanosleep
+        self._call.restype = ctypes.c_int
+        self._call.argtypes = (ctypes.c_int, ctypes.c_int, ctypes.c_void_p, ctypes.c_void_p)
+        self._until = _Timespec()
+        self._address = ctypes.addressof(self._until)
+
+    def until(self, instant_ns: int) -> None:
+        """Sleep until `instant_ns`; return at once where it lies in the past. Signals do not shorten the sleep."""
+        until = self._until
+        until.tv_sec, until.tv_nsec = divmod(instant_ns, 1_000_000_000)
+        # A signal interrupts the sleep without ending it: the absolute instant makes the repetition exact.
+        while self._call(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, self._address, None) == errno.EINTR:
+            pass
 
 
 @dataclass

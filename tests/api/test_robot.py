@@ -13,7 +13,8 @@ import pytest
 
 import rtcp
 from rtcp import api
-from rtcp.api import Arrival, AsyncRobot, GripperRest, JogFrame, Progress, Robot, State, Streamed, methods
+from rtcp.api import Arrival, AsyncRobot, GripperRest, JogFrame, Progress, Robot, State, Streamed
+from rtcp.api.robot import Method, Methods
 from rtcp.ipc.commands import Halt, Jog, MoveGripper, MoveJoints, SetOutput, StreamPosition
 from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.runtime_directory import control_socket
@@ -21,8 +22,7 @@ from tests.gateway.fake_loop import JOINTS, FakeLoop
 
 Q = [0.1] * JOINTS
 LONG = 1_000_000
-METHODS = [name for name, one in vars(methods).items() if inspect.isfunction(one) and one.__module__ == methods.__name__
-           and not name.startswith("_")]  # fmt: skip
+METHODS = {name: one.describe for name, one in vars(Methods).items() if isinstance(one, Method)}
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def run(directory: Path, work: Callable[[AsyncRobot], Coroutine[Any, Any, Any]])
 
 @pytest.mark.parametrize("name", METHODS)
 def test_both_robots_have_every_method_with_its_signature_and_its_documentation(name: str) -> None:
-    described, blocking, awaited = (getattr(one, name) for one in (methods, Robot, AsyncRobot))
+    described, blocking, awaited = METHODS[name], getattr(Robot, name), getattr(AsyncRobot, name)
     parameters = list(inspect.signature(described).parameters.values())
     for method in (blocking, awaited):
         assert list(inspect.signature(method).parameters.values()) == parameters

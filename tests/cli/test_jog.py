@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rtcp.cli.keyboard import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey, RenewalCheck
+from rtcp.cli.jog import RELEASED_AFTER_S, REPEATS_WITHIN_S, HeldKey, RenewalCheck
 
 pytestmark = pytest.mark.alone
 

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from time import monotonic_ns
 from typing import NamedTuple
 
 from rtcp.config import default_config, load
@@ -19,7 +20,6 @@ from rtcp.ipc.events import Emergency, Event
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Answer, EventRecord, Observer
 from rtcp.ipc.states import DriveMode, State
-from rtcp.realtime.clock import monotonic_ns
 from rtcp.realtime.discipline import Discipline
 from rtcp.virtual.models import create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import signal
 import time
+from time import monotonic_ns
 
-from rtcp.realtime.clock import Sleeper, monotonic_ns
+from rtcp.realtime.scheduling import Sleeper
 
 
 def test_it_never_wakes_early() -> None:

@@ -294,13 +294,13 @@ def test_the_kernel_of_this_machine_answers_for_its_interfaces() -> None:
 
 
 def test_the_kernels_answer_is_read_at_the_places_of_its_structure(monkeypatch: pytest.MonkeyPatch) -> None:
-    def answer(number: int, request: bytearray) -> None:
+    def answer(descriptor: object, number: int, request: bytearray, mutate: bool) -> None:
         # struct ifreq: a name of 16 bytes, a pointer; struct ethtool_coalesce: rx-usecs is word 1, tx-usecs word 5,
         # use_adaptive_rx_coalesce word 10.
         words = [0x0E, *range(101, 110), 1, *[0] * 12]
         ctypes.memmove(struct.unpack_from("P", request, 16)[0], struct.pack("23I", *words), 92)
 
-    monkeypatch.setattr(host, "_ioctl", answer)
+    monkeypatch.setattr(host.fcntl, "ioctl", answer)
     assert Host().coalescing("eth0") == Coalescing(receive_us=101, send_us=105, adaptive=True)
 
 
