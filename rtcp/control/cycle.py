@@ -7,6 +7,7 @@ writer -> limiter) -> encode -> publish -> clock discipline. Nothing in here log
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import attrgetter
 from time import monotonic_ns
 
 from rtcp.config.model import ArmConfig, Joint
@@ -37,6 +38,8 @@ from rtcp.ipc.layout import (
 from rtcp.realtime.discipline import Discipline
 from rtcp.realtime.scheduling import Sleeper
 
+_TARGET_POSITION, _TARGET_VELOCITY = attrgetter("target_position"), attrgetter("target_velocity")
+_TARGET_TORQUE, _STATUSWORD = attrgetter("target_torque"), attrgetter("statusword")
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""
 _LONGEST_NS = 2_000_000_000
@@ -219,17 +222,17 @@ class Cycle:
             controller.elapsed_s,
             controller.duration_s,
         )
-        at, n = len(_AT), len(arm.drives)
-        commanded = arm.state.commanded
-        for i, drive in enumerate(arm.drives, at):
-            values[i] = drive.position
-            values[n + i] = drive.velocity
-            values[2 * n + i] = drive.torque
-            values[3 * n + i] = commanded[i - at]
-            values[4 * n + i] = drive.target_position
-            values[5 * n + i] = drive.target_velocity
-            values[6 * n + i] = drive.target_torque
-            values[7 * n + i] = drive.statusword
+        state, drives = arm.state, arm.drives
+        values[len(_AT) :] = (
+            *state.actual,
+            *state.actual_velocity,
+            *state.actual_torque,
+            *state.commanded,
+            *map(_TARGET_POSITION, drives),
+            *map(_TARGET_VELOCITY, drives),
+            *map(_TARGET_TORQUE, drives),
+            *map(_STATUSWORD, drives),
+        )
         self._blackboard.publish(values)
 
 
