@@ -18,10 +18,10 @@ from rtcp.ipc.errors import Faulted
 from rtcp.ipc.events import SlavesParked
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
-from tests.control.conftest import rig, rig_board
+from tests.control.conftest import new_rig, rig, rig_board
 from tests.control.rig import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
-__all__ = ["rig", "rig_board"]
+__all__ = ["new_rig", "rig", "rig_board"]
 
 FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
 

@@ -19,8 +19,9 @@ from tests.malformed.line import OP, SIZES, Line
 from tests.malformed.mutate import mutated
 from tests.malformed.parser_play import LONGEST_S, Loopback, Master, looped
 from tests.malformed.segment_play import writes
+from tests.samples import examples
 
-EXAMPLES = 200
+EXAMPLES = examples(200)
 WHOLE = 3 * len(SIZES)
 """Working counter when all slaves take part."""
 FEW = 2

@@ -12,9 +12,10 @@ from kinematics.forward import frames
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
+from tests.arm_geometry import Point, depth, points
+from tests.samples import examples
 
-from .judge import ARM, examples, with_boxes
-from .reference import Point, depth, points
+from .guard_checker import ARM, with_boxes
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
 MODEL = ARM.arm

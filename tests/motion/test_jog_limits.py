@@ -11,8 +11,7 @@ from kinematics.forward import forward
 from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
 from rtcp.motion.state import Phase
-
-from .judge import some
+from tests.samples import some
 
 ARM = load(default_config())
 MODEL = ARM.arm
