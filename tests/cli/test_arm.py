@@ -64,21 +64,6 @@ def test_the_arm_is_that_of_the_platforms_configuration(
     assert forward(rtcp, [0.0] * 6)[2] == pytest.approx(1.4)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("0", "-0.5", "-.5", "-1e-1", "1.57", "-2", "--json"),
-        ("--json", "--", "0", "-0.5", "-.5", "-1e-1", "1.57", "-2"),
-        ("0", "-0.5", "--json", "-.5", "-1e-1", "1.57", "-2"),
-    ],
-)
-def test_negative_numbers_are_taken_as_they_are_written(rtcp: Rtcp, arguments: tuple[str, ...]) -> None:
-    ended = rtcp("arm", "fk", *arguments)
-    wanted = forward(rtcp, [0.0, -0.5, -0.5, -0.1, 1.57, -2.0])
-    assert ended.code == 0
-    assert [*json.loads(ended.out)["position"], *json.loads(ended.out)["rpy"]] == wanted
-
-
 def test_angles_may_be_fractions_of_pi(rtcp: Rtcp) -> None:
     ended = rtcp("arm", "fk", "0", "-pi/2", "pi/2", "0", "-pi", "2*pi/3", "--json")
     position = json.loads(ended.out)["position"]

@@ -170,41 +170,6 @@ def test_a_move_prints_its_progress_and_the_largest_error(platform: Any, rtcp: C
     assert ended.out.splitlines()[-1] == "arrived, largest error 0.000420 rad"
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "-nan", "-INF", "1e999"])
-def test_a_position_that_is_not_finite_is_refused_with_its_joint(
-    platform: Any, rtcp: Callable[..., Any], value: str
-) -> None:
-    ended = rtcp("move", "0", "0", value, "0", "0", "0")
-    assert ended.code == 2
-    assert "joint 3" in ended.trouble
-    assert "finite" in ended.trouble
-    assert platform.requests == []
-
-
-def test_all_wrong_positions_are_named_at_once(platform: Any, rtcp: Callable[..., Any]) -> None:
-    ended = rtcp("move", "0", "zero", "0", "nan", "-0.5x", "0")
-    assert ended.code == 2
-    assert all(f"joint {joint}" in ended.trouble for joint in (2, 4, 5))
-    assert ended.err.count("\n") == 3
-
-
-@pytest.mark.parametrize("option", ["--sped", "--sped=0.1", "-s", "--spee"])
-def test_a_misspelt_option_among_the_numbers_is_refused(platform: Any, rtcp: Callable[..., Any], option: str) -> None:
-    ended = rtcp("move", *HOME, option, "0.1")
-    assert ended.code == 2
-    assert option.split("=", maxsplit=1)[0] in ended.trouble
-    assert "--speed" in ended.trouble
-    assert platform.requests == []
-
-
-@pytest.mark.parametrize("speed", ["0", "-1", "nan", "inf", "fast"])
-def test_a_speed_that_is_none_is_refused(platform: Any, rtcp: Callable[..., Any], speed: str) -> None:
-    ended = rtcp("move", *HOME, "--speed", speed)
-    assert ended.code == 2
-    assert "--speed" in ended.trouble
-    assert platform.requests == []
-
-
 @pytest.mark.parametrize("help_option", ["-h", "--help"])
 def test_help_is_help_among_the_numbers_too(rtcp: Callable[..., Any], help_option: str) -> None:
     ended = rtcp("move", "0", "-0.5", help_option)
@@ -294,7 +259,24 @@ def test_a_pose_is_passed_on_with_fractions_of_pi_as_numbers(
     assert (asked["line"], asked["speed"]) == (line, speed)
 
 
+def at_joint_3(value: str) -> tuple[str, ...]:
+    return ("move", "0", "0", value, "0", "0", "0")
+
+
 WRONG = {
+    **{
+        f"joint 3 at {value}": (at_joint_3(value), f"joint 3: {value} is not finite")
+        for value in ("nan", "inf", "-inf", "-nan", "-INF", "1e999")
+    },
+    **{
+        f"joint {joint}, not the only one": (("move", "0", "zero", "0", "nan", "-0.5x", "0"), f"joint {joint}: ")
+        for joint in (2, 4, 5)
+    },
+    **{
+        f"option {option}": (("move", *HOME, option, "0.1"), "--speed") for option in ("--sped", "--sped=0.1", "--spee")
+    },
+    "a short option": (("move", *HOME, "-s", "0.1"), "-s"),
+    **{f"speed {speed}": (("move", *HOME, "--speed", speed), "--speed") for speed in ("0", "-1", "nan", "inf", "fast")},
     "five numbers": (("move", "--pose", *POSE[:5]), "5 numbers for a pose of 6: give X Y Z RX RY RZ"),
     "a length as a fraction of pi": (("move", "--pose", "pi", *POSE[1:]), "x: 'pi' is not a number (m)"),
     "an angle that is not finite": (("move", "--pose", *POSE[:5], "inf"), "rz: inf is not finite"),
@@ -309,7 +291,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize(("arguments", "sentence"), WRONG.values(), ids=WRONG.keys())
-def test_a_pose_that_is_none_is_refused(
+def test_a_wrong_argument_of_a_move_is_refused_by_name(
     platform: Any, rtcp: Callable[..., Any], arguments: tuple[str, ...], sentence: str
 ) -> None:
     ended = rtcp(*arguments)

@@ -36,19 +36,6 @@ DRIVEN = replace(CONFIG, gripper=GripperConfig(joint=FINGER, open_position=1.4, 
 
 
 @pytest.fixture(scope="module")
-def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
-    with fake_platform(tmp_path_factory.mktemp("arm"), Q) as made:
-        yield made
-
-
-@pytest.fixture
-def arm(platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePlatform:
-    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
-    platform.reset(Q)
-    return platform
-
-
-@pytest.fixture(scope="module")
 def driven_platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
     with fake_platform(tmp_path_factory.mktemp("arm"), Q, config=DRIVEN) as made:
         yield made

@@ -68,7 +68,7 @@ def narrower(checker: GuardChecker, shares: tuple[float, ...]) -> Values:
     )
 
 
-DEED = st.one_of(
+ACTION = st.one_of(
     st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 40)),
     st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
 )
@@ -77,16 +77,16 @@ DEED = st.one_of(
 @given(
     dt=CYCLES_S,
     start=st.tuples(st.one_of(SHARES, st.sampled_from([0.0, 1.0])), st.one_of(SHARES, st.sampled_from([0.0, 1.0]))),
-    deeds=st.lists(DEED, min_size=1, max_size=15),
+    actions=st.lists(ACTION, min_size=1, max_size=15),
 )
 @settings(max_examples=examples(150))
 def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
-    dt: float, start: tuple[float, float], deeds: list[tuple[object, ...]]
+    dt: float, start: tuple[float, float], actions: list[tuple[object, ...]]
 ) -> None:
     bounds = Limits(JOINTS_ONLY)
     at = [low + share * (high - low) for low, high, share in zip(bounds.low, bounds.high, start, strict=True)]
     checker = GuardChecker(JOINTS_ONLY, at, dt)
-    for kind, *given_ in deeds:
+    for kind, *given_ in actions:
         if kind == "limits":
             checker.change(narrower(checker, given_))  # type: ignore[arg-type]
             continue
