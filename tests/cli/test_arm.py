@@ -125,7 +125,7 @@ def test_the_table_shows_branch_joints_limits_and_distances(rtcp: Rtcp) -> None:
     assert far[3][1:4] == ["q3,", "q4,", "q5"]
 
 
-def test_no_solution_inside_the_limits_is_said(rtcp: Rtcp, arm_files: Path) -> None:
+def test_no_solution_inside_the_limits_is_reported(rtcp: Rtcp, arm_files: Path) -> None:
     file = arm_files / "abb_irb120.yaml"
     file.write_text(file.read_text().replace("min: -11*pi/12, max: 11*pi/12", "min: -0.1, max: 0.1"))
     pose = ("0", "0.3", "0.5", "0", "pi", "0", "--arm", str(file))

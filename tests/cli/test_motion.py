@@ -117,7 +117,7 @@ def test_an_output_is_switched_by_number(platform: Any, rtcp: Callable[..., Any]
     ],
     ids=["on an output", "closed", "open", "holding"],
 )
-def test_it_is_said_where_a_gripper_with_a_drive_has_come_to_rest(
+def test_it_is_shown_where_a_gripper_with_a_drive_has_come_to_rest(
     platform: Any, rtcp: Callable[..., Any], word: str, answer: dict[str, Any], said: str
 ) -> None:
     platform.answers["move_gripper"] = answer
@@ -136,7 +136,7 @@ def test_a_joint_is_zeroed_by_its_name_or_its_number(platform: Any, rtcp: Callab
     assert "/state/zero.yaml" in ended.out
 
 
-def test_a_joint_is_homed_and_told_where_it_stands(platform: Any, rtcp: Callable[..., Any]) -> None:
+def test_a_joint_is_homed_and_reported_where_it_stands(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.answers["home"] = {"joint": "joint6", "position": 0.5}
     ended = rtcp("home", "joint6")
     assert (ended.code, ended.out) == (0, "joint6 is homed and stands at 0.500000 rad\n")
@@ -324,7 +324,7 @@ def test_a_file_is_named_by_its_whole_path(
         ("t.txt", "", "allowed are .yaml, .yml and .csv"),
     ],
 )
-def test_a_mistake_in_a_file_is_told_without_a_platform(
+def test_a_mistake_in_a_file_is_reported_without_a_platform(
     rtcp: Callable[..., Any], tmp_path: Path, name: str, text: str, sentence: str
 ) -> None:
     (tmp_path / name).write_text(text)
@@ -333,7 +333,7 @@ def test_a_mistake_in_a_file_is_told_without_a_platform(
     assert sentence in ended.trouble
 
 
-def test_the_end_of_a_path_tells_its_length_and_whether_joints_slowed_it(
+def test_the_end_of_a_path_shows_its_length_and_whether_joints_slowed_it(
     platform: Any, rtcp: Callable[..., Any]
 ) -> None:  # fmt: skip
     platform.answers["move_pose"] = {

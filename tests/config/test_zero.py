@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtcp.config import ConfigError, default_config, load
 from rtcp.config.model import ArmConfig, GripperConfig, Joint, Range, SlaveConfig
 from rtcp.config.zero import read_zeros, state_directory, store_zero, zero_file
 from rtcp.launch.launcher import StartOptions, _configure
+from tests.samples import examples
 
 ARM = load(default_config())
 
@@ -96,6 +97,7 @@ def test_an_offset_is_stored_and_the_others_are_kept() -> None:
     assert read_zeros(ARM) == (0.0, 0.0, 0.0, 0.0, 0.0, -1.5)
 
 
+@settings(max_examples=examples(100))
 @given(
     st.lists(st.floats(-99, 99), min_size=6, max_size=6), st.text(st.characters(codec="utf-8"), min_size=1, max_size=9)
 )
@@ -361,8 +363,8 @@ def test_two_writers_wait_for_each_other(state: Path) -> None:
     code = (
         "import sys; from rtcp.config import default_config, load; from rtcp.config.zero import store_zero\n"
         "config, axis = load(default_config()), int(sys.argv[1])\n"
-        "for i in range(40): store_zero(config, axis, i / 64)\n"
+        "for i in range(20): store_zero(config, axis, i / 64)\n"
     )
-    writers = [subprocess.Popen([sys.executable, "-c", code, str(axis)]) for axis in range(3)]
-    assert [writer.wait() for writer in writers] == [0, 0, 0]
-    assert read_zeros(ARM) == (39 / 64, 39 / 64, 39 / 64, 0.0, 0.0, 0.0)
+    writers = [subprocess.Popen([sys.executable, "-c", code, str(axis)]) for axis in range(2)]
+    assert [writer.wait() for writer in writers] == [0, 0]
+    assert read_zeros(ARM) == (19 / 64, 19 / 64, 0.0, 0.0, 0.0, 0.0)

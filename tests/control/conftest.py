@@ -57,19 +57,3 @@ def switch_rig(new_rig: Callable[..., LoopRig]) -> Callable[..., LoopRig]:
         return made
 
     return make
-
-
-@pytest.fixture
-def path() -> Iterator[Path]:
-    """A blackboard's file in shared memory, removed at the end."""
-    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
-    yield made
-    made.unlink(missing_ok=True)
-
-
-@pytest.fixture
-def board(path: Path) -> Iterator[Blackboard]:
-    """A blackboard of six joints."""
-    made = Blackboard(path, 6, 500_000)
-    yield made
-    made.close()

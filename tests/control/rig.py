@@ -84,8 +84,8 @@ class Segment:
         self.dc_time = self.missed = self.stale = 0
         self.carries = True
         """Whether frames go out and come back."""
-        self.deaf: dict[tuple[int, int], dict[int, int]] = {}
-        """What a drive understands instead of what it is told: (drive from 0, object) -> {told: understood}."""
+        self.misunderstood: dict[tuple[int, int], dict[int, int]] = {}
+        """What a drive understands instead of what it is sent: (drive from 0, object) -> {sent: understood}."""
         self.away: set[int] = set()
         """Devices (from 0) that no frame reaches: what is in their place of the image stays."""
         self._rx = [PdoImage.from_assignment(device.objects, RX_ASSIGN) for device in self.devices]
@@ -107,7 +107,7 @@ class Segment:
         for i, (image, outputs) in enumerate(zip(self._rx, self._outputs, strict=True)):
             if i not in self.away:
                 image.unpack(outputs)
-        for (axis, index), understood in self.deaf.items():
+        for (axis, index), understood in self.misunderstood.items():
             entry = self.drives[axis].objects[index, 0]
             entry.value = understood.get(entry.value, entry.value)
 
@@ -135,7 +135,7 @@ class Segment:
                 image.pack(inputs)
 
 
-class Said(NamedTuple):
+class DriveFrame(NamedTuple):
     """A drive's inputs and outputs of one cycle as they are on the wire, in counts."""
 
     statusword: int
@@ -162,11 +162,11 @@ class Said(NamedTuple):
 _WIRE = struct.Struct("<Hiiib")
 
 
-class Seen(NamedTuple):
+class CycleFrame(NamedTuple):
     """What is seen of a cycle from outside."""
 
     state: State
-    drives: tuple[Said, ...]
+    drives: tuple[DriveFrame, ...]
 
 
 class Followed(Discipline):
@@ -207,7 +207,7 @@ class LoopRig:
         self.arm, self.box, self.operator = self.loop.arm, self.loop.box, self.loop.operator
         self.machine, self.context = self.loop.machine, self.loop.machine.context
         self.names = Names(config)
-        self.log: list[Seen] = []
+        self.log: list[CycleFrame] = []
         self._events_before = max((event.number for event in observer.events_since(0)), default=0)
         self.lease = observer.acquire("the rig", 3600.0)
 
@@ -237,10 +237,10 @@ class LoopRig:
         self.now_ns = monotonic_ns()
         self.loop.cycle(self.now_ns, self.now_ns)
         self.log.append(
-            Seen(
+            CycleFrame(
                 self.state,
                 tuple(
-                    Said(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
+                    DriveFrame(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
                     for slot in range(1, len(data.devices))
                 ),
             )

@@ -176,10 +176,10 @@ def test_while_the_drives_change_their_mode_neither_a_move_nor_another_mode_is_a
     rig: LoopRig, command: Command
 ) -> None:
     rig.hold()
-    rig.data.deaf[1, 0x6060] = {CSV: CSP}
+    rig.data.misunderstood[1, 0x6060] = {CSV: CSP}
     rig.do(SetDriveMode(DriveMode(CSV)))
     assert rig.send(command).refusal == DriveModeChanging()
-    rig.data.deaf.clear()
+    rig.data.misunderstood.clear()
     rig.run(0.01)
     assert rig.send(command).refusal is None
 

@@ -130,7 +130,7 @@ def test_it_counts_while_frames_are_lost_as_soon_as_they_come_again(rig: LoopRig
 
 def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(rig: LoopRig) -> None:
     rig.hold()
-    rig.data.deaf[1, 0x607A] = dict.fromkeys(range(-40000, 40000), 0)
+    rig.data.misunderstood[1, 0x607A] = dict.fromkeys(range(-40000, 40000), 0)
     rig.do(move_to(0.0, 0.4, speed=SPEED))
     rig.until(State.EMERGENCY_STOP)
     assert (rig.kinds[-1], rig.last.axis) == (FollowingError, 1)

@@ -17,7 +17,7 @@ from .rig import CONFIG, COUNTS, CSP, CST, CSV, QUICK_STOP, UNDER_VOLTAGE, VOLTA
 
 BOX = 1
 QUICK_STOP_RAMP = 0x6085
-DEAF_S = 2.0
+UNOBSERVABLE_S = 2.0
 
 
 def lose_box(rig: LoopRig, state: int) -> None:
@@ -56,7 +56,7 @@ def test_a_box_that_stays_away_takes_the_button_with_it_which_then_counts_as_pre
     rig.hold()
     lose_box(rig, state)
     rig.until(State.FAULT)
-    rig.run(DEAF_S - 0.05)
+    rig.run(UNOBSERVABLE_S - 0.05)
     assert rig.powered == [True, True]
     took_s = rig.wait(lambda: rig.powered == [False, False])
     assert took_s < 0.2
@@ -69,7 +69,7 @@ def test_a_box_that_comes_back_in_time_lets_the_arm_hold(rig: LoopRig) -> None:
     rig.hold()
     for _ in range(3):
         lose_box(rig, AlState.PREOP)
-        rig.run(0.9 * DEAF_S)
+        rig.run(0.9 * UNOBSERVABLE_S)
         rig.data.away.clear()
         rig.board.slave(BOX, AlState.OP, 0)
         rig.run(0.05)
@@ -81,7 +81,7 @@ def test_a_box_in_safe_op_that_answers_every_frame_is_heard(rig: LoopRig) -> Non
     rig.hold()
     rig.board.slave(BOX, AlState.SAFEOP, 0)
     rig.service.lost_slave = BOX
-    rig.run(2 * DEAF_S)
+    rig.run(2 * UNOBSERVABLE_S)
     assert rig.powered == [True, True]
     rig.press()
     assert rig.state is State.EMERGENCY_STOP

@@ -91,7 +91,7 @@ class Case:
 
 
 def understand_all(rig: LoopRig) -> None:
-    rig.data.deaf.clear()
+    rig.data.misunderstood.clear()
 
 
 def drive_understands(index: int, understood: dict[int, int], begin: Step, command: object = None) -> Step:
@@ -99,7 +99,7 @@ def drive_understands(index: int, understood: dict[int, int], begin: Step, comma
 
     def cause(rig: LoopRig) -> None:
         begin(rig)
-        rig.data.deaf[1, index] = understood
+        rig.data.misunderstood[1, index] = understood
         if command is not None:
             rig.do(command)  # type: ignore[arg-type]
 

@@ -16,6 +16,7 @@ from rtcp.ipc.events import (
     Arrived,
     ClockLocked,
     Disabled,
+    LeaseExpired,
     ProcessDataLost,
     Ready,
     ResetDone,
@@ -186,7 +187,7 @@ def test_the_arm_holds_its_place_through_every_change_of_mode(rig: LoopRig, posi
 
 
 def test_the_time_for_disabling_begins_when_the_arm_stands(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    rig.data.misunderstood[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
     rig.set_in_motion().do(Disable())
     rig.until(State.FAULT)
     sent = [said for cycle in rig.log if (said := cycle.drives[1]).controlword == SWITCH_ON and said.has_torque]
@@ -346,6 +347,14 @@ def test_a_stop_comes_to_rest_far_before_the_target_and_holds(rig: LoopRig) -> N
     assert rig.arm.first_moving() == -1
 
 
+def test_a_lease_of_another_commander_ends_the_move_too(rig: LoopRig) -> None:
+    rig.set_in_motion()
+    rig.observer.release(rig.lease)
+    rig.lease = rig.observer.acquire("another", 3600.0)
+    rig.cycle()
+    assert (rig.state, rig.kinds[-1]) == (State.STOPPING, LeaseExpired)
+
+
 def test_disabling_in_motion_takes_the_torque_only_at_standstill(rig: LoopRig) -> None:
     rig.bring_to(State.DISABLING)
     rig.until(State.READY)
@@ -416,7 +425,7 @@ def test_closing_without_one_of_the_slaves_ends_when_the_joints_of_the_others_st
 
 
 def test_closing_ends_after_2_s_where_a_drive_does_not_disable(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    rig.data.misunderstood[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
     rig.hold()
     rig.do(Shutdown())
     assert rig.finish() == pytest.approx(2.0, abs=3 * PERIOD_S)

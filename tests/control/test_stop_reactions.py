@@ -27,7 +27,7 @@ from .rig import (
     VOLTAGE_OFF,
     LoopRig,
     with_switch,
-)  # fmt: skip
+)
 
 HARD = {"quick_stop": QUICK_STOP, "torque_off": VOLTAGE_OFF}
 """Controlword of each reaction that the drives carry out by themselves."""
@@ -126,7 +126,7 @@ def test_a_clock_that_is_lost_while_the_torque_is_taken_ends_without_torque(swit
     rig = switch_rig(clock_lost="controlled_stop").hold()
     CAUSES["clock_lost"][0](rig)
     rig.run(0.98)
-    rig.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    rig.data.misunderstood[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
     rig.do(Disable())
     rig.until(State.FAULT, 0.05)
     rig.run(0.1)
@@ -272,13 +272,13 @@ def test_torque_off_is_disable_voltage_from_operation_enabled_without_the_ramp_o
     assert set(rig.words(0)[-2:]) == {ENABLE_OPERATION, VOLTAGE_OFF}
 
 
-def test_a_drive_that_does_not_hear_the_torque_off_is_told_for_as_long_as_the_fault_lasts(
+def test_a_drive_that_does_not_hear_the_torque_off_is_commanded_for_as_long_as_the_fault_lasts(
     switch_rig: Make,
 ) -> None:
     rig = switch_rig(slave_lost="torque_off").set_in_motion()
-    rig.data.deaf[1, CONTROLWORD] = {VOLTAGE_OFF: ENABLE_OPERATION}
+    rig.data.misunderstood[1, CONTROLWORD] = {VOLTAGE_OFF: ENABLE_OPERATION}
     cause(rig, "slave_lost")
     rig.run(0.3)
-    rig.data.deaf.clear()
+    rig.data.misunderstood.clear()
     rig.run(0.01)
     assert rig.powered == [False, False]

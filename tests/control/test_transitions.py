@@ -143,7 +143,7 @@ def rig(switch_rig: Callable[..., LoopRig]) -> LoopRig:
 
 def bring_to(rig: LoopRig, state: State) -> None:
     # A drive that is kept from enabling keeps the machine in that state.
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
     rig.bring_to(state)
     rig.slaves_come_back = False
 

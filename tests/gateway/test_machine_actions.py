@@ -174,7 +174,7 @@ def test_a_gripper_without_torque_is_refused(driven: FakePlatform) -> None:
 # -- zero and homing --------------------------------------------------------------------------------------------------
 
 
-def test_the_present_position_becomes_the_zero_or_what_it_is_said_to_be(arm: FakePlatform) -> None:
+def test_the_present_position_becomes_the_zero_or_what_it_is_reported_to_be(arm: FakePlatform) -> None:
     answer = arm.ask("zero", joint="joint1")
     assert (answer["joint"], answer["offset"], answer["before"]) == ("joint1", 0.25, 0.0)
     assert arm.ask("zero", joint="2", at=0.05)["joint"] == "joint2"

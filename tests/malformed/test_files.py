@@ -97,7 +97,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [("assistive_arm.yaml", 30), ("devices/cubemars-orh.yaml", 30), ("devices/diewu-io.yaml", 30),
      ("segment.yaml", 60), ("abb_irb120.yaml", 30)],
 )  # fmt: skip
-def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, turns: int) -> None:
+def test_a_damaged_configuration_is_reported_in_sentences(folder: Path, name: str, turns: int) -> None:
     random = Random(name)
     file = folder / name
     whole = file.read_bytes()
@@ -129,7 +129,7 @@ def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, t
      ("b.csv", POSES, read_motion), ("faults.yaml", SCRIPT, load_script)],
     ids=["trajectory", "path", "trajectory in CSV", "poses in CSV", "script of faults"],
 )  # fmt: skip
-def test_a_damaged_motion_or_script_is_told_in_sentences(
+def test_a_damaged_motion_or_script_is_reported_in_sentences(
     tmp_path: Path, name: str, content: bytes, read: Callable[[Path], object]
 ) -> None:
     random = Random(name)
@@ -144,7 +144,9 @@ def test_a_damaged_motion_or_script_is_told_in_sentences(
     assert 100 < found < 300
 
 
-def test_a_damaged_file_of_zero_offsets_is_told_in_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_file_of_zero_offsets_is_reported_in_sentences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
     config = load(default_config())
     store_zero(config, 1, 0.25)

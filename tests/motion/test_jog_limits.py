@@ -196,7 +196,7 @@ def stick(chance: random.Random) -> list[float]:
 
 
 @pytest.mark.parametrize("seed", some(range(10)))
-def test_a_random_stick_never_needs_the_guards(jogged, seed):
+def test_a_random_joystick_never_needs_the_guards(jogged, seed):
     chance = random.Random(seed)
     drive = jogged(ZERO)
     while seed % 5 and not drive.distance() > 0.2:

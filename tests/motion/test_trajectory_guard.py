@@ -231,7 +231,7 @@ def test_a_cut_of_a_mode_that_cannot_live_with_it_is_a_stop_that_looks_at_no_tar
     assert checker.request([checker.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
 
 
-def test_a_step_that_is_too_long_is_told_as_a_speed() -> None:
+def test_a_step_that_is_too_long_is_reported_as_a_speed() -> None:
     checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
     checker.request([0.0, 0.1], tolerates_saturation=False)
     guard = checker.guard

@@ -179,7 +179,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
     assert most == 16
 
 
-def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
+def test_a_stop_outside_a_box_is_never_reported_with_a_distance_inside() -> None:
     chance, stops = Random(5), 0
     for _ in range(60):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
