@@ -22,9 +22,9 @@ from typing import NamedTuple
 # What is played is the tests' own.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.malformed import loop_play, parser_play, segment_play
-from tests.malformed.cable import answerer, master, told
-from tests.malformed.segment_play import Found
+from tests.malformed import mutated_answers, mutated_frames, mutated_loop
+from tests.malformed.cable import answerer, master, report_of
+from tests.malformed.mutated_frames import Found
 
 A_JOB = 50_000
 MOST_OBJECTS, MOST_KB = 20_000, 30_000
@@ -39,7 +39,7 @@ def exchange(count: int, seed: int) -> Found:
     with answerer(seed) as pid:
         done = master(pid, "exchange", round(EXCHANGES * count))
     try:
-        said = told(done)
+        said = report_of(done)
     except AssertionError as failure:
         found.failures.append(str(failure))
         return found
@@ -58,10 +58,10 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "segment": Part(segment_play.play, 1.0, A_JOB),
+    "segment": Part(mutated_frames.run, 1.0, A_JOB),
     "exchange": Part(exchange, 0.85, A_JOB),
-    "parsers": Part(parser_play.play, 0.14, A_JOB // 5),
-    "loop": Part(loop_play.play, 0.01, A_JOB // 50),
+    "parsers": Part(mutated_answers.run, 0.14, A_JOB // 5),
+    "loop": Part(mutated_loop.run, 0.01, A_JOB // 50),
 }
 
 

@@ -1,10 +1,10 @@
-"""Random sessions, judged by the bytes that went over the bus.
+"""Random sessions, checked by the bytes that went over the bus.
 
-`python benchmarks/sessions.py --sessions 10000 --seed 1` plays the sessions of seeds 1 to 10000 on all CPUs, prints
-what came of them and exits with 1 on a failure. A failing seed is played again by `--seed N --sessions 1`.
+`python benchmarks/sessions.py --sessions 10000 --seed 1` runs the sessions of seeds 1 to 10000 on all CPUs, prints
+what came of them and exits with 1 on a failure. A failing seed runs again by `--seed N --sessions 1`.
 
-`python benchmarks/sessions.py --bus virtual --minutes 3 --seed 1` plays one on a real platform: its processes, its
-control socket, and the frames that reached its segment, captured there and judged afterwards.
+`python benchmarks/sessions.py --bus virtual --minutes 3 --seed 1` runs one on a real platform: its processes, its
+control socket, and the frames that reached its segment, captured there and checked afterwards.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from pathlib import Path
 # The sessions are the tests' own.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from tests.sessions.play import Outcome, play
-from tests.sessions.wire_play import play_on_the_wire
+from tests.sessions.session import Outcome, run_session
+from tests.sessions.wire_session import run_on_the_wire
 
 
 def table(title: str, counts: Counter[str]) -> None:
@@ -32,7 +32,7 @@ def table(title: str, counts: Counter[str]) -> None:
 
 def show(outcome: Outcome, wall_s: float) -> None:
     print(f"sessions            {outcome.sessions}")
-    print(f"cycles              {outcome.cycles}, of which with a drive enabled {outcome.judged}")
+    print(f"cycles              {outcome.cycles}, of which with a drive enabled {outcome.checked}")
     print(f"simulated           {outcome.simulated_s:.0f} s in {wall_s:.0f} s")
     table("commands taken     ", outcome.taken)
     table("commands refused   ", outcome.refused)
@@ -66,20 +66,20 @@ def main() -> int:
     if given.bus == "virtual":
         # However it ends, no platform stays behind.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        total = play_on_the_wire(given.seed, 60.0 * given.minutes, given.period, given.keep)
+        total = run_on_the_wire(given.seed, 60.0 * given.minutes, given.period, given.keep)
     else:
-        total = play_inprocess(given)
+        total = run_inprocess(given)
     show(total, time.monotonic() - began)
     return 1 if total.failures else 0
 
 
-def play_inprocess(given: argparse.Namespace) -> Outcome:
+def run_inprocess(given: argparse.Namespace) -> Outcome:
     total = Outcome()
     shown = time.monotonic()
     seeds = range(given.seed, given.seed + given.sessions)
     # Ctrl-C ends it with what is known by then.
     with suppress(KeyboardInterrupt), multiprocessing.Pool(given.processes, initializer=_ignore_interrupts) as pool:
-        for outcome in pool.imap_unordered(play, seeds, chunksize=4):
+        for outcome in pool.imap_unordered(run_session, seeds, chunksize=4):
             total.add(outcome)
             if time.monotonic() - shown > 10:
                 shown = time.monotonic()

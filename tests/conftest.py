@@ -10,9 +10,12 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from rtcp.ipc.blackboard import Blackboard
 
 _UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("same", parent=_UNHURRIED, derandomize=True)
@@ -30,3 +33,19 @@ def state_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Non
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RTCP_STATE_DIR", str(tmp_path_factory.mktemp("state")))
         yield
+
+
+@pytest.fixture
+def path() -> Iterator[Path]:
+    """A blackboard's file in shared memory, removed at the end."""
+    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
+    yield made
+    made.unlink(missing_ok=True)
+
+
+@pytest.fixture
+def board(path: Path) -> Iterator[Blackboard]:
+    """A blackboard of six joints."""
+    made = Blackboard(path, 6, 500_000)
+    yield made
+    made.close()

@@ -32,7 +32,7 @@ def test_from_the_middle_every_joint_moves() -> None:
                for directions in POSES)  # fmt: skip
 
 
-def test_the_table_tells_every_figure(platform: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_table_shows_every_figure(platform: Any, capsys: pytest.CaptureFixture[str]) -> None:
     platform.status["dc"] |= {"filtered_us": {"p50": 1, "p99": 7.25, "max": 9}, "offset_us": {"p99": 44.0}}
     show(figures(platform.status, started_s=1.234, mean_ns=500_010.0))
     shown = capsys.readouterr().out

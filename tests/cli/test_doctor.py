@@ -72,7 +72,7 @@ def test_the_worst_finding_comes_first_in_json(rtcp: Callable[..., Any], host: C
     assert severities(answer) == sorted(severities(answer), key=["bad", "warning", "note", "ok"].index)
 
 
-def test_json_tells_the_worst_severity_and_each_finding_whole(
+def test_json_shows_the_worst_severity_and_each_finding_whole(
     rtcp: Callable[..., Any], host: Callable[..., None]
 ) -> None:
     host({"proc/sys/kernel/sched_rt_runtime_us": "500000", "proc/sys/kernel/sched_rt_period_us": "1000000"})
@@ -138,5 +138,5 @@ def test_this_machine_is_examined_by_a_process_of_its_own() -> None:
     assert json.loads(ended.stdout)["bus"] == "lo"
 
 
-def test_help_tells_the_exit_codes(rtcp: Callable[..., Any]) -> None:
+def test_help_shows_the_exit_codes(rtcp: Callable[..., Any]) -> None:
     assert "5 the loop cannot keep its cycle" in " ".join(rtcp("doctor", "--help").out.split())

@@ -163,7 +163,7 @@ def test_a_picture_replaces_a_link_and_leaves_what_that_leads_to(rtcp: Callable[
     assert [one.name for one in path.parent.iterdir() if one.name.startswith(".") and one.suffix == ".png"] == []
 
 
-def test_who_has_recorded_nothing_is_told_where_the_service_records(
+def test_who_has_recorded_nothing_is_referred_to_where_the_service_records(
     rtcp: Callable[..., Any], state: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     service = tmp_path / "service"
@@ -222,7 +222,7 @@ def test_a_state_directory_that_is_a_file_is_a_sentence(
     assert f"{tmp_path / 'a file' / 'faults'}: the directory cannot be read: Not a directory" in ended.trouble
 
 
-def test_two_faults_that_begin_alike_are_told_apart_at_80_columns(rtcp: Callable[..., Any]) -> None:
+def test_two_faults_that_begin_alike_are_distinct_at_80_columns(rtcp: Callable[..., Any]) -> None:
     made = recording()
     for end in ("drive1 with statusword 0x0218", "drive2 with statusword 0x0208"):
         what = f"a long sentence about something that went wrong with the drive {end}"

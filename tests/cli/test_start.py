@@ -128,7 +128,7 @@ def test_a_loop_that_is_given_its_gateway_back_while_it_holds_is_no_failed_start
     assert (ended.code, ended.out) == (0, "holding: the arm has stopped and holds\n")
 
 
-def test_a_start_in_the_foreground_tells_what_came_of_it_and_runs_on(
+def test_a_start_in_the_foreground_shows_what_came_of_it_and_runs_on(
     rtcp: Callable[..., Any], launched: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def serve(options: object, announce: Callable[[], None]) -> int:

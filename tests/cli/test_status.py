@@ -54,7 +54,9 @@ def test_without_a_platform_status_says_so_and_exits_with_4(rtcp: Callable[..., 
     assert "rtcp start" in ended.trouble
 
 
-def test_a_watch_in_json_prints_an_object_a_line_until_ctrl_c(platform: Any, rtcp_process: Callable[..., Any]) -> None:
+def test_status_watch_in_json_prints_an_object_a_line_until_ctrl_c(
+    platform: Any, rtcp_process: Callable[..., Any]
+) -> None:
     watching = rtcp_process("status", "--json", "--watch")
     lines = [watching.stdout.readline() for _ in range(3)]
     watching.send_signal(signal.SIGINT)
@@ -63,7 +65,7 @@ def test_a_watch_in_json_prints_an_object_a_line_until_ctrl_c(platform: Any, rtc
     assert (watching.returncode, trouble) == (0, "")
 
 
-def test_a_watch_ends_with_4_when_the_platform_ends(
+def test_status_watch_ends_with_4_when_the_platform_ends(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     watching = rtcp_process("status", "--watch")
@@ -84,7 +86,7 @@ def test_a_reader_that_goes_away_ends_the_command_quietly(
     assert (process.wait(), trouble) == (0, "")
 
 
-def test_the_robot_status_and_the_states_are_told_in_words(platform: Any, rtcp: Callable[..., Any]) -> None:
+def test_the_robot_status_and_the_states_are_reported_in_words(platform: Any, rtcp: Callable[..., Any]) -> None:
     platform.status |= {
         "state": "stopped_by_limit",
         "control_mode": "joystick",
@@ -113,7 +115,7 @@ def test_the_last_messages_are_shown_with_their_local_time(
     assert shown[-5:] == [f"16:37:2{n}.873  message [{n}]" for n in (2, 3, 4, 5, 6)]
 
 
-def test_a_watch_goes_on_when_only_the_gateway_was_replaced(
+def test_status_watch_goes_on_when_only_the_gateway_was_replaced(
     platform: Any, rtcp_process: Callable[..., Any], wait_until: Callable[..., None]
 ) -> None:
     watching = rtcp_process("status", "--json", "--watch")
@@ -126,7 +128,7 @@ def test_a_watch_goes_on_when_only_the_gateway_was_replaced(
     assert (watching.communicate()[1], watching.returncode) == ("", 0)
 
 
-def test_a_watch_that_cannot_connect_again_to_a_loop_that_lives_says_why(
+def test_status_watch_that_cannot_connect_again_to_a_loop_that_lives_says_why(
     platform: Any, rtcp_process: Callable[..., Any]
 ) -> None:
     watching = rtcp_process("status", "--json", "--watch")
@@ -163,7 +165,7 @@ def test_without_an_answer_the_clocks_are_not_followed_and_no_counter_is_made_up
     assert "offset" not in shown
 
 
-def test_what_the_joints_last_said_is_said_to_be_old_where_they_are_not_heard(
+def test_what_the_joints_last_said_is_marked_as_old_where_they_are_not_heard(
     platform: Any, rtcp: Callable[..., Any]
 ) -> None:
     platform.status["lost_s"] = 1.5

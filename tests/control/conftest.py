@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from rtcp.config.model import ArmConfig
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Observer
 
-from .rig import CONFIG, PERIOD_S, LoopRig
+from .rig import CONFIG, PERIOD_S, SWITCH_INPUT, LoopRig, with_switch
 
 
 @pytest.fixture(scope="module")
@@ -27,24 +28,32 @@ def rig_board() -> Iterator[tuple[Blackboard, Observer]]:
 
 
 @pytest.fixture
-def rig(rig_board: tuple[Blackboard, Observer]) -> Iterator[LoopRig]:
-    """A rig whose lease is released at the end."""
-    made = LoopRig(*rig_board)
-    yield made
-    rig_board[1].release(made.lease)
+def new_rig(rig_board: tuple[Blackboard, Observer]) -> Iterator[Callable[..., LoopRig]]:
+    """Make a rig of a configuration; its lease is released at the end."""
+    made: list[LoopRig] = []
+
+    def make(config: ArmConfig = CONFIG, **options: bool) -> LoopRig:
+        made.append(LoopRig(*rig_board, config=config, **options))
+        return made[-1]
+
+    yield make
+    for rig in made:
+        rig_board[1].release(rig.lease)
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    """A blackboard's file in shared memory, removed at the end."""
-    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
-    yield made
-    made.unlink(missing_ok=True)
+def rig(new_rig: Callable[..., LoopRig]) -> LoopRig:
+    """A rig of the small arm."""
+    return new_rig()
 
 
 @pytest.fixture
-def board(path: Path) -> Iterator[Blackboard]:
-    """A blackboard of six joints."""
-    made = Blackboard(path, 6, 500_000)
-    yield made
-    made.close()
+def switch_rig(new_rig: Callable[..., LoopRig]) -> Callable[..., LoopRig]:
+    """Make a rig whose enabling switch is held, with stop reactions by key."""
+
+    def make(**stops: str) -> LoopRig:
+        made = new_rig(with_switch(**stops))
+        made.put(SWITCH_INPUT, True)
+        return made
+
+    return make

@@ -10,7 +10,7 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import ArmConfig, InputConfig
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle
 from rtcp.fieldbus.al_state import AlState
@@ -60,6 +60,16 @@ def small_arm() -> ArmConfig:
 
 
 CONFIG = small_arm()
+SWITCH_INPUT = 10
+"""Channel of the enabling switch, from 0."""
+
+
+def with_switch(**stops: str) -> ArmConfig:
+    """The small arm with an enabling switch, and stop reactions by key."""
+    inputs = replace(CONFIG.inputs, enabling_switch=InputConfig(SWITCH_INPUT + 1))
+    return replace(CONFIG, inputs=inputs, stops=replace(CONFIG.stops, **stops))  # type: ignore[arg-type]
+
+
 LONGEST_STEP = CONFIG.joints[0].velocity * PERIOD_S * COUNTS + 1
 """Counts; one more than the speed limit allows, for the rounding of both ends."""
 
@@ -74,8 +84,8 @@ class Segment:
         self.dc_time = self.missed = self.stale = 0
         self.carries = True
         """Whether frames go out and come back."""
-        self.deaf: dict[tuple[int, int], dict[int, int]] = {}
-        """What a drive understands instead of what it is told: (drive from 0, object) -> {told: understood}."""
+        self.misunderstood: dict[tuple[int, int], dict[int, int]] = {}
+        """What a drive understands instead of what it is sent: (drive from 0, object) -> {sent: understood}."""
         self.away: set[int] = set()
         """Devices (from 0) that no frame reaches: what is in their place of the image stays."""
         self._rx = [PdoImage.from_assignment(device.objects, RX_ASSIGN) for device in self.devices]
@@ -97,7 +107,7 @@ class Segment:
         for i, (image, outputs) in enumerate(zip(self._rx, self._outputs, strict=True)):
             if i not in self.away:
                 image.unpack(outputs)
-        for (axis, index), understood in self.deaf.items():
+        for (axis, index), understood in self.misunderstood.items():
             entry = self.drives[axis].objects[index, 0]
             entry.value = understood.get(entry.value, entry.value)
 
@@ -125,7 +135,7 @@ class Segment:
                 image.pack(inputs)
 
 
-class Said(NamedTuple):
+class DriveFrame(NamedTuple):
     """A drive's inputs and outputs of one cycle as they are on the wire, in counts."""
 
     statusword: int
@@ -152,11 +162,11 @@ class Said(NamedTuple):
 _WIRE = struct.Struct("<Hiiib")
 
 
-class Seen(NamedTuple):
+class CycleFrame(NamedTuple):
     """What is seen of a cycle from outside."""
 
     state: State
-    drives: tuple[Said, ...]
+    drives: tuple[DriveFrame, ...]
 
 
 class Followed(Discipline):
@@ -197,7 +207,7 @@ class LoopRig:
         self.arm, self.box, self.operator = self.loop.arm, self.loop.box, self.loop.operator
         self.machine, self.context = self.loop.machine, self.loop.machine.context
         self.names = Names(config)
-        self.log: list[Seen] = []
+        self.log: list[CycleFrame] = []
         self._events_before = max((event.number for event in observer.events_since(0)), default=0)
         self.lease = observer.acquire("the rig", 3600.0)
 
@@ -227,10 +237,10 @@ class LoopRig:
         self.now_ns = monotonic_ns()
         self.loop.cycle(self.now_ns, self.now_ns)
         self.log.append(
-            Seen(
+            CycleFrame(
                 self.state,
                 tuple(
-                    Said(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
+                    DriveFrame(*_WIRE.unpack(data.input(slot)), *_WIRE.unpack(data.output(slot)))
                     for slot in range(1, len(data.devices))
                 ),
             )
@@ -282,10 +292,25 @@ class LoopRig:
         """The messages of all events so far."""
         return [self.names.message(record.event) for record in self.events]
 
+    def put(self, channel: int, level: bool) -> None:
+        """Set an input of the box."""
+        self.data.devices[0].set_input(channel, level)
+
     def press(self, pressed: bool = True) -> None:
         """Press the emergency stop, or release it, and let it be seen."""
-        self.data.devices[0].set_input(EMERGENCY_STOP_INPUT, not pressed)
+        self.put(EMERGENCY_STOP_INPUT, not pressed)
         self.run(0.02)
+
+    @property
+    def powered(self) -> list[bool]:
+        """Whether each drive really has torque."""
+        return [model.powered for model in self.models]
+
+    def recover(self) -> LoopRig:
+        """Reset and enable."""
+        self.do(Reset())
+        self.until(State.READY)
+        return self.enable()
 
     # -- ways to the states -------------------------------------------------------------------------------------
 
@@ -381,3 +406,42 @@ class LoopRig:
 def move_to(*target: float, speed: float = SPEED) -> MoveJoints:
     """A move of all joints, which arrive together."""
     return MoveJoints(target, speed, True)
+
+
+def turn(rig: LoopRig, axis: int, inertia: float, velocity: float, torque: float) -> None:
+    """Turn a joint from outside: too heavy for its drive, or with more torque than that has."""
+    joint = rig.models[axis].mechanics
+    joint.inertia, joint.velocity, joint.external_torque = inertia, velocity, torque
+
+
+def let_go(rig: LoopRig) -> None:
+    """End what `turn` began."""
+    for axis in range(2):
+        turn(rig, axis, 1.0, 0.0, 0.0)
+
+
+def acquire_lease(rig: LoopRig) -> None:
+    rig.lease = rig.observer.acquire("the rig", 3600.0)
+
+
+Step = Callable[[LoopRig], object]
+CAUSES: dict[str, tuple[Step, Step]] = {
+    "lost_frames": (
+        lambda rig: setattr(rig.data, "carries", False),
+        lambda rig: setattr(rig.data, "carries", True),
+    ),
+    "slave_lost": (lambda rig: setattr(rig.service, "lost_slave", 3), lambda rig: None),
+    "drive_fault": (lambda rig: rig.models[1].inject_fault(UNDER_VOLTAGE), lambda rig: None),
+    "clock_lost": (
+        lambda rig: setattr(rig.discipline, "locked", False),
+        lambda rig: setattr(rig.discipline, "locked", True),
+    ),
+    "emergency_stop": (
+        lambda rig: rig.put(EMERGENCY_STOP_INPUT, False),
+        lambda rig: rig.put(EMERGENCY_STOP_INPUT, True),
+    ),
+    "supervision": (lambda rig: turn(rig, 1, 1e5, 0.9, 0.0), let_go),
+    "lease_ended": (lambda rig: rig.observer.release(rig.lease), acquire_lease),
+    "enabling_switch": (lambda rig: rig.put(SWITCH_INPUT, False), lambda rig: rig.put(SWITCH_INPUT, True)),
+}
+"""For each key of `stops` what causes one of its events, and what ends the cause. The clock is missed after 1 s."""

@@ -1,4 +1,4 @@
-"""The thread beside the cycle: what it tells the cycle of a slave that was lost, and whom it keeps waiting."""
+"""The thread beside the cycle: what it reports of a slave that was lost, and whom it keeps waiting."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from rtcp.fieldbus.recovery import MonitoredSlave
 from rtcp.fieldbus.registers import Steps
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Health, Observer
+
+GONE = "the interface does not take frames any more"
 
 
 class Watching:
@@ -45,7 +47,7 @@ class Watching:
         if self.hold is not None:
             self.hold()
         if self.gone:
-            raise BusError("the interface does not take frames any more")
+            raise BusError(GONE)
         left, self.left = self.left, 0
         return left
 
@@ -64,7 +66,7 @@ class Bus:
         self.watching = Watching()
         self.patience = 0
         self.waiting: list[Emergency] = []
-        self.read_state: Callable[[], tuple[SlaveState, ...]] = tuple
+        self.gone = False
 
     def request_state(self, state: AlState) -> None:
         pass
@@ -73,7 +75,9 @@ class Bus:
         return ()
 
     def read_states(self) -> tuple[SlaveState, ...]:
-        return self.read_state()
+        if self.gone:
+            raise BusError(GONE)
+        return ()
 
     def emergencies(self) -> tuple[Emergency, ...]:
         return tuple(self.waiting)
@@ -121,6 +125,23 @@ def until(met: Callable[[], bool]) -> None:
     while not met():
         assert time.monotonic() < end
         time.sleep(0.0005)
+
+
+def sentences(observer: Observer) -> list[str]:
+    return [text.sentence for text in observer.texts_since(0)]
+
+
+def answer_of(observer: Observer) -> dict[str, Any]:
+    """Wait for the service's answer."""
+    found: list[dict[str, Any]] = []
+
+    def answered() -> bool:
+        answer = observer.service_answer()
+        found.extend([] if answer is None else [answer])
+        return bool(found)
+
+    until(answered)
+    return found[0]
 
 
 def hold_turn(bus: Bus) -> threading.Event:
@@ -220,15 +241,8 @@ def test_an_object_that_takes_its_time_holds_up_no_turn_of_the_watcher(
     bus.patience = 30
     before = bus.watching.turns
     observer.ask_service({"do": "sdo_read", "slave": 2, "index": 0x1000, "subindex": 0})
-    found: list[dict[str, Any]] = []
-
-    def answered() -> bool:
-        answer = observer.service_answer()
-        found.extend([] if answer is None else [answer])
-        return bool(found)
-
-    until(answered)
-    assert found == [{"hex": "2a"}]
+    found = answer_of(observer)
+    assert found == {"hex": "2a"}
     assert bus.watching.turns >= before + 30
 
 
@@ -237,15 +251,8 @@ def test_a_request_of_another_form_is_answered_in_a_sentence(
     service: BusService, observer: Observer, request_: Any
 ) -> None:  # fmt: skip
     observer.ask_service(request_)
-    found: list[dict[str, Any]] = []
-
-    def answered() -> bool:
-        answer = observer.service_answer()
-        found.extend([] if answer is None else [answer])
-        return bool(found)
-
-    until(answered)
-    assert "not of the service's form" in found[0]["error"]
+    found = answer_of(observer)
+    assert "not of the service's form" in found["error"]
     assert service.is_alive()
 
 
@@ -258,31 +265,22 @@ def test_what_slaves_have_been_through_is_read_as_it_was_written(
     assert observer.health(2)[0] == Health(0, 0, 0, 0, 0)
 
 
-def test_an_interface_that_is_gone_is_said_once_and_not_in_every_turn(
+def test_an_interface_that_is_gone_is_reported_once_and_not_in_every_turn(
     bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.watching.gone = True
     turns(bus, 100)
-    said = [text.sentence for text in observer.texts_since(0)]
-    assert said == ["the interface does not take frames any more"]
+    assert sentences(observer) == [GONE]
     assert service.is_alive()
 
 
-def gone() -> tuple[SlaveState, ...]:
-    raise BusError("the interface does not take frames any more")
-
-
-def sentences(observer: Observer) -> list[str]:
-    return [text.sentence for text in observer.texts_since(0)]
-
-
 def test_an_end_without_the_interface_is_no_defect(bus: Bus, service: BusService, observer: Observer) -> None:
-    bus.read_state = gone
+    bus.gone = True
     service.finish()
-    assert (service.refused, sentences(observer)) == ((), ["the interface does not take frames any more"])
+    assert (service.refused, sentences(observer)) == ((), [GONE])
 
 
-def test_two_failures_that_take_turns_are_said_once_each(bus: Bus, service: BusService, observer: Observer) -> None:
+def test_two_failures_that_take_turns_are_reported_once_each(bus: Bus, service: BusService, observer: Observer) -> None:
     def alternate() -> None:
         bus.watching.gone = False
         raise BusError(f"failure {bus.watching.turns % 2}")
@@ -303,7 +301,7 @@ def test_emergencies_of_one_slave_without_an_end_leave_room_for_those_of_another
     assert len(said) == 5
 
 
-def test_an_emergency_that_comes_again_after_a_reset_is_said_again(
+def test_an_emergency_that_comes_again_after_a_reset_is_reported_again(
     bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.waiting = [Emergency(2, "drive1", 0x3210, 0, bytes(5))]

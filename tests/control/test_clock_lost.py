@@ -44,7 +44,7 @@ class Reference:
 
 @pytest.fixture(params=["quick_stop", "controlled_stop"])
 def moving(request: pytest.FixtureRequest) -> Iterator[Simulation]:
-    """An arm on its way, under either rung of `stops.clock_lost`."""
+    """An arm on its way, under either reaction of `stops.clock_lost`."""
     config = replace(CONFIG, stops=replace(CONFIG.stops, clock_lost=request.param))
     with Simulation(config, seed=5) as simulation:
         simulation.acquire()
@@ -56,7 +56,7 @@ def moving(request: pytest.FixtureRequest) -> Iterator[Simulation]:
         yield simulation
 
 
-def test_a_reference_clock_that_stands_stops_the_arm_by_its_rung_and_a_reset_waits_until_it_moves(
+def test_a_reference_clock_that_stands_stops_the_arm_by_its_reaction_and_a_reset_waits_until_it_moves(
     moving: Simulation,
 ) -> None:
     words: list[int] = []

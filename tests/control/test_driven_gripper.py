@@ -1,4 +1,4 @@
-"""A gripper with a drive of its own through the whole loop, in simulated time (`inprocess`): lease, stops, watch."""
+"""A gripper with a drive of its own through the whole loop, in simulated time: lease, stops, supervision."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import itertools
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -48,7 +49,7 @@ NEUTRAL, BACKWARD, PADDLE_UP = 63, 61, 47
 
 
 class Hand:
-    """The arm, enabled, with its gripper at `START`; remembers the set-points and what each frame told the drive."""
+    """The arm, enabled, with its gripper at `START`; remembers the set-points and what each frame sent to the drive."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -59,14 +60,14 @@ class Hand:
         assert isinstance(model, CubemarsDrive)
         self.model = model
         self.path: list[float] = []
-        self.told: list[bytes] = []
+        self.sent: list[bytes] = []
         self.object_at: float | None = None
         """Where something hard lies between the fingers, rad."""
         simulation.on_frame = self._see
 
     def _see(self, frame: Frame) -> None:
         self.path.append(self.gripper.motion.position)
-        self.told.append(frame.sent[SLOT])
+        self.sent.append(frame.sent[SLOT])
         self.received.append(frame.received[SLOT])
         if self.object_at is not None:
             mechanics = self.model.mechanics
@@ -156,15 +157,15 @@ def hand(with_hand: Callable[..., Hand]) -> Hand:
 # -- the way ----------------------------------------------------------------------------------------------------------
 
 
-def test_it_closes_and_opens_under_the_lease_and_tells_each_time_where_it_rests(hand: Hand) -> None:
+def test_it_closes_and_opens_under_the_lease_and_reports_each_time_where_it_rests(hand: Hand) -> None:
     hand.close()
     hand.rest()
     assert hand.position == pytest.approx(CLOSED, abs=2e-3)
     hand.open()
     hand.rest()
     assert hand.position == pytest.approx(OPEN, abs=2e-3)
-    told = [(event.axis, event.position, event.holds) for event in hand.reports_of(GripperAtRest)]
-    assert told == [(AXIS, pytest.approx(CLOSED), False), (AXIS, pytest.approx(OPEN), False)]
+    reported = [(event.axis, event.position, event.holds) for event in hand.reports_of(GripperAtRest)]
+    assert reported == [(AXIS, pytest.approx(CLOSED), False), (AXIS, pytest.approx(OPEN), False)]
     assert kept_to_its_limits(hand.path)
     assert hand.state is State.HOLDING
 
@@ -175,7 +176,7 @@ def test_without_the_lease_it_does_not_begin(hand: Hand) -> None:
     assert max(abs(position - START) for position in hand.path) < 1e-4
 
 
-def test_where_it_already_is_it_tells_so_all_the_same(with_hand: Callable[..., Hand]) -> None:
+def test_where_it_already_is_it_reports_so_all_the_same(with_hand: Callable[..., Hand]) -> None:
     hand = with_hand(start=OPEN)
     hand.open()
     hand.simulation.run(0.1)
@@ -231,20 +232,41 @@ def stopped_on_its_way(hand: Hand) -> None:
     assert hand.position == pytest.approx(rest.position, abs=2e-3)
 
 
-def test_it_stops_when_its_commander_falls_silent(hand: Hand) -> None:
-    hand.simulation.run(0.01)
-    hand.simulation.fall_silent()
+def hold_switch(hand: Hand) -> None:
+    assert hand.simulation.send(MoveGripper(False)).refusal == NotPermitted()
+    hand.inputs(put=ENABLING_SWITCH)
+    hand.simulation.run(0.05)
+
+
+def nothing(hand: Hand) -> None:
+    """Nothing is to be prepared, or to be undone."""
+
+
+WITH_SWITCH = replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(11)))
+STOPS: dict[str, tuple[Callable[[Hand], object], Callable[[Hand], object], Callable[[Hand], object]]] = {
+    "halt": (nothing, lambda hand: hand.simulation.send(Halt()), nothing),
+    "another holds the lease": (nothing, lambda hand: hand.simulation.acquire(), nothing),
+    "the lease is not renewed": (lambda hand: hand.simulation.fall_silent(), nothing, nothing),
+    "the enabling switch is released": (
+        hold_switch,
+        lambda hand: hand.inputs(clear=ENABLING_SWITCH),
+        lambda hand: hand.inputs(put=ENABLING_SWITCH),
+    ),
+}
+"""What is done before it moves, what stops it, and what is undone then."""
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_it_stops_and_stays(with_hand: Callable[..., Hand], stop: str) -> None:
+    hand = with_hand(WITH_SWITCH if "switch" in stop else CONFIG)
+    prepare, cause, undo = STOPS[stop]
+    prepare(hand)
     hand.on_its_way()
+    cause(hand)
     hand.rest()
+    undo(hand)
     stopped_on_its_way(hand)
     assert hand.state is State.HOLDING
-
-
-def test_it_stops_when_another_holds_the_lease(hand: Hand) -> None:
-    hand.on_its_way()
-    hand.simulation.acquire()
-    hand.rest()
-    stopped_on_its_way(hand)
 
 
 def test_where_a_lost_commander_means_a_quick_stop_it_ends_in_a_fault_with_the_arm(
@@ -276,25 +298,6 @@ def test_it_stops_while_a_joint_homes_when_its_commander_falls_silent(hand: Hand
     stopped_on_its_way(hand)
 
 
-def test_it_stops_when_the_enabling_switch_is_let_go(with_hand: Callable[..., Hand]) -> None:
-    hand = with_hand(replace(CONFIG, inputs=replace(CONFIG.inputs, enabling_switch=InputConfig(11))))
-    assert hand.simulation.send(MoveGripper(False)).refusal == NotPermitted()
-    hand.inputs(put=ENABLING_SWITCH)
-    hand.simulation.run(0.05)
-    hand.on_its_way()
-    hand.inputs(clear=ENABLING_SWITCH)
-    hand.rest()
-    hand.inputs(put=ENABLING_SWITCH)
-    stopped_on_its_way(hand)
-
-
-def test_it_stops_by_halt(hand: Hand) -> None:
-    hand.on_its_way()
-    assert hand.simulation.send(Halt()).refusal is None
-    hand.rest()
-    stopped_on_its_way(hand)
-
-
 def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
     hand.simulation.data.lose(5, heard=True)
     hand.close()
@@ -305,8 +308,8 @@ def test_a_halt_before_its_first_step_is_a_halt_too(hand: Hand) -> None:
 
 
 @pytest.fixture
-def by_stick(with_hand: Callable[..., Hand]) -> Hand:
-    """The stick closes it; nobody holds a lease."""
+def by_joystick(with_hand: Callable[..., Hand]) -> Hand:
+    """The joystick closes it; nobody holds a lease."""
     hand = with_hand(replace(CONFIG, control_mode="joystick"))
     hand.simulation.lease = 0
     for code in [PADDLE_UP, NEUTRAL] * 3:
@@ -318,35 +321,33 @@ def by_stick(with_hand: Callable[..., Hand]) -> Hand:
     return hand
 
 
-def test_the_stick_closes_it_without_a_lease(by_stick: Hand) -> None:
-    by_stick.rest()
-    assert by_stick.position == pytest.approx(CLOSED, abs=2e-3)
+def test_the_joystick_closes_it_without_a_lease(by_joystick: Hand) -> None:
+    by_joystick.rest()
+    assert by_joystick.position == pytest.approx(CLOSED, abs=2e-3)
 
 
-@pytest.mark.parametrize("code", [NEUTRAL, 0, 1, PADDLE_UP], ids=["released", "no code", "another", "paddle"])
-def test_it_stops_when_the_stick_that_closes_it_is_let_go_or_shows_no_code(by_stick: Hand, code: int) -> None:
-    by_stick.inputs(clear=0x3F, put=code)
-    by_stick.rest()
-    stopped_on_its_way(by_stick)
-
-
-def test_it_stops_when_the_stick_that_closes_it_is_given_to_the_chair(by_stick: Hand) -> None:
-    by_stick.inputs(clear=TOGGLE)
-    by_stick.rest()
-    by_stick.inputs(put=TOGGLE)
-    stopped_on_its_way(by_stick)
+@pytest.mark.parametrize(
+    ("clear", "code"),
+    [(0x3F, NEUTRAL), (0x3F, 0), (0x3F, 1), (0x3F, PADDLE_UP), (TOGGLE, 0)],
+    ids=["released", "no code", "another", "paddle", "given to the chair"],
+)
+def test_it_stops_when_the_joystick_no_longer_closes_it(by_joystick: Hand, clear: int, code: int) -> None:
+    by_joystick.inputs(clear=clear, put=code)
+    by_joystick.rest()
+    by_joystick.inputs(put=TOGGLE)
+    stopped_on_its_way(by_joystick)
 
 
 @pytest.mark.parametrize("command", [Disable, Shutdown])
 def test_its_set_point_comes_to_rest_before_its_torque_goes(hand: Hand, command: Command) -> None:
     hand.on_its_way()
     hand.path.clear()
-    hand.told.clear()
+    hand.sent.clear()
     hand.simulation.send(command())
     assert hand.simulation.until(lambda: hand.state is State.READY or hand.simulation.done, 10.0)
-    off = next(at for at, told in enumerate(hand.told) if told[:2] != ENABLED)
+    off = next(at for at, sent in enumerate(hand.sent) if sent[:2] != ENABLED)
     assert off > 10
-    assert hand.told[off - 1][2:6] == hand.told[off - 2][2:6]
+    assert hand.sent[off - 1][2:6] == hand.sent[off - 2][2:6]
     (rest,) = hand.reports_of(GripperAtRest)
     assert CLOSED + 0.1 < rest.position < START - 0.05
     assert not hand.model.powered
@@ -369,22 +370,15 @@ def goes_nowhere_by_itself(hand: Hand) -> None:
     assert hand.position == pytest.approx(here, abs=2e-3)
 
 
-def test_a_fault_of_another_drive_stops_it(hand: Hand) -> None:
+@pytest.mark.parametrize("own", [True, False])
+def test_a_fault_of_any_drive_stops_it_and_the_arm(hand: Hand, own: bool) -> None:
     hand.on_its_way()
-    hand.simulation.models[2].inject_fault(0x7305)
+    (hand.model if own else hand.simulation.models[2]).inject_fault(0x7305)
     hand.until(State.FAULT)
+    assert hand.message(DriveFault).startswith(f"{'finger' if own else 'joint3'}: the drive is in fault")
     hand.simulation.run(1.0)
-    assert abs(hand.model.mechanics.velocity) < 1e-3
-    assert hand.position > CLOSED + 0.1
-    goes_nowhere_by_itself(hand)
-
-
-def test_a_fault_of_its_own_drive_stops_the_arm_and_names_its_joint(hand: Hand) -> None:
-    hand.on_its_way()
-    hand.model.inject_fault(0x7305)
-    hand.until(State.FAULT)
-    assert hand.message(DriveFault).startswith("finger: the drive is in fault")
-    hand.simulation.run(1.0)
+    assert abs(hand.model.mechanics.velocity) < 1e-3 or own
+    assert hand.position > CLOSED + 0.1 or own
     goes_nowhere_by_itself(hand)
 
 
@@ -400,27 +394,27 @@ def test_the_emergency_stop_stops_it(hand: Hand) -> None:
     goes_nowhere_by_itself(hand)
 
 
-def test_too_fast_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
-    hand.model.mechanics.external_torque = 40.0
+@pytest.mark.parametrize(
+    ("torque", "kind", "value", "limit"),
+    [
+        (40.0, OverSpeed, lambda gripper: gripper.drive.velocity, 1.5 * FINGER.velocity),
+        # Just more than the drive can hold: it yields slowly.
+        (19.6, FollowingError, lambda gripper: gripper.drive.position - gripper.motion.position,
+         CONFIG.supervision.following_error),
+    ],
+    ids=["too fast", "too far from its set-point"],
+)  # fmt: skip
+def test_what_is_beyond_a_limit_for_five_cycles_is_an_emergency_that_names_its_joint(
+    hand: Hand, torque: float, kind: type[Event], value: Callable[[Any], float], limit: float
+) -> None:
+    hand.model.mechanics.external_torque = torque
     beyond = 0
     while hand.state is State.HOLDING:
         hand.simulation.cycle()
-        beyond += abs(hand.gripper.drive.velocity) > 1.5 * FINGER.velocity
+        beyond += abs(value(hand.gripper)) > limit
     assert beyond == CONFIG.supervision.cycles
     assert hand.state is State.EMERGENCY_STOP
-    assert hand.message(OverSpeed).startswith("finger")
-
-
-def test_too_far_from_its_set_point_for_five_cycles_is_an_emergency_that_names_its_joint(hand: Hand) -> None:
-    # Just more than the drive can hold: it yields slowly.
-    hand.model.mechanics.external_torque = 19.6
-    beyond = 0
-    while hand.state is State.HOLDING:
-        hand.simulation.cycle()
-        beyond += abs(hand.gripper.drive.position - hand.gripper.motion.position) > CONFIG.supervision.following_error
-    assert beyond == CONFIG.supervision.cycles
-    assert hand.state is State.EMERGENCY_STOP
-    assert hand.message(FollowingError).startswith("finger")
+    assert hand.message(kind).startswith("finger")
 
 
 def test_too_fast_while_the_loop_closes_it_is_stopped_by_the_drives(hand: Hand) -> None:
@@ -442,7 +436,7 @@ def test_it_does_not_follow_a_false_position_while_it_is_being_enabled(hand: Han
     disabled(hand)
     data, said = hand.simulation.data, hand.simulation.data.input
     assert hand.simulation.send(Enable()).refusal is None
-    assert hand.simulation.until(lambda: hand.told[-1][:2] == ENABLED, 1.0)
+    assert hand.simulation.until(lambda: hand.sent[-1][:2] == ENABLED, 1.0)
 
     def false(slot: int) -> bytes:
         if slot != SLOT:
@@ -478,7 +472,7 @@ def test_its_zero_is_set_and_the_loop_says_where_it_stands_then(hand: Hand) -> N
     assert hand.gripper.drive.position == pytest.approx(0.2, abs=2e-3)
 
 
-def test_the_watch_of_a_new_start_counts_from_zero(hand: Hand) -> None:
+def test_the_supervision_of_a_new_start_counts_from_zero(hand: Hand) -> None:
     supervision = hand.gripper.supervision
     supervision._fast = supervision._off = CONFIG.supervision.cycles - 1
     hand.simulation.send(Disable())

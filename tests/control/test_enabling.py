@@ -92,14 +92,14 @@ def test_a_position_that_stays_false_while_enabling_is_a_fault_that_names_both_p
 
 
 def test_false_positions_that_do_not_follow_each_other_are_not_added_up(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     until_told_to_enable(rig)
     for _ in range(2 * CONFIG.supervision.cycles):
         end = falsify(rig, axis=1, position=0.1)
         rig.cycle()
         end()
         rig.cycle()
-    rig.data.deaf.clear()
+    rig.data.misunderstood.clear()
     rig.until(State.HOLDING)
 
 
@@ -114,7 +114,7 @@ def test_a_joint_that_sags_while_its_brake_opens_is_followed_and_enabled(rig: Lo
 
 
 def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     rig.start().do(Enable())
     rig.wait(lambda: rig.log[-1].drives[0].statusword & 0x6F == 0x27)
     turned = rig.models[0].mechanics
@@ -126,14 +126,14 @@ def test_a_joint_that_runs_away_before_all_drives_are_enabled_is_an_emergency(ri
 def test_a_drive_that_leaves_operation_enabled_while_others_are_on_their_way_is_not_enabled_again(
     rig: LoopRig,
 ) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
     rig.start().do(Enable())
     rig.wait(lambda: rig.log[-1].drives[0].statusword & 0x6F == 0x27)
     rig.run(0.02)
-    rig.data.deaf[0, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    rig.data.misunderstood[0, CONTROLWORD] = {ENABLE_OPERATION: 0}
     rig.until(State.FAULT, 5 * PERIOD_S)
     assert (rig.kinds[-1], rig.last.axis) == (DriveLeftEnabled, 0)
-    rig.data.deaf.clear()
+    rig.data.misunderstood.clear()
     rig.run(0.3)
     assert rig.words(0).count(ENABLE_OPERATION) == 1
     rig.do(Reset())
@@ -150,7 +150,7 @@ def enable_beyond(rig: LoopRig, beyond: float = 0.018) -> LoopRig:
 
 
 @pytest.mark.parametrize(("velocity", "told"), [(0.5, 0.05), (0.02, 0.02)])
-def test_a_joint_that_is_brought_back_into_its_range_is_told_with_how_far_and_how_fast(
+def test_a_joint_that_is_brought_back_into_its_range_is_reported_with_how_far_and_how_fast(
     rig: LoopRig, velocity: float, told: float
 ) -> None:
     limits = rig.arm.limits
@@ -201,7 +201,7 @@ def test_a_joint_that_is_brought_back_stands_when_it_is_disabled_and_begins_anew
 def test_a_drive_that_leaves_while_its_joint_is_brought_back_is_a_fault(rig: LoopRig) -> None:
     enable_beyond(rig).run(0.1)
     assert rig.state is State.ENABLING
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
     rig.until(State.FAULT, 5 * PERIOD_S)
     assert (rig.kinds[-1], rig.last.axis) == (DriveLeftEnabled, 1)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
 from rtcp.config.model import GripperConfig
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState
-from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import MoveGripper, Reset, SetOutput
-from rtcp.ipc.observer import Observer
 from rtcp.ipc.states import State
 
 from .rig import CONFIG, LoopRig
@@ -25,12 +23,11 @@ BOX, DRIVE = 1, 3
 
 
 @pytest.fixture
-def rig(rig_board: tuple[Blackboard, Observer]) -> Iterator[LoopRig]:
+def rig(new_rig: Callable[..., LoopRig]) -> LoopRig:
     """The arm holds; the gripper is closed and an output switched on."""
-    made = LoopRig(*rig_board, config=WITH_GRIPPER).hold()
+    made = new_rig(WITH_GRIPPER).hold()
     switch_on(made)
-    yield made
-    rig_board[1].release(made.lease)
+    return made
 
 
 def switch_on(rig: LoopRig) -> None:

@@ -25,7 +25,7 @@ def reports(monkeypatch: pytest.MonkeyPatch) -> Reports:
     return Reports(monkeypatch)
 
 
-def test_a_sentence_is_said_at_once_and_then_every_ten_seconds_with_its_count(reports: Reports) -> None:
+def test_a_message_is_logged_at_once_and_then_every_ten_seconds_with_its_count(reports: Reports) -> None:
     for _ in range(25):
         reports.throttle.report("it is hot")
         reports.pass_time(1.0)

@@ -140,7 +140,7 @@ def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_o
     assert {word for frame in data.frames[len(ramp) :] for word in (*frame[1], *frame[2])} == {VOLTAGE_OFF}
 
 
-def test_the_grippers_drive_is_told_as_the_joints_are() -> None:
+def test_the_grippers_drive_is_commanded_as_the_joints_are() -> None:
     data = Sent(CONFIG)
     joint, (slot, drive) = make_drives(CONFIG)
     arm = SimpleNamespace(pairs=[joint], gripper=SimpleNamespace(slot=slot, drive=drive))

@@ -164,7 +164,7 @@ def press(simulation: Simulation) -> None:
 
 
 @pytest.mark.parametrize("pressed", [False, True])
-def test_a_joint_that_comes_back_at_another_position_is_told_with_both_when_the_reset_is_done(
+def test_a_joint_that_comes_back_at_another_position_is_reported_with_both_when_the_reset_is_done(
     arm: Simulation, pressed: bool
 ) -> None:
     without_supply(arm)
@@ -188,7 +188,7 @@ def test_a_joint_that_comes_back_at_another_position_is_told_with_both_when_the_
 
 
 @pytest.mark.parametrize("comes_back", [out_of_op, press], ids=lambda way: way.__name__)
-def test_a_joint_that_comes_back_where_it_stood_is_not_told(
+def test_a_joint_that_comes_back_where_it_stood_is_not_reported(
     arm: Simulation, comes_back: Callable[[Simulation], None]
 ) -> None:
     comes_back(arm)
@@ -197,7 +197,9 @@ def test_a_joint_that_comes_back_where_it_stood_is_not_told(
 
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
-def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_have_run_on_to(arm: Simulation) -> None:
+def test_a_joint_that_moved_when_its_supply_was_lost_is_reported_where_it_cannot_have_run_on_to(
+    arm: Simulation,
+) -> None:
     arm.send(Halt())
     assert arm.until(lambda: arm.state is State.HOLDING, 2.0)
     assert arm.send(MoveJoints((0.0, -0.3, 2.4, 0.0, 0.9, 0.0), 0.5, True)).refusal is None
@@ -212,7 +214,7 @@ def test_a_joint_that_moved_when_its_supply_was_lost_is_told_where_it_cannot_hav
 
 
 @pytest.mark.parametrize("arm", ["moving"], indirect=True)
-def test_joints_that_run_on_while_nothing_is_heard_are_not_told(arm: Simulation) -> None:
+def test_joints_that_run_on_while_nothing_is_heard_are_not_reported(arm: Simulation) -> None:
     arm.data.lose(400, heard=False)
     assert arm.until(lambda: arm.state is State.FAULT, 1.0)
     arm.run(0.5)

@@ -1,10 +1,9 @@
-"""The machine's states, what makes a fault of them and what leads out again: the real classes and the real device
-models, cycle by cycle, without a bus and without a clock."""
+"""What the machine does in each state, beside the table of test_transitions.py and the cases of test_faults.py."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise, takewhile
 
 import pytest
@@ -16,27 +15,11 @@ from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset, SetDrive
 from rtcp.ipc.events import (
     Arrived,
     ClockLocked,
-    ClockLost,
-    ControllerFailed,
     Disabled,
-    DisableTimeout,
-    DriveFault,
-    DriveLeftEnabled,
-    DriveModeTimeout,
-    EnableTimeout,
-    Event,
-    GeneratorFailed,
-    HomingStillMoving,
     LeaseExpired,
-    LeftRange,
-    PositionJumped,
     ProcessDataLost,
     Ready,
     ResetDone,
-    ResetTimeout,
-    ResetWhileMoving,
-    ResetWithoutFrames,
-    ResetWithoutSlaves,
     SlaveLost,
     Stopped,
     TorqueRemoved,
@@ -48,20 +31,18 @@ from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.motion.state import ArmState, Setpoint
 
 from .rig import (
-    _WIRE,
+    CAUSES,
     CONFIG,
     CONTROLWORD,
     COUNTS,
     CSP,
     CST,
     CSV,
-    DEBOUNCE_S,
     EMERGENCY_STOP_INPUT,
     ENABLE_OPERATION,
     ENABLE_TIMEOUT_S,
     LONGEST_STEP,
     LOST_CYCLES,
-    MODES_OF_OPERATION,
     PERIOD_S,
     QUICK_STOP,
     SWITCH_ON,
@@ -69,336 +50,6 @@ from .rig import (
     LoopRig,
     move_to,
 )
-
-# -- every fault: what it is, what is said, what the drives are told, and the way back ------------------------------
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A fault from its cause to its end."""
-
-    name: str
-    kind: type[Event]
-    axis: int
-    says: tuple[str, ...]
-    """What its sentence has to name; {word} is the statusword of the joint when it happened."""
-    breaks: Callable[[LoopRig], object]
-    """From the start of the platform to the cause; the fault follows within 4 s."""
-    mend: Callable[[LoopRig], object]
-
-
-def nothing(rig: LoopRig) -> None:
-    """The cause does not last."""
-
-
-def hears_all(rig: LoopRig) -> None:
-    rig.data.deaf.clear()
-
-
-def drive_fault_while_ready(rig: LoopRig) -> None:
-    rig.start().models[1].inject_fault(UNDER_VOLTAGE)
-
-
-def drive_fault_in_motion(rig: LoopRig) -> None:
-    rig.set_in_motion().models[1].inject_fault(UNDER_VOLTAGE)
-
-
-def drive_that_leaves_by_itself(rig: LoopRig) -> None:
-    rig.set_in_motion()
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: 0}
-
-
-def drive_that_does_not_enable(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON}
-    rig.start().do(Enable())
-
-
-def drive_that_does_not_disable(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
-    rig.set_in_motion().do(Disable())
-
-
-def drive_that_keeps_its_mode(rig: LoopRig) -> None:
-    rig.hold().data.deaf[1, MODES_OF_OPERATION] = {CSV: CSP}
-    rig.do(SetDriveMode(DriveMode(CSV)))
-
-
-def drive_whose_fault_lasts(rig: LoopRig) -> None:
-    rig.start().models[1].condition.bus_voltage = 10.0
-    rig.until(State.FAULT)
-    rig.do(Reset())
-
-
-def voltage_returns(rig: LoopRig) -> None:
-    rig.models[1].condition.bus_voltage = 48.0
-
-
-def joint_that_does_not_come_to_rest(rig: LoopRig) -> None:
-    rig.bring_to(State.FAULT)
-    # More than its drive can hold, and too heavy to become fast soon.
-    turned = rig.models[1].mechanics
-    turned.inertia, turned.velocity, turned.external_torque = 2000.0, 0.05, 117.0
-    rig.do(Reset())
-
-
-def joint_that_turns_on_after_its_homing(rig: LoopRig) -> None:
-    rig.bring_to(State.HOMING)
-    rig.run(0.1)
-    turned = rig.models[0].mechanics
-    turned.inertia, turned.velocity, turned.external_torque = 1e5, 0.015, 117.0
-    rig.do(Halt())
-
-
-def joint_is_let_go(rig: LoopRig) -> None:
-    for model in rig.models:
-        turned = model.mechanics
-        turned.inertia, turned.velocity, turned.external_torque = 1.0, 0.0, 0.0
-
-
-def slave_that_leaves_op(rig: LoopRig) -> None:
-    rig.set_in_motion().service.lost_slave = 3
-
-
-def slave_that_does_not_come_back(rig: LoopRig) -> None:
-    rig.bring_to(State.RESETTING)
-
-
-def slaves_come_back(rig: LoopRig) -> None:
-    rig.slaves_come_back = True
-
-
-def frames_stay_away(rig: LoopRig) -> None:
-    rig.set_in_motion().data.carries = False
-
-
-def frames_come_back(rig: LoopRig) -> None:
-    rig.data.carries = True
-
-
-def clock_runs_away(rig: LoopRig) -> None:
-    rig.set_in_motion().discipline.locked = False
-
-
-def clock_is_followed(rig: LoopRig) -> None:
-    rig.discipline.locked = True
-
-
-def joint_is_turned_out_of_its_range(rig: LoopRig) -> None:
-    rig.start().do(Enable())
-    rig.models[1].mechanics.position = 2.1
-
-
-def joint_is_turned_back(rig: LoopRig) -> None:
-    rig.models[1].mechanics.position = 1.9
-
-
-def joint_says_it_is_elsewhere(rig: LoopRig) -> None:
-    rig.start().do(Enable())
-    said = rig.data.input
-
-    def elsewhere(slot: int) -> bytes:
-        values = _WIRE.unpack(said(slot))
-        return _WIRE.pack(values[0], 1000, *values[2:]) if slot == 2 else said(slot)
-
-    rig.data.input = lambda slot: elsewhere(slot) if slot else said(slot)
-
-
-def joint_says_where_it_is(rig: LoopRig) -> None:
-    del rig.data.input
-
-
-def generator_refuses(rig: LoopRig) -> None:
-    generator = rig.set_in_motion().arm.controllers[MoveJoints]
-
-    def refuse(state: ArmState) -> Setpoint:
-        generator.ended = ControllerFailed()
-        target = Setpoint(2)
-        target.position = list(state.commanded)
-        return target
-
-    generator.update = refuse
-
-
-def generator_works(rig: LoopRig) -> None:
-    del rig.arm.controllers[MoveJoints].update
-
-
-FAULT_STORIES = (
-    Fault(
-        "a drive fault while ready", DriveFault, 1,
-        ("joint2", "in fault", "statusword {word}", "`rtcp reset`"),
-        drive_fault_while_ready, nothing,
-    ),
-    Fault(
-        "a drive fault in motion", DriveFault, 1,
-        ("joint2", "in fault", "statusword {word}", "`rtcp reset`"),
-        drive_fault_in_motion, nothing,
-    ),
-    Fault(
-        "a drive that leaves by itself", DriveLeftEnabled, 1,
-        ("joint2", "left Operation Enabled", "statusword {word}", "`rtcp reset`"),
-        drive_that_leaves_by_itself, hears_all,
-    ),
-    Fault(
-        "a drive that does not enable", EnableTimeout, 1,
-        ("joint2", "did not reach Operation Enabled", "0.2 s", "{word}", "enable_timeout_s in assistive_arm.yaml"),
-        drive_that_does_not_enable, hears_all,
-    ),
-    Fault(
-        "a drive that does not disable", DisableTimeout, 1,
-        ("joint2", "kept its torque", "statusword {word}", "enable_timeout_s"),
-        drive_that_does_not_disable, hears_all,
-    ),
-    Fault(
-        "a drive that keeps its mode", DriveModeTimeout, 1,
-        ("joint2", "mode 8", "instead of csv"),
-        drive_that_keeps_its_mode, hears_all,
-    ),
-    Fault(
-        "a drive whose fault lasts", ResetTimeout, 1,
-        ("joint2", "in fault after the reset", "statusword {word}"),
-        drive_whose_fault_lasts, voltage_returns,
-    ),
-    Fault(
-        "a joint that does not come to rest", ResetWhileMoving, 1,
-        ("joint2", "still turns", "rad/s", "3 s", "`rtcp disable`"),
-        joint_that_does_not_come_to_rest, joint_is_let_go,
-    ),
-    Fault(
-        "a joint that turns on after its homing", HomingStillMoving, 0,
-        ("joint1", "still turns", "rad/s", "3 s", "homing", "`rtcp reset`"),
-        joint_that_turns_on_after_its_homing, joint_is_let_go,
-    ),
-    Fault(
-        "a slave that does not come back", ResetWithoutSlaves, -1,
-        ("reset", "3 s", "not all slaves are back in OP"),
-        slave_that_does_not_come_back, slaves_come_back,
-    ),
-    Fault(
-        "a slave that leaves OP", SlaveLost, 3,
-        ("slave 3 (drive2)", "left OP", "`rtcp reset`"),
-        slave_that_leaves_op, nothing,
-    ),
-    Fault(
-        "frames that stay away", ProcessDataLost, -1,
-        ("process data lost", "40 cycles", "bus.lost_cycles in assistive_arm.yaml", "`rtcp reset`"),
-        frames_stay_away, frames_come_back,
-    ),
-    Fault(
-        "a clock that runs away", ClockLost, -1,
-        ("reference clock", "1 s", "`rtcp reset`"),
-        clock_runs_away, clock_is_followed,
-    ),
-    Fault(
-        "a joint that is turned out of its range", LeftRange, 1,
-        ("joint2", "left its range", "2.1 rad", "joints[1].position in assistive_arm.yaml"),
-        joint_is_turned_out_of_its_range, joint_is_turned_back,
-    ),
-    Fault(
-        "a joint that says it is elsewhere while it is enabled", PositionJumped, 1,
-        ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
-        joint_says_it_is_elsewhere, joint_says_where_it_is,
-    ),
-    Fault(
-        "a generator that refuses", GeneratorFailed, -1,
-        ("trajectory generator", "`rtcp reset`"),
-        generator_refuses, generator_works,
-    ),
-)  # fmt: skip
-
-
-class Story:
-    """One fault, lived through once: what every test of it looks at."""
-
-    def __init__(self, fault: Fault, rig: LoopRig) -> None:
-        self.fault, self.rig = fault, rig
-        fault.breaks(rig)
-        if rig.state is State.FAULT:
-            rig.cycle()
-        rig.until(State.FAULT, 4.0)
-        self.event, self.said = rig.last, rig.messages[-1]
-        self.kept = rig.machine.fault
-        self.at = len(rig.log) - 1
-        rig.run(0.3)
-        fault.mend(rig)
-        rig.run(1.0)
-        self.mended = len(rig.log)
-        rig.do(Reset())
-        self.after_reset = self._reach(State.READY)
-        rig.run(0.3)
-        self.before_enable = len(rig.log)
-        self.enable_refusal = rig.send(Enable()).refusal
-        self.after_enable = self._reach(State.HOLDING)
-        rig.run(0.1)
-
-    def _reach(self, state: State) -> State:
-        try:
-            self.rig.until(state, 4.0)
-        except AssertionError:
-            pass
-        return self.rig.state
-
-
-@pytest.fixture(scope="module", params=FAULT_STORIES, ids=lambda fault: fault.name)
-def story(request: pytest.FixtureRequest, rig_board: tuple[Blackboard, Observer]) -> Story:
-    rig = LoopRig(*rig_board)
-    try:
-        return Story(request.param, rig)
-    finally:
-        rig_board[1].release(rig.lease)
-
-
-def test_every_code_of_a_fault_has_its_story() -> None:
-    own = {kind for kind in Event.kinds if kind.__module__ == "rtcp.ipc.events"}
-    # No frames return for 3 s is `ProcessDataLost` first.
-    assert {fault.kind for fault in FAULT_STORIES} | {ResetWithoutFrames} == {
-        kind for kind in own if kind.is_fault and not kind.is_emergency
-    }
-
-
-def test_a_fault_has_its_code_and_its_joint_or_slave(story: Story) -> None:
-    assert isinstance(story.event, story.fault.kind)
-    place = getattr(story.event, "axis", getattr(story.event, "slave", -1))
-    assert (place, story.kept) == (story.fault.axis, story.fault.kind.number)
-
-
-def test_a_fault_is_one_line_that_names_what_is_wrong_where_and_the_key(story: Story) -> None:
-    words = [f"0x{said.statusword:04X}" for said in story.rig.log[story.at].drives]
-    named = [part.format(word=words[story.fault.axis] if "{" in part else "") for part in story.fault.says]
-    assert [part for part in named if part not in story.said] == []
-    assert "\n" not in story.said
-
-
-def test_no_target_jumps_from_the_first_enabling_over_the_fault_to_the_next(story: Story) -> None:
-    assert [story.rig.longest_step(axis) <= LONGEST_STEP for axis in range(2)] == [True, True]
-
-
-def test_every_drive_with_torque_is_told_to_quick_stop_in_the_cycle_of_the_fault(story: Story) -> None:
-    told = [said.controlword for said in story.rig.log[story.at].drives if said.has_torque]
-    assert set(told) <= {QUICK_STOP}
-
-
-def test_in_a_fault_no_speed_and_no_torque_is_sent(story: Story) -> None:
-    sent = {(said.speed, said.effort) for cycle in story.rig.log[story.at : story.mended] for said in cycle.drives}
-    assert sent == {(0, 0)}
-
-
-def test_a_fault_stays_when_its_cause_is_gone(story: Story) -> None:
-    assert {cycle.state for cycle in story.rig.log[story.at : story.mended]} == {State.FAULT}
-
-
-def test_nothing_is_enabled_between_a_fault_and_the_next_enable(story: Story) -> None:
-    told = {said.controlword for cycle in story.rig.log[story.at : story.before_enable] for said in cycle.drives}
-    assert ENABLE_OPERATION not in told
-
-
-def test_a_reset_after_the_cause_leads_to_ready(story: Story) -> None:
-    assert story.after_reset is State.READY
-
-
-def test_an_enable_after_the_reset_leads_to_holding(story: Story) -> None:
-    assert (story.enable_refusal, story.after_enable) == (None, State.HOLDING)
-
 
 # -- starting -------------------------------------------------------------------------------------------------------
 
@@ -414,7 +65,7 @@ def test_the_slaves_are_asked_for_op_only_when_the_clock_is_followed(rig: LoopRi
     assert asked == [100]
 
 
-def test_ready_is_told_when_all_slaves_are_in_op_and_not_before(rig: LoopRig) -> None:
+def test_ready_is_reported_when_all_slaves_are_in_op_and_not_before(rig: LoopRig) -> None:
     rig.run(0.1)
     assert (rig.state, rig.kinds) == (State.STARTING, [ClockLocked])
     rig.service.all_op = True
@@ -469,8 +120,8 @@ def test_enabling_starts_with_the_target_where_each_joint_stands(rig: LoopRig) -
         model.mechanics.position = position
     rig.hold()
     for axis, position in enumerate((7000, -4000)):
-        told = [cycle.drives[axis] for cycle in rig.log if cycle.drives[axis].controlword == ENABLE_OPERATION]
-        assert {said.target for said in told} == {position}
+        sent = [cycle.drives[axis] for cycle in rig.log if cycle.drives[axis].controlword == ENABLE_OPERATION]
+        assert {said.target for said in sent} == {position}
 
 
 def test_a_joint_that_was_turned_by_hand_is_enabled_where_it_stands_then(rig: LoopRig) -> None:
@@ -482,8 +133,8 @@ def test_a_joint_that_was_turned_by_hand_is_enabled_where_it_stands_then(rig: Lo
     rig.run(0.01)
     before = len(rig.log)
     rig.enable()
-    told = [said for cycle in rig.log[before:] if (said := cycle.drives[0]).controlword == ENABLE_OPERATION]
-    assert {said.target for said in told} == {5000}
+    sent = [said for cycle in rig.log[before:] if (said := cycle.drives[0]).controlword == ENABLE_OPERATION]
+    assert {said.target for said in sent} == {5000}
 
 
 @pytest.mark.parametrize("mode", [CSP, CSV, CST])
@@ -535,27 +186,12 @@ def test_the_arm_holds_its_place_through_every_change_of_mode(rig: LoopRig, posi
 # -- how long things may take ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("breaks", "seconds"),
-    [
-        (drive_that_does_not_enable, ENABLE_TIMEOUT_S),
-        (drive_that_keeps_its_mode, 1.0),
-        (clock_runs_away, 1.0),
-        (slave_that_does_not_come_back, 3.0 + DEBOUNCE_S),
-    ],
-)
-def test_a_fault_of_patience_comes_when_it_is_over_and_not_before(
-    rig: LoopRig, breaks: Callable[[LoopRig], object], seconds: float
-) -> None:
-    breaks(rig)
-    assert rig.until(State.FAULT) == pytest.approx(seconds, abs=3 * PERIOD_S)
-
-
 def test_the_time_for_disabling_begins_when_the_arm_stands(rig: LoopRig) -> None:
-    drive_that_does_not_disable(rig)
+    rig.data.misunderstood[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    rig.set_in_motion().do(Disable())
     rig.until(State.FAULT)
-    told = [said for cycle in rig.log if (said := cycle.drives[1]).controlword == SWITCH_ON and said.has_torque]
-    assert len(told) * PERIOD_S == pytest.approx(ENABLE_TIMEOUT_S, abs=3 * PERIOD_S)
+    sent = [said for cycle in rig.log if (said := cycle.drives[1]).controlword == SWITCH_ON and said.has_torque]
+    assert len(sent) * PERIOD_S == pytest.approx(ENABLE_TIMEOUT_S, abs=3 * PERIOD_S)
 
 
 # -- lost frames ----------------------------------------------------------------------------------------------------
@@ -576,25 +212,8 @@ def test_as_many_lost_cycles_as_are_allowed_do_not_end_a_move(rig: LoopRig) -> N
     assert rig.kinds[-1] is Arrived
 
 
-def test_lost_cycles_are_made_up_for_by_as_many_good_ones(rig: LoopRig) -> None:
-    rig.set_in_motion()
-    for _ in range(5):
-        lose(rig, LOST_CYCLES - 1)
-        rig.run((LOST_CYCLES - 1) * PERIOD_S)
-    assert rig.state is State.MOVING
-
-
-def test_set_points_stand_while_no_frame_comes_back_and_go_on_from_there(rig: LoopRig) -> None:
-    rig.set_in_motion()
-    before = rig.log[-1].drives[0].target
-    lose(rig, LOST_CYCLES - 1)
-    assert {cycle.drives[0].target for cycle in rig.log[-LOST_CYCLES + 1 :]} == {before}
-    rig.cycle()
-    assert 0 < rig.log[-1].drives[0].target - before <= LONGEST_STEP
-
-
-def test_drives_that_still_hear_are_told_to_stop_for_as_long_as_no_frame_comes_back(rig: LoopRig) -> None:
-    frames_stay_away(rig)
+def test_drives_that_still_hear_are_commanded_to_stop_for_as_long_as_no_frame_comes_back(rig: LoopRig) -> None:
+    rig.set_in_motion().data.carries = False
     rig.until(State.FAULT)
     at = len(rig.log)
     rig.run(0.5)
@@ -603,50 +222,19 @@ def test_drives_that_still_hear_are_told_to_stop_for_as_long_as_no_frame_comes_b
 
 # -- whatever is lost, in whatever state ----------------------------------------------------------------------------
 
-CAUSES: dict[type[Event], Callable[[LoopRig], object]] = {
-    ProcessDataLost: lambda rig: setattr(rig.data, "carries", False),
-    SlaveLost: lambda rig: setattr(rig.service, "lost_slave", 2),
-    ClockLost: lambda rig: setattr(rig.discipline, "locked", False),
-    DriveFault: lambda rig: rig.models[1].inject_fault(UNDER_VOLTAGE),
-}
-LOST = [
-    *((code, state) for code in (ProcessDataLost, SlaveLost)
-      for state in (State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING)),
-    *((ClockLost, state) for state in (State.READY, State.HOLDING, State.MOVING)),
-    *((DriveFault, state) for state in (State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING)),
-]  # fmt: skip
 
-
-@pytest.mark.parametrize(("code", "state"), LOST, ids=lambda value: value.name.lower())
-def test_what_is_lost_is_that_fault_in_every_state(rig: LoopRig, code: type[Event], state: State) -> None:
-    # A drive that is kept from enabling keeps the machine in that state.
-    rig.data.deaf[0, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
-    rig.bring_to(state)
-    CAUSES[code](rig)
-    rig.until(State.FAULT, 1.1)
-    assert (rig.kinds[-1], rig.machine.fault) == (code, code.number)
-
-
-def test_a_drive_fault_while_enabling_ends_in_a_fault_that_names_the_joint(rig: LoopRig) -> None:
-    rig.bring_to(State.ENABLING).models[1].inject_fault(UNDER_VOLTAGE)
-    rig.until(State.FAULT, ENABLE_TIMEOUT_S + 0.01)
-    assert rig.messages[-1].startswith("joint2: ")
-
-
-@pytest.mark.parametrize("code", [DriveFault, SlaveLost])
-def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, code: type[Event]) -> None:
+@pytest.mark.parametrize("key", ["drive_fault", "slave_lost"])
+def test_a_fault_makes_no_target_jump_where_a_joint_was_held_back(rig: LoopRig, key: str) -> None:
     rig.set_in_motion()
     rig.models[0].mechanics.external_torque = -100.0
     rig.run(0.04)
     lag = rig.log[-1].drives[0].target - rig.log[-1].drives[0].position
     assert lag > 20 * LONGEST_STEP
-    CAUSES[code](rig)
+    CAUSES[key][0](rig)
     rig.until(State.FAULT)
     rig.models[0].mechanics.external_torque = 0.0
     rig.run(0.5)
-    rig.do(Reset())
-    rig.until(State.READY)
-    rig.enable()
+    rig.recover()
     rig.run(0.2)
     assert rig.longest_step(0) <= LONGEST_STEP
 
@@ -666,10 +254,10 @@ def test_a_fault_of_one_drive_brings_the_others_to_rest_under_torque_in_every_mo
 
 def test_disable_in_a_fault_takes_the_torque_off_and_leaves_the_fault(rig: LoopRig) -> None:
     rig.bring_to(State.FAULT)
-    assert [model.powered for model in rig.models] == [True, True]
+    assert rig.powered == [True, True]
     rig.do(Disable())
     rig.run(0.05)
-    assert [model.powered for model in rig.models] == [False, False]
+    assert rig.powered == [False, False]
     assert (rig.state, rig.machine.fault) == (State.FAULT, SlaveLost.number)
     assert rig.kinds[-1] is TorqueRemoved
 
@@ -680,20 +268,18 @@ def test_disable_during_a_reset_ends_it_in_the_fault_that_was(rig: LoopRig) -> N
     rig.slaves_come_back = True
     rig.run(0.5)
     assert (rig.state, rig.machine.fault) == (State.FAULT, SlaveLost.number)
-    assert [model.powered for model in rig.models] == [False, False]
+    assert rig.powered == [False, False]
 
 
 def test_the_fault_after_one_whose_torque_was_taken_off_is_a_quick_stop_again(rig: LoopRig) -> None:
     rig.bring_to(State.FAULT)
     rig.do(Disable())
     rig.run(0.05)
-    rig.do(Reset())
-    rig.until(State.READY)
-    rig.enable()
+    rig.recover()
     rig.service.lost_slave = 3
     rig.run(0.1)
     assert rig.state is State.FAULT
-    assert [model.powered for model in rig.models] == [True, True]
+    assert rig.powered == [True, True]
 
 
 def slow_quick_stop(rig: LoopRig) -> None:
@@ -719,12 +305,12 @@ def test_a_reset_is_tried_again_until_the_cause_of_a_drive_fault_is_gone(rig: Lo
     rig.do(Reset())
     rig.run(0.5)
     assert rig.state is State.RESETTING
-    voltage_returns(rig)
+    rig.models[1].condition.bus_voltage = 48.0
     rig.until(State.READY, 0.1)
 
 
 def test_a_reset_waits_for_the_clock_to_be_followed(rig: LoopRig) -> None:
-    clock_runs_away(rig)
+    rig.set_in_motion().discipline.locked = False
     rig.until(State.FAULT)
     rig.do(Reset())
     rig.run(1.0)
@@ -734,15 +320,6 @@ def test_a_reset_waits_for_the_clock_to_be_followed(rig: LoopRig) -> None:
 
 
 # -- moving, stopping, disabling ------------------------------------------------------------------------------------
-
-
-def test_a_move_arrives_where_it_was_told_to(rig: LoopRig) -> None:
-    rig.hold()
-    rig.move(0.05, -0.05)
-    rig.until(State.HOLDING)
-    rig.run(0.1)
-    assert rig.kinds[-1] is Arrived
-    assert [drive.position for drive in rig.arm.drives] == pytest.approx([0.05, -0.05], abs=1e-3)
 
 
 def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(rig: LoopRig) -> None:
@@ -770,15 +347,6 @@ def test_a_stop_comes_to_rest_far_before_the_target_and_holds(rig: LoopRig) -> N
     assert rig.arm.first_moving() == -1
 
 
-def test_a_lease_that_is_given_up_ends_the_move_in_a_controlled_stop(rig: LoopRig) -> None:
-    rig.set_in_motion()
-    rig.observer.release(rig.lease)
-    rig.cycle()
-    assert (rig.state, rig.kinds[-1]) == (State.STOPPING, LeaseExpired)
-    rig.until(State.HOLDING)
-    assert rig.longest_step(0) <= LONGEST_STEP
-
-
 def test_a_lease_of_another_commander_ends_the_move_too(rig: LoopRig) -> None:
     rig.set_in_motion()
     rig.observer.release(rig.lease)
@@ -791,61 +359,29 @@ def test_disabling_in_motion_takes_the_torque_only_at_standstill(rig: LoopRig) -
     rig.bring_to(State.DISABLING)
     rig.until(State.READY)
     assert rig.kinds[-1] is Disabled
-    told = [said for cycle in rig.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
-    assert told
-    assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
+    sent = [said for cycle in rig.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
+    assert sent
+    assert max(abs(said.velocity) for said in sent) <= 0.02 * COUNTS
 
 
-def test_disabling_while_enabling_is_told_as_done_only_when_no_drive_has_torque(rig: LoopRig) -> None:
+def test_disabling_while_enabling_is_done_only_when_no_drive_has_torque(rig: LoopRig) -> None:
     rig.bring_to(State.ENABLING)
-    # The moment at which the drives have been told to enable, and do not show it yet.
+    # The moment at which the drives have been commanded to enable, and do not show it yet.
     rig.wait(lambda: rig.log[-1].drives[0].controlword == ENABLE_OPERATION)
     rig.do(Disable())
     rig.until(State.READY)
-    assert [model.powered for model in rig.models] == [False, False]
+    assert rig.powered == [False, False]
 
 
 # -- the end --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "state",
-    [
-        State.STARTING, State.READY, State.ENABLING, State.HOLDING, State.MOVING, State.STOPPING, State.DISABLING,
-        State.FAULT, State.RESETTING,
-    ],
-    ids=lambda state: state.name.lower(),
-)  # fmt: skip
-def test_the_loop_may_end_only_when_no_drive_has_torque(rig: LoopRig, state: State) -> None:
-    rig.bring_to(state)
-    if state is State.ENABLING:
-        # The moment at which the drives have been told to enable, and do not show it yet.
-        rig.wait(lambda: rig.log[-1].drives[0].controlword == ENABLE_OPERATION)
-    rig.do(Shutdown())
-    rig.finish()
-    assert [model.powered for model in rig.models] == [False, False]
-
-
-def test_a_drive_that_falls_into_a_fault_while_enabling_ends_it_at_once(rig: LoopRig) -> None:
-    rig.bring_to(State.ENABLING).models[1].inject_fault(UNDER_VOLTAGE)
-    rig.until(State.FAULT, 0.1)
-    assert rig.kinds[-1] is DriveFault
-
-
-def test_a_drive_that_does_not_take_the_mode_while_enabling_is_told_with_its_mode(rig: LoopRig) -> None:
-    rig.data.deaf[1, MODES_OF_OPERATION] = {8: 3}
-    rig.start()
-    rig.do(Enable())
-    rig.until(State.FAULT)
-    assert rig.last == DriveModeTimeout(1, 3, DriveMode.CSP)
-
-
 def test_closing_in_motion_stops_before_it_disables(rig: LoopRig) -> None:
     rig.bring_to(State.CLOSING)
     rig.finish()
-    told = [said for cycle in rig.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
-    assert told
-    assert max(abs(said.velocity) for said in told) <= 0.02 * COUNTS
+    sent = [said for cycle in rig.log for said in cycle.drives if said.has_torque and said.controlword == SWITCH_ON]
+    assert sent
+    assert max(abs(said.velocity) for said in sent) <= 0.02 * COUNTS
 
 
 def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_the_torque(rig: LoopRig) -> None:
@@ -860,22 +396,18 @@ def test_closing_in_a_fault_lets_come_to_rest_what_ramps_down_before_it_takes_th
 
 
 @pytest.mark.parametrize("period_us", [1000.0, 200.0])
-def test_closing_without_frames_tells_all_drives_to_stop_for_as_long_as_a_quick_stop_takes(
-    rig_board: tuple[Blackboard, Observer], period_us: float
+def test_closing_without_frames_commands_a_quick_stop_for_as_long_as_one_takes(
+    new_rig: Callable[..., LoopRig], period_us: float
 ) -> None:
     config = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=period_us))
-    rig = LoopRig(*rig_board, config=config)
-    try:
-        rig.start().run(0.1)
-        rig.enable()
-        rig.data.carries = False
-        rig.do(Shutdown())
-        rig.finish()
-    finally:
-        rig_board[1].release(rig.lease)
+    rig = new_rig(config).start()
+    rig.run(0.1)
+    rig.enable().data.carries = False
+    rig.do(Shutdown())
+    rig.finish()
     longest_s = max(bound.time_s for bound in bounds(config, StopReaction.QUICK_STOP))
-    told = list(takewhile(lambda cycle: {said.controlword for said in cycle.drives} == {QUICK_STOP}, rig.log[::-1]))
-    assert longest_s <= len(told) * period_us * 1e-6 <= longest_s + 0.02
+    stops = list(takewhile(lambda cycle: {said.controlword for said in cycle.drives} == {QUICK_STOP}, rig.log[::-1]))
+    assert longest_s <= len(stops) * period_us * 1e-6 <= longest_s + 0.02
 
 
 @pytest.mark.parametrize("mode", [CSP, CSV, CST])
@@ -888,12 +420,12 @@ def test_closing_without_one_of_the_slaves_ends_when_the_joints_of_the_others_st
     rig.do(Shutdown())
     rig.finish()
     # Whoever ends the loop takes the slaves out of OP then.
-    assert [model.powered for model in rig.models] == [True, True]
+    assert rig.powered == [True, True]
     assert all(abs(model.mechanics.velocity) < 0.01 for model in rig.models)
 
 
 def test_closing_ends_after_2_s_where_a_drive_does_not_disable(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
+    rig.data.misunderstood[1, CONTROLWORD] = {SWITCH_ON: ENABLE_OPERATION}
     rig.hold()
     rig.do(Shutdown())
     assert rig.finish() == pytest.approx(2.0, abs=3 * PERIOD_S)
@@ -902,55 +434,55 @@ def test_closing_ends_after_2_s_where_a_drive_does_not_disable(rig: LoopRig) -> 
 # -- whatever is asked and whatever happens -------------------------------------------------------------------------
 
 COMMANDS = {"enable": Enable(), "disable": Disable(), "reset": Reset(), "halt": Halt()}
-MISHAPS = ["drive fault", "slave lost", "clock lost"]
-DEEDS = st.one_of(
+FAULTS = ["drive fault", "slave lost", "clock lost"]
+ACTIONS = st.one_of(
     st.tuples(st.just("run"), st.integers(1, 300)),
     st.tuples(st.just("lose"), st.integers(1, 60)),
     st.tuples(st.just("move"), st.tuples(st.floats(-2.2, 2.2), st.floats(-2.2, 2.2), st.floats(0.05, 0.55))),
     st.tuples(st.just("mode"), st.sampled_from([CSP, CSV, CST])),
     st.tuples(st.sampled_from(sorted(COMMANDS)), st.none()),
-    st.tuples(st.sampled_from(MISHAPS), st.none()),
+    st.tuples(st.sampled_from(FAULTS), st.none()),
     st.tuples(st.just("recover"), st.none()),
 )
 
 
-def happen(rig: LoopRig, deed: str, how: object) -> None:
-    if deed == "run":
+def do(rig: LoopRig, action: str, how: object) -> None:
+    if action == "run":
         rig.run(how * PERIOD_S)
-    elif deed == "lose":
+    elif action == "lose":
         lose(rig, how)
-    elif deed == "move":
+    elif action == "move":
         rig.send(move_to(*how[:2], speed=how[2]))
-    elif deed == "mode":
+    elif action == "mode":
         rig.send(SetDriveMode(DriveMode(how)))
-    elif deed == "drive fault":
+    elif action == "drive fault":
         rig.models[1].inject_fault(UNDER_VOLTAGE)
-    elif deed == "slave lost":
+    elif action == "slave lost":
         rig.service.lost_slave = 3
-    elif deed == "clock lost":
+    elif action == "clock lost":
         rig.discipline.locked = False
-    elif deed == "recover":
+    elif action == "recover":
         rig.discipline.locked = True
         rig.send(Reset())
         rig.run(0.2)
         rig.send(Enable())
         rig.run(0.05)
     else:
-        rig.send(COMMANDS[deed])
+        rig.send(COMMANDS[action])
     rig.cycle()
 
 
 # A failing example is not shortened: that would take minutes.
 @settings(max_examples=15, deadline=None, derandomize=True, phases=[Phase.generate])
-@given(deeds=st.lists(DEEDS, min_size=20, max_size=40))
+@given(actions=st.lists(ACTIONS, min_size=20, max_size=40))
 def test_whatever_happens_targets_stay_in_steps_and_only_enable_enables(
-    rig_board: tuple[Blackboard, Observer], deeds: list[tuple[str, object]]
+    rig_board: tuple[Blackboard, Observer], actions: list[tuple[str, object]]
 ) -> None:
     rig = LoopRig(*rig_board)
     try:
         rig.set_in_motion()
-        for deed, how in deeds:
-            happen(rig, deed, how)
+        for action, how in actions:
+            do(rig, action, how)
     finally:
         rig_board[1].release(rig.lease)
     for axis, joint in enumerate(CONFIG.joints):

@@ -1,18 +1,228 @@
-"""The table of states and events, and what is derived from it."""
+"""The table of states, commands and events: what is accepted where, and where it leads."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 from docs.machine_page import diagram
 from rtcp.control.machine import STATES
-from rtcp.control.states import ReadyState, StoppedByLimitState
-from rtcp.ipc.commands import Enable, Reset
-from rtcp.ipc.layout import FLAG_ENABLED, FLAG_MOTION_ALLOWED
-from rtcp.ipc.states import State
+from rtcp.control.states import ReadyState, Signal, StoppedByLimitState
+from rtcp.ipc.commands import (
+    ApplyTorque,
+    Command,
+    Disable,
+    Enable,
+    Halt,
+    Home,
+    Jog,
+    MoveAtVelocity,
+    MoveGripper,
+    Reset,
+    RunLines,
+    RunTrajectory,
+    SetControlMode,
+    SetDriveMode,
+    SetLimits,
+    SetOutput,
+    SetZero,
+    Shutdown,
+    StreamPosition,
+)
+from rtcp.ipc.events import (
+    ClockLost,
+    DriveFault,
+    EmergencyStopActivated,
+    Event,
+    LeaseExpired,
+    OverSpeed,
+    PermissionWithdrawn,
+    ProcessDataLost,
+    SlaveLost,
+)
+from rtcp.ipc.refusals import (
+    DamagedRow,
+    EmergencyStopPressed,
+    NoGeometry,
+    PlanStartsElsewhere,
+    Refusal,
+    WrongControlMode,
+    WrongRowCount,
+    WrongState,
+)
+from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
+
+from .rig import (
+    CAUSES,
+    CONTROLWORD,
+    ENABLE_OPERATION,
+    QUICK_STOP,
+    SWITCH_ON,
+    LoopRig,
+    move_to,
+)
+
+# What follows on each command and event in each state, written down a second time: the state that it leads to, `=`
+# where it changes none. `.`: a command is refused, an event is not tried.
+TABLE = """
+                 start ready enab  hold  move  stop  limit home  disab fault emerg reset close
+enable           .     enab  .     .     .     .     .     .     .     .     .     .     .
+disable          .     =     disab disab disab disab disab disab =     =     =     fault .
+reset            .     .     .     .     .     .     hold  .     .     reset reset .     .
+set_drive_mode   .     =     .     =     .     .     .     .     .     .     .     .     .
+set_control_mode .     =     .     =     .     .     .     .     .     .     .     .     .
+move_joints      .     .     .     move  =     .     .     .     .     .     .     .     .
+run_trajectory   .     .     .     =     =     .     .     .     .     .     .     .     .
+run_lines        .     .     .     =     =     .     .     .     .     .     .     .     .
+stream_position  .     .     .     move  =     .     .     .     .     .     .     .     .
+jog              .     .     .     move  =     .     .     .     .     .     .     .     .
+move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
+apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
+halt             .     .     .     =     stop  =     =     =     .     .     .     .     .
+set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
+move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
+set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
+set_zero         .     =     .     .     .     .     .     .     .     .     .     .     .
+home             .     .     .     home  .     .     .     .     .     .     .     .     .
+shutdown         close close close close close close close close close close close close =
+lost_frames      =     fault fault fault fault fault fault fault fault =     =     .     =
+slave_lost       .     fault fault fault fault fault fault fault fault =     =     .     =
+drive_fault      =     fault fault fault fault fault fault fault fault =     =     .     =
+clock_lost       =     fault .     fault fault .     fault fault .     =     =     .     .
+emergency_stop   =     =     emerg emerg emerg emerg emerg emerg emerg emerg =     .     =
+supervision      .     .     emerg emerg emerg emerg emerg emerg .     =     .     .     .
+lease_ended      =     =     =     =     stop  =     =     .     =     =     =     .     =
+enabling_switch  =     =     =     =     stop  =     =     .     =     =     =     .     =
+"""
+_HEAD, *_ROWS = [line.split() for line in TABLE.strip().splitlines()]
+_STATES = {
+    "start": State.STARTING, "ready": State.READY, "enab": State.ENABLING, "hold": State.HOLDING, "move": State.MOVING,
+    "stop": State.STOPPING, "limit": State.STOPPED_BY_LIMIT, "home": State.HOMING, "disab": State.DISABLING,
+    "fault": State.FAULT, "emerg": State.EMERGENCY_STOP, "reset": State.RESETTING, "close": State.CLOSING,
+}  # fmt: skip
+CELLS = {(row[0], _STATES[state]): cell for row in _ROWS for state, cell in zip(_HEAD, row[1:], strict=True)}
+COMMANDS: dict[str, Command] = {
+    command.name: command
+    for command in (
+        Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
+        RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), Jog((0.0, 0.0), JogFrame.JOINTS, 0.2),
+        MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
+        MoveGripper(False), SetLimits(0, 1), SetZero(0, 0.0), Home(0), Shutdown(),
+    )
+}  # fmt: skip
+"""One of each kind, with fields that nobody could refuse."""
+FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
+    RunTrajectory: (DamagedRow, PlanStartsElsewhere),
+    RunLines: (NoGeometry,),
+    MoveAtVelocity: (WrongControlMode,),
+    ApplyTorque: (WrongControlMode,),
+    SetLimits: (WrongRowCount,),
+    Reset: (EmergencyStopPressed,),
+}
+"""Commands that cannot be carried out as they are above, wherever they are accepted; tested elsewhere."""
+
+
+EVENTS: dict[str, type[Event]] = {
+    "lost_frames": ProcessDataLost, "slave_lost": SlaveLost, "drive_fault": DriveFault, "clock_lost": ClockLost,
+    "emergency_stop": EmergencyStopActivated, "supervision": OverSpeed, "lease_ended": LeaseExpired,
+    "enabling_switch": PermissionWithdrawn,
+}  # fmt: skip
+"""Event of each key of `stops`."""
+ACCEPTED = [(COMMANDS[name], state) for (name, state), cell in CELLS.items() if name in COMMANDS and cell != "."]
+HAPPENS = [(name, state) for (name, state), cell in CELLS.items() if name in EVENTS and cell != "."]
+RUNNING = sorted(set(State) - {State.OFF})
+"""Off is what a loop is that does not run."""
+
+
+@pytest.fixture
+def rig(switch_rig: Callable[..., LoopRig]) -> LoopRig:
+    return switch_rig()
+
+
+def bring_to(rig: LoopRig, state: State) -> None:
+    # A drive that is kept from enabling keeps the machine in that state.
+    rig.data.misunderstood[1, CONTROLWORD] = {ENABLE_OPERATION: SWITCH_ON} if state is State.ENABLING else {}
+    rig.bring_to(state)
+    rig.slaves_come_back = False
+
+
+def leads_to(name: str, state: State) -> State:
+    cell = CELLS[name, state]
+    return state if cell == "=" else _STATES[cell]
+
+
+def name_of(value: object) -> str:
+    return value if isinstance(value, str) else getattr(value, "name", "").lower()
+
+
+def test_the_table_has_every_command_and_every_state() -> None:
+    own = {kind.name for kind in Command.kinds if kind.__module__ == "rtcp.ipc.commands"}
+    assert set(CELLS) == {(name, state) for name in {*own, *EVENTS} for state in RUNNING}
+    for command in COMMANDS.values():
+        assert command.states == {state for other, state in ACCEPTED if other is command}
+
+
+@pytest.mark.parametrize(("command", "state"), ACCEPTED, ids=name_of)
+def test_a_command_that_is_accepted_leads_to_its_state(rig: LoopRig, command: Command, state: State) -> None:
+    bring_to(rig, state)
+    refusal = rig.send(command).refusal
+    # A state may accept a command that is refused for what it asks.
+    assert refusal is None or isinstance(refusal, FOR_OTHER_REASONS.get(type(command), ()))
+    assert rig.state is (leads_to(command.name, state) if refusal is None else state)
+    if isinstance(command, Shutdown):
+        rig.finish()
+        assert rig.powered == [False, False]
+
+
+@pytest.mark.parametrize("state", RUNNING, ids=name_of)
+def test_every_other_command_is_refused_with_the_states_that_accept_it_and_changes_nothing(
+    rig: LoopRig, state: State
+) -> None:
+    bring_to(rig, state)
+    for command in (command for command in COMMANDS.values() if CELLS[command.name, state] == "."):
+        refusal = rig.send(command).refusal
+        assert refusal == WrongState(command.number, state)
+        message, _, accepting = rig.names.message(refusal).partition(", only in: ")
+        assert message == f"{command.name} is not accepted in state {state.words}"
+        accepting, _, hint = accepting.partition("; ")
+        assert accepting.split(", ") == sorted(one.words for one in command.states)
+        if state in Reset.states:
+            assert hint == "`rtcp reset` first"
+        elif state is State.READY and State.HOLDING in command.states:
+            assert hint == "`rtcp enable` first"
+        else:
+            assert hint == ("`rtcp disable` first" if command.name == "set_zero" else "")
+        assert rig.state is state
+
+
+@pytest.mark.parametrize(("event", "state"), HAPPENS, ids=name_of)
+def test_an_event_leads_to_its_state(rig: LoopRig, event: str, state: State) -> None:
+    bring_to(rig, state)
+    kind, goal = EVENTS[event], leads_to(event, state)
+    before = rig.kinds.count(kind)
+    CAUSES[event][0](rig)
+    if goal is state:
+        rig.run(0.05)
+        assert rig.state is state or (state is State.CLOSING and rig.machine.closed)
+        return
+    rig.until(goal, 1.1)
+    assert rig.kinds.count(kind) == before + 1
+    words = {said.controlword for said in rig.log[-1].drives if said.has_torque}
+    if goal is State.STOPPING:
+        assert words == {ENABLE_OPERATION}
+        rig.until(State.HOLDING)
+    else:
+        assert words <= {QUICK_STOP}
+        assert rig.machine.fault == kind.number
+    if goal is State.EMERGENCY_STOP:
+        rig.wait(lambda: rig.arm.first_with_torque() == -1, 2.5)
+
+
+# -- what is derived from the table ---------------------------------------------------------------------------------
 
 ROOT = Path(__file__).parents[2]
-ALLOWED_TO_MOVE = FLAG_ENABLED | FLAG_MOTION_ALLOWED
 
 
 def targets(state: State) -> set[State]:
@@ -28,30 +238,24 @@ def reached_from(start: State) -> set[State]:
     return reached
 
 
-def test_every_state_but_off_does_something() -> None:
-    assert {one.state for one in STATES} == set(State) - {State.OFF}
-
-
 def test_every_state_is_reached_from_the_start_and_leads_to_the_end() -> None:
+    assert {one.state for one in STATES} == set(RUNNING)
     assert reached_from(State.STARTING) == set(State)
     assert all(State.OFF in reached_from(state) for state in State)
 
 
 def test_nothing_leads_from_a_fault_or_an_emergency_stop_to_motion_but_through_reset_and_enable() -> None:
-    for state in (State.FAULT, State.EMERGENCY_STOP, State.RESETTING):
-        assert targets(state) <= {
-            State.FAULT,
-            State.EMERGENCY_STOP,
-            State.RESETTING,
-            State.CLOSING,
-            State.READY,
-        }
+    stopped = {State.FAULT, State.EMERGENCY_STOP, State.RESETTING}
+    for state in stopped:
+        assert targets(state) <= {*stopped, State.CLOSING, State.READY}
     assert [cause for cause, target in ReadyState.leads_to.items() if target is State.ENABLING] == [Enable]
-
-
-def test_a_stop_by_a_limit_is_left_by_reset_alone_where_the_arm_stays_enabled() -> None:
     assert [cause for cause, target in StoppedByLimitState.leads_to.items() if target is State.HOLDING] == [Reset]
 
 
-def test_the_picture_shows_every_state() -> None:
+def test_where_a_lost_clock_may_end_in_a_controlled_stop_set_points_move_the_arm() -> None:
+    found = {one.state for one in STATES if Signal.STOP_FOR_CLOCK in one.leads_to}
+    assert found == {State.HOLDING, State.MOVING, State.STOPPING}
+
+
+def test_the_diagram_shows_every_state() -> None:
     assert all(f"{state.name} :" in diagram() for state in State)

@@ -1,4 +1,4 @@
-"""A random session on a whole platform, judged by the frames that reached its segment."""
+"""A random session on a whole platform, checked by the frames that reached its segment."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.wire import BOX_OUT, DRIVE, HEAD, LEAVES, LRW, datagrams, frames
-from tests.sessions.play import Outcome
-from tests.sessions.wire_play import judge, play_on_the_wire
+from tests.sessions.session import Outcome
+from tests.sessions.wire_session import check, run_on_the_wire
 
 pytestmark = pytest.mark.alone
 
@@ -22,21 +22,21 @@ FURTHER = 1000
 
 
 @pytest.fixture(scope="module")
-def played(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, Path]:
+def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, Path]:
     """What came of a session, and its capture."""
     path = tmp_path_factory.mktemp("wire") / "capture"
-    return play_on_the_wire(SEED, SECONDS, PERIOD_US, path), path
+    return run_on_the_wire(SEED, SECONDS, PERIOD_US, path), path
 
 
-def test_no_frame_of_a_random_session_breaks_a_limit_on_the_wire(played: tuple[Outcome, Path]) -> None:
-    outcome, _ = played
+def test_no_frame_of_a_random_session_breaks_a_limit_on_the_wire(session: tuple[Outcome, Path]) -> None:
+    outcome, _ = session
     assert outcome.failures == []
-    assert outcome.judged > 1000
+    assert outcome.checked > 1000
     assert outcome.taken.total() > 10
 
 
-def test_one_target_that_is_changed_in_its_capture_is_found(played: tuple[Outcome, Path], tmp_path: Path) -> None:
-    _, path = played
+def test_one_target_that_is_changed_in_its_capture_is_found(session: tuple[Outcome, Path], tmp_path: Path) -> None:
+    _, path = session
     spoilt = tmp_path / "spoilt"
     enabled = 0
     with spoilt.open("wb") as file:
@@ -50,5 +50,5 @@ def test_one_target_that_is_changed_in_its_capture_is_found(played: tuple[Outcom
                     DRIVE.pack_into(frame, OUTPUTS_AT + BOX_OUT, control, position + FURTHER, *rest)
             file.write(HEAD.pack(when, len(frame) | (LEAVES if leaves else 0)) + frame)
     assert enabled > 100
-    _, failures = judge(spoilt, PERIOD_US * 1e-6)
+    _, failures = check(spoilt, PERIOD_US * 1e-6)
     assert any(f"joint 1: step of {FURTHER}" in sentence for sentence, *_ in failures)

@@ -27,6 +27,7 @@ ITEMS = {
 LEVEL = Pose.from_xyzrpy(-0.5, 0.0, 0.3, 0.0, -pi / 2, 0.0)
 """Where the arm begins: the gripper level, pointing away from the user."""
 CONFIG = load(default_config())
+CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=2000.0))
 
 
 class Person:

@@ -1,4 +1,4 @@
-"""A gateway's process in front of a fake loop, one for the tests of a file."""
+"""A fake loop behind a gateway's process, or behind its methods in this process; one for the tests of a file."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from rtcp.ipc.client import ControlClient
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket
 from rtcp.ipc.session import Session
 from tests.gateway.fake_loop import FakeLoop
+from tests.gateway.fake_platform import FakePlatform, fake_platform
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +63,21 @@ def loop(served_loop: FakeLoop) -> FakeLoop:
 def client(directory: Path, loop: FakeLoop) -> Iterator[ControlClient]:
     with ControlClient("a test", control_socket(directory)) as made:
         yield made
+
+
+@pytest.fixture(scope="module")
+def platform(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
+    """The methods of the gateway; the arm stands at the module's `Q`."""
+    options = getattr(request.module, "OPTIONS", {})
+    with fake_platform(tmp_path_factory.mktemp("arm"), request.module.Q, **options) as made:
+        yield made
+
+
+@pytest.fixture
+def arm(
+    request: pytest.FixtureRequest, platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> FakePlatform:
+    """The same, holding at `Q` with nothing received, and a state directory of the test's own."""
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
+    platform.reset(request.module.Q)
+    return platform

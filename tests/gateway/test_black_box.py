@@ -98,13 +98,6 @@ class Written:
 
 
 @pytest.fixture
-def path() -> Iterator[Path]:
-    made = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
-    yield made
-    made.unlink(missing_ok=True)
-
-
-@pytest.fixture
 def write_board(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[WriteBoard]:
     made: list[Written] = []
 
@@ -257,7 +250,7 @@ def test_a_fault_that_no_gateway_saw_is_made_up_for_although_the_wall_clock_was_
     assert int(second.records["cycle"][second.about.at]) == 1500
 
 
-def test_what_is_said_while_the_wall_clock_is_set_stands_where_it_was_said(
+def test_what_is_reported_while_the_wall_clock_is_set_stands_where_it_was_said(
     write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = write_board()
@@ -336,7 +329,7 @@ def test_the_shortest_cycle_has_its_ten_seconds_too(write_board: WriteBoard, mon
     assert not any("before the fault" in note for note in one.about.notes)
 
 
-def test_cycles_that_were_overwritten_before_they_were_read_are_told(write_board: WriteBoard) -> None:
+def test_cycles_that_were_overwritten_before_they_were_read_are_reported(write_board: WriteBoard) -> None:
     written = write_board()
     box = written.watched()
     written.fill(16_410, fault_at=16_410)
@@ -358,7 +351,7 @@ def test_a_loop_that_had_hung_before_its_fault_has_overwritten_nothing(write_boa
     assert note in recording.about.notes
 
 
-def test_torn_records_are_told_and_not_taken(write_board: WriteBoard) -> None:
+def test_torn_records_are_reported_and_not_taken(write_board: WriteBoard) -> None:
     written = write_board()
     box = written.watched()
     written.fill(1000, fault_at=900)
@@ -371,7 +364,7 @@ def test_torn_records_are_told_and_not_taken(write_board: WriteBoard) -> None:
     assert int(recording.records["cycle"][recording.about.at]) == 900
 
 
-def test_events_that_the_ring_no_longer_holds_are_told(write_board: WriteBoard) -> None:
+def test_events_that_the_ring_no_longer_holds_are_reported(write_board: WriteBoard) -> None:
     written = write_board()
     box = written.watched()
     written.fill(100, fault_at=90)
@@ -381,7 +374,7 @@ def test_events_that_the_ring_no_longer_holds_are_told(write_board: WriteBoard) 
     assert any(note.startswith(f"more than {EVENTS} events came") for note in recording.about.notes)
 
 
-def test_a_loop_that_has_died_is_a_fault_of_its_own_and_one_that_was_told_to_end_is_none(
+def test_a_loop_that_has_died_is_a_fault_of_its_own_and_one_that_was_commanded_to_end_is_none(
     write_board: WriteBoard,
 ) -> None:
     written = write_board()
@@ -517,7 +510,7 @@ def test_a_new_gateway_reads_the_list_once_and_the_ring_not_at_all_for_faults_th
     assert len(written.recordings) == 5
 
 
-def test_a_list_that_cannot_be_made_is_told_and_the_next_fault_is_recorded(
+def test_a_list_that_cannot_be_made_is_reported_and_the_next_fault_is_recorded(
     write_board: WriteBoard, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     written = write_board()

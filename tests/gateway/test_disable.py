@@ -18,10 +18,10 @@ from rtcp.ipc.errors import Faulted
 from rtcp.ipc.events import SlavesParked
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
-from tests.control.conftest import rig, rig_board
+from tests.control.conftest import new_rig, rig, rig_board
 from tests.control.rig import CONFIG, CONTROLWORD, LOST_CYCLES, PERIOD_S, QUICK_STOP, VOLTAGE_OFF, LoopRig
 
-__all__ = ["rig", "rig_board"]
+__all__ = ["new_rig", "rig", "rig_board"]
 
 FINGER = Joint("finger", "drive2", Range(-0.1, 1.5), velocity=1.0, acceleration=4.0, jerk=40.0, torque=3.0)
 
@@ -89,7 +89,7 @@ def test_disabling_is_done_when_no_drive_has_torque_and_not_before(rig: LoopRig,
 
 
 def test_a_drive_that_keeps_its_torque_in_a_fault_is_named_with_its_statusword(rig: LoopRig) -> None:
-    rig.data.deaf[1, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.data.misunderstood[1, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
     rig.bring_to(State.FAULT)
     rig.run(0.5)
     message = failure(rig)
@@ -100,7 +100,7 @@ def test_a_drive_that_keeps_its_torque_in_a_fault_is_named_with_its_statusword(r
 
 
 def test_a_drive_that_keeps_its_torque_in_an_emergency_stop_is_named(rig: LoopRig) -> None:
-    rig.data.deaf[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.data.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
     press_in_motion(rig)
     message = failure(rig)
     assert "not confirmed: joint1 (drive1) shows 0x" in message
@@ -154,7 +154,7 @@ def test_drives_that_were_parked_without_torque_are_confirmed(rig: LoopRig) -> N
 
 
 def test_drives_that_were_parked_and_showed_torque_last_are_not_confirmed(rig: LoopRig) -> None:
-    rig.data.deaf[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
+    rig.data.misunderstood[0, CONTROLWORD] = {VOLTAGE_OFF: QUICK_STOP}
     press_in_motion(rig)
     park(rig)
     message = failure(rig)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,18 +15,6 @@ from tests.gateway.fake_platform import FakePlatform, fake_platform
 
 Q = [0.0] * 6
 MASK, LEVELS = (0x2000, 1), (0x2000, 2)
-
-
-@pytest.fixture(scope="module")
-def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
-    with fake_platform(tmp_path_factory.mktemp("arm"), Q) as made:
-        yield made
-
-
-@pytest.fixture
-def arm(platform: FakePlatform) -> FakePlatform:
-    platform.reset(Q)
-    return platform
 
 
 def written(arm: FakePlatform) -> list[tuple[int, int]]:
@@ -106,14 +93,15 @@ def test_nothing_pressed_holds_the_joystick_neutral_and_leaves_the_other_inputs_
     assert written(arm) == [(2, 63), (1, 0x3F)]
 
 
-def test_only_the_holder_can_release(arm: FakePlatform) -> None:
+@pytest.mark.parametrize("params", [{}, {"byte": 62}], ids=["release", "force"])
+def test_a_second_client_is_refused_with_the_name_of_the_holder(arm: FakePlatform, params: dict[str, int]) -> None:
     async def force() -> None:
         await arm.call("joystick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
         with pytest.raises(Refused, match=r"the joystick is held by rtcp joystick \(pid 7\)"):
-            await arm.call("joystick", {}, "another", connection=2)
+            await arm.call("joystick", params, "another", connection=2)
 
     arm.run(force)
-    assert written(arm)[-1] == (1, 0xFF)
+    assert written(arm) == [(2, 61), (1, 0xFF)]
 
 
 def test_a_closed_connection_releases(arm: FakePlatform) -> None:
@@ -138,16 +126,6 @@ def test_what_is_not_repeated_is_released_after_its_hold_time(arm: FakePlatform)
 
     arm.run(force)
     assert written(arm)[-1] == (1, 0)
-
-
-def test_a_second_client_is_refused_with_the_name_of_the_holder(arm: FakePlatform) -> None:
-    async def force() -> None:
-        await arm.call("joystick", {"byte": 61}, "rtcp joystick (pid 7)", connection=1)
-        with pytest.raises(Refused, match=r"the joystick is held by rtcp joystick \(pid 7\)"):
-            await arm.call("joystick", {"byte": 62}, "another", connection=2)
-
-    arm.run(force)
-    assert written(arm) == [(2, 61), (1, 0xFF)]
 
 
 @pytest.mark.parametrize("hold_s", [0, -1, 1.5])

@@ -36,19 +36,6 @@ DRIVEN = replace(CONFIG, gripper=GripperConfig(joint=FINGER, open_position=1.4, 
 
 
 @pytest.fixture(scope="module")
-def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
-    with fake_platform(tmp_path_factory.mktemp("arm"), Q) as made:
-        yield made
-
-
-@pytest.fixture
-def arm(platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePlatform:
-    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
-    platform.reset(Q)
-    return platform
-
-
-@pytest.fixture(scope="module")
 def driven_platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
     with fake_platform(tmp_path_factory.mktemp("arm"), Q, config=DRIVEN) as made:
         yield made
@@ -187,7 +174,7 @@ def test_a_gripper_without_torque_is_refused(driven: FakePlatform) -> None:
 # -- zero and homing --------------------------------------------------------------------------------------------------
 
 
-def test_the_present_position_becomes_the_zero_or_what_it_is_said_to_be(arm: FakePlatform) -> None:
+def test_the_present_position_becomes_the_zero_or_what_it_is_reported_to_be(arm: FakePlatform) -> None:
     answer = arm.ask("zero", joint="joint1")
     assert (answer["joint"], answer["offset"], answer["before"]) == ("joint1", 0.25, 0.0)
     assert arm.ask("zero", joint="2", at=0.05)["joint"] == "joint2"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +17,10 @@ from rtcp.ipc.events import BoxReached, PermissionWithdrawn, SlaveLost, Stopped
 from rtcp.ipc.refusals import EmergencyStopPressed
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.limits import Limits
-from tests.gateway.fake_platform import FakePlatform, fake_platform
+from tests.gateway.fake_platform import FakePlatform
 
-BENT = [0.0, 0.2, math.pi / 2, 0.0, 0.4, 0.0]
+Q = BENT = [0.0, 0.2, math.pi / 2, 0.0, 0.4, 0.0]
 THERE = [0.2, *BENT[1:]]
-
-
-@pytest.fixture(scope="module")
-def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
-    with fake_platform(tmp_path_factory.mktemp("arm"), BENT) as made:
-        yield made
-
-
-@pytest.fixture
-def arm(platform: FakePlatform) -> FakePlatform:
-    platform.reset(BENT)
-    return platform
 
 
 def tool(arm: FakePlatform, q: list[float]) -> list[float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -59,15 +58,11 @@ class Written:
 
 
 @pytest.fixture
-def written(monkeypatch: pytest.MonkeyPatch) -> Iterator[Written]:
-    path = Path(f"/dev/shm/rtcp-test-{os.getpid()}")
-    board = Blackboard(path, JOINTS, 500_000)
+def written(board: Blackboard, path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Written]:
     monkeypatch.setattr(status_snapshot, "_SILENT_S", 1e9)  # a busy host must not make the loop a silent one
     made = Written(board, path)
     yield made
     made.observer.close()
-    board.close()
-    path.unlink()
 
 
 def test_an_emergency_stop_out_of_a_fault_replaces_the_message_of_the_fault(written: Written) -> None:

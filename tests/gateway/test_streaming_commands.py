@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -15,24 +14,13 @@ from rtcp.ipc.errors import Refused
 from rtcp.ipc.events import BoxReached
 from rtcp.ipc.refusals import StreamPointDropped, WrongState
 from rtcp.ipc.states import ControlMode, JogFrame, State
-from tests.gateway.fake_platform import FakePlatform, fake_platform
+from tests.gateway.fake_platform import FakePlatform
 
 Q = [0.0, 0.2, 1.0, 0.0, 0.4, 0.0]
 SIX = (0.01, 0.02, 0.03, 0.0, 0.0, 0.1)
 LEASE_S = 0.4
+OPTIONS = {"lease_s": LEASE_S}
 JOG: dict[str, Any] = {"velocity": list(SIX), "frame": "base"}
-
-
-@pytest.fixture(scope="module")
-def platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePlatform]:
-    with fake_platform(tmp_path_factory.mktemp("arm"), Q, lease_s=LEASE_S) as made:
-        yield made
-
-
-@pytest.fixture
-def arm(platform: FakePlatform) -> FakePlatform:
-    platform.reset(Q)
-    return platform
 
 
 METHODS: dict[str, tuple[str, dict[str, Any], Command]] = {

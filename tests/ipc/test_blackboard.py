@@ -65,7 +65,7 @@ def test_a_reader_that_keeps_up_loses_nothing(board: Blackboard, observer: Obser
     assert seen == list(range(1, len(seen) + 1))
 
 
-def test_a_reader_that_comes_late_is_told_how_much_it_lost(board: Blackboard, observer: Observer) -> None:
+def test_a_reader_that_comes_late_is_reported_how_much_it_lost(board: Blackboard, observer: Observer) -> None:
     for cycle in range(1, RECORDS + 1001):
         board.publish(record(cycle))
     records, lost = observer.since(0)

@@ -5,7 +5,6 @@ Nothing here uses the code under test except the model and the pose. `RTCP_SLOW=
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from math import inf, pi, radians
 
@@ -13,8 +12,8 @@ import numpy as np
 
 from kinematics.model import ArmModel, DhRow, JointLimit
 from kinematics.pose import Pose
+from tests.samples import SLOW
 
-SLOW = "RTCP_SLOW" in os.environ
 TOOL = Pose.from_xyzrpy(0.03, -0.02, 0.11, 0.4, -1.2, 2.1)
 
 

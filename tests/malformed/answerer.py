@@ -88,8 +88,8 @@ class Answerer:
         self._hide = float(str(order.get("hide", self._hide)))
         if "keep" in order:
             Path(str(order["keep"])).write_text("\n".join(frame.hex() for frame in self._kept.values()))
-        told = json.dumps({"answers": self._answers, "mutated": self._mutated}).encode()
-        self._port.send(b"\xfe" * 6 + ORDER[6:] + told.ljust(60))
+        counts = json.dumps({"answers": self._answers, "mutated": self._mutated}).encode()
+        self._port.send(b"\xfe" * 6 + ORDER[6:] + counts.ljust(60))
 
     def work(self, quiet: bool) -> None:
         """Let happen what time brings."""

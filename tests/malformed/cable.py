@@ -39,7 +39,7 @@ def master(pid: int, scenario: str, amount: int, *further: str) -> subprocess.Co
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
-def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+def report_of(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     """Return what a master said; assert that it came to its end."""
     assert done.returncode == 0, f"ended with {done.returncode}: {done.stderr[-3000:]}"
     found: dict[str, Any] = json.loads(done.stdout)

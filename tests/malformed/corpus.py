@@ -8,7 +8,7 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from tests.malformed.cable import answerer, master, told
+from tests.malformed.cable import answerer, master, report_of
 
 FILE = Path(__file__).with_name("corpus.txt")
 _HEAD = "# What pysoem and RegisterPort send to a segment, one frame of each kind; made by tests/malformed/corpus.py.\n"
@@ -24,7 +24,7 @@ def record() -> list[str]:
     """Let a master live its life and return the frames that it sent."""
     with tempfile.TemporaryDirectory() as folder, answerer(1) as pid:
         kept = Path(folder) / "frames"
-        told(master(pid, "record", 200, str(kept)))
+        report_of(master(pid, "record", 200, str(kept)))
         return kept.read_text().split()
 
 

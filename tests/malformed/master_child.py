@@ -26,7 +26,7 @@ from rtcp.fieldbus.interface import enter
 from rtcp.fieldbus.process_data import SoemProcessData
 from rtcp.fieldbus.soem import SoemBus
 from tests.malformed.answerer import ask
-from tests.malformed.segment_play import resident_kb
+from tests.malformed.mutated_frames import resident_kb
 
 INTERFACE = "ecat0"
 PERIOD_NS = 1_000_000
@@ -111,7 +111,7 @@ def services(bus: SoemBus, amount: int) -> dict[str, Any]:
     """States, registers, SDOs and mailboxes, while one answer in five is mutated."""
     bus.scan()
     before = ask(INTERFACE, garble=0.2)
-    deeds: tuple[Callable[[], Any], ...] = (
+    actions: tuple[Callable[[], Any], ...] = (
         bus.read_states,
         bus.emergencies,
         lambda: bus.sdo_read(2, 0x1008, 0),
@@ -123,7 +123,7 @@ def services(bus: SoemBus, amount: int) -> dict[str, Any]:
     sentences: Counter[str] = Counter()
     for turn in range(amount):
         try:
-            deeds[turn % len(deeds)]()
+            actions[turn % len(actions)]()
         except BusError as error:
             sentences[str(error).partition(":")[0]] += 1
     after = ask(INTERFACE, garble=0)
@@ -148,7 +148,7 @@ def scans(bus: SoemBus, amount: int) -> dict[str, Any]:
     return {"ends": sentences, "mutated": mutated, "slaves": len(bus.scan())}
 
 
-SCENARIOS = {deed.__name__: deed for deed in (record, exchange, services, scans)}
+SCENARIOS = {action.__name__: action for action in (record, exchange, services, scans)}
 
 
 def main() -> None:

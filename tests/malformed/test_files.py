@@ -75,14 +75,14 @@ def sentences_of(read: Callable[[], object]) -> list[str]:
     try:
         read()
     except ConfigError as error:
-        told = error.problems
+        found = error.problems
     else:
         return []
     finally:
         signal.alarm(0)
-    assert told
-    assert all(len(problem) > 10 and "Traceback" not in problem for problem in told)
-    return told
+    assert found
+    assert all(len(problem) > 10 and "Traceback" not in problem for problem in found)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -97,11 +97,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [("assistive_arm.yaml", 30), ("devices/cubemars-orh.yaml", 30), ("devices/diewu-io.yaml", 30),
      ("segment.yaml", 60), ("abb_irb120.yaml", 30)],
 )  # fmt: skip
-def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, turns: int) -> None:
+def test_a_damaged_configuration_is_reported_in_sentences(folder: Path, name: str, turns: int) -> None:
     random = Random(name)
     file = folder / name
     whole = file.read_bytes()
-    told = 0
+    found = 0
 
     def read() -> object:
         if name == "segment.yaml":
@@ -117,9 +117,9 @@ def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, t
     assert sentences_of(read) == []
     for _ in range(turns):
         file.write_bytes(damaged(whole, random))
-        told += bool(sentences_of(read))
+        found += bool(sentences_of(read))
     file.write_bytes(whole)
-    assert told > turns // 3
+    assert found > turns // 3
     assert sentences_of(read) == []
 
 
@@ -129,22 +129,24 @@ def test_a_damaged_configuration_is_told_in_sentences(folder: Path, name: str, t
      ("b.csv", POSES, read_motion), ("faults.yaml", SCRIPT, load_script)],
     ids=["trajectory", "path", "trajectory in CSV", "poses in CSV", "script of faults"],
 )  # fmt: skip
-def test_a_damaged_motion_or_script_is_told_in_sentences(
+def test_a_damaged_motion_or_script_is_reported_in_sentences(
     tmp_path: Path, name: str, content: bytes, read: Callable[[Path], object]
 ) -> None:
     random = Random(name)
     file = tmp_path / name
     file.write_bytes(content)
     assert sentences_of(lambda: read(file)) == []
-    told = 0
+    found = 0
     for _ in range(300):
         file.write_bytes(damaged(content, random))
-        told += bool(sentences_of(lambda: read(file)))
+        found += bool(sentences_of(lambda: read(file)))
     # Some mutants are sound: a comment was hit, or a number changed.
-    assert 100 < told < 300
+    assert 100 < found < 300
 
 
-def test_a_damaged_file_of_zero_offsets_is_told_in_sentences(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_damaged_file_of_zero_offsets_is_reported_in_sentences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path))
     config = load(default_config())
     store_zero(config, 1, 0.25)

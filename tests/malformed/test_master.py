@@ -11,8 +11,8 @@ import pytest
 from rtcp.fieldbus import BusError
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.scan import name_of, read_mailbox
-from tests.malformed import parser_play
-from tests.malformed.cable import answerer, master, told
+from tests.malformed import mutated_answers
+from tests.malformed.cable import answerer, master, report_of
 from tests.malformed.line import Line
 
 pytestmark = pytest.mark.alone
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.alone
 
 def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_again_after_them() -> None:
     with answerer(1) as pid:
-        found = told(master(pid, "exchange", 5000))
+        found = report_of(master(pid, "exchange", 5000))
     assert found["mutated"] > 2000
     assert sum(found["counters"].values()) == 5000
     # Lost, judged by the working counter, or good: all three come.
@@ -30,20 +30,20 @@ def test_process_data_are_exchanged_on_through_mutated_answers_and_are_right_aga
 
 def test_services_beside_the_cycle_end_in_an_answer_or_a_sentence() -> None:
     with answerer(1) as pid:
-        found = told(master(pid, "services", 150))
+        found = report_of(master(pid, "services", 150))
     assert found["mutated"] > 100
     assert bytes.fromhex(found["name"]).startswith(b"Cubemars")
 
 
 def test_scans_and_configurations_on_mutated_answers_end_in_a_sentence_and_a_sane_scan_follows() -> None:
     with answerer(3) as pid:
-        found = told(master(pid, "scans", 3))
+        found = report_of(master(pid, "scans", 3))
     assert sum(found["ends"].values()) == 3
     assert found["slaves"] == 7
 
 
 def test_the_masters_own_parsers_end_in_an_answer_or_a_sentence_and_work_on() -> None:
-    found = parser_play.play(2000, 1)
+    found = mutated_answers.run(2000, 1)
     assert found.failures == []
     assert found.frames >= 2000
     assert found.kinds["done"] > 100
@@ -68,7 +68,7 @@ class Eeprom:
 
 
 def test_a_mailbox_that_no_frame_can_carry_is_none() -> None:
-    def told_of(receive: int, send: int) -> bool:
+    def usable(receive: int, send: int) -> bool:
         words = {
             0x18: b"\x00\x10" + receive.to_bytes(2, "little"),
             0x1A: b"\x80\x10" + send.to_bytes(2, "little"),
@@ -76,10 +76,10 @@ def test_a_mailbox_that_no_frame_can_carry_is_none() -> None:
         }
         return read_mailbox(Eeprom(words)) is not None
 
-    assert told_of(128, 128)
-    assert told_of(128, 0)
-    assert told_of(1486, 16)
-    assert not any((told_of(0, 128), told_of(3, 128), told_of(128, 5), told_of(65535, 128), told_of(128, 1487)))
+    assert usable(128, 128)
+    assert usable(128, 0)
+    assert usable(1486, 16)
+    assert not any((usable(0, 128), usable(3, 128), usable(128, 5), usable(65535, 128), usable(128, 1487)))
 
 
 def test_a_name_in_the_eeprom_that_is_no_utf_8_is_taken_for_latin_1() -> None:
@@ -131,7 +131,7 @@ def test_a_slave_that_never_comes_to_an_end_ends_in_a_sentence(
     endless: bool, messages: list[str], sentence: str
 ) -> None:
     line = Line()
-    with parser_play.looped(line, Random(1)):
+    with mutated_answers.looped(line, Random(1)):
         box: Any = Babbler(line, endless, messages)
         client = SdoClient(box, 2, "drive1", threading.Lock(), lambda message, position: None)
         with pytest.raises(BusError, match=sentence):

@@ -12,7 +12,7 @@ from rtcp.virtual.protocol import Command
 from tests.malformed.corpus import frames
 from tests.malformed.line import OP, SAFE_OP, Line
 from tests.malformed.mutate import MUTATIONS, mutated, shape
-from tests.malformed.segment_play import play
+from tests.malformed.mutated_frames import run
 from tests.virtual.frames import Datagram, build, parse
 
 SHARE = 20_000
@@ -36,7 +36,7 @@ def test_every_mutation_changes_frames(mutation: object) -> None:
 
 
 def test_a_segment_survives_mutated_frames_in_all_states_and_is_led_to_op_afterwards() -> None:
-    found = play(SHARE, 1)
+    found = run(SHARE, 1)
     assert found.failures == []
     assert found.frames == SHARE
     assert found.starts == SHARE // 500 + 1

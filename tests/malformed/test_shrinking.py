@@ -17,14 +17,15 @@ from rtcp.fieldbus import BusError
 from tests.malformed.corpus import frames
 from tests.malformed.line import OP, SIZES, Line
 from tests.malformed.mutate import mutated
-from tests.malformed.parser_play import LONGEST_S, Loopback, Master, looped
-from tests.malformed.segment_play import writes
+from tests.malformed.mutated_answers import LONGEST_S, Loopback, Master, looped
+from tests.malformed.mutated_frames import writes
+from tests.samples import examples
 
-EXAMPLES = 200
+EXAMPLES = examples(200)
 WHOLE = 3 * len(SIZES)
 """Working counter when all slaves take part."""
 FEW = 2
-"""Answers of a deed that are mutated; hypothesis keeps what it draws short."""
+"""Answers of a action that are mutated; hypothesis keeps what it draws short."""
 _lines: list[Line] = []
 
 
@@ -66,12 +67,12 @@ def test_no_mutated_frame_breaks_the_segment_or_changes_what_it_does_not_write(
 @settings(max_examples=EXAMPLES)
 @given(st.randoms(use_true_random=False), st.integers(0, 10), st.integers(0, len(SIZES) - 1), st.integers(0, 99))
 def test_no_mutated_answer_gets_more_than_a_sentence_out_of_the_masters_parsers(
-    random: chance.Random, deed: int, slave: int, seed: int
+    random: chance.Random, action: int, slave: int, seed: int
 ) -> None:
     with line_in_op() as line, looped(line, random, FirstStruck) as (port, loopback):
         began, said = line.now, ["nothing to say"]
         try:
-            Master(line, port, chance.Random(seed)).deeds[deed](slave)
+            Master(line, port, chance.Random(seed)).actions[action](slave)
         except BusError as error:
             said = error.sentences
         assert all(len(sentence) > 10 for sentence in said)

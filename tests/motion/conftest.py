@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import math
-import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,9 +21,10 @@ from rtcp.motion.controllers import Controller, ControllerSetup, JogController
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
+from tests.samples import SLOW
 
 PERIOD = 0.0005
-JOG_PERIOD = 0.0005 if "RTCP_SLOW" in os.environ else 0.002
+JOG_PERIOD = 0.0005 if SLOW else 0.002
 SAMPLED = round(0.01 / JOG_PERIOD)
 C = TypeVar("C", bound=Controller)
 

@@ -12,9 +12,10 @@ from kinematics.forward import frames
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
+from tests.arm_geometry import Point, depth, points
+from tests.samples import examples
 
-from .judge import ARM, examples, with_boxes
-from .reference import Point, depth, points
+from .guard_checker import ARM, with_boxes
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
 MODEL = ARM.arm
@@ -53,7 +54,7 @@ def test_from_the_fastest_stoppable_speed_the_stop_ends_exactly_at_the_edge(room
 
 @given(q=JOINTS, parts=SPEEDS, rates=RATES, dt=st.sampled_from([0.001, 0.004, 0.02]))
 @settings(max_examples=examples(40))
-def test_no_point_travels_further_than_is_said(
+def test_no_point_travels_further_than_is_reported(
     q: Sequence[float], parts: Sequence[float], rates: Sequence[float], dt: float
 ) -> None:
     speeds = [part * joint.velocity for part, joint in zip(parts, ARM.joints, strict=True)]
@@ -75,7 +76,7 @@ def test_no_point_travels_further_than_is_said(
     sizes=st.tuples(SIZES, SIZES, SIZES),
 )
 @settings(max_examples=examples(300))
-def test_a_stop_that_is_said_to_be_free_is_free_in_every_cycle_and_one_with_room_is_said_to_be(
+def test_a_stop_that_is_reported_to_be_free_is_free_in_every_cycle_and_one_with_room_is_reported_to_be(
     q: Sequence[float],
     parts: Sequence[float],
     rates: Sequence[float],

@@ -44,7 +44,7 @@ def test_it_goes_to_where_it_is_closed_or_open(motion, close, goal):
 
 
 @given(st.lists(st.tuples(st.sampled_from(["open", "close", "stop"]), st.integers(1, 800)), min_size=1, max_size=12))
-def test_whatever_it_is_told_it_keeps_to_its_limits(orders):
+def test_whatever_it_is_commanded_it_keeps_to_its_limits(orders):
     motion = GripperMotion(JOINT, OPEN, CLOSED, DT)
     motion.latch(0.5)
     path = [0.5] * 3
@@ -104,7 +104,7 @@ def test_a_stop_before_its_first_step_is_a_stop(motion):
     assert set(run(motion, 0.5)) == {0.5}
 
 
-def test_to_be_told_again_changes_nothing(motion):
+def test_a_command_that_is_repeated_changes_nothing(motion):
     other = GripperMotion(JOINT, OPEN, CLOSED, DT)
     other.latch(0.5)
     path = []

@@ -24,8 +24,7 @@ from rtcp.motion.planning.interpolation import (
     turned_by,
     value,
 )
-
-from .judge import examples
+from tests.samples import examples
 
 NUMBER = st.floats(-10.0, 10.0)
 

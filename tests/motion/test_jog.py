@@ -13,9 +13,9 @@ from kinematics.jacobian import jacobian, singularity_distances
 from rtcp.config import default_config, load
 from rtcp.motion.controllers.jog_inverse import JogInverse
 from rtcp.motion.state import Phase
+from tests.samples import some
 
 from .conftest import JOG_PERIOD
-from .judge import some
 
 MODEL = load(default_config()).arm
 ZERO = [0.0] * 6

@@ -11,8 +11,7 @@ from kinematics.forward import forward
 from kinematics.jacobian import jacobian
 from rtcp.config import default_config, load
 from rtcp.motion.state import Phase
-
-from .judge import some
+from tests.samples import some
 
 ARM = load(default_config())
 MODEL = ARM.arm
@@ -197,7 +196,7 @@ def stick(chance: random.Random) -> list[float]:
 
 
 @pytest.mark.parametrize("seed", some(range(10)))
-def test_a_random_stick_never_needs_the_guards(jogged, seed):
+def test_a_random_joystick_never_needs_the_guards(jogged, seed):
     chance = random.Random(seed)
     drive = jogged(ZERO)
     while seed % 5 and not drive.distance() > 0.2:

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
-
-from .judge import examples
+from tests.samples import examples
 
 PERIOD = 0.0005
 SPEED, ACCELERATION, JERK = [0.5] * 6, [2.0] * 6, [20.0] * 6

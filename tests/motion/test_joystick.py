@@ -105,7 +105,7 @@ def test_the_gripper_opens_forward_and_closes_backward_once_each():
 
 @pytest.mark.parametrize("mode", range(4))
 @pytest.mark.parametrize("way", WAYS)
-def test_a_stick_deflected_at_the_start_does_nothing_until_it_has_been_neutral(mode, way):
+def test_a_joystick_deflected_at_the_start_does_nothing_until_it_has_been_neutral(mode, way):
     joystick = Joystick(JogConfig(SPEED, TURN))
     joystick.mode = mode
     for _ in range(100):
@@ -138,14 +138,14 @@ def test_what_is_no_code_or_not_for_the_arm_stops_at_once_and_neutral_comes_firs
     assert joystick.moves
 
 
-def test_neutral_while_the_stick_is_the_wheelchairs_is_not_the_neutral_that_counts():
+def test_neutral_while_the_joystick_is_the_wheelchairs_is_not_the_neutral_that_counts():
     joystick = joystick_in(0)
     joystick.update(NEUTRAL, False)
     joystick.update(WAYS["left"], True)
     assert at_rest(joystick)
 
 
-def test_a_stick_pushed_while_the_paddle_is_released_waits_for_neutral():
+def test_a_joystick_pushed_while_the_paddle_is_released_waits_for_neutral():
     joystick = joystick_in(0)
     joystick.update(UP, True)
     for _ in range(100):

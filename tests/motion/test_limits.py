@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeArm, LimitsExcludeJoint, LimitWidened, Refusal
 from rtcp.motion.limits import Limits, Values, read, rows
 from rtcp.motion.planning.plan import COLUMNS
+from tests.arm_geometry import points
 
-from .judge import ARM, JOINTS_ONLY, Judge, with_boxes
-from .reference import points
+from .guard_checker import ARM, JOINTS_ONLY, GuardChecker, with_boxes
 
 WIDEST = Values.configured(ARM)
 STILL = [0.0] * 6
@@ -135,34 +135,34 @@ def test_whoever_holds_a_list_sees_the_change() -> None:
 def test_boxes_that_the_arm_stands_in_or_would_come_to_rest_in_are_refused() -> None:
     q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
     wide = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
-    judge = Judge(with_boxes(wide), q, 0.002)
+    checker = GuardChecker(with_boxes(wide), q, 0.002)
     tool = points(q)[0]
 
     def up_to(x: float) -> Values:
-        return replace(judge.limits.widest, box=(*wide[:3], x, *wide[4:]))
+        return replace(checker.limits.widest, box=(*wide[:3], x, *wide[4:]))
 
-    assert judge.guard.refusal_of(judge.state, up_to(tool[0] + 1e-4)) is None
-    refused = judge.guard.refusal_of(judge.state, up_to(tool[0] - 1e-4))
+    assert checker.guard.refusal_of(checker.state, up_to(tool[0] + 1e-4)) is None
+    refused = checker.guard.refusal_of(checker.state, up_to(tool[0] - 1e-4))
     assert refused == LimitsExcludeArm(-1)
     sign = -1.0 if tool[1] > 0 else 1.0
     for _ in range(150):
-        judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)
-    here = points(judge.state.commanded)[0][0]
+        checker.request([checker.state.commanded[0] + sign * 0.5 * checker.dt, *q[1:]], tolerates_saturation=True)
+    here = points(checker.state.commanded)[0][0]
     assert here > tool[0]
-    assert judge.guard.refusal_of(judge.state, up_to(here + 0.2)) is None
-    assert judge.guard.refusal_of(judge.state, up_to(here + 1e-3)) is not None
-    assert judge.change(up_to(here + 0.03))
+    assert checker.guard.refusal_of(checker.state, up_to(here + 0.2)) is None
+    assert checker.guard.refusal_of(checker.state, up_to(here + 1e-3)) is not None
+    assert checker.change(up_to(here + 0.03))
     for _ in range(300):
-        judge.ask([judge.state.commanded[0] + sign * 0.5 * judge.dt, *q[1:]], tolerates_saturation=True)
+        checker.request([checker.state.commanded[0] + sign * 0.5 * checker.dt, *q[1:]], tolerates_saturation=True)
 
 
 def test_an_arm_that_stands_in_a_box_already_may_still_be_slowed_down() -> None:
     q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
     tool = points(q)[0]
-    judge = Judge(with_boxes(None, [*(x - 0.1 for x in tool), *(x + 0.1 for x in tool)]), q, 0.002)
-    assert judge.change(of_first(judge.limits.widest, "velocity", 0.1))
-    first = judge.limits.keep_out[0]
-    assert not judge.change(replace(judge.limits.widest, keep_out=((first[0] - 0.1, *first[1:]),)))
+    checker = GuardChecker(with_boxes(None, [*(x - 0.1 for x in tool), *(x + 0.1 for x in tool)]), q, 0.002)
+    assert checker.change(of_first(checker.limits.widest, "velocity", 0.1))
+    first = checker.limits.keep_out[0]
+    assert not checker.change(replace(checker.limits.widest, keep_out=((first[0] - 0.1, *first[1:]),)))
 
 
 # -- as rows --------------------------------------------------------------------------------------------------------

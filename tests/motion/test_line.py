@@ -185,31 +185,34 @@ def test_lines_stopped_and_begun_anew_never_jump(arm: Any, new_drive: Any, memor
             drive.until_rest(mode)
 
 
-def test_a_line_out_of_reach_ends_in_a_stop_that_says_so(
-    drive: Any, mode: LineController, rows: Any, moved: Any
+@pytest.mark.parametrize(
+    ("place", "rates", "checked", "kind"),
+    [
+        # So far and so fast that the first set-point is out of reach already.
+        (200.0, (1e6, 1e8, 1e9), True, OutOfReach),
+        # Towards the edge of the reach the elbow's speed grows without bound. The drive checks every cycle.
+        (1.5, (0.1, 0.2, 2.0), True, SetpointJump),
+        # As if nothing had been slowed down: the tool stays bounded, a joint does not, and no guard holds it.
+        (None, (5.0, 0.9, 5.0), False, SetpointJump),
+    ],
+    ids=["out of reach", "stretches the arm", "too fast for a joint"],
+)
+def test_a_line_that_cannot_be_followed_ends_in_a_stop_that_says_why(
+    drive: Any, mode: LineController, rows: Any, moved: Any, place: float | None, rates: Any, checked: bool, kind: Any
 ) -> None:
-    plan, count = rows([moved(dy=0.2)])
-    # So far and so fast that the first set-point is out of reach already.
-    plan[8], plan[14], plan[15], plan[16] = 200.0, 1e6, 1e8, 1e9
+    plan, count = rows([moved(dy=0.4 if place is None else 0.2)])
+    plan[8] = plan[8] if place is None else place
+    plan[14], plan[15], plan[16] = rates
+    drive.checked = checked
     drive.at(Q)
     assert drive.execute(mode, plan, count) is None
     drive.until_rest(mode)
-    assert isinstance(mode.ended, OutOfReach)
-    assert mode.ended.distance > 1.0
-    assert drive.state.commanded == list(Q)
-
-
-def test_a_line_that_stretches_the_arm_stops_before_a_joint_is_too_fast(
-    drive: Any, mode: LineController, rows: Any, moved: Any
-) -> None:
-    plan, count = rows([moved(dy=0.2)])
-    # Towards the edge of the reach the elbow's speed grows without bound. The drive checks every cycle.
-    plan[8], plan[14], plan[15], plan[16] = 1.5, 0.1, 0.2, 2.0
-    drive.at(Q)
-    assert drive.execute(mode, plan, count) is None
-    drive.until_rest(mode)
-    assert isinstance(mode.ended, SetpointJump)
-    assert abs(mode.ended.value) > mode.ended.limit
+    assert isinstance(mode.ended, kind)
+    if kind is OutOfReach:
+        assert mode.ended.distance > 1.0
+        assert drive.state.commanded == list(Q)
+    else:
+        assert abs(mode.ended.value) > mode.ended.limit
 
 
 def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it(
@@ -244,21 +247,6 @@ def test_a_line_into_a_joints_range_ends_in_a_stop_that_says_which(arm: Any, dri
     drive.until_rest(mode)
     assert isinstance(mode.ended, JointLimitReached)
     assert mode.ended.axis == 0
-
-
-def test_a_line_that_is_too_fast_for_a_joint_ends_in_a_stop_that_says_so(
-    drive: Any, mode: LineController, rows: Any, moved: Any
-) -> None:
-    plan, count = rows([moved(dy=0.4)])
-    # As if nothing had been slowed down: the tool stays bounded, a joint does not.
-    plan[14], plan[15], plan[16] = 5.0, 0.9, 5.0
-    # The guard is not there to hold the accelerations.
-    drive.checked = False
-    drive.at(Q)
-    drive.execute(mode, plan, count)
-    drive.until_rest(mode)
-    assert isinstance(mode.ended, SetpointJump)
-    assert mode.ended.value > mode.ended.limit
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from rtcp.config.model import Joint, Range
 from rtcp.motion.guards.output_limiter import BACK_RAD_S, OutputLimiter
 from rtcp.motion.limits import Limits
 
-from .judge import ARM
+from .guard_checker import ARM
 
 PERIOD = 0.0005
 JOINT = Joint("shoulder", "drive", Range(-1.0, 2.0), velocity=0.5, acceleration=2.0, jerk=20.0, torque=10.0)

@@ -15,7 +15,7 @@ from kinematics.forward import frames
 from kinematics.model import ArmModel
 from rtcp.motion.guards.singularities import Singularities
 
-from .judge import MODEL
+from .guard_checker import MODEL
 
 ANGLES = st.lists(st.floats(-pi, pi), min_size=6, max_size=6)
 

@@ -17,8 +17,7 @@ from rtcp.ipc.events import StreamEnded
 from rtcp.ipc.refusals import NotFinite, PositionOutOfRange, Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.stream import TIMEOUT_S, StreamController
 from rtcp.motion.state import Phase
-
-from .judge import examples
+from tests.samples import examples
 
 PERIOD = 0.0005
 ZERO = [0.0] * 6

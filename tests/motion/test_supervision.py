@@ -16,7 +16,7 @@ from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
 
-from .judge import JOINTS_ONLY
+from .guard_checker import JOINTS_ONLY
 
 CYCLES = 5
 CONFIG = replace(JOINTS_ONLY, supervision=SupervisionConfig(cycles=CYCLES, speed=1.5, torque=2.0, following_error=0.1))

@@ -22,8 +22,7 @@ from rtcp.motion.drive_writers import CstWriter
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase
-
-from .judge import examples
+from tests.samples import examples, some
 
 PERIOD = 0.0005
 MASS, ARM_M, G = 3.0, 0.4, 9.80665
@@ -194,7 +193,7 @@ def test_the_torque_asked_for_rises_no_faster_than_to_its_limit_in_a_tenth_of_a_
     assert plant.largest_step() <= 49.0 * PERIOD / 0.1 * 1.2
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("sign", some([1.0, -1.0], 2))
 def test_any_torque_leaves_the_speed_and_the_range_as_they_are(plant: Plant, sign: float) -> None:
     # Against the edge of the range, and on against it.
     plant.run(9.0, [sign * torque for torque in plant.limits.torque])

@@ -19,8 +19,7 @@ from rtcp.motion.controllers.trajectory import TrajectoryController
 from rtcp.motion.planning.plan import COLUMNS, KIND, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import ArmState, Phase
-
-from .judge import examples
+from tests.samples import examples
 
 PERIOD = 0.0005
 ZERO = (0.0,) * 6

@@ -20,45 +20,44 @@ from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import Phase, Setpoint
+from tests.samples import examples
 
-from .judge import JOINTS_ONLY, Judge, examples
+from .guard_checker import JOINTS_ONLY, GuardChecker
 
 CYCLES_S = st.sampled_from([0.0005, 0.002, 0.01])
 
-# What may be wanted of a joint, from where it is: (judge, joint) -> rad.
-WISHES: dict[str, Callable[[Judge, int], float]] = {
-    "stay": lambda judge, i: judge.state.commanded[i],
-    "nan": lambda judge, i: nan,
-    "infinite": lambda judge, i: inf,
-    "minus infinite": lambda judge, i: -inf,
-    "far up": lambda judge, i: 1e9,
-    "far down": lambda judge, i: -1e9,
-    "upper edge": lambda judge, i: judge.limits.high[i],
-    "lower edge": lambda judge, i: judge.limits.low[i],
-    "over the edge": lambda judge, i: judge.limits.high[i] + 1e-8,
-    "full acceleration up": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt),
-    "full acceleration down": lambda judge, i: _at(judge, i, judge.mean[i] - judge.limits.acceleration[i] * judge.dt),
-    "a bit too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.00004),
-    "too much": lambda judge, i: _at(judge, i, judge.mean[i] + judge.limits.acceleration[i] * judge.dt * 1.001),
-    "full speed": lambda judge, i: _at(judge, i, judge.limits.velocity[i]),
-    "as it goes": lambda judge, i: _at(judge, i, judge.mean[i]),
-    "creep up": lambda judge, i: _at(judge, i, 1e-7),
-    "creep down": lambda judge, i: _at(judge, i, -4e-8),
-    "brake a bit too little": lambda judge, i: _at(
-        judge, i, judge.mean[i] - judge.limits.acceleration[i] * judge.dt * 0.99996
-    ),
+# What may be wanted of a joint, from where it is: (checker, joint) -> rad.
+WISHES: dict[str, Callable[[GuardChecker, int], float]] = {
+    "stay": lambda c, i: c.state.commanded[i],
+    "nan": lambda c, i: nan,
+    "infinite": lambda c, i: inf,
+    "minus infinite": lambda c, i: -inf,
+    "far up": lambda c, i: 1e9,
+    "far down": lambda c, i: -1e9,
+    "upper edge": lambda c, i: c.limits.high[i],
+    "lower edge": lambda c, i: c.limits.low[i],
+    "over the edge": lambda c, i: c.limits.high[i] + 1e-8,
+    "full acceleration up": lambda c, i: _at(c, i, c.mean[i] + c.limits.acceleration[i] * c.dt),
+    "full acceleration down": lambda c, i: _at(c, i, c.mean[i] - c.limits.acceleration[i] * c.dt),
+    "a bit too much": lambda c, i: _at(c, i, c.mean[i] + c.limits.acceleration[i] * c.dt * 1.00004),
+    "too much": lambda c, i: _at(c, i, c.mean[i] + c.limits.acceleration[i] * c.dt * 1.001),
+    "full speed": lambda c, i: _at(c, i, c.limits.velocity[i]),
+    "as it goes": lambda c, i: _at(c, i, c.mean[i]),
+    "creep up": lambda c, i: _at(c, i, 1e-7),
+    "creep down": lambda c, i: _at(c, i, -4e-8),
+    "brake a bit too little": lambda c, i: _at(c, i, c.mean[i] - c.limits.acceleration[i] * c.dt * 0.99996),
 }
 WISH = st.sampled_from(sorted(WISHES))
 SHARES = st.floats(0.0, 1.0)
 
 
-def _at(judge: Judge, i: int, speed: float) -> float:
-    return judge.state.commanded[i] + speed * judge.dt
+def _at(checker: GuardChecker, i: int, speed: float) -> float:
+    return checker.state.commanded[i] + speed * checker.dt
 
 
-def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
+def narrower(checker: GuardChecker, shares: tuple[float, ...]) -> Values:
     """Limits within the widest; shares of 1 leave them as they are."""
-    widest = judge.limits.widest
+    widest = checker.limits.widest
     a, b, c, d = shares
     return replace(
         widest,
@@ -69,7 +68,7 @@ def narrower(judge: Judge, shares: tuple[float, ...]) -> Values:
     )
 
 
-DEED = st.one_of(
+ACTION = st.one_of(
     st.tuples(st.just("want"), WISH, WISH, st.booleans(), st.integers(1, 40)),
     st.tuples(st.just("limits"), SHARES, SHARES, SHARES, SHARES),
 )
@@ -78,33 +77,33 @@ DEED = st.one_of(
 @given(
     dt=CYCLES_S,
     start=st.tuples(st.one_of(SHARES, st.sampled_from([0.0, 1.0])), st.one_of(SHARES, st.sampled_from([0.0, 1.0]))),
-    deeds=st.lists(DEED, min_size=1, max_size=15),
+    actions=st.lists(ACTION, min_size=1, max_size=15),
 )
 @settings(max_examples=examples(150))
 def test_whatever_is_wanted_range_speed_and_acceleration_are_kept_and_the_guards_stop_rests_inside(
-    dt: float, start: tuple[float, float], deeds: list[tuple[object, ...]]
+    dt: float, start: tuple[float, float], actions: list[tuple[object, ...]]
 ) -> None:
     bounds = Limits(JOINTS_ONLY)
     at = [low + share * (high - low) for low, high, share in zip(bounds.low, bounds.high, start, strict=True)]
-    judge = Judge(JOINTS_ONLY, at, dt)
-    for kind, *given_ in deeds:
+    checker = GuardChecker(JOINTS_ONLY, at, dt)
+    for kind, *given_ in actions:
         if kind == "limits":
-            judge.change(narrower(judge, given_))  # type: ignore[arg-type]
+            checker.change(narrower(checker, given_))  # type: ignore[arg-type]
             continue
         first, second, tolerates_saturation, times = given_
         for _ in range(times):  # type: ignore[call-overload]
-            judge.ask([WISHES[first](judge, 0), WISHES[second](judge, 1)], tolerates_saturation)  # type: ignore[index,arg-type]
-    judge.ask([nan, inf], tolerates_saturation=False)
-    judge.stop()
+            checker.request([WISHES[first](checker, 0), WISHES[second](checker, 1)], tolerates_saturation)  # type: ignore[index,arg-type]
+    checker.request([nan, inf], tolerates_saturation=False)
+    checker.stop()
 
 
 @given(dt=CYCLES_S, velocity=st.lists(st.floats(width=64), min_size=2, max_size=2), way=st.floats(-0.5, 0.5))
 def test_a_speed_that_does_not_go_with_the_position_is_not_commanded(
     dt: float, velocity: list[float], way: float
 ) -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], dt)
     for _ in range(30):
-        judge.ask([way, way], tolerates_saturation=True, velocity=velocity)
+        checker.request([way, way], tolerates_saturation=True, velocity=velocity)
 
 
 # -- what fits passes -----------------------------------------------------------------------------------------------
@@ -119,8 +118,8 @@ def test_a_speed_that_does_not_go_with_the_position_is_not_commanded(
 def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
     dt: float, legs: list[tuple[float, float, float, bool, int]], jerky: bool
 ) -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
-    limits = judge.limits
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], dt)
+    limits = checker.limits
     if jerky:
         # So that the whole move is made with the greatest acceleration there is.
         limits.jerk[:] = [1e4, 1e4]
@@ -131,25 +130,25 @@ def test_moves_at_full_acceleration_up_to_the_very_edge_pass_bit_for_bit(
             limits.high[0] if a > 0.5 else limits.low[0] * (1.0 - 2.0 * a),
             limits.high[1] if b > 0.5 else limits.low[1] * (1.0 - 2.0 * b),
         ]
-        if not generator.move_to(judge.state, goal, speed, synchronized=not each):
+        if not generator.move_to(checker.state, goal, speed, synchronized=not each):
             continue
         for _ in range(cycles):
-            target = generator.update(judge.state)
+            target = generator.update(checker.state)
             position, velocity = list(target.position), list(target.velocity)
-            verdict = judge.ask(position, tolerates_saturation=False, velocity=velocity)
-            guard = judge.guard
-            assert verdict is GuardResult.PASS, (guard.ended, judge.mean)
-            assert (judge.state.commanded, judge.state.commanded_velocity) == (position, velocity)
+            verdict = checker.request(position, tolerates_saturation=False, velocity=velocity)
+            guard = checker.guard
+            assert verdict is GuardResult.PASS, (guard.ended, checker.mean)
+            assert (checker.state.commanded, checker.state.commanded_velocity) == (position, velocity)
             if generator.phase is Phase.HOLD:
                 break
-    assert judge.state.commanded == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
+    assert checker.state.commanded == pytest.approx([limits.low[0], limits.high[1]], abs=1e-7)
 
 
 @settings(max_examples=examples(40))
 @given(start=st.floats(-0.29, 0.19), dt=CYCLES_S, seed=st.integers(0, 2**32))
 def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start: float, dt: float, seed: int) -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, start], dt)
-    limits, position, mean, chance = judge.limits, [0.0, start], [0.0, 0.0], Random(seed)
+    checker = GuardChecker(JOINTS_ONLY, [0.0, start], dt)
+    limits, position, mean, chance = checker.limits, [0.0, start], [0.0, 0.0], Random(seed)
     for _ in range(300):
         for i in range(2):
             u = limits.acceleration[i] * dt
@@ -160,8 +159,8 @@ def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start
             w = max(min(w, bound, top), -bound, bottom)
             mean[i] = min(max(w, mean[i] - u), mean[i] + u)
             position[i] += mean[i] * dt
-        assert judge.ask(position, tolerates_saturation=False) is GuardResult.PASS
-        assert judge.state.commanded == position
+        assert checker.request(position, tolerates_saturation=False) is GuardResult.PASS
+        assert checker.state.commanded == position
 
 
 # -- cuts -----------------------------------------------------------------------------------------------------------
@@ -170,72 +169,72 @@ def test_any_walk_that_keeps_to_the_limits_and_can_stop_passes_bit_for_bit(start
 @pytest.mark.parametrize("dt", [0.001, 0.01])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_wish_beyond_the_range_ends_exactly_at_its_edge(dt: float, sign: float) -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
-    edge = judge.limits.high if sign > 0 else judge.limits.low
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], dt)
+    edge = checker.limits.high if sign > 0 else checker.limits.low
     for _ in range(round(12.0 / dt)):
-        verdict = judge.ask([sign * 1e3] * 2, tolerates_saturation=True)
-    assert (verdict, judge.guard.held) == (GuardResult.CLAMPED, 0b11)
-    assert judge.state.commanded == pytest.approx(edge, abs=1e-12)
-    assert max(map(abs, judge.state.commanded_velocity)) < 1e-9
+        verdict = checker.request([sign * 1e3] * 2, tolerates_saturation=True)
+    assert (verdict, checker.guard.held) == (GuardResult.CLAMPED, 0b11)
+    assert checker.state.commanded == pytest.approx(edge, abs=1e-12)
+    assert max(map(abs, checker.state.commanded_velocity)) < 1e-9
 
 
 def test_a_velocity_mode_that_is_driven_into_a_limit_stops_before_it() -> None:
-    judge = Judge(JOINTS_ONLY, [3.0, 0.0], 0.001)
-    mode = VelocityController(ControllerSetup(JOINTS_ONLY, judge.limits, judge.guard, judge.dt, [].__getitem__))
+    checker = GuardChecker(JOINTS_ONLY, [3.0, 0.0], 0.001)
+    mode = VelocityController(ControllerSetup(JOINTS_ONLY, checker.limits, checker.guard, checker.dt, [].__getitem__))
     for cycle in range(4000):
         if cycle % 100 == 0:
-            assert mode.accept(MoveAtVelocity((0.5, -1.5), 1.0), judge.state, continues=cycle > 0) is None
-        target = mode.update(judge.state)
-        verdict = judge.ask(list(target.position), mode.tolerates_saturation, list(target.velocity))
+            assert mode.accept(MoveAtVelocity((0.5, -1.5), 1.0), checker.state, continues=cycle > 0) is None
+        target = mode.update(checker.state)
+        verdict = checker.request(list(target.position), mode.tolerates_saturation, list(target.velocity))
         assert verdict in (GuardResult.PASS, GuardResult.CLAMPED)
-        judge.state.now_ns += 1_000_000
-        assert judge.state.commanded[0] <= judge.limits.high[0] + 1e-7
-        assert judge.state.commanded[1] >= judge.limits.low[1] - 1e-7
-    assert judge.state.commanded == pytest.approx([judge.limits.high[0], judge.limits.low[1]], abs=1e-3)
+        checker.state.now_ns += 1_000_000
+        assert checker.state.commanded[0] <= checker.limits.high[0] + 1e-7
+        assert checker.state.commanded[1] >= checker.limits.low[1] - 1e-7
+    assert checker.state.commanded == pytest.approx([checker.limits.high[0], checker.limits.low[1]], abs=1e-3)
 
 
 @pytest.mark.parametrize("wish", [nan, inf, -inf])
 def test_what_is_no_number_brakes(wish: float) -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
     for _ in range(100):
-        judge.ask([1.0, 0.2], tolerates_saturation=True)
-    speeds = list(judge.mean)
+        checker.request([1.0, 0.2], tolerates_saturation=True)
+    speeds = list(checker.mean)
     assert min(speeds) > 0.0
-    assert judge.ask([wish, wish], tolerates_saturation=True) is GuardResult.CLAMPED
-    bounds = judge.limits.acceleration
-    assert judge.mean == pytest.approx([v - a * 0.001 for v, a in zip(speeds, bounds, strict=True)], abs=1e-9)
+    assert checker.request([wish, wish], tolerates_saturation=True) is GuardResult.CLAMPED
+    bounds = checker.limits.acceleration
+    assert checker.mean == pytest.approx([v - a * 0.001 for v, a in zip(speeds, bounds, strict=True)], abs=1e-9)
 
 
 def test_only_the_joint_that_asks_too_much_is_clamped() -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
-    fits = 0.5 * judge.limits.acceleration[1] * 0.001**2
-    assert judge.ask([1.0, fits], tolerates_saturation=True) is GuardResult.CLAMPED
-    assert judge.guard.held == 0b01
-    assert judge.state.commanded[1] == fits
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    fits = 0.5 * checker.limits.acceleration[1] * 0.001**2
+    assert checker.request([1.0, fits], tolerates_saturation=True) is GuardResult.CLAMPED
+    assert checker.guard.held == 0b01
+    assert checker.state.commanded[1] == fits
 
 
 def test_a_cut_of_a_mode_that_cannot_live_with_it_is_a_stop_that_looks_at_no_target_until_it_rests() -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
     for _ in range(100):
-        judge.ask([1.0, 0.0], tolerates_saturation=True)
-    assert judge.ask([99.0, 0.0], tolerates_saturation=False) is GuardResult.STOPPING
-    guard = judge.guard
-    assert guard.ended == JointLimitReached(0, 99.0, judge.limits.high[0])
-    speed = judge.state.commanded_velocity[0]
+        checker.request([1.0, 0.0], tolerates_saturation=True)
+    assert checker.request([99.0, 0.0], tolerates_saturation=False) is GuardResult.STOPPING
+    guard = checker.guard
+    assert guard.ended == JointLimitReached(0, 99.0, checker.limits.high[0])
+    speed = checker.state.commanded_velocity[0]
     cycles = 1
-    while judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=True) is GuardResult.STOPPING:
-        assert judge.state.commanded_velocity[0] < speed
-        speed = judge.state.commanded_velocity[0]
+    while checker.request([checker.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=True) is GuardResult.STOPPING:
+        assert checker.state.commanded_velocity[0] < speed
+        speed = checker.state.commanded_velocity[0]
         cycles += 1
-    assert judge.state.commanded_velocity == [0.0, 0.0]
+    assert checker.state.commanded_velocity == [0.0, 0.0]
     assert cycles * 0.001 == pytest.approx(0.1, abs=0.003)
-    assert judge.ask([judge.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
+    assert checker.request([checker.state.commanded[0] + 1e-6, 0.0], tolerates_saturation=False) is GuardResult.PASS
 
 
-def test_a_step_that_is_too_long_is_told_as_a_speed() -> None:
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], 0.001)
-    judge.ask([0.0, 0.1], tolerates_saturation=False)
-    guard = judge.guard
+def test_a_step_that_is_too_long_is_reported_as_a_speed() -> None:
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], 0.001)
+    checker.request([0.0, 0.1], tolerates_saturation=False)
+    guard = checker.guard
     assert guard.ended == JointLimitReached(1, pytest.approx(100.0), pytest.approx(0.7e-3))
 
 
@@ -246,8 +245,8 @@ def test_a_joint_beyond_its_range_comes_back_and_never_goes_further_out(
 ) -> None:
     limits = Limits(JOINTS_ONLY)
     guard = TrajectoryGuard(JOINTS_ONLY, limits, dt)
-    judge = Judge(JOINTS_ONLY, [0.0, 0.0], dt)
-    state = judge.state
+    checker = GuardChecker(JOINTS_ONLY, [0.0, 0.0], dt)
+    state = checker.state
     state.commanded = [limits.high[0] + beyond, limits.low[1] - beyond]
     guard.latch(state)
     target, farthest = Setpoint(2), list(state.commanded)

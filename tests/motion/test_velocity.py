@@ -18,8 +18,7 @@ from rtcp.ipc.events import CommandExpired
 from rtcp.ipc.refusals import HoldTimeOutOfRange, JointSpeedOutOfRange, NotFinite, Refusal, WrongCount
 from rtcp.motion.controllers.velocity import VelocityController
 from rtcp.motion.state import Phase
-
-from .judge import examples
+from tests.samples import examples
 
 PERIOD = 0.0005
 NONE = [0.0] * 6

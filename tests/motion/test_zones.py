@@ -20,9 +20,10 @@ from rtcp.motion.guards.braking import touched
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
 from rtcp.motion.limits import Limits
+from tests.arm_geometry import Point, depth, points
+from tests.samples import SLOW, examples
 
-from .judge import ARM, MODEL, SLOW, Judge, examples, with_boxes
-from .reference import Point, depth, points
+from .guard_checker import ARM, MODEL, GuardChecker, with_boxes
 
 WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
 Q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
@@ -40,14 +41,16 @@ def box_before(point: Point, axis: int, side: float, gap: float, shift: Sequence
 
 
 def driven(
-    judge: Judge, direction: Sequence[float], cycles: int, tolerates_saturation: bool = True
+    checker: GuardChecker, direction: Sequence[float], cycles: int, tolerates_saturation: bool = True
 ) -> list[GuardResult]:
     """Ask for joint speeds in a direction, as parts of each joint's limit."""
     verdicts = []
     for _ in range(cycles):
-        steps = [part * v * judge.dt for part, v in zip(direction, judge.limits.velocity, strict=True)]
+        steps = [part * v * checker.dt for part, v in zip(direction, checker.limits.velocity, strict=True)]
         verdicts.append(
-            judge.ask([q + way for q, way in zip(judge.state.commanded, steps, strict=True)], tolerates_saturation)
+            checker.request(
+                [q + way for q, way in zip(checker.state.commanded, steps, strict=True)], tolerates_saturation
+            )
         )
     return verdicts
 
@@ -84,11 +87,11 @@ def test_who_began_free_never_enters_a_keep_out_box(
 ) -> None:
     box = box_before(points(q)[which], axis, side, gap, shift, size)
     assume(max(depth(point, box) for point in points(q)) <= 0.0)
-    judge = Judge(with_boxes(WIDE, box), q, dt)
+    checker = GuardChecker(with_boxes(WIDE, box), q, dt)
     for direction, cycles, tolerates_saturation in legs:
-        driven(judge, direction, cycles, tolerates_saturation)
-    judge.ask([nan] * 6, tolerates_saturation=False)
-    judge.stop()
+        driven(checker, direction, cycles, tolerates_saturation)
+    checker.request([nan] * 6, tolerates_saturation=False)
+    checker.stop()
 
 
 @given(
@@ -103,9 +106,9 @@ def test_who_began_inside_its_box_never_leaves_it(
 ) -> None:
     tool = points(q)[0]
     box = [p - g for p, g in zip(tool, gaps[:3], strict=True)] + [p + g for p, g in zip(tool, gaps[3:], strict=True)]
-    judge = Judge(with_boxes(box), q, dt)
+    checker = GuardChecker(with_boxes(box), q, dt)
     for direction, cycles, tolerates_saturation in legs:
-        driven(judge, direction, cycles, tolerates_saturation)
+        driven(checker, direction, cycles, tolerates_saturation)
 
 
 @given(
@@ -119,10 +122,10 @@ def test_who_began_inside_its_box_never_leaves_it(
 def test_who_began_inside_a_keep_out_box_only_moves_outward(
     q: Sequence[float], which: int, depth_m: float, dt: float, legs: list[tuple[list[float], int]]
 ) -> None:
-    # The judge finds every cycle in which a point is deeper than before.
-    judge = Judge(with_boxes(WIDE, box_before(points(q)[which], 0, 1.0, -depth_m, (0.0, 0.0), 0.1)), q, dt)
+    # The checker finds every cycle in which a point is deeper than before.
+    checker = GuardChecker(with_boxes(WIDE, box_before(points(q)[which], 0, 1.0, -depth_m, (0.0, 0.0), 0.1)), q, dt)
     for direction, cycles in legs:
-        driven(judge, direction, cycles)
+        driven(checker, direction, cycles)
 
 
 @pytest.mark.parametrize("dt", [0.002, 0.01])
@@ -134,15 +137,15 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     away = [part, 0.0, 0.0, 0.0, 0.0, 0.0] if tool[0] > 0 else [-part, 0.0, 0.0, 0.0, 0.0, 0.0]
     # Joint 1 moves the tool along y; the box begins beside it.
     box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
-    judge = Judge(with_boxes(WIDE, box), q, dt)
-    while points(judge.state.commanded)[0][1] < box[4] + 0.01:
-        assert driven(judge, away, 1)[0] <= GuardResult.CLAMPED
+    checker = GuardChecker(with_boxes(WIDE, box), q, dt)
+    while points(checker.state.commanded)[0][1] < box[4] + 0.01:
+        assert driven(checker, away, 1)[0] <= GuardResult.CLAMPED
     # And the way back in ends before the box.
-    while driven(judge, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
-        assert points(judge.state.commanded)[0][1] > box[4]
-    assert isinstance(judge.guard.ended, BoxReached)
-    assert judge.guard.ended.box == 0
-    here = -depth(points(judge.state.commanded)[0], box)
+    while driven(checker, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
+        assert points(checker.state.commanded)[0][1] > box[4]
+    assert isinstance(checker.guard.ended, BoxReached)
+    assert checker.guard.ended.box == 0
+    here = -depth(points(checker.state.commanded)[0], box)
     assert 0.0 <= here < 0.004
 
 
@@ -176,7 +179,7 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
     assert most == 16
 
 
-def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
+def test_a_stop_outside_a_box_is_never_reported_with_a_distance_inside() -> None:
     chance, stops = Random(5), 0
     for _ in range(60):
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
@@ -184,41 +187,41 @@ def test_a_stop_outside_a_box_is_never_told_with_a_distance_inside() -> None:
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
         high[axis] = tool[axis] - chance.choice((0.01, 0.03, 0.06, 0.1))
         low[axis] = high[axis] - 0.2
-        judge = Judge(with_boxes(WIDE, low + high), q, 0.002)
-        if judge.guard.zone_at(q) is not None:
+        checker = GuardChecker(with_boxes(WIDE, low + high), q, 0.002)
+        if checker.guard.zone_at(q) is not None:
             continue
         direction = [chance.uniform(-1, 1) for _ in range(6)]
         for _ in range(400):
-            driven(judge, direction, 1)
-            if judge.guard.stopping:
+            driven(checker, direction, 1)
+            if checker.guard.stopping:
                 break
-        if judge.guard.stopping and isinstance(judge.guard.ended, BoxReached):
+        if checker.guard.stopping and isinstance(checker.guard.ended, BoxReached):
             stops += 1
-            assert judge.guard.nearest_box(judge.state.commanded)[0] >= 0.0
-            assert judge.guard.ended.distance >= 0.0
+            assert checker.guard.nearest_box(checker.state.commanded)[0] >= 0.0
+            assert checker.guard.ended.distance >= 0.0
     assert stops > 10
 
 
 def test_a_stop_before_the_tools_own_box_names_it() -> None:
     tool = points(Q)[0]
-    judge = Judge(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
-    verdicts = driven(judge, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 400)
+    checker = GuardChecker(with_boxes([t - 0.05 for t in tool] + [t + 0.05 for t in tool]), Q, 0.002)
+    verdicts = driven(checker, [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 400)
     assert GuardResult.STOPPED in verdicts
-    assert isinstance(judge.guard.ended, BoxReached)
-    assert judge.guard.ended.box == -1
-    assert -0.05 < points(judge.state.commanded)[0][0] - tool[0] < 0.05
+    assert isinstance(checker.guard.ended, BoxReached)
+    assert checker.guard.ended.box == -1
+    assert -0.05 < points(checker.state.commanded)[0][0] - tool[0] < 0.05
 
 
 @given(shares=st.lists(st.floats(0.0, 1.0), min_size=4, max_size=4), direction=DIRECTION, dt=CYCLES_S)
 @settings(max_examples=examples(20))
 def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction: list[float], dt: float) -> None:
-    judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, dt)
-    limits = judge.limits
+    checker = GuardChecker(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, dt)
+    limits = checker.limits
     for share in shares:
-        driven(judge, direction, 30)
-        tool = points(judge.state.commanded)[0]
+        driven(checker, direction, 30)
+        tool = points(checker.state.commanded)[0]
         walls = [t + 0.2 * share for t in tool]
-        judge.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
+        checker.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
 
 
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -226,10 +229,10 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
     monkeypatch.setattr(
         "rtcp.motion.guards.trajectory_guard.frames", lambda *given: counted.append(1) or frames(*given)
     )
-    judge = Judge(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
-    driven(judge, [0.5] * 6, 200)
+    checker = GuardChecker(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
+    driven(checker, [0.5] * 6, 200)
     assert len(counted) <= 1
-    assert judge.guard.poses == frames(MODEL, judge.state.commanded)
+    assert checker.guard.poses == frames(MODEL, checker.state.commanded)
 
 
 # -- exactly at a face, and thin plates ---------------------------------------------------------------------------
@@ -240,17 +243,17 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
 def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: int, kept_in: bool) -> None:
     x, y, z = frames(MODEL, Q)[6].position
     box = (*WIDE[:3], x, *WIDE[4:]) if kept_in else (x, y - 0.1, z - 0.1, x + 0.2, y + 0.1, z + 0.1)
-    judge = Judge(with_boxes(box) if kept_in else with_boxes(WIDE, box), Q, 0.001)
+    checker = GuardChecker(with_boxes(box) if kept_in else with_boxes(WIDE, box), Q, 0.001)
     for sign in (1.0, -1.0):
         for _ in range(60):
-            way = [sign * 0.5 * judge.dt if i == axis else 0.0 for i in range(6)]
-            verdict = judge.ask(
-                [q + w for q, w in zip(judge.state.commanded, way, strict=True)], tolerates_saturation=True
+            way = [sign * 0.5 * checker.dt if i == axis else 0.0 for i in range(6)]
+            verdict = checker.request(
+                [q + w for q, w in zip(checker.state.commanded, way, strict=True)], tolerates_saturation=True
             )
             if axis == 5:
                 assert verdict <= GuardResult.CLAMPED
-        judge.ask([float("nan")] * 6, tolerates_saturation=False)
-        judge.stop()
+        checker.request([float("nan")] * 6, tolerates_saturation=False)
+        checker.stop()
 
 
 @pytest.mark.parametrize("dt", [0.0005, 0.01, 0.1])
@@ -262,11 +265,11 @@ def test_a_plate_that_the_first_cycle_would_cross_is_not_crossed(dt: float, gap:
     # Joint 1 moves the tool along y; so far it comes in a cycle from rest.
     way = abs(x) * ARM.joints[0].acceleration * dt * dt
     low = y + gap
-    judge = Judge(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
+    checker = GuardChecker(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
     speed = ARM.joints[0].velocity if x > 0 else -ARM.joints[0].velocity
     for _ in range(50):
-        judge.ask([judge.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
-        assert frames(MODEL, judge.state.commanded)[6].position[1] <= low + 1e-9
+        checker.request([checker.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
+        assert frames(MODEL, checker.state.commanded)[6].position[1] <= low + 1e-9
 
 
 # -- distances ------------------------------------------------------------------------------------------------------
@@ -322,9 +325,9 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
     for gap, sign in product([0.004 * n for n in range(1, 20, 1 if SLOW else 3)], [1.0, -1.0]):
         y = tool[1] + sign * (gap + 0.001)
         box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
-        judge = Judge(with_boxes(WIDE, box), q, 0.01)
+        checker = GuardChecker(with_boxes(WIDE, box), q, 0.01)
         side = -sign if tool[0] > 0 else sign
-        driven(judge, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
-        driven(judge, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
-        here = points(judge.state.commanded)[0][1]
+        driven(checker, [side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
+        driven(checker, [-side, 0.0, 0.0, 0.0, 0.0, 0.0], 200)
+        here = points(checker.state.commanded)[0][1]
         assert sign * here < sign * y, (gap, sign)

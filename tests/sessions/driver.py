@@ -1,4 +1,4 @@
-"""A commander of a simulated arm that acts like a user, a broken program and a bad day; the judge beside it."""
+"""A commander of a simulated arm that acts like a user, a broken program and a bad day; the checker beside it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from math import inf, nan
 from random import Random
 from typing import Any
 
@@ -19,8 +18,9 @@ from rtcp.ipc.message import PAYLOAD_SIZE, Joints, MalformedMessage
 from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.limits import Values, rows
-from tests.sessions.geometry import Box, depth, points
-from tests.sessions.judge import COUNTS, Bounds, Judge
+from tests.arm_geometry import depth, points
+from tests.sessions.actions import NONSENSE
+from tests.sessions.frame_checker import COUNTS, Bounds, FrameChecker
 
 KINDS = sorted((kind for kind in COMMANDS if kind.__module__ == Command.__module__), key=lambda kind: kind.name)
 """All commands of the platform; a test of another file may have registered its own."""
@@ -28,9 +28,6 @@ ODD_INTEGERS = (-1, 0, 7, 99, 1 << 40, -(1 << 63), (1 << 63) - 1)
 PERIODS_US = (1000, 1250, 1500, 2000)
 DRIVE_MODES = (8, 9, 10)
 FAULTS = (0x2310, 0x3210, 0x3220, 0x4310, 0x8130, 0x8400, 0x8611, 0x8612, 0x7305)
-NONSENSE = (nan, inf, -inf, 1e300, -1e300, 1e9, -1e9, 0.0)
-STICK = (63, 62, 61, 59, 55, 47, 31)
-"""Codes of the stick, the facts' table."""
 EMERGENCY_STOP_BIT, TOGGLE_BIT = 1 << 9, 1 << 8
 START_S = 3.0
 
@@ -45,22 +42,21 @@ def bounds_of(config: ArmConfig) -> Bounds:
     """Return the limits of the configuration."""
     joints = config.joints
     cartesian = config.cartesian
-    keep_out: list[Box] = [(zone.min, zone.max) for zone in cartesian.keep_out]
     return Bounds(
         [joint.position.min for joint in joints],
         [joint.position.max for joint in joints],
         [joint.velocity for joint in joints],
         [joint.acceleration for joint in joints],
         [joint.torque for joint in joints],
-        None if cartesian.box is None else (cartesian.box.min, cartesian.box.max),
-        keep_out,
+        None if cartesian.box is None else (*cartesian.box.min, *cartesian.box.max),
+        [(*zone.min, *zone.max) for zone in cartesian.keep_out],
     )
 
 
 def is_free(bounds: Bounds, q: Sequence[float], clearance: float = 0.0) -> bool:
     """Whether elbow, wrist and tool are outside every keep-out box, and the tool inside the box, by `clearance` m."""
     seen = points(q)
-    if bounds.box is not None and depth(seen[2], bounds.box) < clearance:
+    if bounds.box is not None and depth(seen[0], bounds.box) < clearance:
         return False
     return all(depth(point, box) < -clearance for box in bounds.keep_out for point in seen)
 
@@ -94,7 +90,7 @@ class Raw:
 def random_command(random: Random) -> Command:
     """Return a command of any kind, with fields that are of the right types and of any value.
 
-    Not SetLimits: it would put limits of an old plan in force, of which the judge hears nothing.
+    Not SetLimits: it would put limits of an old plan in force, of which the checker hears nothing.
     """
     kind = random.choice([kind for kind in KINDS if kind is not SetLimits])
     return kind(*(_random_field(field, random) for _, field in kind._fields))
@@ -115,7 +111,7 @@ def _random_number(random: Random) -> float:
 
 
 class Driver:
-    """Commands, mishaps and time; counts what became of them.
+    """Commands, faults and time; counts what became of them.
 
     Args:
         config: the arm.
@@ -128,7 +124,7 @@ class Driver:
         self.limits = Values.configured(config)
         self.simulation = Simulation(config, seed, positions=positions, follow_clock=False)
         slots = {slave.name: slot for slot, slave in enumerate(config.slaves)}
-        self.judge = Judge(
+        self.checker = FrameChecker(
             self.bounds,
             config.cycle.period_us * 1e-6,
             [slots[joint.slave] for joint in config.joints],
@@ -150,7 +146,7 @@ class Driver:
 
     def _see(self, frame: Frame) -> None:
         self.states[self.simulation.state] += 1
-        self.judge.see(frame)
+        self.checker.check(frame)
 
     def close(self) -> None:
         """Give the memory back."""
@@ -163,15 +159,15 @@ class Driver:
 
     @property
     def violations(self) -> list[str]:
-        """What the judge has found."""
-        return self.judge.violations
+        """What the checker has found."""
+        return self.checker.violations
 
     @property
     def commanded(self) -> list[float]:
         """The last targets on the bus, rad."""
-        models, zeros = self.simulation.models, self.judge.zero
-        told = [int(model.objects[0x607A, 0].value) for model in models]
-        return [(counts - zero) / COUNTS for counts, zero in zip(told, zeros, strict=True)]
+        models, zeros = self.simulation.models, self.checker.zero
+        sent = [int(model.objects[0x607A, 0].value) for model in models]
+        return [(counts - zero) / COUNTS for counts, zero in zip(sent, zeros, strict=True)]
 
     # -- what may be done -------------------------------------------------------------------------------------------
 
@@ -191,7 +187,7 @@ class Driver:
         (self.taken if refusal is None else self.refused)[command.name] += 1
         self.log[-1] += f" -> {refusal}"
         if refusal is None and isinstance(command, SetZero):
-            self.judge.zero[command.axis] = round(command.offset * COUNTS)
+            self.checker.zero[command.axis] = round(command.offset * COUNTS)
         return refusal is None
 
     def send_raw(self, number: int, numbers: Sequence[float]) -> bool:
@@ -200,18 +196,14 @@ class Driver:
         return self.send(raw.decoded or raw)  # type: ignore[arg-type]
 
     def set_limits(self, new: Values) -> bool:
-        """Change the limits; the judge knows them from the frame on that is worked out under them."""
+        """Change the limits; the checker knows them from the frame on that is worked out under them."""
         plan = rows(new)
         slot = self.simulation.observer.write_plan(plan)
         if not self.send(SetLimits(slot, len(plan))):
             return False
         self.limits = new
-        bounds = self.bounds
-        bounds.low[:], bounds.high[:] = new.low, new.high
-        bounds.velocity[:], bounds.acceleration[:], bounds.torque[:] = new.velocity, new.acceleration, new.torque
-        bounds.box = None if new.box is None else (new.box[:3], new.box[3:])
-        bounds.keep_out[:] = [(box[:3], box[3:]) for box in new.keep_out]
-        self.judge.changed()
+        self.bounds.put(new)
+        self.checker.changed()
         return True
 
     def happen(self, name: str, what: str = "") -> None:
@@ -257,11 +249,11 @@ class Driver:
         self.happen("push", f"{axis} {torque:.1f}")
         self.simulation.models[axis].mechanics.external_torque = torque
 
-    def stick(self, byte: int) -> None:
-        """Show a byte at the stick's inputs."""
+    def joystick(self, byte: int) -> None:
+        """Show a byte at the joystick's inputs."""
         box = self.simulation.box
         if box is not None:
-            self.happen("stick", str(byte))
+            self.happen("joystick", str(byte))
             box.inputs = box.inputs & 0xFF00 | byte & 0xFF
 
     def press(self, pressed: bool) -> None:
@@ -272,7 +264,7 @@ class Driver:
             box.inputs = box.inputs & ~EMERGENCY_STOP_BIT if pressed else box.inputs | EMERGENCY_STOP_BIT
 
     def toggle(self, arm: bool) -> None:
-        """Give the stick to the arm or to the chair."""
+        """Give the joystick to the arm or to the chair."""
         box = self.simulation.box
         if box is not None:
             self.happen("toggle", "arm" if arm else "chair")

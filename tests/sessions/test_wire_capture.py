@@ -15,9 +15,8 @@ from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Values
 from tests.e2e.wire import DRIVE, HEAD, LEAVES, LRW, frame
 from tests.sessions.driver import Driver, configuration, with_start
-from tests.sessions.wire_frames import EXPECTED_WKC, FENCE_INDEX, NOP, exchanges
-from tests.sessions.wire_limits import Change, wider
-from tests.sessions.wire_play import judge
+from tests.sessions.wire_capture import BARRIER_INDEX, EXPECTED_WKC, NOP, Change, exchanges, wider
+from tests.sessions.wire_session import check
 
 PERIOD_US = 2000
 PERIOD_S = PERIOD_US * 1e-6
@@ -51,9 +50,9 @@ class Capture:
         counter = struct.pack("<H", EXPECTED_WKC)
         self._add(seen.now_ns + 1000, True, sent[:26] + image + counter + sent[28 + len(image) :])
 
-    def fence(self, now_ns: int) -> None:
+    def barrier(self, now_ns: int) -> None:
         """The numbered frame after an answer that did not come in time."""
-        self._add(now_ns, False, frame(NOP, FENCE_INDEX, 0, 0, bytes(8)))
+        self._add(now_ns, False, frame(NOP, BARRIER_INDEX, 0, 0, bytes(8)))
 
 
 @pytest.fixture(scope="module")
@@ -61,12 +60,12 @@ def moving() -> list[Frame]:
     """Every frame of an arm that is enabled and moves."""
     driver = Driver(with_start(configuration(), PERIOD_US, "csp"), 1, START)
     found: list[Frame] = []
-    judged = driver.simulation.on_frame
-    assert judged is not None
+    checked = driver.simulation.on_frame
+    assert checked is not None
 
     def see(seen: Frame) -> None:
         found.append(seen)
-        judged(seen)
+        checked(seen)
 
     driver.simulation.on_frame = see
     driver.enable()
@@ -98,38 +97,38 @@ def test_a_capture_is_read_as_the_exchanges_that_were_written(moving: list[Frame
     assert [(one.sent, one.received, one.wkc) for one in read] == [(one.sent, one.received, 21) for one in moving]
 
 
-def test_a_sound_capture_is_not_blamed(moving: list[Frame], tmp_path: Path) -> None:
-    found, failures = judge(written(tmp_path / "capture", moving), PERIOD_S)
+def test_a_sound_capture_has_no_violation(moving: list[Frame], tmp_path: Path) -> None:
+    found, failures = check(written(tmp_path / "capture", moving), PERIOD_S)
     assert failures == []
     assert found.obeyed > 250
     assert found.largest_step > 0.5
 
 
-def test_one_target_that_is_changed_in_the_file_is_found_with_the_deeds_before_it(
+def test_one_target_that_is_changed_in_the_file_is_found_with_the_actions_before_it(
     moving: list[Frame], tmp_path: Path
 ) -> None:
     at = round(MIDDLE * len(moving))
     changed = [*moving[:at], spoilt(moving[at], 3, lambda counts: counts + 12), *moving[at + 1 :]]
-    deeds = [(moving[at].now_ns - 1, "the deed before"), (moving[at].now_ns + 1, "the deed after")]
-    _, failures = judge(written(tmp_path / "capture", changed), PERIOD_S, deeds=deeds)
+    actions = [(moving[at].now_ns - 1, "the action before"), (moving[at].now_ns + 1, "the action after")]
+    _, failures = check(written(tmp_path / "capture", changed), PERIOD_S, actions=actions)
     assert "joint 3: step of" in failures[0][0]
-    assert "the deed before" in failures[0][1]
+    assert "the action before" in failures[0][1]
 
 
-@pytest.mark.parametrize("fenced", [True, False])
-def test_a_target_is_said_again_only_after_an_answer_that_came_too_late(
-    moving: list[Frame], tmp_path: Path, fenced: bool
+@pytest.mark.parametrize("barred", [True, False])
+def test_a_target_is_repeated_only_after_an_answer_that_came_too_late(
+    moving: list[Frame], tmp_path: Path, barred: bool
 ) -> None:
     capture = Capture(tmp_path / "capture")
     at = round(MIDDLE * len(moving))
     for number, one in enumerate(moving):
         capture.answers(one, capture.sends(one))
         if number == at:
-            if fenced:
-                capture.fence(one.now_ns + 2000)
+            if barred:
+                capture.barrier(one.now_ns + 2000)
             capture.answers(one, capture.sends(one))
-    _, failures = judge(capture.path, PERIOD_S)
-    assert bool(failures) is not fenced
+    _, failures = check(capture.path, PERIOD_S)
+    assert bool(failures) is not barred
 
 
 def test_a_frame_that_is_never_answered_is_an_exchange_without_an_answer(moving: list[Frame], tmp_path: Path) -> None:
@@ -141,16 +140,16 @@ def test_a_frame_that_is_never_answered_is_an_exchange_without_an_answer(moving:
     assert [number for number, one in enumerate(exchanges(capture.path)) if one.wkc < 0] == [20, 21]
 
 
-@pytest.mark.parametrize(("asked", "done", "blamed"), [(0.0, 0.1, True), (0.1, 1.0, False), (0.9, 1.0, False)])
+@pytest.mark.parametrize(("asked", "done", "found"), [(0.0, 0.1, True), (0.1, 1.0, False), (0.9, 1.0, False)])
 def test_limits_count_from_when_they_are_surely_in_force(
-    moving: list[Frame], tmp_path: Path, asked: float, done: float, blamed: bool
+    moving: list[Frame], tmp_path: Path, asked: float, done: float, found: bool
 ) -> None:
     first, last = moving[0].now_ns, moving[-1].now_ns
     widest = Values.configured(configuration())
     slow = replace(widest, velocity=tuple(0.2 * v for v in widest.velocity))
     change = Change(round(first + asked * (last - first)), round(first + done * (last - first)), slow)
-    _, failures = judge(written(tmp_path / "capture", moving), PERIOD_S, [change])
-    assert bool(failures) is blamed
+    _, failures = check(written(tmp_path / "capture", moving), PERIOD_S, [change])
+    assert bool(failures) is found
 
 
 def test_the_wider_of_two_limits_allows_what_either_does() -> None:

@@ -26,7 +26,7 @@ from rtcp.fieldbus.slave_setup import configure_slave
 from rtcp.virtual.device import Emergency as Sent
 from tests.malformed.line import OP, PRE_OP, SIZES, STATION, Line
 from tests.malformed.mutate import garbled
-from tests.malformed.segment_play import Found, Memory
+from tests.malformed.mutated_frames import Found, Memory
 
 CONFIGS = load(default_config()).slaves
 LONGEST_S = 60.0
@@ -109,7 +109,7 @@ def looped(line: Line, random: Random, kind: type[Loopback] = Loopback) -> Itera
 
 
 class Master:
-    """What a master does beside its cycle, one deed after the other."""
+    """What a master does beside its cycle, one action after the other."""
 
     def __init__(self, line: Line, port: RegisterPort, random: Random) -> None:
         self._line, self._port, self._random = line, port, random
@@ -117,7 +117,7 @@ class Master:
         self.emergencies: list[Emergency] = []
         self._boxes = [Mailbox(port, STATION + at, _BOX) for at in range(len(SIZES))]
         self._sdos = [SdoClient(box, at + 1, CONFIGS[at].name, lock, self._keep) for at, box in enumerate(self._boxes)]
-        self.deeds: tuple[Callable[[int], object], ...] = (
+        self.actions: tuple[Callable[[int], object], ...] = (
             self._states, self._wait, self._registers, self._upload, self._upload, self._name, self._download,
             self._assignment, self._mailbox, self._configure, self._serial,
         )  # fmt: skip
@@ -129,7 +129,7 @@ class Master:
 
     def do(self) -> None:
         """Do something with a slave; raises BusError alone."""
-        self._random.choice(self.deeds)(self._random.randrange(len(SIZES)))
+        self._random.choice(self.actions)(self._random.randrange(len(SIZES)))
 
     def _states(self, at: int) -> None:
         state, error, code = al_state.read_al(self._port, STATION + at)
@@ -175,8 +175,8 @@ class Master:
         self._sdos[at].read(0x1018, 4)
 
 
-def play(count: int, seed: int) -> Found:
-    """Do what a master does until `count` answers were mutated; a failure names the deed's number."""
+def run(count: int, seed: int) -> Found:
+    """Do what a master does until `count` answers were mutated; a failure names the action's number."""
     found = Found("master, own parsers")
     random, line = Random(seed), Line()
     began = time.monotonic()
@@ -201,7 +201,7 @@ def play(count: int, seed: int) -> Found:
     found.frames = loopback.mutated
     found.seconds = time.monotonic() - began
     if memory is not None:
-        memory.tell(found)
+        memory.report(found)
     return found
 
 

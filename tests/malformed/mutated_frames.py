@@ -53,13 +53,13 @@ class Memory:
         gc.collect()
         self._objects, self._kb = len(gc.get_objects()), resident_kb()
 
-    def tell(self, found: Found) -> None:
+    def report(self, found: Found) -> None:
         gc.collect()
         found.objects = len(gc.get_objects()) - self._objects
         found.kilobytes = resident_kb() - self._kb
 
 
-def play(count: int, seed: int) -> Found:
+def run(count: int, seed: int) -> Found:
     """Give a segment `count` mutated frames; a failure names the frame."""
     found = Found("segment")
     random, corpus, line = Random(seed), frames(), Line()
@@ -83,7 +83,7 @@ def play(count: int, seed: int) -> Found:
         found.failures.append(f"the last start-up:\n{traceback.format_exc()}")
     found.seconds = time.monotonic() - began
     if memory is not None:
-        memory.tell(found)
+        memory.report(found)
     return found
 
 

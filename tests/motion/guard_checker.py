@@ -1,40 +1,23 @@
-"""The guards beside a judge that knows the limits, and nothing of how the guards keep them."""
+"""The guards beside a checker that knows the limits, and nothing of how the guards keep them."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from math import isfinite
-from typing import TypeVar
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, Box, KeepOut
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
-
-from .reference import depth, points
+from tests.arm_geometry import depth, points
 
 ROUNDING_RAD = 1e-6
-Case = TypeVar("Case")
-SLOW = "RTCP_SLOW" in os.environ
-"""Whether every case runs (`RTCP_SLOW=1`); else a share of the samples."""
 ROUNDING_M = 1e-9
 
 
-def examples(full: int) -> int:
-    """How many examples of a property run."""
-    return full if SLOW else max(full // 6, 5)
-
-
-def some(cases: Iterable[Case], every: int = 3) -> list[Case]:
-    """Every third of the cases, or all."""
-    found = list(cases)
-    return found if SLOW else found[::every]
-
-
-class Judge:
+class GuardChecker:
     """A guard and what it was given; every cycle is compared with the limits that were in force when it began."""
 
     def __init__(self, config: ArmConfig, start: Sequence[float], dt: float) -> None:
@@ -56,10 +39,10 @@ class Judge:
         found = [-1.0 if self.limits.box is None else -depth(tool, self.limits.box)]
         return found + [depth(point, box) for box in self.limits.keep_out for point in (tool, wrist, elbow)]
 
-    def ask(
+    def request(
         self, position: Iterable[float], tolerates_saturation: bool, velocity: Iterable[float] | None = None
     ) -> GuardResult:
-        """One cycle with a target, judged."""
+        """One cycle with a target, checked."""
         state, limits, dt = self.state, self.limits, self.dt
         target = self.target
         target.position = list(position)
@@ -99,7 +82,7 @@ class Judge:
             if not self.guard.stopping:
                 assert not any(self.state.commanded_velocity)
                 return cycle
-            self.ask([float("nan")] * len(self.mean), tolerates_saturation=False)
+            self.request([float("nan")] * len(self.mean), tolerates_saturation=False)
         raise AssertionError("the stop does not end")
 
     def change(self, new: Values) -> bool:

@@ -1,4 +1,4 @@
-"""What a random session says on the control socket, and what it is answered: counted, and kept with its time."""
+"""What a random session asks on the control socket, and the answers: counted, and kept with their time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DEFECTS = ("internal", "lost", "not running", "timeout")
 """Kinds of answers that no request may have, whatever it asks."""
 
 
-class Line:
+class Connection:
     """A connection on which something is asked and not waited for; it takes numbers that JSON does not know, too."""
 
     def __init__(self, path: Path) -> None:
@@ -57,15 +57,15 @@ class Line:
         self._socket.close()
 
 
-class Voice:
-    """Asks, and keeps what was asked: `deeds` are (ns of CLOCK_MONOTONIC, sentence)."""
+class WireClient:
+    """Asks, and keeps what was asked: `actions` are (ns of CLOCK_MONOTONIC, sentence)."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._client = ControlClient(NAME, path)
-        self._line: Line | None = None
+        self._long: Connection | None = None
         self._verb = ""
-        self.deeds: list[tuple[int, str]] = []
+        self.actions: list[tuple[int, str]] = []
         self.taken: Counter[str] = Counter()
         self.refused: Counter[str] = Counter()
         self.happenings: Counter[str] = Counter()
@@ -83,7 +83,7 @@ class Voice:
                 if kind == "lost":
                     self.hang_up()
         else:
-            line = Line(self._path)
+            line = Connection(self._path)
             line.begin(verb, arguments)
             reply = line.answer(PATIENCE_S)
             line.close()
@@ -91,37 +91,42 @@ class Voice:
         self._keep(begun, verb, arguments, kind, message)
         return result
 
+    @property
+    def commanded(self) -> list[float]:
+        """The last targets, rad."""
+        return list(self.status()["joints"]["commanded_position"])
+
     def status(self) -> dict[str, Any]:
-        """Return the status, which is no deed."""
+        """Return the status, which is no action."""
         return self._client.call("status", timeout_s=PATIENCE_S)
 
     def begin(self, verb: str, **arguments: Any) -> None:
         """Ask for what takes long on a connection of its own, and do not wait."""
         self.drop()
-        self._line, self._verb = Line(self._path), verb
-        self._line.begin(verb, arguments)
-        self.deeds.append((time.monotonic_ns(), f"{verb} {_short(arguments)} begins"))
+        self._long, self._verb = Connection(self._path), verb
+        self._long.begin(verb, arguments)
+        self.actions.append((time.monotonic_ns(), f"{verb} {_short(arguments)} begins"))
 
     def busy(self, patience_s: float) -> bool:
         """Whether what was begun has not been answered within this time."""
-        if self._line is None:
+        if self._long is None:
             return False
-        reply = self._line.answer(patience_s)
+        reply = self._long.answer(patience_s)
         if reply is None:
             return True
         kind, message, _ = _read(reply)
         self._keep(time.monotonic_ns(), self._verb, {}, kind, message)
-        self._line.close()
-        self._line = None
+        self._long.close()
+        self._long = None
         return False
 
     def drop(self) -> None:
         """Close the connection of what was begun; its lease goes with it."""
-        if self._line is not None:
+        if self._long is not None:
             if self.busy(1e-3):
                 self.happen("connection closed", f"in the middle of {self._verb}")
-                self._line.close()
-            self._line = None
+                self._long.close()
+            self._long = None
 
     def hang_up(self) -> None:
         """Close the connection on which is asked, with its lease, and open another."""
@@ -131,7 +136,7 @@ class Voice:
     def happen(self, name: str, what: str = "") -> None:
         """Note what happens."""
         self.happenings[name] += 1
-        self.deeds.append((time.monotonic_ns(), f"* {name} {what}"))
+        self.actions.append((time.monotonic_ns(), f"* {name} {what}"))
 
     def close(self) -> None:
         """Close both connections."""
@@ -140,7 +145,7 @@ class Voice:
 
     def _keep(self, when: int, verb: str, arguments: Mapping[str, Any], kind: str, message: str) -> None:
         (self.refused if kind else self.taken)[verb] += 1
-        self.deeds.append((when, f"{verb} {_short(arguments)} -> {kind or 'taken'} {message[:120]}"))
+        self.actions.append((when, f"{verb} {_short(arguments)} -> {kind or 'taken'} {message[:120]}"))
         if kind in DEFECTS:
             self.defects.append((when, f"{verb} {_short(arguments)}: {kind}: {message}"))
 

@@ -13,7 +13,7 @@ from rtcp.ipc.commands import Disable, Enable, Halt, MoveJoints, Reset
 from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from tests.malformed.mutate import EDGES
-from tests.malformed.segment_play import Found, Memory
+from tests.malformed.mutated_frames import Found, Memory
 
 WIRE = struct.Struct("<HiiiB")
 COUNTS = 10_000.0
@@ -89,7 +89,7 @@ class Garbler:
 
 
 class Watch:
-    """Looks at every frame: what a drive that is enabled, and told to be, is told to do.
+    """Looks at every frame: what a drive that is enabled, and commanded to be, is commanded to do.
 
     Enabled by its own word: what the loop has heard of it may be wrong.
     """
@@ -114,28 +114,28 @@ class Watch:
                 self._before[axis] = None
                 continue
             self.enabled += 1
-            here, told = position / COUNTS, f"at {frame.now_ns * 1e-9:.4f} joint {axis + 1}"
+            here, where = position / COUNTS, f"at {frame.now_ns * 1e-9:.4f} joint {axis + 1}"
             if mode == CSP:
                 low, high = joint.position.min - MARGIN, joint.position.max + MARGIN
                 if not low <= here <= high:
-                    self.failures.append(f"{told}: target {here} rad, allowed {low} to {high}")
+                    self.failures.append(f"{where}: target {here} rad, allowed {low} to {high}")
                 if (before := self._before[axis]) is not None and before[1] == mode:
                     step = (abs(position - before[0]) - 1) / COUNTS / (joint.velocity * self._dt)
                     self.largest = max(self.largest, step)
                     if step > 1.0:
-                        self.failures.append(f"{told}: a step of {step:.1f} times what the speed limit allows")
+                        self.failures.append(f"{where}: a step of {step:.1f} times what the speed limit allows")
             if abs(velocity) > joint.velocity * COUNTS + 1:
-                self.failures.append(f"{told}: {velocity} counts/s, more than its speed limit")
+                self.failures.append(f"{where}: {velocity} counts/s, more than its speed limit")
             if mode == CST and abs(torque) > joint.torque * COUNTS + 1:
-                self.failures.append(f"{told}: {torque} counts of torque, more than its limit")
+                self.failures.append(f"{where}: {torque} counts of torque, more than its limit")
             self._before[axis] = (position, mode)
 
 
-def play(count: int, seed: int) -> Found:
+def run(count: int, seed: int) -> Found:
     """Let the loop run until `count` answers were mutated, a third in each drive mode; a failure says what and when."""
     found = Found("loop behind the master")
     for at, mode in enumerate(("csp", "csv", "cst")):
-        one = _play(count // 3, seed + at, mode)
+        one = _run(count // 3, seed + at, mode)
         found.frames += one.frames
         found.seconds += one.seconds
         found.starts += one.starts
@@ -146,7 +146,7 @@ def play(count: int, seed: int) -> Found:
     return found
 
 
-def _play(count: int, seed: int, mode: str) -> Found:
+def _run(count: int, seed: int, mode: str) -> Found:
     found = Found(mode)
     random = Random(seed)
     config = load(default_config())
@@ -182,7 +182,7 @@ def _play(count: int, seed: int, mode: str) -> Found:
         found.kinds["cycles with a drive enabled"] = watch.enabled // 6
     found.seconds = time.monotonic() - began
     if memory is not None:
-        memory.tell(found)
+        memory.report(found)
     return found
 
 

@@ -1,4 +1,4 @@
-"""The judge finds nothing in a sound loop, and what is wrong in a broken one: one defect a check."""
+"""The checker finds nothing in a sound loop, and what is wrong in a broken one: one defect a check."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import pytest
 from kinematics import forward
 from rtcp.ipc.commands import Halt, MoveJoints, SetDriveMode
 from rtcp.ipc.states import DriveMode, State
+from tests.arm_geometry import depth, points
 from tests.sessions.driver import Driver, configuration, is_free, with_start
-from tests.sessions.geometry import depth, points
-from tests.sessions.judge import CSP, CST, CSV, ENABLE_OPERATION, WIRE
+from tests.sessions.frame_checker import CSP, CST, CSV, ENABLE_OPERATION, WIRE
 
 PERIOD_US = 1000
 START = [0.5, 0.3, 0.9, 0.2, 0.4, 0.1]
@@ -59,7 +59,7 @@ def move(driver: Driver, by: float = 0.5, speed: float = 0.4) -> None:
 
 
 @pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
-def test_a_sound_loop_is_not_blamed(mode: str) -> None:
+def test_a_sound_loop_has_no_violation(mode: str) -> None:
     with driver_in(mode) as driver:
         enable(driver)
         move(driver)
@@ -70,22 +70,22 @@ def test_a_sound_loop_is_not_blamed(mode: str) -> None:
         driver.send(Halt())
         driver.wait(500)
         assert driver.violations == []
-        assert driver.judge.obeyed > 1000
+        assert driver.checker.obeyed > 1000
 
 
 @pytest.mark.parametrize("mode", ["csp", "csv", "cst"])
-def test_an_enabling_that_brings_a_joint_back_into_its_range_is_not_blamed(mode: str) -> None:
+def test_an_enabling_that_brings_a_joint_back_into_its_range_has_no_violation(mode: str) -> None:
     config = with_start(configuration(), PERIOD_US, mode)
     driver = Driver(config, 1, [*START[:5], config.joints[5].position.max + 0.018])
     try:
         enable(driver)
         assert driver.violations == []
-        assert driver.judge.obeyed > 400
+        assert driver.checker.obeyed > 400
     finally:
         driver.close()
 
 
-def test_a_target_beyond_the_joints_range_is_seen() -> None:
+def test_a_target_beyond_the_joints_range_is_found() -> None:
     with driver_in("csp") as driver:
         enable(driver)
         driver.bounds.high[AXIS] = START[AXIS] + 0.1
@@ -95,7 +95,7 @@ def test_a_target_beyond_the_joints_range_is_seen() -> None:
 
 
 @pytest.mark.parametrize("counts", [7, -7, 2_000_000_000])
-def test_a_step_beyond_speed_times_cycle_is_seen(counts: int) -> None:
+def test_a_step_beyond_speed_times_cycle_is_found(counts: int) -> None:
     def defect(sent: Fields, cycle: int) -> Fields:
         return sent[0], sent[1] + (counts if cycle > 3 else 0), *sent[2:]
 
@@ -106,7 +106,7 @@ def test_a_step_beyond_speed_times_cycle_is_seen(counts: int) -> None:
         assert any("joint 3: step of" in violation for violation in driver.violations)
 
 
-def test_a_motion_that_ends_without_slowing_down_is_seen() -> None:
+def test_a_motion_that_ends_without_slowing_down_is_found() -> None:
     held: list[int] = []
 
     def defect(sent: Fields, cycle: int) -> Fields:
@@ -122,7 +122,7 @@ def test_a_motion_that_ends_without_slowing_down_is_seen() -> None:
         assert "counts from straight" in driver.violations[0]
 
 
-def test_an_acceleration_of_one_and_a_half_times_its_bound_is_seen() -> None:
+def test_an_acceleration_of_one_and_a_half_times_its_bound_is_found() -> None:
     bound = configuration().joints[AXIS].acceleration
 
     def defect(sent: Fields, cycle: int) -> Fields:
@@ -136,14 +136,14 @@ def test_an_acceleration_of_one_and_a_half_times_its_bound_is_seen() -> None:
         assert "counts from straight" in driver.violations[0]
 
 
-def test_a_first_target_that_is_not_where_the_joint_stands_is_seen() -> None:
+def test_a_first_target_that_is_not_where_the_joint_stands_is_found() -> None:
     with driver_in("csp") as driver:
         spoil(driver, lambda sent, cycle: (sent[0], sent[1] + 20, *sent[2:]))
         enable(driver)
         assert "joint 3: first target" in driver.violations[0]
 
 
-def test_a_target_that_goes_on_while_the_drive_hears_nothing_is_seen() -> None:
+def test_a_target_that_goes_on_while_the_drive_hears_nothing_is_found() -> None:
     with driver_in("csp") as driver:
         enable(driver)
         move(driver)
@@ -161,7 +161,7 @@ def test_a_target_that_goes_on_while_the_drive_hears_nothing_is_seen() -> None:
     ("mode", "what", "said"),
     [("csv", 2, "target velocity"), ("cst", 3, "target torque")],
 )
-def test_a_velocity_or_torque_beyond_its_bound_is_seen(mode: str, what: int, said: str) -> None:
+def test_a_velocity_or_torque_beyond_its_bound_is_found(mode: str, what: int, said: str) -> None:
     def defect(sent: Fields, cycle: int) -> Fields:
         changed = list(sent)
         changed[what] = 600_000 if sent[0] == ENABLE_OPERATION else sent[what]
@@ -175,7 +175,7 @@ def test_a_velocity_or_torque_beyond_its_bound_is_seen(mode: str, what: int, sai
         assert f"joint 3: {said} 600000" in driver.violations[0]
 
 
-def test_a_velocity_that_changes_faster_than_the_acceleration_allows_is_seen() -> None:
+def test_a_velocity_that_changes_faster_than_the_acceleration_allows_is_found() -> None:
     def defect(sent: Fields, cycle: int) -> Fields:
         return *sent[:2], sent[2] + (500 if cycle > 3 else 0), *sent[3:]  # type: ignore[return-value]
 
@@ -186,7 +186,7 @@ def test_a_velocity_that_changes_faster_than_the_acceleration_allows_is_seen() -
         assert "joint 3: target velocity changes by" in driver.violations[0]
 
 
-def test_a_set_point_that_jumps_on_the_change_of_the_mode_is_seen() -> None:
+def test_a_set_point_that_jumps_on_the_change_of_the_mode_is_found() -> None:
     def defect(sent: Fields, cycle: int) -> Fields:
         return sent[0], sent[1] + (50 if sent[4] == CSP else 0), *sent[2:]
 
@@ -202,24 +202,24 @@ def test_a_set_point_that_jumps_on_the_change_of_the_mode_is_seen() -> None:
 
 @pytest.mark.parametrize("mode", [CSP, CSV])
 @pytest.mark.parametrize("point", [0, 1, 2])
-def test_a_point_of_the_arm_in_a_keep_out_box_is_seen(mode: int, point: int) -> None:
+def test_a_point_of_the_arm_in_a_keep_out_box_is_found(mode: int, point: int) -> None:
     with driver_in({CSP: "csp", CSV: "csv"}[mode]) as driver:
         enable(driver)
         there = points([q + 0.3 for q in START])[point]
-        driver.bounds.keep_out.append(([x - 0.02 for x in there], [x + 0.02 for x in there]))
+        driver.bounds.keep_out.append((*(x - 0.02 for x in there), *(x + 0.02 for x in there)))
         assert is_free(driver.bounds, START)
-        driver.judge.changed()
+        driver.checker.changed()
         move(driver, 0.3)
         driver.wait(700)
         assert any("keep-out box" in violation for violation in driver.violations)
 
 
-def test_a_tool_that_leaves_the_box_is_seen() -> None:
+def test_a_tool_that_leaves_the_box_is_found() -> None:
     with driver_in("csp") as driver:
         enable(driver)
-        there = points(START)[2]
-        driver.bounds.box = ([x - 0.05 for x in there], [x + 0.05 for x in there])
-        driver.judge.changed()
+        there = points(START)[0]
+        driver.bounds.box = (*(x - 0.05 for x in there), *(x + 0.05 for x in there))
+        driver.checker.changed()
         move(driver, 0.3)
         assert any("outside the box" in violation for violation in driver.violations)
 
@@ -228,18 +228,18 @@ def test_a_tool_that_leaves_the_box_is_seen() -> None:
 
 
 def test_its_geometry_is_that_of_the_facts() -> None:
-    assert points([0.0] * 6)[2] == pytest.approx((0.0, 0.0, 1.300))
-    assert points([0.0, 0.0, pi / 2, 0.0, 0.0, 0.0])[2] == pytest.approx((-0.690, 0.0, 0.610))
+    assert points([0.0] * 6)[0] == pytest.approx((0.0, 0.0, 1.300))
+    assert points([0.0, 0.0, pi / 2, 0.0, 0.0, 0.0])[0] == pytest.approx((-0.690, 0.0, 0.610))
 
 
 def test_its_geometry_is_that_of_the_platform() -> None:
     arm = configuration().arm
     assert arm is not None
     pose = forward(arm, START)
-    assert points(START)[2] == pytest.approx(tuple(pose.position))
+    assert points(START)[0] == pytest.approx(tuple(pose.position))
 
 
 def test_the_depth_in_a_box_is_the_way_to_its_nearest_face() -> None:
-    box = ((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
+    box = (0.0, 0.0, 0.0, 1.0, 2.0, 3.0)
     assert depth((0.1, 1.0, 1.0), box) == pytest.approx(0.1)
     assert depth((1.5, 1.0, 1.0), box) == pytest.approx(-0.5)

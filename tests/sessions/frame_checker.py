@@ -1,4 +1,4 @@
-"""The judge of what goes over the bus: bytes decoded by its own table, limits as they are at that time.
+"""A checker of what goes over the bus: bytes decoded by its own table, limits as they are at that time.
 
 It knows the facts' process data (15 bytes a drive, 10000 counts to the rad, rad/s and Nm) and nothing of the loop.
 """
@@ -10,7 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from rtcp.launch.simulation import Frame
-from tests.sessions.geometry import REACH, Box, depth, points
+from rtcp.motion.limits import Corners, Values
+from tests.arm_geometry import L2, L3, L4, L5, depth, points
 
 WIRE = struct.Struct("<Hiiib")
 """Controlword or statusword, position, velocity, torque, mode: the same both ways."""
@@ -29,6 +30,8 @@ LATCHED = 5
 """Counts between the first target after enabling and the joint, which may sag a little when the brake opens."""
 ZONE_TOLERANCE_M = 0.5e-3
 """Of positions rounded to 0.1 mrad."""
+REACH = (L2 + L3 + L4 + L5, L2 + L3 + L4 + L5, L3 + L4 + L5, L5, L5, 0.0)
+"""m a rad: how far a point of the arm moves at most when the joint turns."""
 _KEPT = 2 * WINDOWS[-1] + 1
 
 
@@ -41,8 +44,14 @@ class Bounds:
     velocity: list[float]
     acceleration: list[float]
     torque: list[float]
-    box: Box | None = None
-    keep_out: list[Box] = field(default_factory=list)
+    box: Corners | None = None
+    keep_out: list[Corners] = field(default_factory=list)
+
+    def put(self, new: Values) -> None:
+        """Change all of them in place."""
+        self.low[:], self.high[:] = new.low, new.high
+        self.velocity[:], self.acceleration[:], self.torque[:] = new.velocity, new.acceleration, new.torque
+        self.box, self.keep_out[:] = new.box, new.keep_out
 
 
 class _Joint:
@@ -59,11 +68,11 @@ class _Joint:
         """The one that the drive heard last."""
 
 
-class Judge:
-    """Sees every frame; `violations` are sentences, `largest_step` and `largest_acceleration` relative to the bound.
+class FrameChecker:
+    """Checks every frame; `violations` are sentences, `largest_step` and `largest_acceleration` relative to the bound.
 
     Args:
-        bounds: the limits; changed in place, then told by `changed`.
+        bounds: the limits; changed in place, then reported by `changed`.
         period_s: the cycle.
         drives: index of each joint's slave.
         expected_wkc: working counter of an exchange in which every slave took part.
@@ -76,7 +85,7 @@ class Judge:
         self.largest_acceleration = 0.0
         self.frames = 0
         self.obeyed = 0
-        """Frames in which at least one drive was enabled and told to be."""
+        """Frames in which at least one drive was enabled and commanded to be."""
         self.zero = [0] * len(drives)
         """What each drive shows at the arm's zero, counts."""
         self._dt = period_s
@@ -87,7 +96,6 @@ class Judge:
         self._look_again = 0
         self._excused = True
         """Whether the arm was enabled inside a zone and has not come out of it yet."""
-        """Actual position of each joint in the answer before: what this frame was worked out from."""
 
     def changed(self) -> None:
         """Take note that `bounds` have changed: windows do not reach back beyond this."""
@@ -97,8 +105,8 @@ class Judge:
             joint.resting = 0
         self._look_again = 0
 
-    def see(self, frame: Frame) -> None:
-        """Judge a frame; the statuswords that came back with it say which drives obey it."""
+    def check(self, frame: Frame) -> None:
+        """Check a frame; the statuswords that came back with it say which drives obey it."""
         self.frames += 1
         answered, self._answered = self._answered, frame.wkc == self._expected
         obeying = 0
@@ -113,22 +121,22 @@ class Judge:
                 continue
             obeying += 1
             if mode != shown:
-                # Told to change its mode and has not yet.
+                # Commanded to change its mode and has not yet.
                 if joint.mode:
-                    self._judge_going_on(axis, joint, position, mode, frame.now_ns)
+                    self._check_going_on(axis, joint, position, mode, frame.now_ns)
                     joint.mode = CHANGING
             elif mode != joint.mode:
-                self._judge_entry(axis, joint, position, actual, mode, frame.now_ns)
+                self._check_entry(axis, joint, position, actual, mode, frame.now_ns)
                 joint = self._joints[axis] = _Joint()
                 joint.mode = mode
             elif mode == CST:
-                self._judge_torque(axis, torque, frame.now_ns)
+                self._check_torque(axis, torque, frame.now_ns)
             else:
-                self._judge_position(axis, joint, position, answered, frame.now_ns)
+                self._check_position(axis, joint, position, answered, frame.now_ns)
                 if frame.heard:
-                    self._judge_heard(axis, joint, position, frame.now_ns)
+                    self._check_heard(axis, joint, position, frame.now_ns)
                 if mode == CSV:
-                    self._judge_velocity(axis, joint, velocity, answered, frame.now_ns)
+                    self._check_velocity(axis, joint, velocity, answered, frame.now_ns)
             if mode != CST and joint.mode == mode and not joint.positions:
                 joint.positions.append(position)
             joint.last = position
@@ -136,7 +144,7 @@ class Judge:
             self.obeyed += 1
         if obeying == len(REACH) and (self.bounds.box or self.bounds.keep_out):
             if all(joint.positions for joint in self._joints):
-                self._judge_zones(frame.now_ns)
+                self._check_zones(frame.now_ns)
         else:
             self._look_again = 0
             self._excused = True
@@ -145,22 +153,22 @@ class Judge:
         if len(self.violations) < 20:
             self.violations.append(f"{now_ns * 1e-9:.4f} s, joint {axis + 1}: {sentence}")
 
-    def _judge_entry(self, axis: int, joint: _Joint, position: int, actual: int, mode: int, now: int) -> None:
+    def _check_entry(self, axis: int, joint: _Joint, position: int, actual: int, mode: int, now: int) -> None:
         """The first target after enabling is where the joint is; the first in another mode goes on from the last."""
         bounds = self.bounds
         low, high = bounds.low[axis] * COUNTS - 1, bounds.high[axis] * COUNTS + 1
-        self._judge_going_on(axis, joint, position, mode, now)
+        self._check_going_on(axis, joint, position, mode, now)
         if not joint.mode and mode == CSP and abs(position - actual) > LATCHED:
             self._violation(now, axis, f"first target {position}, the joint stands at {actual}")
         if mode == CSP and not low - MARGIN <= position <= high + MARGIN:
             self._violation(now, axis, f"first target {position} outside {low:.0f}..{high:.0f}")
 
-    def _judge_going_on(self, axis: int, joint: _Joint, position: int, mode: int, now: int) -> None:
+    def _check_going_on(self, axis: int, joint: _Joint, position: int, mode: int, now: int) -> None:
         step = self.bounds.velocity[axis] * self._dt * COUNTS + 1
         if joint.mode and mode == CSP and abs(position - joint.last) > step:
             self._violation(now, axis, f"target {position} after the change of mode, {joint.last} before it")
 
-    def _judge_position(self, axis: int, joint: _Joint, position: int, answered: bool, now: int) -> None:
+    def _check_position(self, axis: int, joint: _Joint, position: int, answered: bool, now: int) -> None:
         bounds, past = self.bounds, joint.positions
         low, high = bounds.low[axis] * COUNTS - 1, bounds.high[axis] * COUNTS + 1
         last = past[-1]
@@ -195,14 +203,14 @@ class Judge:
                 if second > allowed + 1e-6:
                     self._violation(now, axis, f"{second} counts from straight over {n} cycles, allowed {allowed:.1f}")
 
-    def _judge_heard(self, axis: int, joint: _Joint, position: int, now: int) -> None:
+    def _check_heard(self, axis: int, joint: _Joint, position: int, now: int) -> None:
         """A drive that missed frames must not be far behind when it hears again."""
         allowed = self.bounds.velocity[axis] * self._dt * COUNTS + 1
         if joint.heard is not None and abs(position - joint.heard) > allowed:
             self._violation(now, axis, f"the drive hears {position}, and heard {joint.heard} before that")
         joint.heard = position
 
-    def _judge_velocity(self, axis: int, joint: _Joint, velocity: int, answered: bool, now: int) -> None:
+    def _check_velocity(self, axis: int, joint: _Joint, velocity: int, answered: bool, now: int) -> None:
         """In CSV the velocity itself is on the wire, with what pulls the joint back to its position."""
         bounds, past = self.bounds, joint.velocities
         bound = bounds.velocity[axis] * COUNTS + 1
@@ -225,23 +233,23 @@ class Judge:
                     now, axis, f"target velocity changes by {change:.0f} in {n} cycles, allowed {allowed:.0f}"
                 )
 
-    def _judge_torque(self, axis: int, torque: int, now: int) -> None:
+    def _check_torque(self, axis: int, torque: int, now: int) -> None:
         bound = self.bounds.torque[axis] * COUNTS + 1
         if abs(torque) > bound:
             self._violation(now, axis, f"target torque {torque}, allowed {bound:.0f}")
 
-    def _judge_zones(self, now: int) -> None:
+    def _check_zones(self, now: int) -> None:
         self._look_again -= 1
         if self._look_again > 0:
             return
         bounds = self.bounds
-        elbow, wrist, tool = points([joint.positions[-1] / COUNTS for joint in self._joints])
+        tool, wrist, elbow = points([joint.positions[-1] / COUNTS for joint in self._joints])
         inner = [depth(point, box) for box in bounds.keep_out for point in (elbow, wrist, tool)]
         if bounds.box is not None:
             inner.append(-depth(tool, bounds.box))
         deepest = max(inner)
         if deepest > ZONE_TOLERANCE_M and self._excused:
-            # The arm was enabled in there: it is not to be judged until it is out.
+            # The arm was enabled in there: it is not to be checked until it is out.
             self._look_again = 1
             return
         self._excused = False
