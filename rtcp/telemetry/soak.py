@@ -107,7 +107,7 @@ def random_fault(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[s
         {"fault": "clock_jump", "slave": slave, "us": random.choice((-300, 50, 300))},
         {"fault": "clock_drift", "slave": slave, "ppm": random.choice((-200, 200))},
         {"fault": "input", "number": random.choice((1, 9, 10)), "how": random.choice(("low", "bounce")), "ms": 20},
-        {"fault": "stick_code", "value": random.randrange(64)},
+        {"fault": "joystick_code", "value": random.randrange(64)},
         {"fault": "noise", "rate_hz": random.choice((50, 500))},
     )
     fault = random.choice(some)

@@ -137,8 +137,8 @@ CASES: tuple[Case, ...] = (
         (EMERGENCY,),
     ),
     Case("joystick input stuck", [_fault("input", number=1, how="low")], (CONTINUES,), workloads=THREE, watch_s=1.0),
-    Case("joystick out of code", [_fault("stick_code", value=0)], (CONTINUES,), workloads=THREE, watch_s=1.0),
-    Case("joystick out of code", [_fault("stick_code", value=0)], (STOPS,), workloads=(JOYSTICK,), watch_s=1.0),
+    Case("joystick out of code", [_fault("joystick_code", value=0)], (CONTINUES,), workloads=THREE, watch_s=1.0),
+    Case("joystick out of code", [_fault("joystick_code", value=0)], (STOPS,), workloads=(JOYSTICK,), watch_s=1.0),
     Case(
         "toggle bounces", [_fault("input", number=9, how="bounce", ms=20)], (STOPS,), workloads=(JOYSTICK,), watch_s=1.0
     ),
@@ -151,7 +151,7 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "inputs frozen, then the joystick shows neutral",
-        [_fault("input_frozen", slave=BOX), _fault("stick_code", value=63)],
+        [_fault("input_frozen", slave=BOX), _fault("joystick_code", value=63)],
         (CONTINUES,),
         workloads=(JOYSTICK,),
         watch_s=1.0,

@@ -361,10 +361,10 @@ class TerminalFault(TerminalsFault):
 
 
 @dataclass(frozen=True)
-class StickCode(TerminalsFault):
-    """The joystick's six inputs show `value`, whatever the stick does; 63 is neutral, most values mean nothing."""
+class JoystickCode(TerminalsFault):
+    """The joystick's six inputs show `value`, whatever the joystick does; 63 is neutral, most values mean nothing."""
 
-    name = "stick_code"
+    name = "joystick_code"
     value: Annotated[int, Ge(0), Le(63)]
 
     def broken(self, inputs: int) -> BrokenTerminals:

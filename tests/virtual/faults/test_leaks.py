@@ -40,7 +40,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "clock_drift": {"slave": 2},
     "input": {"number": 3, "how": "bounce"},
     "input_frozen": {"slave": 1},
-    "stick_code": {"value": 9},
+    "joystick_code": {"value": 9},
     "noise": {"rate_hz": 2000},
 }
 BY_RATE = [name for name, keys in KINDS.items() if "rate" in keys]

@@ -8,7 +8,7 @@ import pytest
 
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.faults.fault import FaultRefused
-from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, PowerFault, StickCode, TerminalFault
+from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, PowerFault, JoystickCode, TerminalFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from tests.virtual.line import MS, Line, begin
 
@@ -182,7 +182,7 @@ def test_an_input_that_bounces_changes_with_each_half_period_and_begins_with_the
 
 def test_the_joystick_s_lines_show_a_code_whatever_the_stick_does(box: DiewuIoBox) -> None:
     line = Line([box])
-    end = begin(line.segment, StickCode(0b010101), line.now)
+    end = begin(line.segment, JoystickCode(0b010101), line.now)
     box.inputs = 0xFFC0
     assert seen(line) == 0xFFD5
     end(line.now)
@@ -213,7 +213,7 @@ def test_only_an_io_box_has_inputs_to_freeze() -> None:
 
 def test_without_an_io_box_no_input_can_be_broken() -> None:
     line = Line([create("cubemars-orh40")])
-    for fault in (TerminalFault(1, "high"), StickCode(0)):
+    for fault in (TerminalFault(1, "high"), JoystickCode(0)):
         with pytest.raises(FaultRefused, match="no IO box on the segment"):
             begin(line.segment, fault, line.now)
 
@@ -221,7 +221,7 @@ def test_without_an_io_box_no_input_can_be_broken() -> None:
 def test_on_the_bus_inprocess_drives_and_inputs_fail_alike() -> None:
     bus = InProcessBus([create("diewu-io"), create("cubemars-orh70")])
     models = [slave.device for slave in bus.slaves]
-    undo = StickCode(0).begin(models)
+    undo = JoystickCode(0).begin(models)
     DriveFault(2, "over-voltage").begin(models)
     for model in models:
         for _ in range(120):
