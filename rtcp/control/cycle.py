@@ -7,7 +7,6 @@ writer -> limiter) -> encode -> publish -> clock discipline. Nothing in here log
 from __future__ import annotations
 
 from collections.abc import Callable
-from operator import attrgetter
 from time import monotonic_ns
 
 from rtcp.config.model import ArmConfig, Joint
@@ -38,8 +37,6 @@ from rtcp.ipc.layout import (
 from rtcp.realtime.discipline import Discipline
 from rtcp.realtime.scheduling import Sleeper
 
-_TARGET_POSITION, _TARGET_VELOCITY = attrgetter("target_position"), attrgetter("target_velocity")
-_TARGET_TORQUE, _STATUSWORD = attrgetter("target_torque"), attrgetter("statusword")
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""
 _LONGEST_NS = 2_000_000_000
@@ -222,17 +219,15 @@ class Cycle:
             controller.elapsed_s,
             controller.duration_s,
         )
-        state, drives = arm.state, arm.drives
-        values[len(_AT) :] = (
-            *state.actual,
-            *state.actual_velocity,
-            *state.actual_torque,
-            *state.commanded,
-            *map(_TARGET_POSITION, drives),
-            *map(_TARGET_VELOCITY, drives),
-            *map(_TARGET_TORQUE, drives),
-            *map(_STATUSWORD, drives),
-        )
+        state, n = arm.state, len(arm.drives)
+        at = len(_AT) + 4 * n
+        values[len(_AT) : at] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)
+        for drive in arm.drives:
+            values[at] = drive.target_position
+            values[at + n] = drive.target_velocity
+            values[at + 2 * n] = drive.target_torque
+            values[at + 3 * n] = drive.statusword
+            at += 1
         self._blackboard.publish(values)
 
 
