@@ -158,8 +158,8 @@ def text_of(path: Path) -> str:
         raise ConfigError([f"{path}: the file cannot be read: {error.strerror}"]) from error
     except UnicodeDecodeError as error:
         byte = error.object[error.start]
-        told = f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"
-        raise ConfigError([told]) from error
+        text = f"{path}: this is not a text file: byte {error.start} is {byte:#04x}, which is not UTF-8"
+        raise ConfigError([text]) from error
 
 
 def _reason(error: MarkedYAMLError) -> str:
@@ -205,8 +205,8 @@ class _Builder:
             (self._characters, _LARGEST, "characters"),
         ):
             if found > limit:
-                told = f"the file holds more than {limit} {what}, the limit of a configuration"
-                raise _TooMuch(f"{told}; an alias counts as everything that it stands for")
+                text = f"the file holds more than {limit} {what}, the limit of a configuration"
+                raise _TooMuch(f"{text}; an alias counts as everything that it stands for")
         if self._depth >= _DEEPEST:
             raise _TooMuch("the lists and mappings are nested too deeply")
 
@@ -271,8 +271,8 @@ class _Builder:
                 continue
             inner = (*where, key)
             if key in values:
-                told = f"this key occurs twice, in lines {self._lines[inner]} and {line}; keep one of them"
-                self.findings.append((inner, told))
+                text = f"this key occurs twice, in lines {self._lines[inner]} and {line}; keep one of them"
+                self.findings.append((inner, text))
                 self._value(next(self._events), inner)
                 continue
             self._lines[inner] = line

@@ -124,8 +124,8 @@ def load_kinematics(path: Path) -> ArmModel:
     if _is_whole_arm(document):
         arm = load(path).arm
         if arm is None:
-            told = f"the key kinematics is missing; it must be {allowed(Kinematics)}"
-            raise ConfigError(document.sentences([((), told)]))
+            finding = f"the key kinematics is missing; it must be {allowed(Kinematics)}"
+            raise ConfigError(document.sentences([((), finding)]))
         return arm
     file = _KINEMATICS.read(document)
     return _arm_model(document, file.name, file.kinematics, ())
@@ -178,8 +178,8 @@ def with_control_mode(config: ArmConfig, control_mode: ControlModeName) -> ArmCo
         ConfigError: the arm lacks what this mode needs: its geometry, a joystick.
     """
     geometry, joystick = config.arm is not None, config.inputs.joystick is not None
-    if told := rules.missing_for(control_mode, geometry=geometry, joystick=joystick):
-        raise ConfigError([f"control_mode: {told}"])
+    if finding := rules.missing_for(control_mode, geometry=geometry, joystick=joystick):
+        raise ConfigError([f"control_mode: {finding}"])
     return replace(config, control_mode=control_mode)
 
 

@@ -145,13 +145,13 @@ def _pdos(direction: str, pdos: Sequence[Pdo], kind: str) -> Iterator[Finding]:
             wanted = f"{low:#x} to {high:#x}, the objects of a {direction}"
             yield (direction, i, "index"), f"found {pdo.index:#06x}, allowed is {wanted}"
         elif first.setdefault(pdo.index, i) != i:
-            told = f"found {pdo.index:#06x}, the index of {direction}[{first[pdo.index]}]; each needs its own"
-            yield (direction, i, "index"), told
+            text = f"found {pdo.index:#06x}, the index of {direction}[{first[pdo.index]}]; each needs its own"
+            yield (direction, i, "index"), text
         for j, entry in enumerate(pdo.channels):
             where = (direction, i, "channels", j)
             if entry.index and names.setdefault(entry.name, (where, entry))[1] is not entry:
-                told = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
-                yield (*where, "name"), told
+                text = f'found the text "{entry.name}" again; each channel of the {direction} needs its own'
+                yield (*where, "name"), text
     bits = sum(BITS[entry.type] for pdo in pdos for entry in pdo.channels)
     if bits % 8:
         wanted = "whole bytes; fill up with padding (`{index: 0, sub_index: 0, type: bool}`)"
@@ -191,16 +191,16 @@ def period_findings(device: DeviceDescription, period_us: float) -> Iterator[Fin
 @rule(Range)
 @rule(MechanicalLimit)
 def _range(limits: Range | MechanicalLimit) -> Iterator[Finding]:
-    if told := _min_below_max(limits.min, limits.max):
-        yield (), told
+    if text := _min_below_max(limits.min, limits.max):
+        yield (), text
 
 
 @rule(Box)
 @rule(KeepOut)
 def _corners(box: Box | KeepOut) -> Iterator[Finding]:
     for axis, low, high in zip("xyz", box.min, box.max, strict=True):
-        if told := _min_below_max(low, high):
-            yield (), told.replace(";", f" in {axis};")
+        if text := _min_below_max(low, high):
+            yield (), text.replace(";", f" in {axis};")
 
 
 @rule(GripperConfig)
@@ -263,8 +263,8 @@ def _interface(arm: ArmFile) -> Iterator[Finding]:
 @rule(ArmFile, "control_mode", "inputs")
 def _control_mode(arm: ArmFile) -> Iterator[Finding]:
     stick = arm.inputs.joystick is not None
-    if told := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=stick):
-        yield ("control_mode",), told
+    if text := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=stick):
+        yield ("control_mode",), text
 
 
 def missing_for(control_mode: str, *, geometry: bool, joystick: bool) -> str:
@@ -316,18 +316,18 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
         slave = slaves.get(joint.slave)
         device = devices.get(slave.device) if slave else None
         if slave is None:
-            told = f'found the text "{joint.slave}", which is no slave; allowed are the names under slaves: '
-            yield (*where, "slave"), told + ", ".join(slaves)
+            text = f'found the text "{joint.slave}", which is no slave; allowed are the names under slaves: '
+            yield (*where, "slave"), text + ", ".join(slaves)
         elif device is not None and device.kind == "io":
-            told = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
-            yield (*where, "slave"), f"{told}{device.kind}; allowed is kind cia402"
+            text = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
+            yield (*where, "slave"), f"{text}{device.kind}; allowed is kind cia402"
         elif device is not None:
             mapped = {entry.name for pdo in (*device.rpdo, *device.tpdo) for entry in pdo.channels}
             if missing := [name for name in MODE_CHANNELS[arm.drive_mode] if name not in mapped]:
-                told = (
+                text = (
                     f"its device {slave.device} maps no {', '.join(missing)}, which drive_mode {arm.drive_mode} needs"
                 )
-                yield (*where, "slave"), told
+                yield (*where, "slave"), text
             yield from _beyond_the_wire(where, joint, device)
 
 
@@ -368,20 +368,20 @@ def _joints_of_kinematics(arm: ArmFile) -> Iterator[Finding]:
     if part is None:
         return
     if len(arm.joints) != len(part.dh):
-        told = f"found beside {len(arm.joints)} joints, allowed are {len(part.dh)}; leave it out for such an arm"
-        yield ("kinematics",), told
+        text = f"found beside {len(arm.joints)} joints, allowed are {len(part.dh)}; leave it out for such an arm"
+        yield ("kinematics",), text
     for i, (joint, limit) in enumerate(zip(arm.joints, part.limits or ())):  # noqa: B905 the count is checked above
         place = f"kinematics.limits[{i}]"
         low, high = joint.position.min, joint.position.max
         if low < limit.min:
-            told = f"found {low:g}, allowed is at least {limit.min:g}, the joint's mechanical end in {place}"
-            yield ("joints", i, "position", "min"), told
+            text = f"found {low:g}, allowed is at least {limit.min:g}, the joint's mechanical end in {place}"
+            yield ("joints", i, "position", "min"), text
         if high > limit.max:
-            told = f"found {high:g}, allowed is at most {limit.max:g}, the joint's mechanical end in {place}"
-            yield ("joints", i, "position", "max"), told
+            text = f"found {high:g}, allowed is at most {limit.max:g}, the joint's mechanical end in {place}"
+            yield ("joints", i, "position", "max"), text
         if limit.velocity is not None and joint.velocity > limit.velocity:
-            told = f"found {joint.velocity:g}, allowed is at most {limit.velocity:g}, the velocity in {place}"
-            yield ("joints", i, "velocity"), told
+            text = f"found {joint.velocity:g}, allowed is at most {limit.velocity:g}, the velocity in {place}"
+            yield ("joints", i, "velocity"), text
 
 
 @rule(ArmFile, "cartesian", "kinematics")
@@ -392,8 +392,8 @@ def _boxes(arm: ArmFile) -> Iterator[Finding]:
     for where, box in boxes:
         if part is None:
             yield where, "found a box, which needs the arm's geometry: the key kinematics is missing"
-        elif told := _misplaced(box, part):
-            yield where, told
+        elif text := _misplaced(box, part):
+            yield where, text
         elif tool and isinstance(box, KeepOut) and _holds(box, tool):
             yield where, "found a box around all of cartesian.box: the tool has no place left"
 
@@ -407,11 +407,11 @@ def _box_names(arm: ArmFile) -> Iterator[Finding]:
     taken |= {joint.name: dotted(where) for where, joint in axes_of(arm) if joint.name not in taken}
     for i, box in enumerate(boxes):
         if box.name in taken:
-            told = f'found the text "{box.name}", which in the key of a limit means {taken[box.name]}'
-            yield ("cartesian", "keep_out", i, "name"), told
+            text = f'found the text "{box.name}", which in the key of a limit means {taken[box.name]}'
+            yield ("cartesian", "keep_out", i, "name"), text
         elif "." in box.name:
-            told = f'found the text "{box.name}", allowed is one without a dot: dots separate the parts of a key'
-            yield ("cartesian", "keep_out", i, "name"), told
+            text = f'found the text "{box.name}", allowed is one without a dot: dots separate the parts of a key'
+            yield ("cartesian", "keep_out", i, "name"), text
 
 
 def shoulder_and_reach(part: Kinematics) -> tuple[Position, float]:
@@ -427,12 +427,12 @@ def _misplaced(box: Box | KeepOut, part: Kinematics) -> str:
     away = math.dist(shoulder, nearest)
     if away > reach:
         what = "the arm never meets it" if isinstance(box, KeepOut) else "the tool is never inside"
-        told = f"found a box that begins {away:.3f} m from the shoulder, allowed is at most {reach:.3f} m"
-        return f"{told}, the arm's reach: {what}"
+        text = f"found a box that begins {away:.3f} m from the shoulder, allowed is at most {reach:.3f} m"
+        return f"{text}, the arm's reach: {what}"
     if isinstance(box, KeepOut) and _meets(_BASE, shoulder, box):
         at = ", ".join(f"{coordinate:g}" for coordinate in shoulder)
-        told = "found a box around the arm's base, allowed is one beside it"
-        return f"{told}: the base is at (0, 0, 0), the shoulder at ({at})"
+        text = "found a box around the arm's base, allowed is one beside it"
+        return f"{text}: the base is at (0, 0, 0), the shoulder at ({at})"
     return ""
 
 
@@ -488,7 +488,7 @@ def _points(motion: MotionFile) -> Iterator[Finding]:
         for key in ("q", "v", "a"):
             numbers, as_first = getattr(point, key), getattr(first, key)
             if numbers is not None and len(numbers) != len(first.q):
-                told = f"found {len(numbers)} numbers, allowed are {len(first.q)}, as the first point has"
-                yield (*where, key), told
+                text = f"found {len(numbers)} numbers, allowed are {len(first.q)}, as the first point has"
+                yield (*where, key), text
             if (numbers is None) != (as_first is None):
                 yield (*where, key), f"{key} must be given for all points or for none"

@@ -141,16 +141,16 @@ def _findings(document: Document, config: ArmConfig) -> list[Finding]:
         return [*findings, (("offsets",), "found no mapping, allowed is a number for each axis")]
     names = [axis.name for axis in config.axes]
     for name in offsets.keys() - set(names):
-        told = f"this is no axis of {config.name}; its axes are {', '.join(names)}"
-        findings.append((("offsets", name), told))
+        finding = f"this is no axis of {config.name}; its axes are {', '.join(names)}"
+        findings.append((("offsets", name), finding))
     for i, name in enumerate(names):
         if "offsets" in data and name not in offsets:
             findings.append((("offsets",), f"the key {name} is missing: each axis of {config.name} has its offset"))
-        elif name in offsets and (told := _wrong(config, i, offsets[name])):
-            findings.append((("offsets", name), told))
+        elif name in offsets and (finding := _wrong(config, i, offsets[name])):
+            findings.append((("offsets", name), finding))
     if not findings and data["check"] != (right := _check(config.name, offsets)):
-        told = f"found {data['check']}, allowed is {right}: the file is damaged, or was edited"
-        findings.append((("check",), f"{told}; if its offsets are right write {right}"))
+        finding = f"found {data['check']}, allowed is {right}: the file is damaged, or was edited"
+        findings.append((("check",), f"{finding}; if its offsets are right write {right}"))
     return findings
 
 
@@ -165,5 +165,5 @@ def _wrong(config: ArmConfig, axis: int, offset: object) -> str:
     if all(low <= end <= high for end in ends):
         return ""
     reach = f"position {joint.position.min:g} to {joint.position.max:g} would be {ends[0]:g} to {ends[1]:g} there"
-    told = f"found {offset:g}, with which the drive of {joint.name} cannot be sent its range: {reach}"
-    return f"{told}, allowed is {low:g} to {high:g}, the range of target_position of {device.name}"
+    finding = f"found {offset:g}, with which the drive of {joint.name} cannot be sent its range: {reach}"
+    return f"{finding}, allowed is {low:g} to {high:g}, the range of target_position of {device.name}"

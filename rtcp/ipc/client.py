@@ -102,10 +102,10 @@ class ControlClient:
         """Return the answer to a request; pass on the progress before it."""
         while True:
             reply = jsonrpc.read_reply(self._receive(method, timeout_s), method)
-            told = jsonrpc.progress(reply)
-            if told is not None:
-                if progress is not None and told.get("request") == number:
-                    progress(told)
+            report = jsonrpc.progress(reply)
+            if report is not None:
+                if progress is not None and report.get("request") == number:
+                    progress(report)
             elif "id" in reply and reply["id"] in (number, None):
                 # null: the answer to a line whose id could not be read.
                 return reply

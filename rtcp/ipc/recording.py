@@ -184,8 +184,8 @@ def _fill(path: Path, recording: Recording) -> None:
     with open(path, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start("ros2", f"rtcp {about.versions.get('rtcp', '')}")
-        told = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
-        writer.add_metadata(_ABOUT, {"json": json.dumps(told)})
+        metadata = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
+        writer.add_metadata(_ABOUT, {"json": json.dumps(metadata)})
         _write_cycles(writer, recording)
         schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(_LOG_SCHEMA).encode())
         channel = writer.register_channel(_LOG, "json", schema)
@@ -334,10 +334,10 @@ def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
     """Return what a file says about itself, and the seconds from its first cycle to its last."""
     for record in _records(file):
         if isinstance(record, Metadata) and record.name == _ABOUT:
-            told = json.loads(record.metadata["json"])
-            if not isinstance(told, dict) or told.get("format") != FORMAT:
+            metadata = json.loads(record.metadata["json"])
+            if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
                 raise ValueError(f"allowed is format {FORMAT}")
-            yield _checked(told), float(_of(told, "seconds", float))
+            yield _checked(metadata), float(_of(metadata, "seconds", float))
 
 
 def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
@@ -357,16 +357,16 @@ def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
     return np.frombuffer(b"".join(found), dtype=kind)
 
 
-def _checked(told: Mapping[str, Any]) -> About:
-    numbers = {key: _of(told, key, int) for key in ("number", "time_ns", "period_ns", "began_ns", "event", "at")}
-    texts = {key: _of(told, key, str) for key in ("what", "before", "arm", "bus")}
-    moments = [Moment(_of(one, "time_ns", int), _of(one, "message", str)) for one in _of(told, "timeline", list)]
+def _checked(metadata: Mapping[str, Any]) -> About:
+    numbers = {key: _of(metadata, key, int) for key in ("number", "time_ns", "period_ns", "began_ns", "event", "at")}
+    texts = {key: _of(metadata, key, str) for key in ("what", "before", "arm", "bus")}
+    moments = [Moment(_of(one, "time_ns", int), _of(one, "message", str)) for one in _of(metadata, "timeline", list)]
     about = About(
         **numbers,
         **texts,
-        joints=tuple(str(name) for name in _of(told, "joints", list)[:_JOINTS_MAX]),
-        versions={str(name): str(version) for name, version in _of(told, "versions", dict).items()},
-        notes=tuple(str(note) for note in _of(told, "notes", list)),
+        joints=tuple(str(name) for name in _of(metadata, "joints", list)[:_JOINTS_MAX]),
+        versions={str(name): str(version) for name, version in _of(metadata, "versions", dict).items()},
+        notes=tuple(str(note) for note in _of(metadata, "notes", list)),
         timeline=tuple(moments),
     )
     if about.period_ns <= 0 or not math.isfinite(about.when.timestamp()):
@@ -374,7 +374,7 @@ def _checked(told: Mapping[str, Any]) -> About:
     return about
 
 
-def _of(told: Mapping[str, Any], key: str, kind: type) -> Any:
-    if type(found := told[key]) is not kind:
+def _of(metadata: Mapping[str, Any], key: str, kind: type) -> Any:
+    if type(found := metadata[key]) is not kind:
         raise TypeError(f"{key} is {type(found).__name__}, allowed is {kind.__name__}")
     return found

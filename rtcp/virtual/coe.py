@@ -421,7 +421,7 @@ class ValueInfo(IntFlag):
     MAXIMUM = 0x40
 
 
-_ALWAYS_TOLD = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
+_ALWAYS_REPORTED = ValueInfo.ACCESS | ValueInfo.CATEGORY | ValueInfo.MAPPABLE
 _RECORD_TYPES = {
     **dict.fromkeys(range(0x1600, 0x1800), DataType.PDO_MAPPING),
     **dict.fromkeys(range(0x1A00, 0x1C00), DataType.PDO_MAPPING),
@@ -500,19 +500,19 @@ class SdoInformation:
             raise SdoAbort(AbortCode.LENGTH)
         index, subindex, asked = _ENTRY_REQUEST.unpack_from(request)
         entry = self._objects[index, subindex]
-        told, limits = _limits(entry, ValueInfo(asked & 0x7F))
-        head = _ENTRY.pack(index, subindex, told, entry.data_type, entry.bit_length, entry.access)
+        reported, limits = _limits(entry, ValueInfo(asked & 0x7F))
+        head = _ENTRY.pack(index, subindex, reported, entry.data_type, entry.bit_length, entry.access)
         return head + limits + entry.name.encode("ascii", "replace")
 
 
 def _limits(entry: Entry, asked: ValueInfo) -> tuple[ValueInfo, bytes]:
-    """Return which of `asked` is told, and the bytes of minimum and maximum where they are."""
-    told, data = asked & _ALWAYS_TOLD, b""
+    """Return which of `asked` is reported, and the bytes of minimum and maximum where they are."""
+    reported, data = asked & _ALWAYS_REPORTED, b""
     for flag, limit in ((ValueInfo.MINIMUM, entry.minimum), (ValueInfo.MAXIMUM, entry.maximum)):
         if flag & asked and limit is not None:
-            told |= flag
+            reported |= flag
             data += encode(entry, limit).ljust(byte_size(entry), b"\0")
-    return told, data
+    return reported, data
 
 
 def _data_type(found: DictionaryObject) -> int:
