@@ -1,4 +1,4 @@
-"""Distributed clocks on the way to SAFE-OP: delays, offsets, SYNC0 (ETG.1000.4, 6.9)."""
+"""Distributed clocks on the way to SAFE-OP: delays, offsets, SYNC0 (ETG.1000.4, 6.8)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def start_clocks(master: Any, port: RegisterPort, slaves: Sequence[SlaveConfig],
 def take_over_time(
     port: RegisterPort, position: int, label: str, delay: bytes, others: Sequence[int], *, always: bool
 ) -> None:
-    """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.6).
+    """Set the clock of one slave by that of another: one broadcast latches the local times of both (ETG.1000.4, 6.8).
 
     Args:
         port: the port for registers.

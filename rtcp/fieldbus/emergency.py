@@ -6,7 +6,7 @@ import struct
 from dataclasses import dataclass
 
 EMERGENCY = 1
-"""CoE service of an emergency (ETG.1000.6, table 28)."""
+"""CoE service of an emergency (ETG.1000.6, table 29)."""
 _MESSAGE = struct.Struct("<HHB5s")
 
 # Exact codes first; a code that is not listed takes the meaning of its class (low byte, then low 12 bits cleared).

@@ -25,7 +25,7 @@ _PATIENCE_S = 3.0
 _SDO = struct.Struct("<BHBI")
 _COE_HEADER = 2
 _REQUEST, _RESPONSE = 2, 3
-"""CoE services (ETG.1000.6, table 28)."""
+"""CoE services (ETG.1000.6, table 29)."""
 _EXPEDITED, _SIZED, _TOGGLE, _LAST = 0x02, 0x01, 0x10, 0x01
 _DOWNLOAD, _DOWNLOAD_SEGMENT, _UPLOAD, _UPLOAD_SEGMENT, _ABORT = 0x20, 0x00, 0x40, 0x60, 0x80
 """Commands of the client (upper three bits)."""

@@ -1,6 +1,6 @@
 """Error counters of the slaves' ports, added up beyond their 8 bits, and the cable that they point at.
 
-Registers 0x0300 to 0x0313 (ETG.1000.4, 6.3): for each port invalid frames and receive errors, errors forwarded, lost
+Registers 0x0300 to 0x0313 (ETG.1000.4, 6.2): for each port invalid frames and receive errors, errors forwarded, lost
 links. What a port counts as its own came in over that port's cable; slaves behind it count the same frame as forwarded.
 """
 

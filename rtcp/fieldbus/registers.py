@@ -31,7 +31,7 @@ _SOURCE = bytes((0x02, 0, 0, 0x52, 0x54, 0x43))
 
 
 class Command(IntEnum):
-    """EtherCAT commands used here (ETG.1000.4, table 8)."""
+    """EtherCAT commands used here (ETG.1000.4, 5.4)."""
 
     NOP = 0
     APRD = 1

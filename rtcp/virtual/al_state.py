@@ -1,6 +1,6 @@
 """The EtherCAT state machine as tables, and the supervision of SYNC0.
 
-States and transitions: ETG.1000.6, 6.4.1; AL status codes: ETG.1020, table 11; sync error counter: ETG.1020, 21.2.
+States and transitions: ETG.1000.6, 6.4.1; AL status codes: ETG.1000.6, table 11; sync error counter: ETG.1020, 21.2.
 """
 
 from __future__ import annotations

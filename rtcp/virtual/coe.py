@@ -194,7 +194,7 @@ MAILBOX_AND_COE_HEADER = 8
 
 
 class CoeService(IntEnum):
-    """Services in the CoE header (ETG.1000.6, table 28)."""
+    """Services in the CoE header (ETG.1000.6, table 29)."""
 
     EMERGENCY = 1
     SDO_REQUEST = 2

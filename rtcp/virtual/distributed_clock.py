@@ -1,4 +1,4 @@
-"""Distributed clocks: local time, SYNC0 and their registers 0x0900 to 0x09FF (ETG.1000.4, 6.6)."""
+"""Distributed clocks: local time, SYNC0 and their registers 0x0900 to 0x09FF (ETG.1000.4, 6.8)."""
 
 from __future__ import annotations
 

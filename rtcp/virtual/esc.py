@@ -41,7 +41,7 @@ LOOP_AUTO_CLOSE, LOOP_OPEN, LOOP_ALWAYS_CLOSED = 1, 2, 3
 PDI_RUNS = 0x0001
 WATCHDOG_OK = 0x0002
 WATCHDOG_CLOCK_NS = 40
-"""The watchdog divider counts periods of 25 MHz (ETG.1000.4, table 50)."""
+"""The watchdog divider counts periods of 25 MHz (ETG.1000.4, 6.3)."""
 RESET_SEQUENCE = b"RES"
 """Three consecutive writes to 0x0040 that reset the controller and its device."""
 

@@ -1,4 +1,4 @@
-"""Logical addressing: FMMUs, and the copies that a logical datagram needs (ETG.1000.4, 6.3).
+"""Logical addressing: FMMUs, and the copies that a logical datagram needs (ETG.1000.4, 6.6).
 
 What a datagram means is defined by `transfer`, bit by bit where an FMMU asks for it. `compile_plan` finds the datagrams
 that are nothing but whole process images, once, and turns them into slice copies.

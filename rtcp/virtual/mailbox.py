@@ -1,4 +1,4 @@
-"""The mailbox of a slave: headers, counters, error replies, and what waits to be sent (ETG.1000.4, 5.6 and 6.4)."""
+"""The mailbox of a slave: headers, counters, error replies, and what waits to be sent (ETG.1000.4, 5.6 and 6.7)."""
 
 from __future__ import annotations
 

@@ -179,7 +179,7 @@ HEADER = struct.Struct("<BBHHHH")
 
 
 class Command(IntEnum):
-    """Datagram commands (ETG.1000.4, table 15 and following)."""
+    """Datagram commands (ETG.1000.4, 5.4)."""
 
     NOP = 0
     APRD = 1

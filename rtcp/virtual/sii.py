@@ -1,4 +1,4 @@
-"""The slave information interface: the EEPROM of a device and its registers (ETG.1000.6, 5.4; ETG.1000.4, 6.5)."""
+"""The slave information interface: the EEPROM of a device and its registers (ETG.1000.6, 5.4; ETG.1000.4, 6.4)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _END = 0xFFFF
 _ERASED = b"\xff"
 _CONFIG = struct.Struct("<5H4x")
 _CONTROL = 0x0080
-"""PDI control: on-chip bus, for there is no other processor interface here (ETG.1000.4, 6.2)."""
+"""PDI control: on-chip bus, for there is no other processor interface here (ETG.2010, table 2)."""
 _SYNC_PULSE = 100
 """Length of a SYNC pulse in units of 10 ns."""
 _IDENTITY = struct.Struct("<4L")
