@@ -117,7 +117,7 @@ def reactions(config: ArmConfig) -> str:
             "unchanged", "by itself, with the next right working counter",
         ],
         [
-            "controlled stop", "2", "set-points decelerate under the limits; drives stay enabled",
+            "controlled stop", "2", "setpoints decelerate under the limits; drives stay enabled",
             f"{controlled[0]}; {1000 * max(tool).time_s:.0f} ms where the limits of the tool lead",
             f"{controlled[1]}; the tool {tool[0].way_rad:.2f} m and {tool[1].way_rad:.2f} rad",
             "holding; fault for `clock_lost`", "a new command; after `clock_lost` as after a quick stop",

@@ -44,7 +44,7 @@ class Status:
     torques: Positions
     """Actual torques, Nm."""
     commanded_positions: Positions
-    """Set-points of the controller, rad."""
+    """Setpoints of the controller, rad."""
     sent_positions: Positions
     """Target positions in the frame, rad: what left on the wire."""
     holder: str

@@ -54,7 +54,7 @@ ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
 HardStop = Literal["quick_stop", "torque_off"]
-"""Reactions where set-points cannot be executed or trusted: the drives stop by themselves."""
+"""Reactions where setpoints cannot be executed or trusted: the drives stop by themselves."""
 AnyStop = Literal["controlled_stop", "quick_stop", "torque_off"]
 
 

@@ -131,20 +131,20 @@ class Arm:
             self.gripper.stop()
 
     def rest(self) -> None:
-        """Hold where the set-points are; at standstill."""
+        """Hold where the setpoints are; at standstill."""
         for controller in self.controllers.values():
             controller.hold()
         self.active = self._holder
 
     def hold(self) -> None:
-        """Hold at the last set-point, at rest from now on."""
+        """Hold at the last setpoint, at rest from now on."""
         self.rest()
         self.trajectory_guard.latch(self.state)
 
     def track_actual(self) -> None:
-        """Let set-points and targets follow the drives that have no torque.
+        """Let setpoints and targets follow the drives that have no torque.
 
-        The set-point of a joint outside its range is the edge of it, so that every controller begins inside; from where
+        The setpoint of a joint outside its range is the edge of it, so that every controller begins inside; from where
         the joint is to there the output limiter moves its target, once the drive follows it.
         """
         commanded, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
@@ -262,11 +262,11 @@ class Arm:
 
     @property
     def still(self) -> bool:
-        """Whether the set-points stand still."""
+        """Whether the setpoints stand still."""
         return self.active.phase is Phase.HOLD
 
     @property
     def all_still(self) -> bool:
-        """Whether the gripper's set-point stands still too, and no guard brakes: the torque may go."""
+        """Whether the gripper's setpoint stands still too, and no guard brakes: the torque may go."""
         gripper = self.gripper
         return self.still and not self.trajectory_guard.stopping and (gripper is None or not gripper.motion.moving)

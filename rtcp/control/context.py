@@ -185,9 +185,9 @@ class Context:
     # -- one cycle of an enabled arm ------------------------------------------------------------------------------
 
     def track(self) -> Event | None:
-        """Check what was lost and measured, then move the set-points on by one cycle.
+        """Check what was lost and measured, then move the setpoints on by one cycle.
 
-        Return what ends the state. Without a good cycle the set-points stand still: the slaves missed the last ones.
+        Return what ends the state. Without a good cycle the setpoints stand still: the slaves missed the last ones.
         """
         arm = self.arm
         event = self.bus_fault()

@@ -56,14 +56,14 @@ class DrivenGripper:
 
     @property
     def off_target(self) -> bool:
-        """Whether `track_actual` would move the set-point further than a gripper can have turned."""
+        """Whether `track_actual` would move the setpoint further than a gripper can have turned."""
         drive = self.drive
         return drive.state is not DriveState.OPERATION_ENABLED and not (
             abs(drive.position - self.motion.position) <= TRACKED_RAD
         )
 
     def track_actual(self) -> None:
-        """Let the set-point follow a drive without torque; an enabled one keeps its own, at rest."""
+        """Let the setpoint follow a drive without torque; an enabled one keeps its own, at rest."""
         drive, motion = self.drive, self.motion
         if drive.state is not DriveState.OPERATION_ENABLED:
             motion.latch(drive.position)

@@ -1,4 +1,4 @@
-"""The homing of one joint: its drive homes by itself, its set-point follows, those of the other joints stand."""
+"""The homing of one joint: its drive homes by itself, its setpoint follows, those of the other joints stand."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class HomingSequence:
         return arm.first_returning() < 0
 
     def step(self) -> None:
-        """Run a cycle; the set-point of the joint is where its drive shows it, those of the others stand."""
+        """Run a cycle; the setpoint of the joint is where its drive shows it, those of the others stand."""
         arm, axis, homing = self._arm, self.axis, self._homing
         if homing.ended:
             return

@@ -266,7 +266,7 @@ class Holding(MachineState):
     """Enabled and at rest."""
 
     state = State.HOLDING
-    drives = "the last set-points, unchanged"
+    drives = "the last setpoints, unchanged"
     leads_to = {
         **_TORQUE,
         MotionCommand: State.MOVING,
@@ -322,7 +322,7 @@ class Moving(MachineState):
     """A controller moves the arm."""
 
     state = State.MOVING
-    drives = "the set-points of the active controller, after the guards"
+    drives = "the setpoints of the active controller, after the guards"
     leads_to = {
         **_TORQUE,
         MotionCommand: State.MOVING,
@@ -356,7 +356,7 @@ class Stopping(MachineState):
     """A controlled stop."""
 
     state = State.STOPPING
-    drives = "set-points decelerate to standstill under the limits"
+    drives = "setpoints decelerate to standstill under the limits"
     leads_to = {
         **_TORQUE,
         Stopped: State.HOLDING,
@@ -392,7 +392,7 @@ class StoppedByLimitState(MachineState):
     """A limit ended the motion; a reset leads on."""
 
     state = State.STOPPED_BY_LIMIT
-    drives = "the set-points at which it came to rest, unchanged"
+    drives = "the setpoints at which it came to rest, unchanged"
     leads_to = {**_TORQUE, Reset: State.HOLDING}
 
     def update(self, ctx: Context) -> Event | Signal | None:
@@ -814,7 +814,7 @@ class Closing(MachineState):
         ctx.publish(event)
 
     def _stop(self, ctx: Context) -> bool:
-        """Bring the set-points to rest; return whether they are, or the drives do not follow them anyway."""
+        """Bring the setpoints to rest; return whether they are, or the drives do not follow them anyway."""
         arm = ctx.arm
         arm.stop()
         if arm.all_still or arm.first_not_enabled() >= 0:

@@ -72,7 +72,7 @@ class Homing:
     """Controls the homing of a drive: `start` once, then `step` every cycle after `decode`, until it has `ended`.
 
     The drive is enabled, in CSP and at standstill at the start and again at the end. While it homes, nothing but this
-    object sets its controlword and its mode, and the joint's set-point is `position`, whatever it reads: at the home
+    object sets its controlword and its mode, and the joint's setpoint is `position`, whatever it reads: at the home
     the drive begins to count anew, and `position` jumps with it. A drive that leaves Operation Enabled is not this
     object's matter: the caller sees it, and calls `abandon`.
     """
@@ -108,7 +108,7 @@ class Homing:
 
     @property
     def position(self) -> float:
-        """The joint's set-point, rad: the last one until the drive is in mode 6, then where the drive is, and from its
+        """The joint's setpoint, rad: the last one until the drive is in mode 6, then where the drive is, and from its
         way back to CSP on where it was then."""
         drive = self._drive
         if drive is None:

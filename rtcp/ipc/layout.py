@@ -144,7 +144,7 @@ PER_JOINT = (
 )
 """Fields of a cycle record that are one number a joint, rad, rad/s, Nm.
 
-`commanded_position` is the set-point of the controller after the trajectory guard; `sent_...` are the targets in the
+`commanded_position` is the setpoint of the controller after the trajectory guard; `sent_...` are the targets in the
 frame, after the output limiter: of those, the drive mode decides which one the drive follows.
 """
 

@@ -18,7 +18,7 @@ from rtcp.ipc.events import EVENTS, Event
 _LATENCY_CYCLES = 3
 """From the cycle that finds a reason to the drive that obeys, and to the master that sees it: frame, SYNC0, frame."""
 _DRIVE_S = 0.03
-"""A joint comes to rest so long after the end of its drive's ramp, or of its set-points, at most."""
+"""A joint comes to rest so long after the end of its drive's ramp, or of its setpoints, at most."""
 _QUICK_STOP_DECELERATION = (0x6085, 0)
 _UNKNOWN_S = 2.0
 """A quick stop at a rate that is not known is given so long: as the emergency stop gives it."""
@@ -30,7 +30,7 @@ class StopReaction(IntEnum):
     HOLD = 0
     """The last targets are sent again."""
     CONTROLLED_STOP = 1
-    """Set-points decelerate to standstill under the limits; drives stay enabled: stop category 2."""
+    """Setpoints decelerate to standstill under the limits; drives stay enabled: stop category 2."""
     QUICK_STOP = 2
     """Each drive decelerates by itself at 0x6085 and holds (0x605A = 6): category 2, and 1 where the torque follows."""
     TORQUE_OFF = 3

@@ -1,1 +1,1 @@
-"""Motion in joint space: the generator of set-points, the drive modes that carry them, the guard behind both."""
+"""Motion in joint space: controllers, planning, the guards behind every controller, the writers of the drive modes."""

@@ -1,4 +1,4 @@
-"""How set-points reach a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
+"""How setpoints reach a drive in each cyclic synchronous mode (CiA 402: CSP, CSV, CST).
 
 In CSP the drive closes the position loop; in CSV and CST it is closed here, so that `hold` and `move` mean the same in
 all three.
@@ -37,11 +37,11 @@ class DriveWriter(Protocol):
         """Begin at standstill: forget what an earlier use left behind."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Write the targets of the drives for the set-points `position` (rad) and `velocity` (rad/s)."""
+        """Write the targets of the drives for the setpoints `position` (rad) and `velocity` (rad/s)."""
 
 
 class CspWriter:
-    """CSP: the set-point itself."""
+    """CSP: the setpoint itself."""
 
     mode = DriveMode.CSP
 
@@ -49,7 +49,7 @@ class CspWriter:
         """Nothing is kept."""
 
     def update(self, position: Sequence[float], velocity: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Pass the set-points on; the drive takes the velocity field as its speed limit, which the driver fills in."""
+        """Pass the setpoints on; the drive takes the velocity field as its speed limit, which the driver fills in."""
         for i, drive in enumerate(drives):
             drive.target_position = position[i]
             drive.target_velocity = 0.0
@@ -57,7 +57,7 @@ class CspWriter:
 
 
 class CsvWriter:
-    """CSV: the set-point's velocity and a proportional pull back to its position."""
+    """CSV: the setpoint's velocity and a proportional pull back to its position."""
 
     mode = DriveMode.CSV
 
@@ -82,7 +82,7 @@ class CsvWriter:
 
 
 class CstWriter:
-    """CST: stiffness, damping and a bounded integral about the set-point (an impedance that ends where it should)."""
+    """CST: stiffness, damping and a bounded integral about the setpoint (an impedance that ends where it should)."""
 
     mode = DriveMode.CST
 
@@ -102,9 +102,9 @@ class CstWriter:
             self._integral[i] = min(max(drive.torque, -bound), bound)
 
     def pass_on(self, position: Sequence[float], torque: Sequence[float], drives: Sequence[Commanded]) -> None:
-        """Write `torque` (Nm) itself, with nothing about a set-point; `position` (rad) is where the arm is.
+        """Write `torque` (Nm) itself, with nothing about a setpoint; `position` (rad) is where the arm is.
 
-        `update` takes over without a step, wherever its set-point is.
+        `update` takes over without a step, wherever its setpoint is.
         """
         integral = self._integral
         self._passed = True

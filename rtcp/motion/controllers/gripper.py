@@ -11,14 +11,14 @@ _FIRM_CYCLES = 5
 
 
 class GripperMotion:
-    """Set-points of a gripper's joint: jerk-limited, one `update` a cycle.
+    """Setpoints of a gripper's joint: jerk-limited, one `update` a cycle.
 
     While it moves, a torque at the joint's limit against the motion for 5 cycles means that it holds something: the
-    set-point stays, a little inside of what is held. A drive pushes ever harder towards a set-point that it cannot
-    reach: for as long as the torque is beyond the limit the set-point yields, under the joint's acceleration. Nothing
+    setpoint stays, a little inside of what is held. A drive pushes ever harder towards a setpoint that it cannot
+    reach: for as long as the torque is beyond the limit the setpoint yields, under the joint's acceleration. Nothing
     else ever ends in force: the drive's following error would be a fault.
 
-    Attributes: `position` (rad, the set-point), `gripped` (it was stopped by what it holds).
+    Attributes: `position` (rad, the setpoint), `gripped` (it was stopped by what it holds).
     """
 
     def __init__(self, joint: Joint, open_position: float, closed_position: float, period_s: float) -> None:
@@ -40,7 +40,7 @@ class GripperMotion:
 
     @property
     def position(self) -> float:
-        """The set-point, rad."""
+        """The setpoint, rad."""
         return self._state.commanded[0]
 
     @property
@@ -83,10 +83,10 @@ class GripperMotion:
             self._motion.hold()
 
     def update(self, torque: float) -> float:
-        """Return the set-point of the next cycle, rad; `torque`: measured, Nm."""
+        """Return the setpoint of the next cycle, rad; `torque`: measured, Nm."""
         state = self._state
         before = state.commanded_velocity[0]
-        # A drive pushes in the direction of its set-point: what resists shows as torque in that direction.
+        # A drive pushes in the direction of its setpoint: what resists shows as torque in that direction.
         firm = self.moving and (torque if before > 0.0 else -torque) >= self._firm_torque
         self._firm = self._firm + 1 if firm else 0
         if self._firm >= _FIRM_CYCLES:

@@ -20,9 +20,9 @@ _FADE = 0.3
 _FREE = 1.0 - _FADE
 _STILL_RAD_S = 0.01
 _AHEAD_RAD_S = 0.1
-"""Torque fades out by where the arm is so much faster than its set-point; twice as much is damped."""
+"""Torque fades out by where the arm is so much faster than its setpoint; twice as much is damped."""
 _CATCH_UP = 20.0
-"""1/s: how fast the set-point goes to where the arm is, on the last bit of the way."""
+"""1/s: how fast the setpoint goes to where the arm is, on the last bit of the way."""
 _MARGIN_RAD = 0.02
 """So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
 
@@ -118,7 +118,7 @@ class TorqueController(Controller):
             up, down = _bound(above, top, slow), _bound(below, top, slow)
             # Towards the edge nothing is left of a torque, whether the joint moves or stands.
             left = (up - v if pushed > 0.0 else down + v) / (_FADE * top)
-            # Nor where the arm runs away from its set-point, which keeps to the acceleration.
+            # Nor where the arm runs away from its setpoint, which keeps to the acceleration.
             ahead = v - state.commanded_velocity[i]
             slack = 1.0 - (ahead if pushed > 0.0 else -ahead) / _AHEAD_RAD_S
             left = slack if slack < left else left
@@ -151,7 +151,7 @@ def _bound(stopping_distance: float, fastest: float, slowing: float) -> float:
 
 
 def _chase(lag: float, speed: float, now: float, fastest: float, acceleration: float, dt: float) -> float:
-    """The set-point's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
+    """The setpoint's next speed: it catches up with the arm, `lag` rad away at `speed`, and has its speed there."""
     far = lag if lag >= 0.0 else -lag
     closing = sqrt(acceleration * far)
     closing = closing if closing < _CATCH_UP * far else _CATCH_UP * far

@@ -66,7 +66,7 @@ class VelocityController(Controller):
             self._wanted = list(self._zero)
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the set-points of the next cycle."""
+        """Return the setpoints of the next cycle."""
         target = self.setpoint
         if self.phase is Phase.MOVE and state.now_ns > self._until_ns:
             if any(self._wanted):

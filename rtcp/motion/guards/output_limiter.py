@@ -40,7 +40,7 @@ class OutputLimiter:
         """Check against other limits from now on."""
         self._low, self._high = limits.low, limits.high
         self._speed, self._torque = limits.velocity, limits.torque
-        # Rounding of the set-points is no violation.
+        # Rounding of the setpoints is no violation.
         self._change = [acceleration * self._period_s for acceleration in limits.acceleration]
         self._step = [velocity * self._period_s * (1 + 1e-6) for velocity in limits.velocity]
         self._back = [min(BACK_RAD_S, velocity) for velocity in limits.velocity]

@@ -1,9 +1,9 @@
-"""The guards of the set-points: behind every mode, before the law of the drives.
+"""The guards of the setpoints: behind every controller, before the writer of the drive mode.
 
 For each joint the mean speed of the next cycle is within its limit, differs from the last by no more than
 acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). Whoever keeps to this
 once can keep to it for ever: what a stop leaves of the speed in the next cycle fulfils it there. The boxes are kept
-in the same way: a set-point is passed on only if the stop from it touches none, so that the stop from the last one,
+in the same way: a setpoint is passed on only if the stop from it touches none, so that the stop from the last one,
 which was examined a cycle ago, is always at hand.
 """
 
@@ -43,7 +43,7 @@ class GuardResult(IntEnum):
 
 
 class TrajectoryGuard:
-    """Guards the set-points of one arm.
+    """Guards the setpoints of one arm.
 
     After a cut, `held` is the bit mask of the joints that were clamped.
 
