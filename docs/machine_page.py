@@ -11,7 +11,7 @@ from rtcp.control.states import Signal
 from rtcp.ipc.commands import COMMANDS, Shutdown
 from rtcp.ipc.events import EVENTS, Emergency, Fault
 from rtcp.ipc.message import Message
-from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
+from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, watchdog_bounds
 
 M = TypeVar("M", bound=Message)
 _EVERYWHERE = (Fault, Emergency, Shutdown)
@@ -106,7 +106,7 @@ def reactions(config: ArmConfig) -> str:
             bounds(config, StopReaction.HOLD),
             bounds(config, StopReaction.CONTROLLED_STOP),
             bounds(config, StopReaction.QUICK_STOP),
-            unheard(config),
+            watchdog_bounds(config),
         )
     )
     tool = tool_bounds(config, config.cartesian.speed, config.cartesian.angular_speed)

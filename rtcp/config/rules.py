@@ -262,8 +262,8 @@ def _interface(arm: ArmFile) -> Iterator[Finding]:
 
 @rule(ArmFile, "control_mode", "inputs")
 def _control_mode(arm: ArmFile) -> Iterator[Finding]:
-    stick = arm.inputs.joystick is not None
-    if text := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=stick):
+    joystick = arm.inputs.joystick is not None
+    if text := missing_for(arm.control_mode, geometry=arm.kinematics is not None, joystick=joystick):
         yield ("control_mode",), text
 
 
@@ -295,8 +295,8 @@ def _output_terminals(arm: ArmFile) -> Iterator[Finding]:
 
 
 def _inputs(arm: ArmFile) -> Iterator[Place]:
-    if stick := arm.inputs.joystick:
-        yield from ((("inputs", "joystick", key), getattr(stick, key)) for key in JOYSTICK_TERMINALS)
+    if joystick := arm.inputs.joystick:
+        yield from ((("inputs", "joystick", key), getattr(joystick, key)) for key in JOYSTICK_TERMINALS)
     for key in ("arm_toggle", "enabling_switch", "emergency_stop"):
         if terminal := getattr(arm.inputs, key):
             yield ("inputs", key, "number"), terminal.number

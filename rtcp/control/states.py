@@ -472,32 +472,32 @@ class Standstill:
     """
 
     _STAND_S = 2.0
-    """A drive that still turns so long after its quick stop does not stop by itself: its brake has to."""
-    _UNHEARD_S = 0.5
-    """So much longer than the quick stop of a usual arm that a late start does not matter."""
+    """A drive that still turns so long after its quick stop began does not stop by itself: its brake has to, s."""
+    _LOST_S = 0.5
+    """The least time of lost cycles after which `unobservable` holds, s: well beyond a quick stop that began late."""
 
     def __init__(self, ctx: Context) -> None:
         ramp_s = quick_stop_s(ctx.config)
         self._stand_cycles = ctx.cycles(max(self._STAND_S, ramp_s))
-        self._unheard_cycles = ctx.cycles(max(self._UNHEARD_S, ramp_s))
-        self._cycles = self._unheard = 0
+        self._lost_limit = ctx.cycles(max(self._LOST_S, ramp_s))
+        self._cycles = self._lost = 0
 
     def begin(self) -> None:
         """Begin with the quick stop."""
-        self._cycles = self._unheard = 0
+        self._cycles = self._lost = 0
 
     @property
-    def unheard(self) -> bool:
-        """Whether the drives have not answered for as long as any quick stop takes: their states are unknown."""
-        return self._unheard > self._unheard_cycles
+    def unobservable(self) -> bool:
+        """Whether cycles were lost for as long as any quick stop takes: the states of the drives are unknown."""
+        return self._lost > self._lost_limit
 
     def reached(self, ctx: Context) -> bool:
         """Count the cycle; return whether the joints stand, or waiting for it gains nothing."""
         self._cycles += 1
         if not ctx.good:
-            self._unheard += 1
+            self._lost += 1
         stands = ctx.good and self._cycles > FIRST_CYCLES and ctx.arm.first_moving() < 0
-        return stands or self.unheard or self._cycles > self._stand_cycles
+        return stands or self.unobservable or self._cycles > self._stand_cycles
 
 
 class FaultReaction:
@@ -626,8 +626,7 @@ class FaultState(MachineState):
 class EmergencyStopState(MachineState):
     """The emergency stop: quick stop, torque off at standstill or at once, slaves to PRE-OP.
 
-    Source: the emergency stop of the thesis stops the network and takes the slaves to PRE-OP (facts, "The drive"). Here
-    the drives come to rest first: a drive that loses its process data in motion lets the arm fall.
+    The drives come to rest before the slaves leave OP: one that loses its process data in motion lets the arm fall.
     """
 
     state = State.EMERGENCY_STOP
@@ -666,7 +665,7 @@ class EmergencyStopState(MachineState):
         if not reaction.torque_off:
             arm.advance(TargetState.QUICK_STOPPED)
             if reaction.standstill.reached(ctx):
-                if reaction.standstill.unheard:
+                if reaction.standstill.unobservable:
                     # The states of the drives are unknown: from each of them this removes the torque.
                     self._off = TargetState.TORQUE_OFF
                 reaction.torque_off = True
@@ -795,7 +794,7 @@ class Closing(MachineState):
         if not self._hard:
             return False
         self._standstill.reached(ctx)
-        if self._standstill.unheard:
+        if self._standstill.unobservable:
             self._target = TargetState.TORQUE_OFF
         if arm.first_moving() < 0 or self._cycles > ctx.cycles(self._CLOSING_S):
             return False

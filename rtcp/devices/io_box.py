@@ -195,10 +195,10 @@ RESTLESS = 4
 
 
 class JoystickInput:
-    """What the stick shows. `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
+    """What the joystick shows. `read` sets `forward`, `side` (left is +1) and `paddle` (-1, 0, 1), `code` and `valid`.
 
     Args:
-        config: which inputs are the stick's, and which others have a meaning.
+        config: which inputs are the joystick's, and which others have a meaning.
         cycle_s: how often `read` is called, s.
     """
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
-from rtcp.fieldbus.al_state import AL_CONTROL, ERROR_BIT, AlState, read_al, refusal
+from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.clocks import DC_ACTIVATE, forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
@@ -48,8 +48,8 @@ class SlaveSetup:
     """Serial number in its EEPROM; 0: it has none."""
 
 
-def take_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
-    """Copy a slave's set-up, `serial` its serial number; raises BusError where it does not answer."""
+def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
+    """Return a slave's set-up as its registers hold it; `serial`: its serial number. Raises BusError: no answer."""
     station = station_of(position)
     fmmus = port.read(station, _FMMUS, _FMMUS_SIZE)
     managers = port.read(station, _SYNC_MANAGERS, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
@@ -118,13 +118,13 @@ class SlaveRestorer:
         if set_up.delay is not None:
             forget_drift(port, position, label)
         yield
-        yield from self._lead(position, AlState.INIT)
+        yield from self._change_state(position, AlState.INIT)
         port.put(station, _SYNC_MANAGERS, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
         port.put(station, _FMMUS, bytes(_FMMUS_SIZE), label)
         self._write_sync_managers(position, range(_MAILBOXES))
         if not eeprom_to_device(port, station):
             raise BusError(f"{label} did not take its EEPROM back")
-        yield from self._lead(position, AlState.PREOP)
+        yield from self._change_state(position, AlState.PREOP)
         yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
         self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
         port.put(station, _FMMUS, set_up.fmmus, label)
@@ -133,7 +133,7 @@ class SlaveRestorer:
                 yield from settle_clock(port, station, label)
             start_sync(port, station, label, config.device, self._period_ns)
         yield
-        yield from self._lead(position, AlState.SAFEOP)
+        yield from self._change_state(position, AlState.SAFEOP)
 
     def _label(self, position: int) -> str:
         return slave_label(position, self._slaves[position - 1].name)
@@ -192,11 +192,10 @@ class SlaveRestorer:
                 address = _SYNC_MANAGERS + number * _SYNC_MANAGER_SIZE
                 self._port.put(station_of(position), address, setting, self._label(position))
 
-    def _lead(self, position: int, state: AlState) -> Steps[None]:
-        """Request `state`, acknowledging what error there is, and wait for it; raises BusError."""
+    def _change_state(self, position: int, state: AlState) -> Steps[None]:
+        """Request `state`, which acknowledges an error, and wait for it; raises BusError where that fails."""
         port, station = self._port, station_of(position)
-        error = read_al(port, station)[1]
-        port.write(station, AL_CONTROL, (state | (ERROR_BIT if error else 0)).to_bytes(2, "little"))
+        request_state(port, (station,), state)
         deadline = time.monotonic() + _STATE_S
         while True:
             yield

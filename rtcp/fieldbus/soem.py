@@ -25,7 +25,7 @@ from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, layout, layout_faults
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
-from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, take_set_up
+from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
 from rtcp.fieldbus.supervision import SlaveWatcher
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
@@ -173,7 +173,7 @@ class SoemBus:
         if refused := self.wait_for_state(AlState.SAFEOP, self._state_timeout_s):
             raise BusError(*refused)
         set_ups = [
-            take_set_up(self.port, position, config.name, serial)
+            read_set_up(self.port, position, config.name, serial)
             for position, (config, serial) in enumerate(zip(slaves, self._serials, strict=True), 1)
         ]
         self._restorer = SlaveRestorer(self.port, slaves, set_ups, self._mailboxes.sdo, period_ns)

@@ -91,7 +91,7 @@ def bounds(config: ArmConfig, reaction: StopReaction, braking: Sequence[float] =
     return tuple(found)
 
 
-def unheard(config: ArmConfig) -> tuple[Bound, ...]:
+def watchdog_bounds(config: ArmConfig) -> tuple[Bound, ...]:
     """Return the bound of each joint where no frame reaches its drive any more, counted from the first that does not.
 
     Until its watchdog ends it the drive goes on with its last target; then it is in fault and ramps down (0x605E = 2).

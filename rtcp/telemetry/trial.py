@@ -12,7 +12,7 @@ from typing import Any
 from rtcp.api import Robot, RtcpError, State
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.runtime_directory import control_socket
-from rtcp.ipc.stop_reactions import StopReaction, bounds, unheard
+from rtcp.ipc.stop_reactions import StopReaction, bounds, watchdog_bounds
 from rtcp.telemetry.harness import CLIENT_NAME, Harness, TrialFailed
 
 CONTINUES = frozenset({State.HOLDING, State.MOVING, State.STOPPING})
@@ -225,7 +225,7 @@ def stopping_bounds(config: ArmConfig) -> list[float]:
         bounds(config, reaction)
         for reaction in (StopReaction.HOLD, StopReaction.CONTROLLED_STOP, StopReaction.QUICK_STOP)
     )
-    watchdog = unheard(config)
+    watchdog = watchdog_bounds(config)
     return [
         max(h.way_rad + max(c.way_rad, q.way_rad), w.way_rad)
         for h, c, q, w in zip(hold, stop, quick, watchdog, strict=True)

@@ -254,7 +254,6 @@ class Esc:
         for register, content in DEFAULTS:
             self.memory[register : register + len(content)] = content
         self.put(Register.FEATURES, features, 2)
-        self._links = links
         self.put(Register.DL_STATUS, self._dl_status(links), 2)
         # The link comes up after power-on: the first change of the DL status (ET1100, 0x0210.2).
         self.put(Register.EVENT_REQUEST, EcatEvent.DL_STATUS, 2)

@@ -168,7 +168,6 @@ COUNTER = 2
 """Bytes of the working counter behind a datagram's data."""
 LENGTH_MASK = 0x07FF
 MORE_FOLLOWS = 0x8000
-CIRCULATING = 0x4000
 TYPE_DATAGRAMS = 0x1
 MAX_FRAME = 1514
 LOCAL_BIT = 0x02

@@ -102,7 +102,7 @@ class Chain:
 
 
 DELAYS = (0, 820, 1660, 2500, 3320, 4160, 5020)
-"""Propagation delays in ns from the master to the slaves of the robot (facts of the machine)."""
+"""Propagation delays in ns from the master to the slaves of the robot."""
 FURTHER_DELAY = 840
 """What every slave after these adds, in ns."""
 IDLE_TICK = 1_000_000

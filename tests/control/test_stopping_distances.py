@@ -16,7 +16,7 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.commands import Command, Enable, Jog, MoveJoints, SetDriveMode
 from rtcp.ipc.states import DriveMode, JogFrame, State
-from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, unheard
+from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, watchdog_bounds
 from rtcp.launch.simulation import NAME, Frame, Simulation
 
 CONFIG = load(default_config())
@@ -184,7 +184,7 @@ def test_frames_that_stay_away_end_in_a_quick_stop_or_by_the_drives_watchdog(
     simulation.data.lose(100_000, heard)
     simulation.run(0.6)
     assert simulation.state is State.FAULT
-    limits: Sequence[Bound] = unheard(CONFIG)
+    limits: Sequence[Bound] = watchdog_bounds(CONFIG)
     if heard:
         held, stop = bounds(CONFIG, StopReaction.HOLD), bounds(CONFIG, StopReaction.QUICK_STOP)
         limits = [Bound(a.time_s + b.time_s, a.way_rad + b.way_rad) for a, b in zip(held, stop, strict=True)]

@@ -13,7 +13,7 @@ from master_child import Cycle, arm, to_op, with_device
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus import AlState
 from rtcp.fieldbus.bus import station_of
-from rtcp.fieldbus.slave_setup import SlaveRestorer, take_set_up
+from rtcp.fieldbus.slave_setup import SlaveRestorer, read_set_up
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.fieldbus.supervision import SlaveWatcher
 from rtcp.virtual.faults.client import SegmentClient
@@ -117,7 +117,7 @@ class Watched:
         own = self.slaves[position - 1].device
         other = own if serial else replace(own, product_id=0x4711)
         changed = [replace(one, device=other) if at == position else one for at, one in enumerate(self.slaves, 1)]
-        set_ups = [take_set_up(self.bus.port, at, one.name, serial) for at, one in enumerate(self.slaves, 1)]
+        set_ups = [read_set_up(self.bus.port, at, one.name, serial) for at, one in enumerate(self.slaves, 1)]
         restorer = SlaveRestorer(self.bus.port, changed, set_ups, self.bus.sdo, PERIOD)
         return SlaveWatcher(self.bus.port, [one.name for one in self.slaves], restorer, say)
 

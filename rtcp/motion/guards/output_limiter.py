@@ -1,7 +1,7 @@
 """The last place before the drives: no target outside a limit passes, whatever asked for it.
 
-Promises 1 and 2 of the design: position inside the joint's range, no step beyond speed x cycle, speed and torque
-inside their bounds, never a number that is none; and no target velocity that changes by more than acceleration x cycle,
+Position inside the joint's range, no step beyond speed x cycle, speed and torque inside their bounds, finite numbers
+only; and no target velocity that changes by more than acceleration x cycle,
 whatever the position loop that is closed in CSV makes of a disturbance. A joint that was enabled outside its range is
 led back into it.
 """

@@ -35,7 +35,7 @@ AlCode = Annotated[int, Ge(1), Le(0xFFFF)]
 DriveError = Literal[
     "over-current", "over-voltage", "under-voltage", "over-temperature", "encoder", "over-speed", "following-error"
 ]
-STICK = 0x3F
+JOYSTICK = 0x3F
 """The joystick's lines: the six first inputs."""
 
 _D = TypeVar("_D", bound=DeviceModel)
@@ -362,11 +362,11 @@ class TerminalFault(TerminalsFault):
 
 @dataclass(frozen=True)
 class JoystickCode(TerminalsFault):
-    """The joystick's six inputs show `value`, whatever the joystick does; 63 is neutral, most values mean nothing."""
+    """The joystick's six inputs show `value`, whatever its lever does; 63 is neutral, most values mean nothing."""
 
     name = "joystick_code"
     value: Annotated[int, Ge(0), Le(63)]
 
     def broken(self, inputs: int) -> BrokenTerminals:
         """Return the joystick's terminals."""
-        return BrokenTerminals(STICK, self.value)
+        return BrokenTerminals(JOYSTICK, self.value)

@@ -8,7 +8,7 @@ import pytest
 
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.faults.fault import FaultRefused
-from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, PowerFault, JoystickCode, TerminalFault
+from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, JoystickCode, PowerFault, TerminalFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from tests.virtual.line import MS, Line, begin
 
@@ -180,7 +180,7 @@ def test_an_input_that_bounces_changes_with_each_half_period_and_begins_with_the
     assert [seen(line) for _ in range(9)] == [level] * 9
 
 
-def test_the_joystick_s_lines_show_a_code_whatever_the_stick_does(box: DiewuIoBox) -> None:
+def test_the_joystick_s_lines_show_a_code_whatever_its_lever_does(box: DiewuIoBox) -> None:
     line = Line([box])
     end = begin(line.segment, JoystickCode(0b010101), line.now)
     box.inputs = 0xFFC0
