@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterable, Mapping
 from enum import IntEnum
 
-from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort
+from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort
 
 ERROR_BIT = 0x10
 """Error indication in AL status, acknowledge in AL control (ETG.1000.6, 5.3.1 and 5.3.2)."""
@@ -134,9 +134,6 @@ def refusal(slave: str, requested: int, found: int, code: int) -> str:
     )
 
 
-AL_CONTROL = 0x0120
-AL_STATUS = 0x0130
-"""AL status (2 bytes), two bytes of nothing, AL status code (2 bytes)."""
 _POLL_S = 0.002
 
 
@@ -148,7 +145,7 @@ def read_al(port: RegisterPort, station: int, tries: int | None = None) -> tuple
         station: the slave's configured address.
         tries: frames that may be lost before it counts as one that does not answer; None: as many as the port's.
     """
-    data = port.read(station, AL_STATUS, 6, tries=tries)
+    data = port.read(station, Register.AL_STATUS, 6, tries=tries)
     if data is None:
         return AlState.NONE, False, 0
     status = int.from_bytes(data[:2], "little")
@@ -161,19 +158,19 @@ def request_state(port: RegisterPort, stations: Iterable[int], state: AlState) -
     """Request `state` of the slaves; an error that one of them shows is acknowledged with it. Nothing is waited for."""
     for station in stations:
         error = read_al(port, station)[1]
-        port.write(station, AL_CONTROL, (state | (ERROR_BIT if error else 0)).to_bytes(2, "little"))
+        port.write(station, Register.AL_CONTROL, (state | (ERROR_BIT if error else 0)).to_bytes(2, "little"))
 
 
 def broadcast_state(port: RegisterPort, state: AlState) -> int:
     """Request `state` of all slaves at once and acknowledge their errors; return how many took it, -1: no frame."""
-    return port.write_all(AL_CONTROL, (state | ERROR_BIT).to_bytes(2, "little"))
+    return port.write_all(Register.AL_CONTROL, (state | ERROR_BIT).to_bytes(2, "little"))
 
 
 def acknowledge(port: RegisterPort, station: int) -> AlState:
     """Acknowledge a slave's error; it stays in the state that it is in, which is returned."""
     state = read_al(port, station)[0]
     if state is not AlState.NONE:
-        port.write(station, AL_CONTROL, (state | ERROR_BIT).to_bytes(2, "little"))
+        port.write(station, Register.AL_CONTROL, (state | ERROR_BIT).to_bytes(2, "little"))
     return state
 
 

@@ -10,15 +10,9 @@ from typing import Any
 from rtcp.config.model import DeviceDescription, SlaveConfig
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import RegisterPort, Steps
+from rtcp.fieldbus.registers import Register, RegisterPort, Steps
 
-DC_ACTIVATE = 0x0981
-"""Activation register: bit 0 cyclic operation, bit 1 SYNC0, bit 2 SYNC1."""
-_DC_RECEIVE_TIMES, _DC_RECEIVE_TIME = 0x0900, 0x0918
-"""Writing the first latches, in every slave that the frame passes, the local time at the second."""
-_DC_SYSTEM_TIME, _DC_OFFSET, _DC_DELAY, _DC_DIFFERENCE = 0x0910, 0x0920, 0x0928, 0x092C
-_DC_SPEED, _DC_SPEED_DEFAULT = 0x0930, b"\x00\x10"
-_DC_CYCLIC_UNIT, _DC_START, _DC_CYCLES = 0x0980, 0x0990, 0x09A0
+_DC_SPEED_DEFAULT = b"\x00\x10"
 _SYNC_DELAY_NS = 100_000_000
 """From the activation to the first SYNC0 at least."""
 _SETTLED_NS = 2_000
@@ -67,40 +61,40 @@ def take_over_time(
         BusError: it stopped answering, or no slave took the broadcast.
     """
     if not always:
-        shown = port.read_at(position, _DC_DIFFERENCE, 4)
+        shown = port.read_at(position, Register.DC_DIFFERENCE, 4)
         if shown is not None and _difference(shown) < _SETTLED_NS:
             return
     # Without it the two registers below would hold times of two different frames.
-    if port.write_all(_DC_RECEIVE_TIMES, bytes(4)) < 1:
+    if port.write_all(Register.DC_PORT_RECEIVE_TIMES, bytes(4)) < 1:
         raise BusError(f"{label}: the local times could not be latched while its clock was set")
-    own = port.read_at(position, _DC_RECEIVE_TIME, 8)
+    own = port.read_at(position, Register.DC_RECEIVE_TIME, 8)
     if own is None:
         raise BusError(f"{label} stopped answering while its clock was set")
     # Where no other clock lives, the host's time is as good as any (SOEM starts with it): ns since 2000.
     time_then = time.time_ns() - _UNTIL_2000_NS
     for other in others:
         station = station_of(other)
-        theirs = [port.read(station, address, 8) for address in (_DC_RECEIVE_TIME, _DC_OFFSET)]
-        their_delay = port.read(station, _DC_DELAY, 4)
+        theirs = [port.read(station, address, 8) for address in (Register.DC_RECEIVE_TIME, Register.DC_OFFSET)]
+        their_delay = port.read(station, Register.DC_DELAY, 4)
         if None not in theirs and their_delay is not None:
             time_then = sum(int.from_bytes(part or b"", "little") for part in theirs)
             time_then += int.from_bytes(delay, "little") - int.from_bytes(their_delay, "little")
             break
     offset = time_then - int.from_bytes(own, "little") & (1 << 64) - 1
-    port.put_at(position, _DC_DELAY, delay, label)
-    port.put_at(position, _DC_OFFSET, offset.to_bytes(8, "little"), label)
+    port.put_at(position, Register.DC_DELAY, delay, label)
+    port.put_at(position, Register.DC_OFFSET, offset.to_bytes(8, "little"), label)
 
 
 def forget_drift(port: RegisterPort, position: int, label: str) -> None:
     """Let a slave forget what drift compensation has learnt: it may have followed a reference that stood still."""
-    port.put_at(position, _DC_SPEED, _DC_SPEED_DEFAULT, label)
+    port.put_at(position, Register.DC_SPEED, _DC_SPEED_DEFAULT, label)
 
 
 def settle_clock(port: RegisterPort, station: int, label: str) -> Steps[None]:
     """Let drift compensation bring a slave's clock to the reference's; raises BusError where it does not get there."""
     until = time.monotonic() + _SETTLE_S
     while True:
-        shown = port.read(station, _DC_DIFFERENCE, 4)
+        shown = port.read(station, Register.DC_DIFFERENCE, 4)
         if shown is not None and _difference(shown) < _SETTLED_NS:
             return
         if time.monotonic() >= until:
@@ -127,23 +121,23 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
     cycles = struct.pack("<II", period_ns, 0)
     activation = bytes((device.assign_activate >> 8,))
     for _ in range(_SYNC_ATTEMPTS):
-        port.put(station, DC_ACTIVATE, b"\0", label)
-        port.put(station, _DC_CYCLIC_UNIT, b"\0", label)
-        now = port.read(station, _DC_SYSTEM_TIME, 8)
+        port.put(station, Register.DC_ACTIVATION, b"\0", label)
+        port.put(station, Register.DC_CYCLIC_UNIT, b"\0", label)
+        now = port.read(station, Register.DC_SYSTEM_TIME, 8)
         if now is None:
             raise BusError(f"{label} stopped answering while its SYNC0 was started")
         begin = (int.from_bytes(now, "little") + _SYNC_DELAY_NS) // period_ns * period_ns + period_ns + shift
-        port.put(station, _DC_START, begin.to_bytes(8, "little"), label)
-        port.put(station, _DC_CYCLES, cycles, label)
-        if port.read(station, _DC_CYCLES, len(cycles)) != cycles:
+        port.put(station, Register.DC_START, begin.to_bytes(8, "little"), label)
+        port.put(station, Register.DC_SYNC0_CYCLE, cycles, label)
+        if port.read(station, Register.DC_SYNC0_CYCLE, len(cycles)) != cycles:
             raise BusError(f"{label}: it does not keep the cycle of SYNC0, {period_ns / 1000:g} us (register 0x09A0)")
-        port.put(station, DC_ACTIVATE, activation, label)
+        port.put(station, Register.DC_ACTIVATION, activation, label)
         # A SYNC0 whose time had passed at the activation never comes (SOEM#757): frames may have been lost meanwhile.
         if first_sync_is_ahead(port, station):
             break
     else:
         raise BusError(f"{label}: its first SYNC0 lies in the past: it would never come")
-    active = port.read(station, DC_ACTIVATE, 1)
+    active = port.read(station, Register.DC_ACTIVATION, 1)
     if active != activation:
         shown = "nothing" if active is None else f"0x{active[0]:02X}"
         raise BusError(
@@ -153,8 +147,8 @@ def start_sync(port: RegisterPort, station: int, label: str, device: DeviceDescr
 
 def first_sync_is_ahead(port: RegisterPort, station: int) -> bool:
     """Whether the next SYNC0 of the slave is still to come."""
-    now = port.read(station, _DC_SYSTEM_TIME, 4)
-    start = port.read(station, _DC_START, 4)
+    now = port.read(station, Register.DC_SYSTEM_TIME, 4)
+    start = port.read(station, Register.DC_START, 4)
     if now is None or start is None:
         return False
     # The low 32 bits alone: an ESC may have no more.

@@ -16,7 +16,7 @@ from enum import IntEnum
 from rtcp.fieldbus.bus import MailboxInfo, slave_label, station_of
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.fieldbus.registers import Command, RegisterPort, Steps, T, finish, pause
+from rtcp.fieldbus.registers import Command, Register, RegisterPort, Steps, T, finish, pause
 
 _RETRY_S = 0.01
 _TIMEOUT_S = 0.7
@@ -245,7 +245,7 @@ def abort_meaning(code: int) -> str:
     return ABORT_CODES.get(code, "not in the standard")
 
 
-_SM0_STATUS, _SM1_STATUS, _FULL = 0x0805, 0x080D, 0x08
+_SM0_STATUS, _SM1_STATUS, _FULL = Register.SYNC_MANAGER + 5, Register.SYNC_MANAGER + 13, 0x08
 _HEADER = struct.Struct("<HHBB")
 
 

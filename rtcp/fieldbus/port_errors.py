@@ -11,9 +11,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rtcp.fieldbus.bus import slave_label, station_of
-from rtcp.fieldbus.registers import Command, RegisterPort
+from rtcp.fieldbus.registers import Command, Register, RegisterPort
 
-_COUNTERS, _SIZE = 0x0300, 0x14
+_SIZE = 0x14
 _FORWARDED, _LINKS = 0x08, 0x10
 _PORTS = 4
 _OF_FRAMES, _OF_LINKS = slice(0, _FORWARDED + _PORTS), slice(_LINKS, _LINKS + _PORTS)
@@ -60,7 +60,7 @@ class ErrorCounters:
         self._names = names
         self._report = report
         # What was counted before is of no cable that is in use now: plugs were put in.
-        self._last = [port.read(station_of(position), _COUNTERS, _SIZE) for position in range(1, len(names) + 1)]
+        self._last = [port.read(station_of(at), Register.ERROR_COUNTERS, _SIZE) for at in range(1, len(names) + 1)]
         self._turn = 0
         self._cables: dict[tuple[str, int], _CableErrors] = {}
         self.of = [PortErrors() for _ in names]
@@ -70,7 +70,7 @@ class ErrorCounters:
         """Read the next slave's counters; a slave that does not answer keeps what it had."""
         index, self._turn = self._turn, (self._turn + 1) % len(self._names)
         station = station_of(index + 1)
-        found, wkc = self._port.exchange(Command.FPRD, station, _COUNTERS, bytes(_SIZE), tries=1)
+        found, wkc = self._port.exchange(Command.FPRD, station, Register.ERROR_COUNTERS, bytes(_SIZE), tries=1)
         if wkc != 1:
             return
         before = self._last[index]
@@ -78,7 +78,8 @@ class ErrorCounters:
             self._add(index, before, found)
         for part in (_OF_FRAMES, _OF_LINKS):
             shown = found[part]
-            if max(shown) >= _CLEAR_FROM and self._port.write(station, _COUNTERS + part.start, bytes(len(shown))):
+            address = Register.ERROR_COUNTERS + part.start
+            if max(shown) >= _CLEAR_FROM and self._port.write(station, address, bytes(len(shown))):
                 found = found[: part.start] + bytes(len(shown)) + found[part.stop :]
         self._last[index] = found
 

@@ -42,6 +42,45 @@ class Command(IntEnum):
     BWR = 8
 
 
+class Register(IntEnum):
+    """Addresses of the registers used here (ETG.1000.4, clause 6)."""
+
+    FMMU_COUNT = 0x0004
+    FEATURES = 0x0008
+    STATION_ADDRESS = 0x0010
+    STATION_ALIAS = 0x0012
+    DL_STATUS = 0x0110
+    AL_CONTROL = 0x0120
+    AL_STATUS = 0x0130
+    """AL status (2 bytes), two reserved bytes, AL status code (2 bytes)."""
+    ERROR_COUNTERS = 0x0300
+    WATCHDOG_DIVIDER = 0x0400
+    WATCHDOG_PROCESS_DATA = 0x0420
+    EEPROM_CONFIG = 0x0500
+    EEPROM_CONTROL = 0x0502
+    EEPROM_DATA = 0x0508
+    FMMU = 0x0600
+    SYNC_MANAGER = 0x0800
+    DC_PORT_RECEIVE_TIMES = 0x0900
+    """A write latches the local time, in every slave that the frame passes, here and in DC_RECEIVE_TIME."""
+    DC_SYSTEM_TIME = 0x0910
+    DC_RECEIVE_TIME = 0x0918
+    """Local time at which the processing unit received the frame that latched, ns."""
+    DC_OFFSET = 0x0920
+    DC_DELAY = 0x0928
+    """Propagation delay from the reference clock, ns."""
+    DC_DIFFERENCE = 0x092C
+    DC_SPEED = 0x0930
+    DC_CYCLIC_UNIT = 0x0980
+    DC_ACTIVATION = 0x0981
+    """Bit 0 cyclic operation, bit 1 SYNC0, bit 2 SYNC1."""
+    DC_START = 0x0990
+    DC_SYNC0_CYCLE = 0x09A0
+    """Four bytes; those of SYNC1 follow."""
+
+
+FEATURE_DC = 0x04
+"""Bit of FEATURES: the slave has a distributed clock."""
 _ANSWER_S = 0.02
 TRIES, PATIENT_TRIES = 3, 25
 """Frames for a datagram: beside the cycle, where a quick answer counts, and before it, where half a second without any

@@ -13,17 +13,9 @@ from rtcp.fieldbus.bus import MailboxInfo, PdoEntryInfo, PdoInfo, SlaveInfo, Syn
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, reading_assignment
-from rtcp.fieldbus.registers import RegisterPort, finish
+from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, finish
 
 _DEVICE_NAME = 0x1008
-_ESC_FMMUS = 0x0004
-_ALIAS = 0x0012
-_ESC_FEATURES = 0x0008
-_FEATURE_DC = 0x04
-_DL_STATUS = 0x0110
-_EEPROM_CONFIG = 0x0500
-_SYNC_MANAGERS = 0x0800
-_DC_DELAY = 0x0928
 _SII_SERIAL, _SII_RECEIVE, _SII_SEND, _SII_PROTOCOLS = 0x0E, 0x18, 0x1A, 0x1C
 _EEPROM_US = 500_000
 """For a word of it: a shared host may be off its CPU for longer than the 20 ms that pysoem gives it."""
@@ -116,7 +108,7 @@ def parents(ports: list[tuple[str, ...]]) -> list[int]:
 
 
 def _sync_managers(port: RegisterPort, station: int) -> tuple[SyncManagerInfo, ...]:
-    data = port.read(station, _SYNC_MANAGERS, 4 * _SYNC_MANAGER.size)
+    data = port.read(station, Register.SYNC_MANAGER, 4 * _SYNC_MANAGER.size)
     if data is None:
         return ()
     found = []
@@ -159,7 +151,7 @@ def describe(
         except BusError:
             # A slave need not have assignment objects (ETG.1000.6, 5.6.7.4): its PDOs are then fixed in its EEPROM.
             outputs, inputs = (), ()
-    dc = bool(register(_ESC_FEATURES, 2) & _FEATURE_DC)
+    dc = bool(register(Register.FEATURES, 2) & FEATURE_DC)
     return SlaveInfo(
         position=sdo.position,
         station=station,
@@ -168,7 +160,7 @@ def describe(
         product_code=slave.id,
         revision=slave.rev,
         serial=serial,
-        alias=register(_ALIAS, 2),
+        alias=register(Register.STATION_ALIAS, 2),
         state=state_name(state | (ERROR_BIT if error else 0)),
         al_status_code=code,
         al_status=code_meaning(code),
@@ -179,9 +171,9 @@ def describe(
         output_bits=sum(pdo.bits for pdo in outputs),
         input_bits=sum(pdo.bits for pdo in inputs),
         sync_managers=_sync_managers(port, station),
-        fmmus=register(_ESC_FMMUS, 1),
+        fmmus=register(Register.FMMU_COUNT, 1),
         dc=dc,
-        delay_ns=register(_DC_DELAY, 4) if dc else 0,
-        ports=_ports(register(_DL_STATUS, 2)),
+        delay_ns=register(Register.DC_DELAY, 4) if dc else 0,
+        ports=_ports(register(Register.DL_STATUS, 2)),
         parent=0,
     )

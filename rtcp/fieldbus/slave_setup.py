@@ -16,20 +16,17 @@ from typing import Any
 from rtcp.config.model import DeviceDescription, SlaveConfig, StartupSdo
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, read_al, refusal, request_state
 from rtcp.fieldbus.bus import slave_label, station_of
-from rtcp.fieldbus.clocks import DC_ACTIVATE, forget_drift, settle_clock, start_sync, take_over_time
+from rtcp.fieldbus.clocks import forget_drift, settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError, ForeignSlave, SdoAborted
 from rtcp.fieldbus.mailbox import ABSENT, SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, TYPES, compare_mapping, mapping_of, write_mapping
-from rtcp.fieldbus.registers import RegisterPort, Steps
+from rtcp.fieldbus.registers import FEATURE_DC, Register, RegisterPort, Steps
 from rtcp.fieldbus.scan import name_of
 
-STATION = 0x0010
-_FMMUS, _FMMUS_SIZE = 0x0600, 0x80
-_SYNC_MANAGERS, _SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 0x0800, 8, 8
+_FMMUS_SIZE = 0x80
+_SYNC_MANAGER_SIZE, _SYNC_MANAGER_COUNT = 8, 8
 _MAILBOXES = 2
 """Sync managers 0 and 1 are the mailboxes."""
-_FEATURES, _FEATURE_DC, _DELAY = 0x0008, 0x04, 0x0928
-_EEPROM_CONFIG, _EEPROM_CONTROL, _EEPROM_DATA = 0x0500, 0x0502, 0x0508
 _EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
 _EEPROM_S, _STATE_S = 0.5, 3.0
@@ -51,16 +48,16 @@ class SlaveSetup:
 def read_set_up(port: RegisterPort, position: int, name: str, serial: int) -> SlaveSetup:
     """Return a slave's set-up as its registers hold it; `serial`: its serial number. Raises BusError: no answer."""
     station = station_of(position)
-    fmmus = port.read(station, _FMMUS, _FMMUS_SIZE)
-    managers = port.read(station, _SYNC_MANAGERS, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
-    features = port.read(station, _FEATURES, 2)
+    fmmus = port.read(station, Register.FMMU, _FMMUS_SIZE)
+    managers = port.read(station, Register.SYNC_MANAGER, _SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT)
+    features = port.read(station, Register.FEATURES, 2)
     if fmmus is None or managers is None or features is None:
         raise BusError(f"{slave_label(position, name)} stopped answering while its set-up was read")
     own = (managers[at : at + _SYNC_MANAGER_SIZE] for at in range(0, len(managers), _SYNC_MANAGER_SIZE))
     return SlaveSetup(
         fmmus,
         tuple(one[:5] + bytes((0, one[6] & 1, 0)) for one in own),
-        port.read(station, _DELAY, 4) if features[0] & _FEATURE_DC else None,
+        port.read(station, Register.DC_DELAY, 4) if features[0] & FEATURE_DC else None,
         serial,
     )
 
@@ -110,7 +107,7 @@ class SlaveRestorer:
         if set_up.delay is not None:
             # SYNC0 first: it must not run on while the time is set. The address last: the frames of the cycle ask the
             # reference clock by its address, and every other slave follows its time.
-            port.put_at(position, DC_ACTIVATE, b"\0", label)
+            port.put_at(position, Register.DC_ACTIVATION, b"\0", label)
             others = [other for other in self._clocks if other != position]
             take_over_time(port, position, label, set_up.delay, others, always=lost_address)
         if lost_address:
@@ -119,15 +116,15 @@ class SlaveRestorer:
             forget_drift(port, position, label)
         yield
         yield from self._change_state(position, AlState.INIT)
-        port.put(station, _SYNC_MANAGERS, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
-        port.put(station, _FMMUS, bytes(_FMMUS_SIZE), label)
+        port.put(station, Register.SYNC_MANAGER, bytes(_SYNC_MANAGER_SIZE * _SYNC_MANAGER_COUNT), label)
+        port.put(station, Register.FMMU, bytes(_FMMUS_SIZE), label)
         self._write_sync_managers(position, range(_MAILBOXES))
         if not eeprom_to_device(port, station):
             raise BusError(f"{label} did not take its EEPROM back")
         yield from self._change_state(position, AlState.PREOP)
         yield from configure_slave(self._sdo(position), port, station, config, self._period_ns)
         self._write_sync_managers(position, range(_MAILBOXES, _SYNC_MANAGER_COUNT))
-        port.put(station, _FMMUS, set_up.fmmus, label)
+        port.put(station, Register.FMMU, set_up.fmmus, label)
         if config.device.assign_activate:
             if position != self._clocks[0]:
                 yield from settle_clock(port, station, label)
@@ -161,12 +158,12 @@ class SlaveRestorer:
         """Return four bytes of the EEPROM from `word` on (ETG.1000.4, 6.4)."""
         port, label = self._port, self._label(position)
         # Taken back from the device by force, as it may have it after power-on.
-        port.put_at(position, _EEPROM_CONFIG, b"\x02", label)
-        port.put_at(position, _EEPROM_CONFIG, b"\x00", label)
-        port.put_at(position, _EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
+        port.put_at(position, Register.EEPROM_CONFIG, b"\x02", label)
+        port.put_at(position, Register.EEPROM_CONFIG, b"\x00", label)
+        port.put_at(position, Register.EEPROM_CONTROL, struct.pack("<HI", _EEPROM_READ, word), label)
         deadline = time.monotonic() + _EEPROM_S
         while True:
-            data = port.read_at(position, _EEPROM_CONTROL, 2)
+            data = port.read_at(position, Register.EEPROM_CONTROL, 2)
             if data is None:
                 raise BusError(f"{self._label(position)} stopped answering while its EEPROM was read")
             status = int.from_bytes(data, "little")
@@ -175,21 +172,22 @@ class SlaveRestorer:
             if time.monotonic() >= deadline:
                 raise BusError(f"{self._label(position)}: its EEPROM stays busy")
             yield
-        found = port.read_at(position, _EEPROM_DATA, 4)
+        found = port.read_at(position, Register.EEPROM_DATA, 4)
         if found is None or status & _EEPROM_FAILED:
             raise BusError(f"{self._label(position)}: its EEPROM cannot be read (status 0x{status:04X})")
         return int.from_bytes(found, "little")
 
     def _write_address(self, position: int) -> None:
-        data = station_of(position).to_bytes(2, "little")
-        if not self._port.write_at(position, STATION, data) or self._port.read_at(position, STATION, 2) != data:
+        port, data = self._port, station_of(position).to_bytes(2, "little")
+        taken = port.write_at(position, Register.STATION_ADDRESS, data)
+        if not taken or port.read_at(position, Register.STATION_ADDRESS, 2) != data:
             raise BusError(f"{self._label(position)} does not keep its station address")
 
     def _write_sync_managers(self, position: int, numbers: range) -> None:
         for number in numbers:
             setting = self._set_ups[position - 1].sync_managers[number]
             if any(setting):
-                address = _SYNC_MANAGERS + number * _SYNC_MANAGER_SIZE
+                address = Register.SYNC_MANAGER + number * _SYNC_MANAGER_SIZE
                 self._port.put(station_of(position), address, setting, self._label(position))
 
     def _change_state(self, position: int, state: AlState) -> Steps[None]:
@@ -208,7 +206,6 @@ class SlaveRestorer:
                 raise BusError(refusal(self._label(position), state, found | (ERROR_BIT if error else 0), code))
 
 
-_WATCHDOG_DIVIDER, _WATCHDOG_TIME = 0x0400, 0x0420
 _DIVIDER = 2498
 """Watchdog divider of 100 us: (2498 + 2) * 40 ns (ETG.1000.4, 6.3)."""
 _INTERPOLATION = 0x60C2
@@ -334,7 +331,7 @@ def write_interpolation_time(sdo: SdoClient, period_ns: int) -> Steps[list[str]]
 def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDescription) -> None:
     """Set the process-data watchdog (ETG.1000.4, 6.3; steps of 100 us) and read it back; raises BusError."""
     ticks = max(1, math.ceil(device.watchdog_ms * 10 - 1e-9))
-    for address, value in ((_WATCHDOG_DIVIDER, _DIVIDER), (_WATCHDOG_TIME, ticks)):
+    for address, value in ((Register.WATCHDOG_DIVIDER, _DIVIDER), (Register.WATCHDOG_PROCESS_DATA, ticks)):
         data = value.to_bytes(2, "little")
         port.write(station, address, data)
         kept = port.read(station, address, 2)
@@ -348,4 +345,4 @@ def set_watchdog(port: RegisterPort, station: int, label: str, device: DeviceDes
 
 def eeprom_to_device(port: RegisterPort, station: int) -> bool:
     """Hand the EEPROM back to the slave, which some need to leave INIT (ETG.1000.4, 6.4.2); return whether it did."""
-    return port.write(station, _EEPROM_CONFIG, b"\x01\x00")
+    return port.write(station, Register.EEPROM_CONFIG, b"\x01\x00")

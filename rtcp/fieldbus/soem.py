@@ -16,14 +16,14 @@ from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
-from rtcp.fieldbus.clocks import DC_ACTIVATE, start_clocks
+from rtcp.fieldbus.clocks import start_clocks
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.interface import PromiscuousMode, check_interface, claim, enter
 from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, layout, layout_faults
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
-from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, RegisterPort, attach_filter, finish
+from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
 from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
 from rtcp.fieldbus.supervision import SlaveWatcher
@@ -34,8 +34,8 @@ _BELOW_SAFEOP = 0x03
 _MAP_ATTEMPTS = 8
 _DISCOVERY_ATTEMPTS = 4
 """Each takes `_PATIENCE_US`: a host that runs master and slaves may stand still for longer than one."""
-_MAILBOXES, _MAILBOXES_SIZE = 0x0800, 16
-"""Sync managers 0 and 1 (ETG.1000.4, 6.7)."""
+_MAILBOXES_SIZE = 16
+"""Bytes of the registers of sync managers 0 and 1 (ETG.1000.4, 6.7)."""
 
 
 _SOEM_LAST_INDEX = 15
@@ -218,7 +218,7 @@ class SoemBus:
         if self._infos[position - 1] is None:
             return
         station, label = station_of(position), slave_label(position, self._names[position - 1])
-        registers = self.port.read(station, _MAILBOXES, _MAILBOXES_SIZE)
+        registers = self.port.read(station, Register.SYNC_MANAGER, _MAILBOXES_SIZE)
         if registers is None:
             raise BusError(f"{label} stopped answering while it was set up")
         for mailbox in ("out", "in"):
@@ -228,8 +228,8 @@ class SoemBus:
                     slave.amend_mbx(mailbox, 0, 0)
                     break
         # An ESC takes address and length of a sync manager only while it is off.
-        self.port.put(station, _MAILBOXES, bytes(_MAILBOXES_SIZE), label)
-        self.port.put(station, _MAILBOXES, registers, label)
+        self.port.put(station, Register.SYNC_MANAGER, bytes(_MAILBOXES_SIZE), label)
+        self.port.put(station, Register.SYNC_MANAGER, registers, label)
 
     def _discover(self) -> None:
         if self._master is None:
@@ -244,7 +244,7 @@ class SoemBus:
         self._boxes = Mailboxes(self.port, self._names, self._infos)
         for position in range(1, len(found) + 1):
             eeprom_to_device(self.port, station_of(position))
-        left = self.port.read_all(DC_ACTIVATE, 1).data
+        left = self.port.read_all(Register.DC_ACTIVATION, 1).data
         if any(left):
             raise BusError(f"SYNC0 of a slave on {self.interface} is still active and cannot be switched off")
 
@@ -315,7 +315,7 @@ class SoemBus:
 
     def read_states(self) -> tuple[SlaveState, ...]:
         """Return the AL status of every slave; one frame while all are in OP."""
-        all_of_them = self.port.read_all(al_state.AL_STATUS, 2)
+        all_of_them = self.port.read_all(Register.AL_STATUS, 2)
         in_op = all_of_them.wkc == len(self._names) and all_of_them.data == b"\x08\x00"
         result = []
         for position, name in enumerate(self._names, 1):
@@ -367,7 +367,7 @@ class SoemBus:
     def _to_init(self, port: RegisterPort) -> None:
         everyone = self._stations(None)
         # Drives come to rest on the way from OP to SAFE-OP. A slave below SAFE-OP would refuse that with an AL error.
-        reported = port.read_all(al_state.AL_STATUS, 2)
+        reported = port.read_all(Register.AL_STATUS, 2)
         if reported.wkc < 0:
             raise BusError("no frame comes back")
         if reported.data[0] & _BELOW_SAFEOP == 0:
@@ -378,7 +378,7 @@ class SoemBus:
             al_state.wait_for_state(port, in_op, AlState.SAFEOP, _LEAVE_OP_S)
         al_state.broadcast_state(port, AlState.INIT)
         left = al_state.wait_for_state(port, everyone, AlState.INIT, _INIT_S)
-        port.write_all(DC_ACTIVATE, b"\0")
+        port.write_all(Register.DC_ACTIVATION, b"\0")
         if left:
             raise BusError(*left)
 

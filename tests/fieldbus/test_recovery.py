@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from rtcp.fieldbus import recovery, supervision
-from rtcp.fieldbus.al_state import AL_CONTROL, AL_STATUS, AlState
+from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import Answer, Command, RegisterPort, Steps
+from rtcp.fieldbus.registers import Answer, Command, Register, RegisterPort, Steps
 from rtcp.fieldbus.supervision import SlaveWatcher
 
 NAMES = ("io", "drive1", "drive2")
@@ -43,11 +43,11 @@ class Slaves(RegisterPort):
                 together |= one
             return Answer(bytes((together, 0)), len(self.al))
         index = station - station_of(1)
-        if command is Command.FPRD and address == AL_STATUS:
+        if command is Command.FPRD and address == Register.AL_STATUS:
             if index + 1 in self.lost:
                 return Answer(b"", -1)
             return Answer(bytes((self.al[index], 0, 0, 0, 0x1A if self.al[index] & 0x10 else 0, 0)), 1)
-        if command is Command.FPWR and address == AL_CONTROL:
+        if command is Command.FPWR and address == Register.AL_CONTROL:
             if index + 1 in self.deaf:
                 return Answer(data, 0)
             self.requests.append((index + 1, data[0] & 0x0F))
