@@ -102,7 +102,7 @@ class CommandHandler:
         }
 
     def handle(self) -> None:
-        """Take the next command and answer it. Only when one waits."""
+        """Carry out the next command and answer it; called only when one waits."""
         number, lease, command = self._blackboard.take_command()
         self._blackboard.answer(number, self._refusal(command, lease))
 

@@ -193,7 +193,7 @@ def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
 
 
 def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: TargetState, device: DeviceDescription) -> bytes:
-    """Lead a drive one step; where its driver raises, its controlword alone is put where the description has it."""
+    """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, and 0 in the rest."""
     try:
         drive.decode(data.input(slot))
         drive.advance(goal)

@@ -189,7 +189,7 @@ class Cia402Drive(Driver):
         self.target_position += moved
 
     def decode(self, data: bytes) -> None:
-        """Take the inputs of the cycle (`input_bytes` long). Until the drive is enabled the target follows them."""
+        """Decode the inputs of the cycle (`input_bytes` long). Until the drive is enabled the target follows them."""
         values = self._unpack(data)
         status, position, velocity, torque, mode = self._in
         by_position, by_velocity, by_torque = self._in_factors

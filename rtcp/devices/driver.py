@@ -63,7 +63,7 @@ class Driver:
         self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if channel.index}
 
     def decode(self, data: bytes) -> None:
-        """Take the inputs of the cycle (`input_bytes` long)."""
+        """Decode the inputs of the cycle (`input_bytes` long)."""
         for channel, counts in zip(self.tpdo.channels, self.codec_in.unpack(data), strict=True):
             if channel.index:
                 self.values[channel.name] = counts * channel.factor

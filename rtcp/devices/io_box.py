@@ -33,7 +33,7 @@ class IoBox(Driver):
         self.counter = 0
 
     def decode(self, data: bytes) -> None:
-        """Take the inputs of the cycle (`input_bytes` long)."""
+        """Decode the inputs of the cycle (`input_bytes` long)."""
         single, at = self._inputs
         self.inputs = single.unpack_from(data, at)[0]
         if self._counter is not None:
@@ -110,7 +110,7 @@ class Switch:
             self.read(levels)
 
     def read(self, levels: int) -> None:
-        """Take the levels of all inputs of a cycle."""
+        """Update from the levels of all inputs of a cycle."""
         if not self._bit:
             return
         seen = bool(levels & self._bit) is not self._inverted
@@ -145,7 +145,7 @@ class Inputs:
         self.arm_toggle = Switch(config.arm_toggle, config.arm_toggle is None, cycle_s)
 
     def read(self, levels: int) -> None:
-        """Take the levels of all inputs of a cycle."""
+        """Update from the levels of all inputs of a cycle."""
         self.emergency_stop.read(levels)
         self.enabling_switch.read(levels)
         self.arm_toggle.read(levels)
@@ -230,7 +230,7 @@ class JoystickInput:
         self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~meant
 
     def read(self, levels: int) -> None:
-        """Take the levels of all inputs of a cycle; a change counts once it has lasted as long as configured."""
+        """Update from the levels of all inputs of a cycle; a change counts once it has lasted as long as configured."""
         if not self._lines:
             return
         seen = levels & self._checked

@@ -289,7 +289,7 @@ class Mailbox:
         return self._port.patience_s
 
     def send(self, content: bytes) -> bool:
-        """Give the slave a CoE message; return False while its mailbox is still full.
+        """Send the slave a CoE message; return False while its mailbox is still full.
 
         Args:
             content: CoE header and what follows, `room` bytes at most.

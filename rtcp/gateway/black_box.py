@@ -160,11 +160,11 @@ class BlackBox:
             self._events.on = False
 
     def end_is_wanted(self) -> None:
-        """Take it that the loop is told to end: from here on neither its silence nor its end is a fault."""
+        """The loop is told to end: from here on neither its silence nor its end is a fault."""
         self._end_wanted = True
 
     def loop_has_ended(self) -> None:
-        """Take it that the loop's process has ended without having been told to."""
+        """Record that the loop's process has ended without having been told to."""
         if self._dead:
             return
         self.look()
@@ -173,7 +173,7 @@ class BlackBox:
             self._process_fault(time.monotonic_ns(), _ENDED)
 
     def loop_had_ended(self) -> None:
-        """Take it that the loop's process ended while no gateway was there to see it."""
+        """Record that the loop's process ended while no gateway ran."""
         self._dead = True
         latest = self._observer.latest()
         if latest is not None:

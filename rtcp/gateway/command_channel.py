@@ -143,7 +143,7 @@ class CommandChannel:
             self.observer.release(lease)
 
     def acquire(self, caller: Caller) -> int:
-        """Take the lease and return its id; the caller has to renew and to release it."""
+        """Acquire the lease and return its id; the caller renews and releases it."""
         try:
             return self.observer.acquire(caller.name, self.config.lease_s)
         except LeaseRefused as refused:

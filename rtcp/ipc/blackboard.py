@@ -165,7 +165,7 @@ class Blackboard:
         return self._words[COMMAND_HEAD_AT] != self._taken
 
     def take_command(self) -> tuple[int, int, Command | Malformed]:
-        """Take the next command: its number in the ring, the lease id, and what it is. Only when `command_waits`."""
+        """Read the next command: its number in the ring, the lease id, and what it is. Only when `command_waits`."""
         at = COMMANDS_AT + ((self._taken + 1) % COMMANDS) * COMMAND_SIZE
         number, lease, kind = COMMAND.unpack_from(self._map, at)
         self._taken += 1

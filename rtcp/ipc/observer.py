@@ -294,7 +294,7 @@ class Observer:
             fcntl.flock(self._descriptor, fcntl.LOCK_UN)
 
     def acquire(self, name: str, duration_s: float) -> int:
-        """Take the lease for `name`; return its id.
+        """Acquire the lease for `name`; return its id.
 
         Raises:
             LeaseRefused: while another holds it.
@@ -321,7 +321,7 @@ class Observer:
             return True
 
     def release(self, lease: int) -> None:
-        """Give the lease back; does nothing where it is another's by now."""
+        """Release the lease; does nothing where another commander holds it by now."""
         with self._alone():
             if self._words[LEASE_ID_AT] == lease:
                 self._words[LEASE_ID_AT] = 0

@@ -389,7 +389,7 @@ class InProcessBus:
         self._slave(position).virtual.application.fall(State(state), code)
 
     def restart(self, position: int) -> None:
-        """Take a slave's supply away and give it back."""
+        """Switch a slave's supply off and on again."""
         self.segment.chain.restart(self._slave(position).virtual, self.now_ns)
         self.segment.rewire()
 

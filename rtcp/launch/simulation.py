@@ -109,7 +109,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """Give the memory back."""
+        """Free the memory."""
         self.observer.close()
         # Whoever still holds a view of it keeps the mapping, not the file.
         with contextlib.suppress(BufferError):
@@ -174,7 +174,7 @@ class Simulation:
     # -- a commander ------------------------------------------------------------------------------------------------
 
     def acquire(self) -> None:
-        """Take a lease, renewed from now on."""
+        """Acquire a lease, renewed from now on."""
         words = self.board.words
         words[LEASE_ID_AT] = 0
         words[LEASE_DURATION_AT] = self._lease_ns

@@ -79,7 +79,7 @@ class Mailbox:
         self._own_counter = 0
 
     def receive(self, data: bytes, state: int, t: int = 0) -> None:
-        """Take what the master wrote to SM0 (the whole buffer) by instant `t`; `state` decides on access rights.
+        """Process what the master wrote to SM0 (the whole buffer) by instant `t`; `state` decides on access rights.
 
         Malformed messages are answered with a mailbox error; a message with the counter of the one before is the
         master's repetition of it and not answered twice.

@@ -43,14 +43,14 @@ class Chain:
         self._follow()
 
     def power_off(self, number: int, t: int) -> None:
-        """Take the supply from a slave."""
+        """Switch a slave's supply off."""
         self._outages[number - 1] += 1
         if self._outages[number - 1] == 1:
             self._slaves[number - 1].power_off(t)
         self._follow()
 
     def power_on(self, number: int, t: int) -> None:
-        """Give a slave its supply back."""
+        """Switch a slave's supply on again."""
         self._outages[number - 1] -= 1
         if not self._outages[number - 1]:
             self._slaves[number - 1].power_on(t)
@@ -145,7 +145,7 @@ class Segment:
         self.rewire()
 
     def rewire(self) -> None:
-        """Lead frames to the slaves that they reach by now."""
+        """Route frames to the slaves that they reach now."""
         self._wire = Wire(self.slaves[: self.chain.reach], self.miscounts)
         for slave in self.slaves:
             slave.esc.on_attention = self._attention_of(slave)

@@ -316,7 +316,7 @@ class EepromInterface:
             self.image[2 * word : 2 * word + 2] = self._memory[Register.EEPROM_DATA : Register.EEPROM_DATA + 2]
 
     def _reload(self) -> None:
-        """Take PDI control and station alias from the EEPROM, if its checksum is right."""
+        """Load PDI control and station alias from the EEPROM, if its checksum is right."""
         self._errors = 0
         if len(self.image) < 16 or self.image[CONFIGURATION_BYTES] != crc8(bytes(self.image[:CONFIGURATION_BYTES])):
             self._errors = CHECKSUM_ERROR

@@ -297,7 +297,7 @@ class Slave:
 
 def make_slaves(devices: Sequence[DeviceModel], drifts_ppm: Sequence[float], delays: Sequence[int],
                 aliases: Sequence[int], t: int) -> list[Slave]:  # fmt: skip
-    """Give every device a controller, in the order of the wire; `delays` are ns from the master and must not fall."""
+    """Make a slave of every device, in the order of the wire; `delays` are ns from the master and must not fall."""
     slaves = []
     for position, (device, drift, delay, alias) in enumerate(zip(devices, drifts_ppm, delays, aliases, strict=True)):
         last = position + 1 == len(devices)

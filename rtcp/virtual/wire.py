@@ -42,7 +42,7 @@ class Wire:
     """Answers frames in place. What frames ask of clocks and firmware is noted for `Segment.settle`."""
 
     def __init__(self, slaves: Sequence[Slave], miscounts: Sequence[Miscount] = (), passing: bool = False) -> None:
-        """Lead to `slaves`; `miscounts` may change later. A `passing` wire serves one frame beside the lasting one."""
+        """Connect `slaves`; `miscounts` may change later. A `passing` wire serves one frame beside the lasting one."""
         self.slaves = tuple(slaves)
         self._miscounts = miscounts
         self._passing = passing

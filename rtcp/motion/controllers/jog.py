@@ -342,7 +342,7 @@ class TwistRamp:
             v[i] += acc[i] * dt
 
     def held(self, velocity: Sequence[float]) -> None:
-        """Take what has become of the velocity; an acceleration against what was cut is given up."""
+        """Set the velocity to what the bounds left of it; an acceleration against what was cut is given up."""
         v, acc, weight = self.velocity, self.acceleration, self._weight
         a, b, c = velocity[0] - v[0], velocity[1] - v[1], velocity[2] - v[2]
         d, e, f = velocity[3] - v[3], velocity[4] - v[4], velocity[5] - v[5]

@@ -69,7 +69,7 @@ class Joystick:
         self._gripped = 0
 
     def update(self, shown: Shown, counts: bool) -> None:
-        """Take what the joystick shows in this cycle; `counts`: the arm has it, and motion is permitted."""
+        """Update from what the joystick shows in this cycle; `counts`: the arm has it, and motion is permitted."""
         if not (counts and shown.valid):
             self.wait_for_neutral()
             return

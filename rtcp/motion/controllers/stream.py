@@ -69,7 +69,7 @@ class StreamController(Controller):
         self._speed = list(self._zero)
 
     def _take(self, q: Sequence[float], stamp_s: float, now_ns: int) -> float | None:
-        """Take a target over, or return how late it is, s, and drop it."""
+        """Accept a target, or drop it and return how late it is, s."""
         lag = now_ns * 1e-9 - stamp_s
         step = stamp_s - self._stamp_s
         if not self._first:

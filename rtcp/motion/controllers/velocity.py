@@ -121,7 +121,7 @@ class VelocityController(Controller):
         return goals
 
     def _aim(self, state: ArmState, goals: list[float], moved: bool) -> None:
-        """Give ruckig the goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
+        """Set ruckig's goals: a speed, or, near an edge of the range, the edge, no faster than the speed."""
         way, limits = self._way, self.limits
         kinds, targets = [goal == 1.0 for goal in goals[::4]], goals[1::4]
         way.per_dof_control_interface = [_POSITION if kind else _VELOCITY for kind in kinds]

@@ -46,7 +46,7 @@ class OutputLimiter:
         self._back = [min(BACK_RAD_S, velocity) for velocity in limits.velocity]
 
     def latch(self, axis: int, position: float) -> None:
-        """Take `position` (rad) as the target sent last: while a drive has no torque, its target is where it is."""
+        """Set the target sent last to `position`, rad: while a drive has no torque, its target is where it is."""
         self.sent[axis] = position
         self._pace[axis] = self._velocity[axis] = 0.0
 

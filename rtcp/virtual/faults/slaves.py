@@ -71,7 +71,7 @@ class PowerFault(SlaveFault):
     name = "power"
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
-        """Take the supply away."""
+        """Switch the supply off."""
         slave_at(segment, self.slave)
 
         def on(t: int) -> None:

@@ -155,7 +155,7 @@ class CubemarsDrive(DeviceModel):
         self._switch_off(State.NOT_READY_TO_SWITCH_ON)
 
     def set_outputs_valid(self, valid: bool) -> None:
-        """Tell that process data outputs have become valid (OP) or must be ignored; then the controlword counts as 0.
+        """Set whether process data outputs are valid (OP) or ignored; ignored, the controlword counts as 0.
 
         Losing them with the power stage on is fault 0x8130.
         """

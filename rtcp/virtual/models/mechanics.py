@@ -164,7 +164,7 @@ class Axis:
         return self.mechanics.position + self.offset
 
     def synchronise(self) -> None:
-        """Take the joint's own position and velocity as what is demanded: no jump when something else takes over."""
+        """Set the demand to the joint's own position and velocity: no jump when something else takes over."""
         self.demand = self.reference = self.mechanics.position + self.offset
         self.reference_velocity = self.mechanics.velocity
 
@@ -251,7 +251,7 @@ class Axis:
         self.run(velocity + _POSITION_GAIN * error, h)
 
     def ramp(self, velocity: float, acceleration: float, h: float) -> None:
-        """Lead the demand at a speed that comes nearer to `velocity` by `acceleration` (rad/s^2), and follow it."""
+        """Move the demand at a speed that approaches `velocity` by `acceleration` (rad/s^2), and follow it."""
         self.reference_velocity = ramp(self.reference_velocity, velocity, acceleration, acceleration, h)
         self.demand = self.reference = self.reference + self.reference_velocity * h
         self.follow(h)

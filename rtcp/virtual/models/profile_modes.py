@@ -85,7 +85,7 @@ class ProfilePosition(Motion):
         self._inside = 0.0
 
     def update(self, controlword: int, h: float, count: int) -> None:
-        """Take a set-point when one is offered; move towards the active one."""
+        """Accept a set-point when one is offered; move towards the active one."""
         self._handshake(controlword)
         axis = self._axis
         for _ in range(count):

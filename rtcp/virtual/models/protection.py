@@ -161,7 +161,7 @@ class ErrorLog:
         self._fields = [number(objects, 0x1003, place) for place in range(1, HISTORY_LENGTH + 1)]
 
     def add(self, code: int) -> None:
-        """Tell of an error: the newest stands at 0x1003:1."""
+        """Report an error: the newest stands at 0x1003:1."""
         self._code.value = code
         self._register.value |= error_register(code)
         fields = self._fields
@@ -172,6 +172,6 @@ class ErrorLog:
         self.emergencies.append(Emergency(code, self._register.value))
 
     def reset(self) -> None:
-        """Tell that no error is left (emergency message 0x0000); the history stays."""
+        """Report that no error is left (emergency message 0x0000); the history stays."""
         self._code.value = self._register.value = 0
         self.emergencies.append(Emergency(0, 0))
