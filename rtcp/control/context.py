@@ -34,6 +34,7 @@ from rtcp.realtime.discipline import Discipline
 
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 _CLOCK_S = 1.0
+"""Time without lock to the reference clock that is a fault, s."""
 
 
 class Context:

@@ -52,7 +52,7 @@ STATES: tuple[type[MachineState], ...] = (
     Resetting,
     Closing,
 )
-WITH_TORQUE = frozenset(
+_ENDED_BY_EMERGENCY_STOP = frozenset(
     {
         State.ENABLING,
         State.HOLDING,
@@ -61,12 +61,12 @@ WITH_TORQUE = frozenset(
         State.STOPPED_BY_LIMIT,
         State.HOMING,
         State.DISABLING,
+        State.FAULT,
+        State.RESETTING,
     }
 )
-"""States in which drives may have torque and follow their targets."""
-_PRESSABLE = WITH_TORQUE | {State.FAULT, State.RESETTING}
-"""States that the input of the emergency stop ends. On the way to OP the inputs are not yet valid; while ready no drive
-has torque, and enabling is refused while it is pressed."""
+"""States that the input of the emergency stop ends: those with torque, and those after a fault. On the way to OP the
+inputs are not yet valid; while ready no drive has torque, and enabling is refused while it is pressed."""
 _SLAVES_RETURN = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
 """States in which a slave that has left OP may return to it."""
 
@@ -130,7 +130,7 @@ class StateMachine:
         ctx = self.context
         ctx.begin_cycle(good)
         operator = ctx.operator
-        if operator.emergency_stop and ctx.state in _PRESSABLE:
+        if operator.emergency_stop and ctx.state in _ENDED_BY_EMERGENCY_STOP:
             self.change(EmergencyStopActivated())
         event = self._active.update(ctx)
         if event is not None and self._handle(event):

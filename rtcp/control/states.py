@@ -59,7 +59,7 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 
 
 class Signal(Enum):
-    """Causes that nobody is told of."""
+    """Causes that are not published as events."""
 
     JOYSTICK_DEFLECTED = 1
     JOYSTICK_AT_REST = 2
@@ -277,6 +277,7 @@ class Holding(MachineState):
     }
 
     _MODE_S = 1.0
+    """Time for the drives to show a new mode, s."""
 
     def __init__(self) -> None:
         self.changing_mode = False
@@ -508,7 +509,8 @@ class FaultReaction:
     """
 
     _ESTOP_S = 2.0
-    """The slave watcher brings back sooner what merely left OP, also what does so twice."""
+    """Time after which an emergency stop that cannot be read counts as pressed, s; the slave watcher brings back sooner
+    what merely left OP, also what does so twice."""
     _MOVED_RAD = 0.05
     """A joint that stood at the fault does not move so far until its brake holds (docs/faults.md)."""
     _RAN_ON_S = 1.0
@@ -637,6 +639,7 @@ class EmergencyStopState(MachineState):
     leads_to = {Reset: State.RESETTING, Disable: State.EMERGENCY_STOP, Shutdown: State.CLOSING}
 
     _OFF_S = 1.0
+    """Time after which the slaves are parked although a drive still shows torque, s."""
 
     def __init__(self, reaction: FaultReaction) -> None:
         self._reaction = reaction
@@ -697,6 +700,7 @@ class Resetting(MachineState):
     }
 
     _RESET_S = 3.0
+    """Time for slaves, clock and drives to be ready again, s; the debounce time of the emergency stop is added."""
 
     def __init__(self, reaction: FaultReaction) -> None:
         self._reaction = reaction
@@ -745,6 +749,7 @@ class Closing(MachineState):
     leads_to = {Shutdown: State.CLOSING, Signal.CLOSED: State.OFF}
 
     _CLOSING_S = 2.0
+    """Time for the drives to stop and disable, counted from standstill of the setpoints, s; then the loop ends."""
 
     def __init__(self, standstill: Standstill) -> None:
         self._standstill = standstill

@@ -19,9 +19,11 @@ from rtcp.fieldbus.errors import BusError, SdoAborted
 from rtcp.fieldbus.registers import Command, Register, RegisterPort, Steps, T, finish, pause
 
 _RETRY_S = 0.01
+"""Pause before a service is tried again, s."""
 _TIMEOUT_S = 0.7
+"""Time for the answer to one request, s."""
 _PATIENCE_S = 3.0
-"""For the mailbox, while another service of the same slave is under way."""
+"""Time for the mailbox to become free while another service of the same slave is under way, s."""
 _SDO = struct.Struct("<BHBI")
 _COE_HEADER = 2
 _REQUEST, _RESPONSE = 2, 3

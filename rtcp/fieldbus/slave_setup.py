@@ -29,7 +29,9 @@ _MAILBOXES = 2
 """Sync managers 0 and 1 are the mailboxes."""
 _EEPROM_READ, _EEPROM_BUSY, _EEPROM_FAILED = 0x0100, 0x8000, 0x2000
 _SII_VENDOR, _SII_PRODUCT, _SII_SERIAL = 0x08, 0x0A, 0x0E
+"""Word addresses in the EEPROM (ETG.2010, table 2)."""
 _EEPROM_S, _STATE_S = 0.5, 3.0
+"""Time for one read of the EEPROM, and for one change of the AL state, s."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class SlaveSetup:
     sync_managers: tuple[bytes, ...]
     """Eight bytes each, status and the slave's own byte left out."""
     delay: bytes | None
-    """Propagation delay from the reference clock; None: it has no clock."""
+    """Propagation delay from the reference clock, as register 0x0928 holds it; None: it has no clock."""
     serial: int
     """Serial number in its EEPROM; 0: it has none."""
 

@@ -26,9 +26,13 @@ Json = dict[str, Any]
 IN_MOTION = frozenset({State.MOVING, State.STOPPING})
 """States that a motion passes through."""
 _POLL_S = 0.002
+"""Interval at which the blackboard is read while somebody waits, s."""
 _ANSWER_S = 2.0
+"""Time for the loop to accept or refuse a command, s."""
 _PROGRESS_S = 0.1
+"""Longest interval between two progress reports, and between two renewals of the lease, s."""
 _REST_S = 10.0
+"""Time for the arm to come to rest after its commander has released the lease, s."""
 _BROKEN = frozenset({State.FAULT, State.EMERGENCY_STOP})
 
 

@@ -31,7 +31,7 @@ MEMORY_SIZE = REGISTER_SPACE + RAM_SIZE
 ALIAS_ENABLE = 0x01
 """Bit of 0x0103 that lets the alias serve as station address."""
 LINK = 0x0010
-"""Bit of the DL status for a physical link at port 0; that of port n is n places further up."""
+"""Bit of the DL status (ETG.1000.4, table 34) for a physical link at port 0; that of port n is n places further up."""
 LOOP_CLOSED = 0x0100
 COMMUNICATION = 0x0200
 """Bits of the DL status for port 0: the frame turns round there, or continues; those of port n are 2n further up."""
@@ -45,6 +45,7 @@ WATCHDOG_CLOCK_NS = 40
 RESET_SEQUENCE = b"RES"
 """Three consecutive writes to 0x0040 that reset the controller and its device."""
 
+# Bits of a sync manager's control, activation, PDI control and status registers (ETG.1000.4, 6.7.2).
 CONTROL_MODE = 0x03
 MODE_MAILBOX = 0x02
 CONTROL_DIRECTION = 0x0C

@@ -31,17 +31,17 @@ LONGEST_HOLD_S = 1.0
 
 @dataclass(frozen=True)
 class ControllerSetup:
-    """What controllers are made from.
-
-    limits: of the joints, in force; their lists change in place. trajectory_guard: knows the boxes, and the poses of
-    what is commanded. plan: returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`).
-    """
+    """What controllers are made from."""
 
     config: ArmConfig
     limits: Limits
+    """Limits of the joints in force; the lists change in place."""
     trajectory_guard: TrajectoryGuard
+    """Knows the boxes, and the poses of what is commanded."""
     period_s: float
+    """The cycle, s."""
     plan: Callable[[int], memoryview[float]]
+    """Returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`)."""
 
 
 class Controller:
@@ -90,7 +90,7 @@ class Controller:
         raise NotImplementedError
 
     def advance(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle, in the phases MOVE and STOP; used up at once.
+        """Return the setpoints of the next cycle, in the phases MOVE and STOP; they are valid until the next call.
 
         Fill lists of your own and set them in `setpoint`: after `rest` its lists are those of the state. Set `phase` to
         HOLD in the cycle that reaches the end; `give_up` ends a motion early.
@@ -131,7 +131,7 @@ class Controller:
         return setpoint
 
     def update(self, state: ArmState) -> Setpoint:
-        """Return the setpoints of the next cycle; used up at once."""
+        """Return the setpoints of the next cycle; they are valid until the next call."""
         if not self.phase:
             return self.rest(state)
         return self.follow_motion(state) if self._braking else self.advance(state)
@@ -182,7 +182,7 @@ class Controller:
         return None
 
     def rows_of(self, slot: int, rows: int, most: int) -> memoryview[float] | Refusal:
-        """Return the rows of a plan, or why there are none."""
+        """Return the rows of the plan in `slot`, or a refusal: `rows` is not 1 to `most`, or there is no such slot."""
         return self._rows_in(slot) if slot in range(PLANS) and 1 <= rows <= most else WrongRowCount(rows, most)
 
 
