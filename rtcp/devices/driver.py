@@ -12,7 +12,7 @@ from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.pdo import TYPES, Channel, ImageLayout, layout
 
 Number = int | float
-GROUP = "rtcp.devices"
+ENTRY_POINTS = "rtcp.devices"
 """Entry point group in which a package registers its drivers: the kind is the name, the class is the object."""
 
 
@@ -84,7 +84,7 @@ def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
         DeviceError: no installed package has a driver for this kind, or the description cannot serve.
     """
     kind = slave.device.kind
-    found = entry_points(group=GROUP)
+    found = entry_points(group=ENTRY_POINTS)
     for point in found:
         if point.name == kind:
             driver: Driver = point.load()(slave, period_s=period_s)

@@ -17,7 +17,7 @@ from typing import ClassVar, Protocol, cast
 from rtcp.config.document import Finding, shown
 from rtcp.virtual.objects import DataType, Entry, ObjectDictionary
 
-GROUP = "rtcp.virtual_models"
+ENTRY_POINTS = "rtcp.virtual_models"
 """Entry points of device models, by the name that a segment's file uses."""
 LONGEST_QUEUE = 16
 """Emergency messages that wait; the oldest are dropped where nobody reads the mailbox."""
@@ -226,7 +226,7 @@ def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> d
 
 def models() -> dict[str, EntryPoint]:
     """Return the installed device models by name."""
-    return {found.name: found for found in entry_points(group=GROUP)}
+    return {found.name: found for found in entry_points(group=ENTRY_POINTS)}
 
 
 def create(model: str, **options: object) -> DeviceModel:
@@ -236,7 +236,7 @@ def create(model: str, **options: object) -> DeviceModel:
         OptionError: an unknown model, or an option that does not exist or is out of range.
     """
     installed = models()
-    found = EntryPoint(model, model, GROUP) if ":" in model else installed.get(model)
+    found = EntryPoint(model, model, ENTRY_POINTS) if ":" in model else installed.get(model)
     if found is None:
         names = ", ".join(sorted(installed))
         raise OptionError((("model",), f'found the text "{model}", allowed is one of {names}, or module:Class'))

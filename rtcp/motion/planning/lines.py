@@ -14,14 +14,13 @@ from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import singularity_distances
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.config.model import CartesianConfig, Stop
+from rtcp.config.model import MOST_POINTS, CartesianConfig, Stop
 from rtcp.motion.planning.interpolation import Quaternion, quaternion, rotation, turn_between, turned_by
 from rtcp.motion.planning.plan import LINE, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
-MOST_PIECES = 4096
 SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
 """A line is looked at whenever the tool has moved or turned so far."""
 _JUMP_RAD = 0.3
@@ -72,8 +71,8 @@ def plan_lines(
     """
     if not stops:
         raise PlanRefused("the path has no poses, at least one is needed")
-    if len(stops) > MOST_PIECES:
-        raise PlanRefused(f"the path has {len(stops)} poses, at most {MOST_PIECES} are allowed")
+    if len(stops) > MOST_POINTS:
+        raise PlanRefused(f"the path has {len(stops)} poses, at most {MOST_POINTS} are allowed")
     inverse = InverseKinematics(model)
     rows: list[tuple[float, ...]] = []
     here, q = forward(model, q_now), tuple(q_now)

@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
-from rtcp.config.model import Point
+from rtcp.config.model import MOST_POINTS, Point
 from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
 from rtcp.motion.planning.interpolation import (
     Coefficients,
@@ -24,7 +24,6 @@ from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Pl
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
-MOST_POINTS = 4096
 SHORTEST_S = 1e-3
 """Between two points there is at least so much time."""
 ZONE_STEP_RAD = 0.01
