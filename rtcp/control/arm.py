@@ -9,7 +9,7 @@ from rtcp.control.gripper import TRACKED_RAD, DrivenGripper
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command, Jog, MoveJoints
-from rtcp.ipc.events import Emergency
+from rtcp.ipc.events import EmergencyStop
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
@@ -172,7 +172,7 @@ class Arm:
             self.gripper.command()
         return result
 
-    def beyond_limits(self, supervision: Supervision) -> Emergency | None:
+    def beyond_limits(self, supervision: Supervision) -> EmergencyStop | None:
         """Return what was measured of joints or gripper beyond its limit for too long, or None."""
         event = supervision.check(self.state)
         if event is None and self.gripper is not None:

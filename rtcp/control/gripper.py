@@ -5,7 +5,7 @@ from __future__ import annotations
 from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
 from rtcp.devices.cia402 import Cia402Drive, DriveState, drive_of
 from rtcp.fieldbus.bus import ProcessData
-from rtcp.ipc.events import Emergency, FollowingError, GripperAtRest, OverSpeed
+from rtcp.ipc.events import EmergencyStop, FollowingError, GripperAtRest, OverSpeed
 from rtcp.motion.controllers.gripper import GripperMotion
 
 _RANGE_MARGIN_RAD = 0.02
@@ -92,7 +92,7 @@ class DrivenGripper:
             return None
         return GripperAtRest(self._axis, self.motion.position, self.motion.gripped)
 
-    def beyond_limits(self) -> Emergency | None:
+    def beyond_limits(self) -> EmergencyStop | None:
         """Return what was measured beyond its limit for too long, or None."""
         return self.supervision.check(self.drive, self.motion)
 
@@ -120,7 +120,7 @@ class GripperSupervision:
         self._error = config.following_error
         self._fast = self._off = 0
 
-    def check(self, drive: Cia402Drive, motion: GripperMotion) -> Emergency | None:
+    def check(self, drive: Cia402Drive, motion: GripperMotion) -> EmergencyStop | None:
         """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
         # A comparison with NaN is false: it counts as beyond.
         self._fast = 0 if abs(drive.velocity) <= self._speed else self._fast + 1

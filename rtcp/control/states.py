@@ -20,7 +20,7 @@ from rtcp.ipc.events import (
     DisableTimeout,
     DriveFault,
     DriveLeftEnabled,
-    Emergency,
+    EmergencyStop,
     EmergencyStopActivated,
     Enabled,
     EnabledInBox,
@@ -83,7 +83,7 @@ _TARGETS = {
 """Where a stop reaction takes the drives."""
 _FAULTS: dict[type[Message] | Signal, State] = {
     Fault: State.FAULT,
-    Emergency: State.EMERGENCY_STOP,
+    EmergencyStop: State.EMERGENCY_STOP,
     Shutdown: State.CLOSING,
 }
 _TORQUE: dict[type[Message] | Signal, State] = {**_FAULTS, Disable: State.DISABLING}
@@ -595,7 +595,7 @@ class FaultState(MachineState):
     leads_to = {
         Reset: State.RESETTING,
         Disable: State.FAULT,
-        Emergency: State.EMERGENCY_STOP,
+        EmergencyStop: State.EMERGENCY_STOP,
         Shutdown: State.CLOSING,
     }
 
@@ -695,7 +695,7 @@ class Resetting(MachineState):
         ResetDone: State.READY,
         Fault: State.FAULT,
         Disable: State.FAULT,
-        Emergency: State.EMERGENCY_STOP,
+        EmergencyStop: State.EMERGENCY_STOP,
         Shutdown: State.CLOSING,
     }
 

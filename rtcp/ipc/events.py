@@ -36,7 +36,7 @@ class Fault(Event, abstract=True):
     is_fault = True
 
 
-class Emergency(Fault, abstract=True):
+class EmergencyStop(Fault, abstract=True):
     """Base of events that begin the emergency stop."""
 
     is_emergency = True
@@ -335,13 +335,13 @@ class EstopUnobservable(Event, number=46):
     after_s: float
 
 
-class EmergencyStopActivated(Emergency, number=23):
+class EmergencyStopActivated(EmergencyStop, number=23):
     """the emergency stop is pressed: {reaction}; release it, then `rtcp reset`"""
 
     stop_key = "emergency_stop"
 
 
-class OverSpeed(Emergency, number=24):
+class OverSpeed(EmergencyStop, number=24):
     """{joint}: measured speed {value:.6g} rad/s exceeded {limit:.6g} rad/s for {supervision}: {reaction}; then `rtcp
     reset`"""
 
@@ -351,7 +351,7 @@ class OverSpeed(Emergency, number=24):
     limit: float
 
 
-class OverTorque(Emergency, number=25):
+class OverTorque(EmergencyStop, number=25):
     """{joint}: measured torque {value:.6g} Nm exceeded {limit:.6g} Nm for {supervision}: {reaction}; then `rtcp
     reset`"""
 
@@ -361,7 +361,7 @@ class OverTorque(Emergency, number=25):
     limit: float
 
 
-class FollowingError(Emergency, number=26):
+class FollowingError(EmergencyStop, number=26):
     """{joint}: following error {value:.6g} rad exceeded {limit:.6g} rad for {supervision}: {reaction}; then `rtcp
     reset`"""
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from rtcp.config.model import VIRTUAL, ArmConfig
 from rtcp.ipc.commands import COMMANDS, Reset
-from rtcp.ipc.events import JOYSTICK_MODES, Emergency
+from rtcp.ipc.events import JOYSTICK_MODES, EmergencyStop
 from rtcp.ipc.message import Message
 from rtcp.ipc.states import State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
@@ -74,7 +74,7 @@ class Names:
         """Return the stop reaction to an event, the key that sets it, and the way out where the arm does not hold."""
         found = self.reactions[type(event)]
         words = found.words
-        if isinstance(event, Emergency):
+        if isinstance(event, EmergencyStop):
             words += " at once" if found is StopReaction.TORQUE_OFF else ", then torque off"
         if event.stop_key:
             words += f" (stops.{event.stop_key} in {self.file})"

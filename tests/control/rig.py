@@ -16,7 +16,7 @@ from rtcp.control.cycle import Cycle
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveJoints, Reset, SetDriveMode, Shutdown
-from rtcp.ipc.events import Emergency, Event
+from rtcp.ipc.events import EmergencyStop, Event
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Answer, EventRecord, Observer
 from rtcp.ipc.states import DriveMode, State
@@ -31,7 +31,7 @@ DEBOUNCE_S = 0.005
 """Of the emergency stop's input, which a reset waits for as well."""
 LOST_CYCLES = 40
 CSP, CSV, CST = 8, 9, 10
-EMERGENCIES = {kind for kind in Event.kinds if issubclass(kind, Emergency)}
+EMERGENCIES = {kind for kind in Event.kinds if issubclass(kind, EmergencyStop)}
 """Events of the emergency stop: tested in test_emergency_stop.py."""
 CONTROLWORD, QUICK_STOP_OPTION, MODES_OF_OPERATION = 0x6040, 0x605A, 0x6060
 VOLTAGE_OFF, QUICK_STOP, SWITCH_ON, ENABLE_OPERATION = 0x00, 0x02, 0x07, 0x0F

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rtcp.config.model import SupervisionConfig
-from rtcp.ipc.events import Emergency, FollowingError, OverSpeed, OverTorque
+from rtcp.ipc.events import EmergencyStop, FollowingError, OverSpeed, OverTorque
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
@@ -44,7 +44,7 @@ class Seen:
         self.watch = Supervision(CONFIG, self.limits)
         self.state = ArmState(2)
 
-    def look(self, kind: Kind, *values: float) -> list[Emergency | None]:
+    def look(self, kind: Kind, *values: float) -> list[EmergencyStop | None]:
         """Look once for each of these values of the second joint."""
         found = []
         for value in values:

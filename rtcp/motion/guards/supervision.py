@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.events import Emergency, FollowingError, OverSpeed, OverTorque
+from rtcp.ipc.events import EmergencyStop, FollowingError, OverSpeed, OverTorque
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState
 
@@ -30,7 +30,7 @@ class Supervision:
             for i in self._joints:
                 counts[i] = 0
 
-    def check(self, state: ArmState) -> Emergency | None:
+    def check(self, state: ArmState) -> EmergencyStop | None:
         """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
         limits, error = self._limits, self._error
         speeds, torques, errors = self._counts
