@@ -97,7 +97,10 @@ def _held(hold_s: float, sent_s: float | None) -> Json:
 class Methods:
     """The methods of every robot; a subclass has `_carry_out`, which a coroutine function makes awaited methods."""
 
-    def __init_subclass__(cls) -> None:
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if Methods not in cls.__bases__:
+            return  # it inherits those of a robot, and may have put its own in their place
         awaited = inspect.iscoroutinefunction(cls._carry_out)  # type: ignore[attr-defined]
         for name, method in vars(Methods).items():
             if isinstance(method, Method):

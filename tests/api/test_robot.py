@@ -52,6 +52,20 @@ def test_both_robots_have_every_method_with_its_signature_and_its_documentation(
     assert inspect.iscoroutinefunction(awaited)
 
 
+@pytest.mark.parametrize("robot", [Robot, AsyncRobot])
+def test_a_subclass_of_a_robot_keeps_the_methods_that_it_overrides(robot: Any) -> None:
+    class Own(robot):  # type: ignore[misc]
+        def halt(self) -> None:
+            raise NotImplementedError
+
+    class Mixed(Own):
+        pass
+
+    assert Own.halt is Mixed.halt
+    assert "Own.halt" in Own.halt.__qualname__
+    assert Own.enable is robot.enable
+
+
 def test_the_package_shows_the_names_of_the_api() -> None:
     assert all(getattr(rtcp, name) is getattr(api, name) for name in rtcp.__all__)
     assert all(hasattr(api, name) for name in api.__all__)
