@@ -226,7 +226,7 @@ class MachineActions:
 
     def _axis(self, joint: str) -> int:
         names = [axis.name for axis in self._config.axes]
-        if joint.isdecimal() and 1 <= int(joint) <= len(names):
+        if joint.isdecimal() and len(joint) < 6 and 1 <= int(joint) <= len(names):
             return int(joint) - 1
         if joint not in names:
             raise RtcpError("invalid", f'joint: found the text "{joint}", allowed is one of {", ".join(names)}')

@@ -77,6 +77,7 @@ def test_a_command_reaches_the_loop_as_it_was_sent(
         ("mode", {"name": "fast"}, 'name: found the text "fast", allowed is one of joint, cartesian, joystick'),
         ("set_drive_mode", {"mode": "CSP"}, 'mode: found the text "CSP", allowed is one of csp, csv, cst'),
         ("zero", {"joint": "joint9"}, 'joint: found the text "joint9", allowed is one of joint1, joint2'),
+        ("zero", {"joint": "9" * 5000}, "allowed is one of joint1, joint2"),
         ("home", {"joint": "0"}, 'joint: found the text "0", allowed is one of joint1'),
         ("sdo_read", {"slave": True, "index": 1, "subindex": 0}, "slave: found true, allowed is an integer"),
         ("sdo_write", {"slave": 2, "index": 1, "subindex": 0, "hex": 12}, "hex: found 12, allowed is a text"),
