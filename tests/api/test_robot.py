@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import pydoc
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -64,6 +65,12 @@ def test_a_subclass_of_a_robot_keeps_the_methods_that_it_overrides(robot: Any) -
     assert Own.halt is Mixed.halt
     assert "Own.halt" in Own.halt.__qualname__
     assert Own.enable is robot.enable
+
+
+@pytest.mark.parametrize("shown", [Robot, AsyncRobot, Methods])
+def test_python_helps_with_a_robot_and_its_methods(shown: type) -> None:
+    assert "Move to joint positions and return when the arm is there." in pydoc.render_doc(shown)
+    assert "move_joints" in dict(inspect.getmembers(shown))
 
 
 def test_the_package_shows_the_names_of_the_api() -> None:
