@@ -50,14 +50,17 @@ class Method(Generic[P, T]):
         self.describe = describe
 
     @overload
+    def __get__(self, robot: None, kind: object) -> Callable[..., Any]: ...
+
+    @overload
     def __get__(self, robot: _Blocking, kind: object) -> Callable[P, T]: ...
 
     @overload
     def __get__(self, robot: _Awaited, kind: object) -> Callable[P, Coroutine[Any, Any, T]]: ...
 
     def __get__(self, robot: Any, kind: object) -> Any:
-        """Never called: `Methods` puts functions in the place of its methods. For type checkers."""
-        raise NotImplementedError
+        """Return the description, to `help` and the like: a robot has functions in the place of its methods."""
+        return self.describe
 
     def function(self, awaited: bool) -> object:
         """Return the function that carries the call out, with name, signature and docstring of the description."""
@@ -97,7 +100,10 @@ def _held(hold_s: float, sent_s: float | None) -> Json:
 class Methods:
     """The methods of every robot; a subclass has `_carry_out`, which a coroutine function makes awaited methods."""
 
-    def __init_subclass__(cls) -> None:
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        if Methods not in cls.__bases__:
+            return  # it inherits those of a robot, and may have put its own in their place
         awaited = inspect.iscoroutinefunction(cls._carry_out)  # type: ignore[attr-defined]
         for name, method in vars(Methods).items():
             if isinstance(method, Method):

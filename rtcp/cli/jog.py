@@ -33,6 +33,7 @@ LONGEST_JOG_S, LONGEST_JOYSTICK_S = 60.0, 3600.0
 SHOW_INTERVAL_S = 0.25
 BACKWARD = ("down", "left", "-")
 _JOINT = re.compile(r"joint([1-9]\d?)")
+_BYTE = re.compile(r"[0-9]{1,5}")
 Jog = Callable[[float, float], None]
 """Sends a jog: its direction, and the instant at which it was wanted, s of CLOCK_MONOTONIC."""
 
@@ -317,7 +318,7 @@ def _joystick(
 def _position(words: Sequence[str]) -> tuple[list[str], int | None]:
     """Return the inputs that are pressed, or the whole input byte."""
     if words[0] == "byte":
-        if len(words) != 2 or not (words[1].isascii() and words[1].isdecimal()) or int(words[1]) > 255:
+        if len(words) != 2 or not _BYTE.fullmatch(words[1]) or int(words[1]) > 255:
             raise CommandError(f"{' '.join(words)} is not allowed: one number from 0 to 255")
         return [], int(words[1])
     if list(words) == ["release"]:

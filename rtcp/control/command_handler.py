@@ -293,5 +293,8 @@ class CommandHandler:
             return TorquePresent()
         drive = arm.all_drives[axis]
         drive.zero = command.offset
+        if axis < len(arm.drives):
+            # It was decoded by now: the record of this cycle counts from the new zero, as its targets do.
+            arm.state.actual[axis] = drive.position
         self._blackboard.event(ZeroSet(axis, command.offset, drive.position))
         return None

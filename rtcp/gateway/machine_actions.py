@@ -185,22 +185,30 @@ class MachineActions:
             try:
                 offsets = read_zeros(config) or (0.0,) * len(config.axes)
                 before = offsets[axis]
-                # Unchanged at first: the answer says where the drive stands. A record has the joints of the arm alone.
+                # Unchanged at first: the event says where the drive stands. A record has the joints of the arm alone.
                 since = channel.observer.last_event
                 await channel.send(lease, SetZero(axis, before))
-                stands = [one.event for one in channel.events(since) if isinstance(one.event, ZeroSet)][-1].position
-                offset = before + stands - at
-                await channel.send(lease, SetZero(axis, offset))
+                offset = before + self._stood(axis, since) - at
                 try:
+                    await channel.send(lease, SetZero(axis, offset))
                     path = store_zero(config, axis, offset)
                 except BaseException:
-                    # Loop and file have to agree, or the next start would stand elsewhere.
+                    # Loop and file have to agree, or the next start would stand elsewhere: also where the client went
+                    # away, or the answer came too late, while the loop set it.
                     with contextlib.suppress(RtcpError):
                         await channel.send(lease, SetZero(axis, before))
                     raise
             except ConfigError as error:
                 raise RtcpError("refused", str(error)) from None
         return {"joint": config.axes[axis].name, "offset": offset, "before": before, "file": str(path)}
+
+    def _stood(self, axis: int, since: int) -> float:
+        """Return where an axis stood when its zero was last set, rad, by the events after the number `since`."""
+        events = (record.event for record in reversed(self._channel.events(since)))
+        found = next((event for event in events if isinstance(event, ZeroSet) and event.axis == axis), None)
+        if found is None:
+            raise RtcpError("fault", "the event that says where the joint stands was overwritten; nothing is changed")
+        return found.position
 
     async def home(self, caller: Caller, joint: str) -> Json:
         """Run the homing of a joint's drive (mode 6); return when the arm holds again."""
@@ -218,7 +226,7 @@ class MachineActions:
 
     def _axis(self, joint: str) -> int:
         names = [axis.name for axis in self._config.axes]
-        if joint.isdecimal() and 1 <= int(joint) <= len(names):
+        if joint.isdecimal() and len(joint) < 6 and 1 <= int(joint) <= len(names):
             return int(joint) - 1
         if joint not in names:
             raise RtcpError("invalid", f'joint: found the text "{joint}", allowed is one of {", ".join(names)}')

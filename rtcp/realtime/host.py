@@ -138,7 +138,8 @@ class Host:
         """Return an interface's IPv4 address, None where it has none; asks the running kernel."""
         import psutil  # here: it loads slowly
 
-        found = psutil.net_if_addrs().get(interface, ())
+        with _not_known(f"the address of {interface}"):
+            found = psutil.net_if_addrs().get(interface, [])
         return next((each.address for each in found if each.family == socket.AF_INET), None)
 
     def _at(self, path: str) -> str:

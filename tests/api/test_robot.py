@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import pydoc
 import time
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
@@ -50,6 +51,26 @@ def test_both_robots_have_every_method_with_its_signature_and_its_documentation(
         assert method.__doc__ == described.__doc__
         assert method.__doc__
     assert inspect.iscoroutinefunction(awaited)
+
+
+@pytest.mark.parametrize("robot", [Robot, AsyncRobot])
+def test_a_subclass_of_a_robot_keeps_the_methods_that_it_overrides(robot: Any) -> None:
+    class Own(robot):  # type: ignore[misc]
+        def halt(self) -> None:
+            raise NotImplementedError
+
+    class Mixed(Own):
+        pass
+
+    assert Own.halt is Mixed.halt
+    assert "Own.halt" in Own.halt.__qualname__
+    assert Own.enable is robot.enable
+
+
+@pytest.mark.parametrize("shown", [Robot, AsyncRobot, Methods])
+def test_python_helps_with_a_robot_and_its_methods(shown: type) -> None:
+    assert "Move to joint positions and return when the arm is there." in pydoc.render_doc(shown)
+    assert "move_joints" in dict(inspect.getmembers(shown))
 
 
 def test_the_package_shows_the_names_of_the_api() -> None:

@@ -330,6 +330,7 @@ def test_a_position_is_held_for_a_time_by_renewal(
         (("sideways",), "'sideways' is not a joystick position"),
         (("byte",), "byte is not allowed"),
         (("byte", "256"), "byte 256 is not allowed: one number from 0 to 255"),
+        (("byte", "9" * 5000), "one number from 0 to 255"),
         (("byte", "61", "62"), "one number from 0 to 255"),
         (("forward", "release"), "'release' is not a joystick position"),
         (("forward", "--seconds", "0"), "--seconds 0 is not allowed"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.ipc.commands import MoveJoints
+from rtcp.ipc.commands import MoveJoints, SetZero
 from rtcp.motion.state import ArmState, Setpoint
 
 from .rig import COUNTS, CSP, CST, CSV, LoopRig
@@ -46,3 +46,12 @@ def test_a_record_says_what_was_commanded_where_the_limiter_sends_less(rig: Loop
     assert sent(rig, "commanded_position")[0] == pytest.approx(0.1 * COUNTS)
     assert sent(rig, "sent_position")[0] == pytest.approx(frame.target, abs=0.5)
     assert frame.target <= rig.arm.limits.velocity[0] * rig.arm.period_s * COUNTS + 1
+
+
+@pytest.mark.parametrize("carries", [True, False])
+def test_a_record_of_the_cycle_in_which_a_zero_is_set_counts_all_positions_from_it(rig: LoopRig, carries: bool) -> None:
+    rig.start()
+    rig.data.carries = carries
+    rig.do(SetZero(0, 0.3))
+    assert sent(rig, "actual_position")[0] == pytest.approx(-0.3 * COUNTS, abs=1)
+    assert sent(rig, "sent_position") == pytest.approx(sent(rig, "actual_position"), abs=0.5)

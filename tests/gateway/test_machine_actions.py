@@ -23,8 +23,9 @@ from rtcp.ipc.commands import (
     SetOutput,
     SetZero,
 )
-from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed
-from rtcp.ipc.refusals import GripperDisabled, TorquePresent, WrongState
+from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, Homed, HomingFailed, OverSpeed, ZeroSet
+from rtcp.ipc.layout import EVENTS
+from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from tests.gateway.fake_platform import FakePlatform, fake_platform
 
@@ -76,6 +77,7 @@ def test_a_command_reaches_the_loop_as_it_was_sent(
         ("mode", {"name": "fast"}, 'name: found the text "fast", allowed is one of joint, cartesian, joystick'),
         ("set_drive_mode", {"mode": "CSP"}, 'mode: found the text "CSP", allowed is one of csp, csv, cst'),
         ("zero", {"joint": "joint9"}, 'joint: found the text "joint9", allowed is one of joint1, joint2'),
+        ("zero", {"joint": "9" * 5000}, "allowed is one of joint1, joint2"),
         ("home", {"joint": "0"}, 'joint: found the text "0", allowed is one of joint1'),
         ("sdo_read", {"slave": True, "index": 1, "subindex": 0}, "slave: found true, allowed is an integer"),
         ("sdo_write", {"slave": 2, "index": 1, "subindex": 0, "hex": 12}, "hex: found 12, allowed is a text"),
@@ -197,6 +199,30 @@ def test_a_zero_that_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm:
     assert error.kind == "refused"
     assert str(tmp_path / "state") in str(error)
     assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.0, 0.25, 0.0])
+
+
+def test_a_zero_whose_answer_does_not_come_is_taken_back_from_the_loop(
+    arm: FakePlatform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rtcp.gateway.command_channel._ANSWER_S", 0.1)
+    loop, answer = arm.loop, arm.loop.board.answer
+
+    def withheld(number: int, refusal: Refusal | None = None) -> None:
+        if loop.commands[-1] != SetZero(0, 0.25):
+            answer(number, refusal)
+
+    monkeypatch.setattr(loop.board, "answer", withheld)
+    assert arm.error("zero", joint="joint1").kind == "timeout"
+    assert loop.commands == [SetZero(0, 0.0), SetZero(0, 0.25), SetZero(0, 0.0)]
+    assert not zero_file(arm.config.name).exists()
+
+
+def test_a_zero_is_taken_from_the_event_of_its_own_joint_and_of_no_other(arm: FakePlatform) -> None:
+    arm.loop.reports[SetZero] = [ZeroSet(3, 0.0, 9.0)]
+    assert arm.ask("zero", joint="joint1")["offset"] == 0.25
+    arm.loop.reports[SetZero] = [Disabled()] * EVENTS
+    error = arm.error("zero", joint="joint1")
+    assert (error.kind, "was overwritten" in str(error)) == ("fault", True)
 
 
 def test_the_gripper_with_a_drive_has_a_zero_too(driven: FakePlatform) -> None:

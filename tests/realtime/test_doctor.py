@@ -309,6 +309,15 @@ def test_frames_that_come_while_no_master_runs_are_counted(good: Any) -> None:
     assert good.finding("other-traffic").found.startswith("3 frames came and 1 went on eth0 within 0.5 s")
 
 
+def test_an_ipv4_address_that_the_kernel_does_not_tell_is_not_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused() -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr("psutil.net_if_addrs", refused)
+    with pytest.raises(NotKnown, match="the address of lo: Operation not permitted"):
+        Host().ipv4_address("lo")
+
+
 def test_an_ipv4_address_is_removed_unless_it_is_the_hosts_way_to_its_network(good: Any) -> None:
     good.card.ipv4 = "192.168.1.7"
     finding = good.finding("ip-address")

@@ -106,6 +106,7 @@ class DeviceFault(Fault):
 
     def start(self, segment: Segment, frames: Frames, t: int) -> End:
         """Let it begin in one of the devices of the segment."""
+        place_of(segment.slaves, getattr(self, "slave", 1))
         return self.begin([slave.device for slave in segment.slaves])
 
     def begin(self, devices: Sequence[Any]) -> End:

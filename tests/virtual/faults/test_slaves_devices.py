@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import pytest
 
 from rtcp.launch.inprocess import InProcessBus
-from rtcp.virtual.faults.fault import FaultRefused
+from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.faults.fault import DeviceFault, End, FaultRefused, Position
 from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, JoystickCode, PowerFault, TerminalFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from tests.virtual.line import MS, Line, begin
@@ -22,6 +25,25 @@ CODES = {
     "following-error": 0x8611,
 }
 AT_ONCE = {"over-current", "over-voltage", "under-voltage", "encoder"}
+
+
+@dataclass(frozen=True)
+class Trusting(DeviceFault):
+    """A kind of a package outside, which leaves it to its base to look whether there is such a slave."""
+
+    name = "trusting"
+    slave: Position
+
+    def begin(self, devices: Sequence[DeviceModel]) -> End:
+        assert devices[self.slave - 1] is not None
+        return lambda _: None
+
+
+def test_a_slave_that_is_not_there_is_refused_for_a_kind_of_a_package_outside_too() -> None:
+    line = Line([create("diewu-io")])
+    begin(line.segment, Trusting(1), 0)
+    with pytest.raises(FaultRefused, match="there is no slave 2: the segment has slaves 1 to 1"):
+        begin(line.segment, Trusting(2), 0)
 
 
 class Joint:
