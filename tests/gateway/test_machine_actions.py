@@ -43,7 +43,8 @@ def driven_platform(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakePl
 
 
 @pytest.fixture
-def driven(driven_platform: FakePlatform) -> FakePlatform:
+def driven(driven_platform: FakePlatform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FakePlatform:
+    monkeypatch.setenv("RTCP_STATE_DIR", str(tmp_path / "state"))
     driven_platform.reset(Q)
     return driven_platform
 
