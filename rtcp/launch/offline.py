@@ -13,13 +13,13 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rtcp.ipc.errors import RtcpError
-from rtcp.launch.platform import read_lines, spawn
+from rtcp.launch.platform import defer_signals, read_lines, spawn
 
 if TYPE_CHECKING:
     from rtcp.config.model import ArmConfig
@@ -92,20 +92,22 @@ def _ask(bus: str, config: Path | None, question: Mapping[str, Any]) -> dict[str
 
 def _question(question: Mapping[str, Any]) -> dict[str, Any]:
     """Ask one question in a child process and return its answer."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "rtcp.launch.offline"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        start_new_session=True,  # Ctrl-C reaches the command, which then ends this process in order
-    )
     bus = question["interface"]
-    try:
-        answered, complaint = child.communicate(json.dumps(question).encode(), QUESTION_TIMEOUT_S)
-    except subprocess.TimeoutExpired as error:
-        raise RtcpError("timeout", f"the bus {bus} gave no answer within {QUESTION_TIMEOUT_S:g} s") from error
-    finally:
-        _end(child)
+    with ExitStack() as stack:
+        # A signal between start and registration would leave a process that nobody ends.
+        with defer_signals():
+            child = subprocess.Popen(
+                [sys.executable, "-m", "rtcp.launch.offline"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C reaches the command, which then ends this process in order
+            )
+            stack.callback(_end, child)
+        try:
+            answered, complaint = child.communicate(json.dumps(question).encode(), QUESTION_TIMEOUT_S)
+        except subprocess.TimeoutExpired as error:
+            raise RtcpError("timeout", f"the bus {bus} gave no answer within {QUESTION_TIMEOUT_S:g} s") from error
     try:
         answer: dict[str, Any] = json.loads(answered.splitlines()[-1])
     except (IndexError, ValueError) as error:
@@ -119,16 +121,17 @@ def _question(question: Mapping[str, Any]) -> dict[str, Any]:
 @contextmanager
 def _segment(file: Path) -> Iterator[dict[str, Any]]:
     """Run a virtual segment in namespaces of its own; give its ready line: `pid` and `interface`."""
-    segment, reading = spawn("rtcp.virtual", "--config", str(file), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    try:
+    arguments = ("--config", str(file))
+    with ExitStack() as stack:
+        with defer_signals():
+            segment, reading = spawn("rtcp.virtual", *arguments, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+            stack.callback(_end, segment)
         ready = next(read_lines(reading, SEGMENT_TIMEOUT_S), None)
         if ready is None:
             raise _not_ready(segment)
         if "error" in ready:
             raise RtcpError("fault", str(ready["error"]))
         yield ready
-    finally:
-        _end(segment)
 
 
 def _not_ready(segment: subprocess.Popen[bytes]) -> RtcpError:
