@@ -26,7 +26,7 @@ _STOP_EVENTS = {
     "lost_frames": "`bus.lost_cycles` lost cycles in a row, or that many more lost than good ones",
     "slave_lost": "a slave left OP, or does not answer",
     "drive_fault": "a drive is in fault, or left Operation Enabled by itself: the reaction of all others",
-    "clock_lost": "the cycle was not locked to the reference clock for 1 s",
+    "clock_lost": "the cycle was not locked to the reference clock for `bus.clock_lost_s`",
     "emergency_stop": "its input is active",
     "supervision": "speed, torque or following error exceeded its limit for `supervision.cycles`",
     "lease_ended": "the commander of a motion fell silent or released its lease",

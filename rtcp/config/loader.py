@@ -41,7 +41,7 @@ RENAMED = {
 }
 """Keys of the arm's file in version 0.1, and their names now."""
 _SYNC_ERROR_LIMIT = (0x10F1, 2)
-_LONGEST_SCALED_LEASE_S = 3.0
+_LONGEST_SCALED_LEASE_S, _LONGEST_SCALED_UNLOCKED_S = 3.0, 5.0
 _LONGEST_WATCHDOG_MS = 6000.0
 
 
@@ -188,9 +188,9 @@ def widen(config: ArmConfig) -> ArmConfig:
 
     Master and virtual slaves are processes of one host: where it takes the CPU away for 30 ms, as virtual machines do,
     both stand still, and a limit that suits a cable would end every second run. Multiplied are `bus.lost_cycles`,
-    `watchdog_ms` of every device and, up to 3 s, `lease_s`. The sync error counter limit among its start-up SDOs
-    (0x10F1:02, ETG.1020) becomes 0, which disables that check: a missed SYNC0 counts 3 and one that is met takes 1
-    away, so that a host which loses a quarter of its ticks exceeds any limit in the end.
+    `watchdog_ms` of every device, up to 3 s `lease_s`, up to 5 s `bus.clock_lost_s`. The sync error counter limit among
+    its start-up SDOs (0x10F1:02, ETG.1020) becomes 0, which disables that check: a missed SYNC0 counts 3 and one that
+    is met takes 1 away, so that a host which loses a quarter of its ticks exceeds any limit in the end.
     """
     scale = config.bus.timeout_scale
     if config.bus.interface != VIRTUAL or scale == 1:
@@ -204,7 +204,11 @@ def widen(config: ArmConfig) -> ArmConfig:
     return replace(
         config,
         lease_s=max(config.lease_s, min(config.lease_s * scale, _LONGEST_SCALED_LEASE_S)),
-        bus=replace(config.bus, lost_cycles=round(config.bus.lost_cycles * scale)),
+        bus=replace(
+            config.bus,
+            lost_cycles=round(config.bus.lost_cycles * scale),
+            clock_lost_s=max(config.bus.clock_lost_s, min(config.bus.clock_lost_s * scale, _LONGEST_SCALED_UNLOCKED_S)),
+        ),
         slaves=tuple(replace(slave, device=widened(slave.device)) for slave in config.slaves),
     )
 

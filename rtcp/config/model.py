@@ -256,9 +256,11 @@ class BusConfig:
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
-    """Factor on `lost_cycles`, `watchdog_ms` and `lease_s` on the virtual bus alone; above 1 no sync error check."""
+    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
     send_phase: Fraction = 0.5
     """Instant between two SYNC0 at which the frame passes the reference clock, fraction of the period."""
+    clock_lost_s: Positive = 1.0
+    """Time without lock to the reference clock that is a fault, s."""
     op_timeout_s: Positive = 5.0
     """Timeout for all slaves from INIT to OP, s."""
     watch_ms: Annotated[float, Ge(2), Le(1000)] = 10.0
@@ -357,7 +359,7 @@ class StopsConfig:
     drive_fault: HardStop = "quick_stop"
     """A drive is in fault or has left Operation Enabled by itself: the reaction of all others."""
     clock_lost: AnyStop = "quick_stop"
-    """The cycle has not followed the reference clock for 1 s."""
+    """The cycle has not followed the reference clock for `bus.clock_lost_s`."""
     emergency_stop: HardStop = "quick_stop"
     """The emergency stop input is active: torque goes off at standstill (category 1), or at once (category 0)."""
     supervision: HardStop = "quick_stop"

@@ -33,8 +33,6 @@ from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
 
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
-_CLOCK_S = 1.0
-"""Time without lock to the reference clock that is a fault, s."""
 
 
 class Context:
@@ -69,7 +67,7 @@ class Context:
         self.reactions = reactions(config.stops)
         self._discipline = discipline
         self._lost_limit = config.bus.lost_cycles
-        self._clock_cycles = round(_CLOCK_S / self.period_s)
+        self._clock_cycles = round(config.bus.clock_lost_s / self.period_s)
         self._unlocked = 0
         self.state = State.STARTING
         """Written by the machine alone."""
@@ -151,7 +149,7 @@ class Context:
         self._unlocked = 0 if self.clock_locked else self._unlocked + 1
         if self._unlocked > self._clock_cycles and self.pending is None:
             self._unlocked = 0
-            return ClockLost()
+            return ClockLost(self.config.bus.clock_lost_s)
         return None
 
     def lease_held(self, lease: int) -> bool:

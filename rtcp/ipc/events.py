@@ -287,9 +287,10 @@ class DriveModeTimeout(Fault, number=8):
 
 
 class ClockLost(Fault, number=19):
-    """the cycle was not locked to the reference clock for 1 s: {reaction}; then `rtcp reset`"""
+    """the cycle was not locked to the reference clock for {seconds:g} s: {reaction}; then `rtcp reset`"""
 
     stop_key = "clock_lost"
+    seconds: float
 
 
 class LeftRange(Fault, number=20):
