@@ -52,7 +52,9 @@ class Platform:
         file = mine / "assistive_arm.yaml"
         text = file.read_text()
         for old, new in {
-            "timeout_scale: 100 ": f"timeout_scale: {lost_ms / (0.04 * period_us):g} ",
+            # 20 ms of lost cycles, as the drives' watchdog, both times the same factor.
+            "lost_cycles: 40 ": f"lost_cycles: {max(1, round(20_000 / period_us))} ",
+            "timeout_scale: 100 ": f"timeout_scale: {lost_ms / 20:g} ",
             "period_us: 500": f"period_us: {period_us}",
         }.items():
             assert old in text
