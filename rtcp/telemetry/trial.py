@@ -29,6 +29,7 @@ _JOG_INTERVAL_S, _JOG_HOLD_S = 0.05, 0.25
 _JOYSTICK_HOLD_S, _NEUTRAL = 0.5, 63
 _MESSAGE_S = 0.3
 """Time after a stop in which messages about the fault still arrive."""
+_RESET_GIVEN_UP_S = 10.0
 _UNEXPECTED_S, _MOVED_RAD = 0.4, 0.003
 """Time after clearing a fault in which nothing may move or get torque, and what counts as motion."""
 _CHECK_RAD = 0.02
@@ -283,6 +284,8 @@ def _inject(
             harness.robot.reset()
         except RtcpError as error:
             early_reset_refusal = error.message
+        # A slow host may have ended the wait for the reset before the machine gave it up.
+        harness.wait_for(lambda: harness.state() is not State.RESETTING, _RESET_GIVEN_UP_S)
         state = harness.state()
     messages = tuple(harness.messages_since(moment))
     with contextlib.suppress(RtcpError):
