@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import cProfile
 import pstats
-import statistics
 import struct
 import time
 from collections.abc import Callable
@@ -90,40 +89,11 @@ def bus_alone(period_us: int, seconds: float) -> tuple[float, float]:
         return factors(seconds, batch)
 
 
-def compute_us(simulation: Simulation, cycles: int) -> float:
-    """Return the median time from an answer to the end of its cycle, us: what the loop itself computes."""
-    data, loop = simulation.data, simulation.loop
-    receive, cycle = data.receive, loop.cycle
-    answered = 0
-    took: list[int] = []
-
-    def timed_receive() -> int:
-        nonlocal answered
-        wkc = receive()
-        answered = time.perf_counter_ns()
-        return wkc
-
-    def timed_cycle(planned: int, woken: int) -> int:
-        following = cycle(planned, woken)
-        took.append(time.perf_counter_ns() - answered)
-        return following
-
-    data.receive, loop.cycle = timed_receive, timed_cycle  # type: ignore[method-assign]
-    for _ in range(cycles):
-        simulation.cycle()
-    return statistics.quantiles(took, n=20)[0] * 1e-3
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=6.0, help="simulated time of each figure")
     parser.add_argument("--profile", action="store_true")
-    parser.add_argument("--compute", action="store_true", help="the loop's own time in a cycle of a joint move, alone")
     given = parser.parse_args()
-    if given.compute:
-        with moving(1000) as simulation:
-            print(f"{compute_us(simulation, round(given.seconds * 1000)):.1f} us compute a cycle")
-        return
     if given.profile:
         with moving(1000) as simulation:
             profile = cProfile.Profile()

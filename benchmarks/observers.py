@@ -36,7 +36,7 @@ from cycle import Round, figures, platform_round, spread
 from rtcp.config.find import find_config
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory, segment_control
-from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
+from rtcp.virtual.faults.control import SegmentAway, SegmentClient, SegmentRefused
 
 WATCH_MS = {"alone": 1000, "observed": 10, "setting up": 10}
 TURN_S = 0.01

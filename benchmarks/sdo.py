@@ -27,7 +27,7 @@ from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.realtime.scheduling import share_interpreter_quickly
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 
 PERIOD_NS = 1_000_000
 ARM = Path(__file__).parents[1] / "config" / "assistive_arm.yaml"

@@ -9,12 +9,12 @@ from rtcp.config.model import ArmConfig, StopsConfig
 from rtcp.control.machine import STATES
 from rtcp.control.states import Signal
 from rtcp.ipc.commands import COMMANDS, Shutdown
-from rtcp.ipc.events import EVENTS, EmergencyStop, Fault
+from rtcp.ipc.events import EVENTS, EmergencyStop, FaultEvent
 from rtcp.ipc.message import Message
 from rtcp.ipc.stop_reactions import Bound, StopReaction, bounds, tool_bounds, watchdog_bounds
 
 M = TypeVar("M", bound=Message)
-_EVERYWHERE = (Fault, EmergencyStop, Shutdown)
+_EVERYWHERE = (FaultEvent, EmergencyStop, Shutdown)
 """Causes that lead out of nearly every state: in the table, left out of the diagram."""
 _SIGNALS = {
     Signal.JOYSTICK_DEFLECTED: "joystick deflected",
@@ -48,6 +48,7 @@ def _words(cause: type[Message] | Signal) -> str:
     if isinstance(cause, Signal):
         return _SIGNALS[cause]
     name = getattr(cause, "name", "") or "".join(f" {c.lower()}" if c.isupper() else c for c in cause.__name__).strip()
+    name = name.removesuffix(" event")
     return name.replace("_", " ")
 
 

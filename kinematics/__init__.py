@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import kinematics.compiled  # noqa: F401  first: it says whether the others are imported compiled
 from kinematics.damped_least_squares import NumericResult, solve_numeric
 from kinematics.forward import forward, forward_batch, frames
 from kinematics.gravity import gravity_torques

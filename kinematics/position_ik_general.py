@@ -260,12 +260,14 @@ def solve_quadratic(form: Quadratic) -> list[float]:
     constant, c1, s1, c2, s2 = form
     if not max(map(abs, form)) > 0.0:
         return []
-
-    def at(angle: float) -> float:
-        return constant + c1 * cos(angle) + s1 * sin(angle) + c2 * cos(2.0 * angle) + s2 * sin(2.0 * angle)
-
     # tan(x / 2) is infinite at x = pi: count x from the angle half a turn from which the form is largest
-    start = max((0.25 * pi * eighth for eighth in range(8)), key=lambda angle: abs(at(angle + pi)))
+    start, largest = 0.0, -1.0
+    for eighth in range(8):
+        angle = 0.25 * pi * eighth
+        x = angle + pi
+        size = abs(constant + c1 * cos(x) + s1 * sin(x) + c2 * cos(2.0 * x) + s2 * sin(2.0 * x))
+        if size > largest:
+            start, largest = angle, size
     c, s = cos(start), sin(start)
     c1, s1 = c * c1 + s * s1, c * s1 - s * c1
     c, s = cos(2.0 * start), sin(2.0 * start)

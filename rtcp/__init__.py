@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import kinematics.compiled  # noqa: F401  first: it says whether the modules of the cycle are imported compiled
+
 if TYPE_CHECKING:
     from rtcp.api import (
         AsyncRobot,

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
+from kinematics.compiled import BUILD
 from rtcp.ipc.blackboard import Blackboard
 
 _UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -25,6 +26,13 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Begun in the background by a shell, which has its children ignore Ctrl-C, and so all that the tests start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Leave out what only the interpreter allows where the cycle runs compiled."""
+    for item in items:
+        if BUILD.is_used and item.get_closest_marker("interpreted"):
+            item.add_marker(pytest.mark.skip(reason="it replaces a method, which compiled code does not allow"))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -19,25 +19,33 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel, built from a copy so that the checkout may be read-only."""
-    directory = tmp_path_factory.mktemp("wheel")
+    """The wheel of the source alone."""
+    return built(tmp_path_factory.mktemp("wheel"), pure=True)
+
+
+def built(directory: Path, *, pure: bool) -> Path:
+    """Build the wheel from a copy, so that the checkout may be read-only."""
     source = directory / "source"
     source.mkdir()
     for name in ("rtcp", "kinematics", "config", "systemd"):
-        shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "_fast"))
+    for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
         shutil.copy(REPOSITORY / name, source)
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(directory), str(source)]
     if importlib.util.find_spec("hatchling"):
         command.append("--no-build-isolation")
-    subprocess.run(command, check=True)
+    subprocess.run(command, check=True, env={**os.environ, "RTCP_PURE": "1" if pure else "0"})
     return next(directory.glob("rtcp-*.whl"))
 
 
 @pytest.fixture(scope="module")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The interpreter of an environment that holds the wheel, with the dependencies of this one."""
-    directory = tmp_path_factory.mktemp("elsewhere")
+    return install(wheel, tmp_path_factory.mktemp("elsewhere"))
+
+
+def install(wheel: Path, directory: Path) -> Path:
+    """Install a wheel into a new environment; return its interpreter."""
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(directory)], check=True)
     purelib = subprocess.run(
         [directory / "bin" / "python", "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"],
@@ -111,3 +119,15 @@ def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) ->
         shutil.rmtree(directory)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "start to OP" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(0)
+def test_a_wheel_that_was_compiled_runs_compiled_wherever_it_is_installed(tmp_path: Path) -> None:
+    wheel = built(tmp_path, pure=False)
+    assert "-none-any" not in wheel.name
+    python = install(wheel, tmp_path / "elsewhere")
+    code = "import rtcp.control.arm as arm; from kinematics.compiled import BUILD; print(BUILD.is_used, arm.__file__)"
+    (said,) = run(python, code)
+    assert said.startswith("True ")
+    assert said.endswith(sysconfig.get_config_var("EXT_SUFFIX"))

@@ -25,7 +25,7 @@ from rtcp.ipc.runtime_directory import (
 )
 
 if TYPE_CHECKING:
-    from rtcp.virtual.faults.client import SegmentClient
+    from rtcp.virtual.faults.control import SegmentClient
 
 ControlPath = Annotated[
     Path | None,
@@ -255,7 +255,7 @@ def _client(path: Path | None) -> Iterator[SegmentClient]:
     Raises:
         CommandError: no segment runs, several run, or the segment refuses.
     """
-    from rtcp.virtual.faults.client import SegmentAway, SegmentClient, SegmentRefused
+    from rtcp.virtual.faults.control import SegmentAway, SegmentClient, SegmentRefused
 
     try:
         with SegmentClient(path or _running()) as client:

@@ -253,7 +253,8 @@ def realtime_line(realtime: Json) -> str:
         return "-"
     memory = "memory locked" if realtime["memory_locked"] else "memory not locked"
     cpu = "no CPU of its own" if realtime["cpu"] is None else f"CPU {realtime['cpu']}"
-    return "\n".join([f"{realtime['scheduler']}, {memory}, {cpu}", *realtime["notes"]])
+    code = "runs compiled" if realtime.get("compiled") else f"runs as source ({realtime.get('interpreted_because')})"
+    return "\n".join([f"{realtime['scheduler']}, {memory}, {cpu}", f"the cycle {code}", *realtime["notes"]])
 
 
 def _messages(status: Json) -> list[RenderableType]:

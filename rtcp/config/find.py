@@ -1,11 +1,15 @@
-"""Which file is the arm's."""
+"""Finds what a configuration names: the arm's file, and the classes of installed packages, this one among them."""
 
 from __future__ import annotations
 
 import os
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from typing import TypeVar
 
-from rtcp.config.model import ConfigError
+from rtcp.config.model import ConfigError, PluginError
+
+T = TypeVar("T")
 
 SYSTEM = Path("/etc/rtcp/assistive_arm.yaml")
 """The configuration of this machine."""
@@ -81,3 +85,35 @@ def _there(path: Path, asked_by: str) -> Path:
     if not exists(path):
         raise ConfigError([f"{path}, named by {asked_by}, does not exist; name the arm's file"])
     return path
+
+
+def registered(group: str) -> dict[str, EntryPoint]:
+    """Return what installed packages registered in a group of entry points, by name.
+
+    Raises:
+        PluginError: two packages use the same name.
+        ConfigError: there is none, not even of this package.
+    """
+    found: dict[str, EntryPoint] = {}
+    for entry in sorted(entry_points(group=group)):
+        other = found.setdefault(entry.name, entry)
+        if other.value != entry.value:
+            raise PluginError(entry, f"has the name of {other.value}: rename one, or uninstall its package")
+    if not found:
+        raise ConfigError([f"no entry points {group}: the package is older than its metadata; run `make setup`"])
+    return found
+
+
+def load_class(entry: EntryPoint, base: type[T]) -> type[T]:
+    """Return the class of an entry point.
+
+    Raises:
+        PluginError: it cannot be imported, or does not extend `base`.
+    """
+    try:
+        found = entry.load()
+    except Exception as error:  # the module of another package: whatever it raises
+        raise PluginError(entry, f"cannot be loaded: {type(error).__name__}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise PluginError(entry, f"is not a subclass of {base.__module__}.{base.__name__}")
+    return found

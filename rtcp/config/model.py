@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -50,6 +51,12 @@ BITS: dict[str, int] = {
     "float32": 32, "float64": 64,
 }  # fmt: skip
 DriveModeName = Literal["csp", "csv", "cst"]
+MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "csp": ((), ()),
+    "csv": (("target_velocity",), ("velocity",)),
+    "cst": (("target_torque",), ("velocity", "torque")),
+}
+"""Channels of rpdo and of tpdo that a drive mode needs beside those that every CiA 402 drive needs."""
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
@@ -64,6 +71,13 @@ class ConfigError(Exception):
     def __init__(self, problems: Iterable[str]) -> None:
         self.problems = list(problems)
         super().__init__("\n".join(self.problems))
+
+
+class PluginError(ConfigError):
+    """A class that an installed package registered cannot be used."""
+
+    def __init__(self, entry: EntryPoint, problem: str) -> None:
+        super().__init__([f"entry point {entry.name} = {entry.value} of {entry.group} {problem}"])
 
 
 # -- devices: config/devices/*.yaml ------------------------------------------------------------------------------------

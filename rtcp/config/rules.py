@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from importlib.metadata import entry_points
 
 from rtcp.config.document import Finding, KeyPath, dotted
+from rtcp.config.find import registered
 from rtcp.config.model import (
     BITS,
+    MODE_CHANNELS,
     MOST_AXES,
     VIRTUAL,
     ArmConfig,
@@ -61,9 +62,6 @@ CHANNELS: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {
 }
 OPTIONAL = {"target_velocity", "target_torque", "velocity", "torque", "counter"}
 """Channels that only some modes of a drive need (`MODE_CHANNELS`), and only some boxes have."""
-MODE_CHANNELS = {
-    "csp": (), "csv": ("target_velocity", "velocity"), "cst": ("target_torque", "velocity", "torque"),
-}  # fmt: skip
 PDO_RANGE = {"rpdo": (0x1600, 0x17FF), "tpdo": (0x1A00, 0x1BFF)}
 """Objects of receive and transmit PDO mappings (ETG.1000.6)."""
 JOYSTICK_TERMINALS = ("forward", "backward", "left", "right", "mode_up", "mode_down")
@@ -113,7 +111,7 @@ def _startup_value(sdo: StartupSdo) -> Iterator[Finding]:
 @rule(DeviceDescription, "kind")
 def _kind(device: DeviceDescription) -> Iterator[Finding]:
     # By name alone: a driver is loaded by the loop, which stands above the configuration.
-    kinds = sorted(entry_points(group="rtcp.devices").names)
+    kinds = sorted(registered("rtcp.devices"))
     if device.kind not in kinds:
         yield ("kind",), f'found the text "{device.kind}", allowed is one of {", ".join(kinds)}'
 
@@ -322,8 +320,11 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
             text = f'found the text "{joint.slave}", which moves no joint: its device {slave.device} is of kind '
             yield (*where, "slave"), f"{text}{device.kind}; allowed is kind cia402"
         elif device is not None:
-            mapped = {entry.name for pdo in (*device.rpdo, *device.tpdo) for entry in pdo.channels}
-            if missing := [name for name in MODE_CHANNELS[arm.drive_mode] if name not in mapped]:
+            missing: list[str] = []
+            for needed, pdos in zip(MODE_CHANNELS[arm.drive_mode], (device.rpdo, device.tpdo), strict=True):
+                mapped = {entry.name for pdo in pdos for entry in pdo.channels}
+                missing += [name for name in needed if name not in mapped]
+            if missing:
                 text = (
                     f"its device {slave.device} maps no {', '.join(missing)}, which drive_mode {arm.drive_mode} needs"
                 )

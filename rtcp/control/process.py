@@ -19,7 +19,8 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from rtcp.config.model import ArmConfig, DeviceDescription
+from kinematics.compiled import BUILD
+from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, make_discipline, position_of
@@ -90,8 +91,8 @@ def main() -> int:
     try:
         bus.open()
         _work(bus, session, given.directory, report)
-    except (BusError, DeviceError) as error:
-        sentences = list(error.sentences) if isinstance(error, BusError) else [str(error)]
+    except (BusError, DeviceError, ConfigError) as error:
+        sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
         sys.stderr.write("\n".join(sentences) + "\n")
         return 2
@@ -141,6 +142,8 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
                 "scheduler": realtime.scheduler,
                 "memory_locked": realtime.memory_locked,
                 "cpu": realtime.cpu,
+                "compiled": BUILD.is_used,
+                "interpreted_because": BUILD.reason,
                 "notes": realtime.notes,
             },
             "start_to_op_s": round((time.monotonic_ns() - session.began_ns) * 1e-9, 3),

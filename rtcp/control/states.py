@@ -27,7 +27,7 @@ from rtcp.ipc.events import (
     EnableTimeout,
     EstopUnobservable,
     Event,
-    Fault,
+    FaultEvent,
     Homed,
     HomingFailed,
     HomingStillMoving,
@@ -82,7 +82,7 @@ _TARGETS = {
 }
 """Where a stop reaction takes the drives."""
 _FAULTS: dict[type[Message] | Signal, State] = {
-    Fault: State.FAULT,
+    FaultEvent: State.FAULT,
     EmergencyStop: State.EMERGENCY_STOP,
     Shutdown: State.CLOSING,
 }
@@ -111,7 +111,7 @@ class Starting(MachineState):
 
     state = State.STARTING
     drives = "drives disabled; targets follow the actual positions"
-    leads_to = {Ready: State.READY, Fault: State.FAULT, Shutdown: State.CLOSING}
+    leads_to = {Ready: State.READY, FaultEvent: State.FAULT, Shutdown: State.CLOSING}
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Ask for OP once the clock is locked."""
@@ -531,8 +531,16 @@ class FaultReaction:
         self.turned = [0.0] * len(ctx.config.joints)
         """How fast it turned there, rad/s."""
 
-    def begin(self, ctx: Context, before: State) -> None:
-        """Begin: forget what was under way, and remember where the joints are."""
+    def begin(self, ctx: Context, before: State, *, torque_off: bool, off_at_rest: bool) -> None:
+        """Begin: forget what was under way, and remember where the joints are.
+
+        Args:
+            ctx: the cycle and the joints.
+            before: the state that the machine left.
+            torque_off: remove the torque at once.
+            off_at_rest: remove it when the joints stand.
+        """
+        self.torque_off, self.off_at_rest = torque_off, off_at_rest
         # Where it begins: a lost slave was last read before that. Not again until the reset, as by an emergency stop in
         # the fault: its drive may be without supply by then. Nor in a start, in which perhaps no joint was read.
         if before not in self._NOT_REMEMBERED:
@@ -614,9 +622,12 @@ class FaultState(MachineState):
         )
         # Who commanded no torque is not left with an arm that holds, and a reset that fails does not restore it.
         fails = before is State.RESETTING
-        reaction.torque_off = hard or (fails and reaction.torque_off)
-        reaction.off_at_rest = before is State.DISABLING or (fails and reaction.off_at_rest)
-        reaction.begin(ctx, before)
+        reaction.begin(
+            ctx,
+            before,
+            torque_off=hard or (fails and reaction.torque_off),
+            off_at_rest=before is State.DISABLING or (fails and reaction.off_at_rest),
+        )
         ctx.arm.advance(TargetState.TORQUE_OFF if reaction.torque_off else TargetState.QUICK_STOPPED)
 
     def update(self, ctx: Context) -> Event | Signal | None:
@@ -654,9 +665,7 @@ class EmergencyStopState(MachineState):
             return
         assert isinstance(cause, Event)
         reaction, hard = self._reaction, ctx.reactions[type(cause)] is StopReaction.TORQUE_OFF
-        reaction.torque_off = hard
-        reaction.off_at_rest = True
-        reaction.begin(ctx, before)
+        reaction.begin(ctx, before, torque_off=hard, off_at_rest=True)
         self._off = TargetState.TORQUE_OFF if hard else TargetState.DISABLED
         self._since = ctx.cycle
         self._parked = False
@@ -693,7 +702,7 @@ class Resetting(MachineState):
     drives = "slaves return to OP, drive faults are reset, drives disabled"
     leads_to = {
         ResetDone: State.READY,
-        Fault: State.FAULT,
+        FaultEvent: State.FAULT,
         Disable: State.FAULT,
         EmergencyStop: State.EMERGENCY_STOP,
         Shutdown: State.CLOSING,

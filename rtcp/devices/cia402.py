@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import Enum
 
-from rtcp.config.model import ArmConfig, Joint, SlaveConfig
+from rtcp.config.model import MODE_CHANNELS, ArmConfig, Joint, SlaveConfig
 from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
 from rtcp.fieldbus.pdo import ImageLayout
 
@@ -99,12 +99,7 @@ _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_d
 CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
 _WITH_SPEED = (CSP, CSV)
-NEEDED: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    CSP: ((), ()),
-    CSV: (("target_velocity",), ("velocity",)),
-    CST: (("target_torque",), ("velocity", "torque")),
-}
-"""Mode -> channels of rpdo and of tpdo that it needs beside the required ones."""
+_NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
 _WINDOW_S = 0.02
 """Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
 _ENABLED = DriveState.OPERATION_ENABLED
@@ -144,9 +139,7 @@ class Cia402Drive(Driver):
     REQUIRED_OUTPUTS = ("controlword", "target_position", "modes_of_operation")
     REQUIRED_INPUTS = ("statusword", "position", "modes_of_operation_display")
 
-    def __init__(
-        self, slave: SlaveConfig, period_s: float = 0.001, *, speed_limit: float = 0.0, zero: float = 0.0
-    ) -> None:
+    def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
         super().__init__(slave, period_s)
         self._out, self._in = _slots(self.rpdo, _OUTPUTS), _slots(self.tpdo, _INPUTS)
         targets = [None if slot < 0 else self.rpdo.channels[slot] for slot in self._out[1:4]]
@@ -173,7 +166,7 @@ class Cia402Drive(Driver):
 
     def supports(self, mode: int) -> bool:
         """Whether the process data has what a mode (CSP, CSV, CST) needs."""
-        outputs, inputs = NEEDED[mode]
+        outputs, inputs = _NEEDED[mode]
         return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
 
     @property
@@ -254,7 +247,9 @@ class Cia402Drive(Driver):
         by_position, by_velocity, by_torque = self._scales
         fields[control] = self.controlword
         fields[mode] = commanded = self.mode
-        fields[position] = self._counts((self.target_position + self._zero) * by_position, 0, fields[position])
+        counts = (self.target_position + self._zero) * by_position
+        low, high = self._limits[0]
+        fields[position] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[position])
         speed = effort = 0
         if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import ClassVar
 
+from mypy_extensions import mypyc_attr
+
+from rtcp.config.find import load_class, registered
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.pdo import TYPES, Channel, ImageLayout, layout
 
@@ -20,6 +22,7 @@ class DeviceError(ValueError):
     """A device description that its driver cannot work with."""
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)
 class Driver:
     """Bytes of one slave's process image on one side, SI units and states on the other.
 
@@ -41,7 +44,7 @@ class Driver:
     REQUIRED_INPUTS: ClassVar[tuple[str, ...]] = ()
     """Channels of `tpdo` that the driver cannot do without."""
 
-    def __init__(self, slave: SlaveConfig, period_s: float = 0.001) -> None:
+    def __init__(self, slave: SlaveConfig, period_s: float) -> None:
         device = slave.device
         self.name = slave.name
         self.device = device.name
@@ -82,17 +85,16 @@ def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
 
     Raises:
         DeviceError: no installed package has a driver for this kind, or the description cannot serve.
+        PluginError: what is registered for this kind is no driver.
     """
     kind = slave.device.kind
-    found = entry_points(group=ENTRY_POINTS)
-    for point in found:
-        if point.name == kind:
-            driver: Driver = point.load()(slave, period_s=period_s)
-            return driver
-    raise DeviceError(
-        f"{slave.device.name}: no driver is installed for kind {kind} (key `kind`); installed are "
-        f"{', '.join(sorted(found.names)) or 'none: reinstall rtcp (`make setup`)'}"
-    )
+    found = registered(ENTRY_POINTS)
+    if kind not in found:
+        raise DeviceError(
+            f"{slave.device.name}: no driver is installed for kind {kind} (key `kind`); installed are "
+            f"{', '.join(found)}"
+        )
+    return load_class(found[kind], Driver)(slave, period_s=period_s)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ class IoBox(Driver):
     REQUIRED_OUTPUTS = ("outputs",)
     REQUIRED_INPUTS = ("inputs",)
 
-    def __init__(self, slave: SlaveConfig, period_s: float = 0.001) -> None:
+    def __init__(self, slave: SlaveConfig, period_s: float) -> None:
         super().__init__(slave, period_s)
         self._inputs = _field(self, self.tpdo, "inputs")
         self._outputs, at = _field(self, self.rpdo, "outputs")

@@ -16,7 +16,7 @@ from enum import IntEnum
 from rtcp.fieldbus.bus import MailboxInfo, slave_label, station_of
 from rtcp.fieldbus.emergency import Emergency, parse
 from rtcp.fieldbus.errors import BusError, SdoAborted
-from rtcp.fieldbus.registers import Command, Register, RegisterPort, Steps, T, finish, pause
+from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps, T, finish, pause
 
 _RETRY_S = 0.01
 """Pause before a service is tried again, s."""
@@ -306,7 +306,7 @@ class Mailbox:
         message = message.ljust(self._info.receive_size, b"\0")
         # Once only: whether a lost frame reached the slave is not known.
         start = self._info.receive_start
-        if self._port.exchange(Command.FPWR, self._station, start, message, tries=1).wkc != 1:
+        if self._port.exchange(DatagramCommand.FPWR, self._station, start, message, tries=1).wkc != 1:
             raise BusError("it did not take the message")
         return True
 

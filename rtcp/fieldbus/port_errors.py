@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from rtcp.fieldbus.bus import slave_label, station_of
-from rtcp.fieldbus.registers import Command, Register, RegisterPort
+from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort
 
 _SIZE = 0x14
 _FORWARDED, _LINKS = 0x08, 0x10
@@ -70,7 +70,7 @@ class ErrorCounters:
         """Read the next slave's counters; a slave that does not answer keeps what it had."""
         index, self._turn = self._turn, (self._turn + 1) % len(self._names)
         station = station_of(index + 1)
-        found, wkc = self._port.exchange(Command.FPRD, station, Register.ERROR_COUNTERS, bytes(_SIZE), tries=1)
+        found, wkc = self._port.exchange(DatagramCommand.FPRD, station, Register.ERROR_COUNTERS, bytes(_SIZE), tries=1)
         if wkc != 1:
             return
         before = self._last[index]

@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from rtcp.fieldbus.registers import Command, build_frame, open_socket
+from rtcp.fieldbus.registers import DatagramCommand, build_frame, open_socket
 
 _LARGEST_FRAME_DATA = 1466
 """Bytes of process data that fit one frame beside the clock's datagram (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
@@ -124,7 +124,7 @@ class FrameBarrier:
         self._socket = open_socket(interface, _INDEX, _INDEX)
         self._socket.setblocking(False)
         self._fd = self._socket.fileno()
-        self._frame = bytearray(build_frame(Command.NOP, _INDEX, 0, 0, bytes(8)))
+        self._frame = bytearray(build_frame(DatagramCommand.NOP, _INDEX, 0, 0, bytes(8)))
         self._out = (ctypes.c_char * len(self._frame)).from_buffer(self._frame)
         self._in = ctypes.create_string_buffer(1518)
         self._number = 0

@@ -10,7 +10,7 @@ from enum import Enum
 from rtcp.fieldbus.al_state import ERROR_BIT, AlState, refusal
 from rtcp.fieldbus.bus import SlaveState, slave_label, station_of
 from rtcp.fieldbus.errors import BusError, ForeignSlave
-from rtcp.fieldbus.registers import Command, Register, RegisterPort, Steps
+from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort, Steps
 from rtcp.fieldbus.slave_setup import SlaveRestorer
 
 LONG_AGO = float("-inf")
@@ -205,7 +205,7 @@ class SlaveRecovery:
         """Request `state` of a slave; return False where it certainly did not receive that."""
         word = state | (ERROR_BIT if acknowledge else 0)
         data = word.to_bytes(2, "little")
-        return self._port.exchange(Command.FPWR, slave.station, Register.AL_CONTROL, data, tries=1).wkc != 0
+        return self._port.exchange(DatagramCommand.FPWR, slave.station, Register.AL_CONTROL, data, tries=1).wkc != 0
 
     def note_fall(self, slave: MonitoredSlave, now: float) -> None:
         """Note that a slave left OP; one that does so repeatedly is brought back after pauses, and set up again."""
@@ -232,7 +232,7 @@ class SlaveRecovery:
             return
         slave.probe_at = now + _PROBE_S
         place = 1 - slave.position & 0xFFFF
-        data, wkc = self._port.exchange(Command.APRD, place, Register.STATION_ADDRESS, bytes(2), tries=1)
+        data, wkc = self._port.exchange(DatagramCommand.APRD, place, Register.STATION_ADDRESS, bytes(2), tries=1)
         if wkc != 1:
             return
         station = int.from_bytes(data, "little")

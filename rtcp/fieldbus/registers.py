@@ -30,7 +30,7 @@ _HEADER = struct.Struct("<6s6s2sHBBHHHH")
 _SOURCE = bytes((0x02, 0, 0, 0x52, 0x54, 0x43))
 
 
-class Command(IntEnum):
+class DatagramCommand(IntEnum):
     """EtherCAT commands used here (ETG.1000.4, 5.4)."""
 
     NOP = 0
@@ -85,7 +85,7 @@ _ANSWER_S = 0.02
 TRIES, PATIENT_TRIES = 3, 25
 """Frames for a datagram: beside the cycle, where a quick answer counts, and before it, where half a second without any
 is no shared host's stall."""
-_BY_STATION = (Command.FPRD, Command.FPWR)
+_BY_STATION = (DatagramCommand.FPRD, DatagramCommand.FPWR)
 _NOT_TAKEN = "{label} did not take what was written to register 0x{address:04X}"
 
 
@@ -96,7 +96,7 @@ class Answer(NamedTuple):
     wkc: int
 
 
-def build_frame(command: Command, index: int, station: int, address: int, data: bytes) -> bytes:
+def build_frame(command: DatagramCommand, index: int, station: int, address: int, data: bytes) -> bytes:
     """Return an Ethernet frame with one datagram."""
     header = _HEADER.pack(
         b"\xff" * 6, _SOURCE, ETHERTYPE.to_bytes(2, "big"), 0x1000 | (12 + len(data)),
@@ -159,7 +159,7 @@ class RegisterPort:
 
     def exchange(
         self,
-        command: Command,
+        command: DatagramCommand,
         station: int,
         address: int,
         data: bytes,
@@ -202,12 +202,12 @@ class RegisterPort:
     def read(self, station: int, address: int, length: int, *, tries: int | None = None) -> bytes | None:
         """Return registers of the slave at configured address `station` (FPRD), None where it does not answer."""
         tries = self.tries if tries is None else tries
-        data, wkc = self.exchange(Command.FPRD, station, address, bytes(length), tries=tries)
+        data, wkc = self.exchange(DatagramCommand.FPRD, station, address, bytes(length), tries=tries)
         return data if wkc == 1 else None
 
     def write(self, station: int, address: int, data: bytes) -> bool:
         """Write registers of the slave at configured address `station` (FPWR); return whether it took them."""
-        return self.exchange(Command.FPWR, station, address, data).wkc == 1
+        return self.exchange(DatagramCommand.FPWR, station, address, data).wkc == 1
 
     def put(self, station: int, address: int, data: bytes, label: str) -> None:
         """Write registers as `write` does; raises BusError where the slave, named `label`, does not take them."""
@@ -216,12 +216,12 @@ class RegisterPort:
 
     def read_at(self, position: int, address: int, length: int) -> bytes | None:
         """Return registers of the slave at `position` on the cable (APRD), which needs no station address for it."""
-        data, wkc = self.exchange(Command.APRD, 1 - position & 0xFFFF, address, bytes(length))
+        data, wkc = self.exchange(DatagramCommand.APRD, 1 - position & 0xFFFF, address, bytes(length))
         return data if wkc == 1 else None
 
     def write_at(self, position: int, address: int, data: bytes) -> bool:
         """Write registers of the slave at `position` on the cable (APWR); return whether it took them."""
-        return self.exchange(Command.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
+        return self.exchange(DatagramCommand.APWR, 1 - position & 0xFFFF, address, data).wkc == 1
 
     def put_at(self, position: int, address: int, data: bytes, label: str) -> None:
         """Write registers as `write_at` does; raises BusError where the slave, named `label`, does not take them."""
@@ -230,11 +230,11 @@ class RegisterPort:
 
     def read_all(self, address: int, length: int) -> Answer:
         """Read registers of all slaves (BRD): data OR-ed together, the working counter is their number."""
-        return self.exchange(Command.BRD, 0, address, bytes(length))
+        return self.exchange(DatagramCommand.BRD, 0, address, bytes(length))
 
     def write_all(self, address: int, data: bytes) -> int:
         """Write registers of all slaves (BWR); return the working counter, -1 where no frame came back."""
-        return self.exchange(Command.BWR, 0, address, data).wkc
+        return self.exchange(DatagramCommand.BWR, 0, address, data).wkc
 
     def close(self) -> None:
         """Close the port; may be called twice."""

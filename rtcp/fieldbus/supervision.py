@@ -15,7 +15,7 @@ from rtcp.fieldbus.bus import Bus
 from rtcp.fieldbus.mailbox import SdoClient
 from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.recovery import LONG_AGO, REPORT_INTERVAL_S, MonitoredSlave, SlaveRecovery
-from rtcp.fieldbus.registers import Command, Register, RegisterPort
+from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort
 from rtcp.fieldbus.slave_setup import SlaveRestorer
 
 _PARK_S = 3.0
@@ -111,7 +111,7 @@ class SlaveWatcher:
             BusError: the interface is gone.
         """
         now = time.monotonic()
-        data, wkc = self._port.exchange(Command.BRD, 0, Register.AL_STATUS, bytes(2), timeout_s=0.01, tries=1)
+        data, wkc = self._port.exchange(DatagramCommand.BRD, 0, Register.AL_STATUS, bytes(2), timeout_s=0.01, tries=1)
         if wkc < 0:
             self._note_silence(now)
             return 0
@@ -162,7 +162,7 @@ class SlaveWatcher:
         found = (AlState.NONE, False, 0)
         # A frame that was damaged unnoticed must not stop the arm: who was in OP is asked twice.
         for _ in range(2 if slave.was_in_op else 1):
-            data, wkc = self._port.exchange(Command.FPRD, slave.station, Register.AL_STATUS, bytes(6), tries=1)
+            data, wkc = self._port.exchange(DatagramCommand.FPRD, slave.station, Register.AL_STATUS, bytes(6), tries=1)
             if wkc < 0:
                 return None
             status = int.from_bytes(data[:2], "little") if wkc else 0

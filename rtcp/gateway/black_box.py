@@ -40,7 +40,7 @@ AFTER_S = 1.0
 
 
 @dataclass(frozen=True)
-class Fault:
+class FaultRecord:
     """What has begun: by an event of the loop, or (number 0) by its silence or end."""
 
     time_ns: int
@@ -55,7 +55,7 @@ class Fault:
     """It came while a fault was on already."""
 
 
-class FaultEvents:
+class RecordingTrigger:
     """Divides events into recordings: within one fault at most one begins in 10 s.
 
     What comes in between is put off: the newest event of it begins a recording then, and the others are in the ten
@@ -70,13 +70,13 @@ class FaultEvents:
         self._names = names
         self.on = False
         """A fault is on."""
-        self._later: Fault | None = None
+        self._later: FaultRecord | None = None
         self._ends_ns = self._next_ns = 0
         """When the newest recording ends, and from when on another may begin; CLOCK_MONOTONIC."""
 
-    def begun(self, events: Sequence[EventRecord], now_ns: int) -> list[Fault]:
+    def begun(self, events: Sequence[EventRecord], now_ns: int) -> list[FaultRecord]:
         """Return what begins a recording, of new events and of what was put off; `now_ns`: CLOCK_MONOTONIC."""
-        found: list[Fault] = []
+        found: list[FaultRecord] = []
         for event in events:
             found += self._due(event.monotonic_ns)
             if isinstance(event.event, ResetDone):
@@ -84,10 +84,12 @@ class FaultEvents:
                 self.on = False
             elif type(event.event) in self._names.faults:
                 what = self._names.message(event.event)
-                found += self.met(Fault(event.time_ns, event.monotonic_ns, what, event.number, event.event.number))
+                found += self.met(
+                    FaultRecord(event.time_ns, event.monotonic_ns, what, event.number, event.event.number)
+                )
         return found + self._due(now_ns)
 
-    def put_off(self) -> list[Fault]:
+    def put_off(self) -> list[FaultRecord]:
         """Return what was put off: it begins its recording now."""
         if self._later is None:
             return []
@@ -95,7 +97,7 @@ class FaultEvents:
         self._begin(fault, max(self._next_ns, fault.monotonic_ns))
         return [fault]
 
-    def met(self, fault: Fault) -> list[Fault]:
+    def met(self, fault: FaultRecord) -> list[FaultRecord]:
         """Return what a fault begins: its own recording, or that of what was put off."""
         fault = replace(fault, later=self.on)
         if not self.on:
@@ -108,10 +110,10 @@ class FaultEvents:
             self._later = fault
         return self._due(fault.monotonic_ns)
 
-    def _due(self, now_ns: int) -> list[Fault]:
+    def _due(self, now_ns: int) -> list[FaultRecord]:
         return self.put_off() if now_ns >= self._next_ns else []
 
-    def _begin(self, fault: Fault, begun_ns: int) -> None:
+    def _begin(self, fault: FaultRecord, begun_ns: int) -> None:
         self._ends_ns = fault.monotonic_ns + round(AFTER_S * 1e9)
         self._next_ns = begun_ns + round(BEFORE_S * 1e9)
 
@@ -132,7 +134,7 @@ class BlackBox:
         self._directory = directory
         self._report = report
         self._names = Names(session.config)
-        self._events = FaultEvents(self._names)
+        self._events = RecordingTrigger(self._names)
         self._event = 0
         self._since = 0.0
         """When the fault that is on was seen."""
@@ -179,7 +181,7 @@ class BlackBox:
         if latest is not None:
             sentence = f"the loop (process {self._observer.loop_pid}) {_ENDED}"
             last_ns = int(latest["time_ns"][0])
-            self._writer.submit(self._make_up_for, [Fault(_wall(last_ns), last_ns, sentence)])
+            self._writer.submit(self._make_up_for, [FaultRecord(_wall(last_ns), last_ns, sentence)])
 
     def finish(self) -> None:
         """Write what is still to be written and return when it is; a second time is harmless."""
@@ -189,7 +191,7 @@ class BlackBox:
         self._over.set()
         self._writer.shutdown()
 
-    def _begun(self) -> list[Fault]:
+    def _begun(self) -> list[FaultRecord]:
         """Return the faults that events have begun since the last look."""
         events = self._observer.events_since(self._event)
         self._event = events[-1].number if events else self._event
@@ -219,7 +221,7 @@ class BlackBox:
         self._say(sentence)
         if self._over.is_set():
             return
-        fault = Fault(_wall(monotonic_ns), monotonic_ns, sentence)
+        fault = FaultRecord(_wall(monotonic_ns), monotonic_ns, sentence)
         # Nothing comes after its end that would have to be kept apart from it.
         begun = [fault] if self._dead else self._events.met(fault)
         self._since = time.monotonic()
@@ -232,7 +234,7 @@ class BlackBox:
 
     # -- what; in the writer's thread -------------------------------------------------------------------------------
 
-    def _make_up_for(self, faults: Sequence[Fault]) -> None:
+    def _make_up_for(self, faults: Sequence[FaultRecord]) -> None:
         """Record faults that began before this gateway did, unless that was done or they have left the ring."""
         try:
             abouts = [one.about for one in listed(self._directory) if one.about is not None]
@@ -254,7 +256,7 @@ class BlackBox:
             else:
                 self._record(fault)
 
-    def _record(self, fault: Fault) -> None:
+    def _record(self, fault: FaultRecord) -> None:
         try:
             # At once: a short cycle's ring is soon written over.
             before, _ = self._observer.since(0)
@@ -278,7 +280,7 @@ class BlackBox:
         self._say(f"black box: {what}, by a defect: {type(error).__name__} {error}")
 
     def _recording(
-        self, fault: Fault, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
+        self, fault: FaultRecord, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
     ) -> Recording:
         records = np.concatenate([before, after])
         at = _place(records, fault, len(before) - 1)
@@ -310,7 +312,7 @@ class BlackBox:
         )
         return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
 
-    def _timeline(self, fault: Fault, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
+    def _timeline(self, fault: FaultRecord, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""
         events, texts = self._observer.events_since(0), self._observer.texts_since(0)
         # Counted from the fault, however the wall clock is set meanwhile. A text has its wall time alone.
@@ -328,7 +330,7 @@ class BlackBox:
         return tuple(Moment(fault.time_ns + away_ns, message) for away_ns, message in kept), notes
 
 
-def _place(records: npt.NDArray[np.void], fault: Fault, newest: int) -> int:
+def _place(records: npt.NDArray[np.void], fault: FaultRecord, newest: int) -> int:
     """Return the index of the cycle in which the fault began, -1 without records; `newest` was the last one then."""
     if not len(records):
         return -1

@@ -13,12 +13,12 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, make_dataclass
 from enum import IntEnum
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 from annotated_types import Ge, Gt, Le
 
+from rtcp.config.find import registered
 from rtcp.config.model import Point, Stop
 from rtcp.config.validation import Checker
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
@@ -116,8 +116,8 @@ class Methods:
         self.table = self._table()
 
     def _table(self) -> dict[str, Method]:
-        for point in entry_points(group="rtcp.controllers"):
-            point.load()  # registers the commands that its controller accepts
+        for entry in registered("rtcp.controllers").values():
+            entry.load()  # registers the commands that its controller accepts
         found = (getattr(self, name) for name in dir(type(self)) if hasattr(getattr(type(self), name), "method_flags"))
         table = {one.name: one for one in map(_method_of, found)}
         for kind in COMMANDS:

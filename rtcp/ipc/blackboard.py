@@ -108,13 +108,13 @@ class Blackboard:
         """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
         number = self._records + 1
         at = RECORDS_AT + (number & self._ring_mask) * self._record_size
-        words = self._words
-        words[at] = 0
-        words.fence()
+        words, fence = self._words.plain, self._words.fence
+        words[at >> 3] = 0
+        fence()
         self._pack_record(self._map, at + 8, *values, number)
-        words.fence()
-        words[at] = number
-        words[RECORDS_HEAD_AT] = number
+        fence()
+        words[at >> 3] = number
+        words[RECORDS_HEAD_AT >> 3] = number
         self._records = number
 
     def event(self, event: Event) -> None:

@@ -30,13 +30,13 @@ class Event(Message, abstract=True):
 EVENTS = Event.kinds
 
 
-class Fault(Event, abstract=True):
+class FaultEvent(Event, abstract=True):
     """Base of events that begin a fault."""
 
     is_fault = True
 
 
-class EmergencyStop(Fault, abstract=True):
+class EmergencyStop(FaultEvent, abstract=True):
     """Base of events that begin the emergency stop."""
 
     is_emergency = True
@@ -199,7 +199,7 @@ class HomingInBox(Event, number=42):
 # -- faults -----------------------------------------------------------------------------------------------------------
 
 
-class ProcessDataLost(Fault, number=1):
+class ProcessDataLost(FaultEvent, number=1):
     """process data lost: {in_a_row} cycles in a row, and {allowed} more without than with the expected working counter
     ({lost_cycles} in {file}): {reaction}; `rtcp reset` when the slaves answer"""
 
@@ -208,7 +208,7 @@ class ProcessDataLost(Fault, number=1):
     allowed: int
 
 
-class DriveLeftEnabled(Fault, number=2):
+class DriveLeftEnabled(FaultEvent, number=2):
     """{joint}: the drive left Operation Enabled by itself (statusword 0x{statusword:04X}): {reaction}; then `rtcp
     reset`"""
 
@@ -217,7 +217,7 @@ class DriveLeftEnabled(Fault, number=2):
     statusword: int
 
 
-class DriveFault(Fault, number=18):
+class DriveFault(FaultEvent, number=18):
     """{joint}: the drive is in fault (statusword 0x{statusword:04X}): {reaction}; then `rtcp reset`"""
 
     stop_key = "drive_fault"
@@ -225,7 +225,7 @@ class DriveFault(Fault, number=18):
     statusword: int
 
 
-class EnableTimeout(Fault, number=3):
+class EnableTimeout(FaultEvent, number=3):
     """{joint}: the drive did not reach Operation Enabled within {enable_timeout:g} s (statusword 0x{statusword:04X};
     enable_timeout_s in {file}): {reaction}; then `rtcp reset`"""
 
@@ -233,7 +233,7 @@ class EnableTimeout(Fault, number=3):
     statusword: int
 
 
-class DisableTimeout(Fault, number=4):
+class DisableTimeout(FaultEvent, number=4):
     """{joint}: the drive kept its torque for {enable_timeout:g} s (statusword 0x{statusword:04X}; enable_timeout_s in
     {file}): {reaction}; then `rtcp reset`"""
 
@@ -241,7 +241,7 @@ class DisableTimeout(Fault, number=4):
     statusword: int
 
 
-class SlaveLost(Fault, number=5):
+class SlaveLost(FaultEvent, number=5):
     """slave {slave} ({slave_name}) left OP or does not answer: {reaction}; `rtcp reset` when it is back"""
 
     stop_key = "slave_lost"
@@ -249,7 +249,7 @@ class SlaveLost(Fault, number=5):
     """Position on the cable, from 1."""
 
 
-class ResetTimeout(Fault, number=6):
+class ResetTimeout(FaultEvent, number=6):
     """{joint}: the drive remains in fault after the reset (statusword 0x{statusword:04X}): remove the cause, then `rtcp
     reset`"""
 
@@ -257,16 +257,16 @@ class ResetTimeout(Fault, number=6):
     statusword: int
 
 
-class ResetWithoutSlaves(Fault, number=49):
+class ResetWithoutSlaves(FaultEvent, number=49):
     """reset failed within 3 s: not all slaves are back in OP (`rtcp status` shows which): repair that, then `rtcp
     reset`"""
 
 
-class ResetWithoutFrames(Fault, number=50):
+class ResetWithoutFrames(FaultEvent, number=50):
     """reset failed within 3 s: no frames return, or the reference clock is not locked (`rtcp status`)"""
 
 
-class ResetWhileMoving(Fault, number=22):
+class ResetWhileMoving(FaultEvent, number=22):
     """{joint} still turns at {velocity:.6g} rad/s 3 s after the reset: its torque goes at standstill only; `rtcp
     disable` removes it at once"""
 
@@ -274,11 +274,11 @@ class ResetWhileMoving(Fault, number=22):
     velocity: float
 
 
-class GeneratorFailed(Fault, number=7):
+class GeneratorFailed(FaultEvent, number=7):
     """the trajectory generator refused its input: {reaction}; then `rtcp reset`"""
 
 
-class DriveModeTimeout(Fault, number=8):
+class DriveModeTimeout(FaultEvent, number=8):
     """{joint}: the drive shows mode {found} instead of {wanted}: {reaction}; then `rtcp reset`"""
 
     axis: int
@@ -286,14 +286,14 @@ class DriveModeTimeout(Fault, number=8):
     wanted: DriveMode
 
 
-class ClockLost(Fault, number=19):
+class ClockLost(FaultEvent, number=19):
     """the cycle was not locked to the reference clock for {seconds:g} s: {reaction}; then `rtcp reset`"""
 
     stop_key = "clock_lost"
     seconds: float
 
 
-class LeftRange(Fault, number=20):
+class LeftRange(FaultEvent, number=20):
     """{joint} left its range of {low:g} to {high:g} rad while being enabled or homed: it stands at {position:.6g} rad
     ({key}.position in {file}): {reaction}; then `rtcp reset`"""
 
@@ -301,7 +301,7 @@ class LeftRange(Fault, number=20):
     position: float
 
 
-class PositionJumped(Fault, number=43):
+class PositionJumped(FaultEvent, number=43):
     """{joint} jumped from {before:.6g} to {position:.6g} rad while being enabled, for {supervision}: it was turned, or
     its drive shows a false position; {reaction}; compare it with `rtcp status`, then `rtcp reset`"""
 
@@ -310,7 +310,7 @@ class PositionJumped(Fault, number=43):
     before: float
 
 
-class HomingStillMoving(Fault, number=39):
+class HomingStillMoving(FaultEvent, number=39):
     """{joint} still turns at {velocity:.6g} rad/s 3 s after its homing: {reaction}; then `rtcp reset`"""
 
     axis: int

@@ -195,14 +195,15 @@ class AtomicWords:
 
     def __init__(self, memory: mmap.mmap) -> None:
         self._view = memoryview(memory)
-        self._words = self._view.cast("Q")
+        self.plain = self._view.cast("Q")
+        """The words by their index: for every cycle."""
         self._lock = threading.Lock()
 
     def __getitem__(self, at: int) -> int:
-        return self._words[at >> 3]
+        return self.plain[at >> 3]
 
     def __setitem__(self, at: int, value: int) -> None:
-        self._words[at >> 3] = value
+        self.plain[at >> 3] = value
 
     def fence(self) -> None:
         """Order the stores before against those after, also on weakly ordered CPUs (aarch64): two passes of a lock."""
@@ -214,7 +215,7 @@ class AtomicWords:
 
     def close(self) -> None:
         """Release the file, which cannot be unmapped before."""
-        self._words.release()
+        self.plain.release()
         self._view.release()
 
 

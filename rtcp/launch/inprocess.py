@@ -35,10 +35,10 @@ from rtcp.virtual.protocol import (
     HEADER,
     SM_SIZE,
     TYPE_DATAGRAMS,
-    Command,
+    DatagramCommand,
     Register,
-    State,
 )
+from rtcp.virtual.protocol import AlState as VirtualAlState
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
 
@@ -176,7 +176,7 @@ class InProcessData:
             at += length
         self._counter_at = at
         length = at - self._data_at
-        header = HEADER.pack(Command.LRW, 0, 0, 0, length, 0)
+        header = HEADER.pack(DatagramCommand.LRW, 0, 0, 0, length, 0)
         frame_header = (length + DATAGRAM_HEADER + COUNTER | TYPE_DATAGRAMS << 12).to_bytes(2, "little")
         ethernet = b"\xff" * 6 + b"\x01" * 6 + ETHERTYPE.to_bytes(2, "big")
         self._empty = bytearray(ethernet + frame_header + header + bytes(length + COUNTER))
@@ -386,7 +386,7 @@ class InProcessBus:
 
     def drop(self, position: int, state: int, code: int) -> None:
         """Let a slave leave its state by itself, with an AL status code."""
-        self._slave(position).virtual.application.fall(State(state), code)
+        self._slave(position).virtual.application.fall(VirtualAlState(state), code)
 
     def restart(self, position: int) -> None:
         """Switch a slave's supply off and on again."""

@@ -77,10 +77,10 @@ def read(plan: memoryview[float], count: int) -> Values | None:
     if n not in range(1, MOST_JOINTS + 1) or with_box not in (0.0, 1.0) or count != 1 + n + with_box + boxes:
         return None
     first = 1 + int(n)
-    joints = [plan[at * COLUMNS : at * COLUMNS + 6].tolist() for at in range(1, first)]
+    rows = [[plan[at * COLUMNS + column] for column in range(6)] for at in range(1, count)]
+    joints = rows[: first - 1]
     found: list[Corners] = []
-    for at in range(first, count):
-        a, b, c, d, e, f = plan[at * COLUMNS : at * COLUMNS + 6].tolist()
+    for a, b, c, d, e, f in rows[first - 1 :]:
         found.append((a, b, c, d, e, f))
     low, high, velocity, acceleration, jerk, torque = zip(*joints, strict=True)
     box = found.pop(0) if with_box else None

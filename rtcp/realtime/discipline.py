@@ -14,6 +14,8 @@ grid to the configured phase between two SYNC0, before any drive is in OP), *tra
 
 from __future__ import annotations
 
+from mypy_extensions import mypyc_attr
+
 MEASURE_CYCLES = 100
 LOCK_CYCLES = 200
 LOCK_WITHIN_NS = 10_000.0
@@ -35,6 +37,7 @@ _RATE_BOUND = 500e-6
 """No two oscillators differ by more; keeps a jump of the reference from winding up the rate."""
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)
 class Discipline:
     """Computes wake-up instants (CLOCK_MONOTONIC, ns) that keep the send instant at a phase of the DC cycle.
 

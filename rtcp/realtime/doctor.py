@@ -13,6 +13,7 @@ from enum import IntEnum
 from functools import partial
 from pathlib import Path
 
+from kinematics.compiled import BUILD, Build
 from rtcp.realtime.host import Host, NotKnown, format_cpus, name_cpus, parse_cpus, whole
 
 _CPUS = "/sys/devices/system/cpu"
@@ -33,6 +34,7 @@ class Case:
     """How long the loop waits for its frame."""
     blackboard: Path | None = None
     """Blackboard of the platform that may be running; None: do not look."""
+    build: Build = BUILD
 
 
 class Severity(IntEnum):
@@ -790,6 +792,13 @@ def _jetson_clocks(case: Case) -> Result | None:
 # -- the platform that is running -------------------------------------------------------------------------------
 
 
+def _compiled(case: Case) -> Result:
+    if case.build.is_used:
+        return _ok("the cycle runs compiled")
+    found = f"the cycle runs as source: {case.build.reason}"
+    return (_warning if case.build.is_stale else _note)(found, "make fast   # needs a C compiler")
+
+
 def _skipped_ticks(case: Case) -> Result | None:
     if case.blackboard is None or not case.blackboard.exists():
         return None
@@ -855,6 +864,7 @@ CHECKS = (
     Check("power-mode", _power_mode, "a lower mode switches CPUs off and bounds the clocks of the others"),
     Check("jetson-clocks", _jetson_clocks,
           "else memory and CPU clocks follow the load, and a short cycle looks like none"),
+    Check("compiled", _compiled, "the interpreter takes about twice the time for each cycle"),
     Check("skipped-ticks", _skipped_ticks,
           "a skipped tick delays the motion by a cycle; the drives bridge one, not many"),
 )  # fmt: skip

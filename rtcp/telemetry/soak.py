@@ -14,7 +14,7 @@ import psutil
 from rtcp.api import RtcpError
 from rtcp.telemetry.harness import Harness, TrialFailed
 from rtcp.telemetry.trial import WORKLOADS, named, run_trial
-from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
+from rtcp.virtual.faults.control import SegmentAway, SegmentRefused
 
 SETTLE_S = 60.0
 """After this time a process has allocated all that it keeps: its memory must not grow."""

@@ -13,7 +13,7 @@ from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.esc import MEMORY_SIZE, Esc, SyncManager
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
-from rtcp.virtual.protocol import REGISTER_SPACE, Register, State
+from rtcp.virtual.protocol import REGISTER_SPACE, AlState, Register
 
 MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS = range(4)
 """Sync managers of a slave with mailbox, by their use (ETG.1000.6, 5.6.7.4)."""
@@ -141,9 +141,9 @@ _SYNC: tuple[Check, ...] = (
 )
 
 # Steps up, and what must hold for them. A step down is always allowed; any other pair is 0x0011.
-UPWARD: dict[tuple[State, State], tuple[Check, ...]] = {
-    (State.INIT, State.PRE_OP): _MAILBOXES,
-    (State.PRE_OP, State.SAFE_OP): (
+UPWARD: dict[tuple[AlState, AlState], tuple[Check, ...]] = {
+    (AlState.INIT, AlState.PRE_OP): _MAILBOXES,
+    (AlState.PRE_OP, AlState.SAFE_OP): (
         *_MAILBOXES,
         (lambda esc, device: mapped_image(device, RX_ASSIGN) is not None, AlStatusCode.INVALID_OUTPUT_MAPPING),
         (lambda esc, device: mapped_image(device, TX_ASSIGN) is not None, AlStatusCode.INVALID_INPUT_MAPPING),
@@ -151,16 +151,16 @@ UPWARD: dict[tuple[State, State], tuple[Check, ...]] = {
         (check_watchdog, AlStatusCode.INVALID_WATCHDOG),
         *_SYNC,
     ),
-    (State.SAFE_OP, State.OP): _SYNC,
+    (AlState.SAFE_OP, AlState.OP): _SYNC,
 }
 
-_PROCESS_DATA = ((_MAILBOXES, State.INIT), (_BUFFERS, State.PRE_OP))
+_PROCESS_DATA = ((_MAILBOXES, AlState.INIT), (_BUFFERS, AlState.PRE_OP))
 # What must go on to hold in a state when sync managers are written, and where the slave falls to otherwise.
-HELD: dict[State, tuple[tuple[tuple[Check, ...], State], ...]] = {
-    State.INIT: (),
-    State.PRE_OP: _PROCESS_DATA[:1],
-    State.SAFE_OP: _PROCESS_DATA,
-    State.OP: _PROCESS_DATA,
+HELD: dict[AlState, tuple[tuple[tuple[Check, ...], AlState], ...]] = {
+    AlState.INIT: (),
+    AlState.PRE_OP: _PROCESS_DATA[:1],
+    AlState.SAFE_OP: _PROCESS_DATA,
+    AlState.OP: _PROCESS_DATA,
 }
 
 
@@ -169,15 +169,15 @@ def first_failure(checks: tuple[Check, ...], esc: Esc, device: DeviceModel) -> A
     return next((code for holds, code in checks if not holds(esc, device)), AlStatusCode.NO_ERROR)
 
 
-def judge(state: State, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:
+def judge(state: AlState, wanted: int, esc: Esc, device: DeviceModel) -> AlStatusCode:
     """Whether a slave in `state` may go to `wanted`, the value of AL control's low four bits."""
-    if wanted not in State.__members__.values():
+    if wanted not in AlState.__members__.values():
         return AlStatusCode.UNKNOWN_STATE
-    if wanted == State.BOOTSTRAP:
-        return AlStatusCode.BOOTSTRAP_NOT_SUPPORTED if state == State.INIT else AlStatusCode.INVALID_STATE_CHANGE
+    if wanted == AlState.BOOTSTRAP:
+        return AlStatusCode.BOOTSTRAP_NOT_SUPPORTED if state == AlState.INIT else AlStatusCode.INVALID_STATE_CHANGE
     if wanted <= state:
         return AlStatusCode.NO_ERROR
-    checks = UPWARD.get((state, State(wanted)))
+    checks = UPWARD.get((state, AlState(wanted)))
     return AlStatusCode.INVALID_STATE_CHANGE if checks is None else first_failure(checks, esc, device)
 
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from math import isfinite
 from types import MappingProxyType
 from typing import ClassVar, Protocol, cast
 
 from rtcp.config.document import Finding, shown
+from rtcp.config.find import load_class, registered
+from rtcp.config.model import PluginError
 from rtcp.virtual.objects import DataType, Entry, ObjectDictionary
 
 ENTRY_POINTS = "rtcp.virtual_models"
@@ -226,7 +228,7 @@ def _read_options(table: Mapping[str, Option], given: Mapping[str, object]) -> d
 
 def models() -> dict[str, EntryPoint]:
     """Return the installed device models by name."""
-    return {found.name: found for found in entry_points(group=ENTRY_POINTS)}
+    return registered(ENTRY_POINTS)
 
 
 def create(model: str, **options: object) -> DeviceModel:
@@ -241,9 +243,7 @@ def create(model: str, **options: object) -> DeviceModel:
         names = ", ".join(sorted(installed))
         raise OptionError((("model",), f'found the text "{model}", allowed is one of {names}, or module:Class'))
     try:
-        made = found.load()
-    except (ImportError, AttributeError) as error:
-        raise OptionError((("model",), f'the device model "{model}" cannot be loaded: {error}')) from error
-    if not (isinstance(made, type) and issubclass(made, DeviceModel)):
-        raise OptionError((("model",), f'"{model}" is no device model: it must be a subclass of DeviceModel'))
+        made = load_class(found, DeviceModel)
+    except PluginError as error:
+        raise OptionError((("model",), str(error))) from error
     return made(**options)

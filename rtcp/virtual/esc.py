@@ -21,9 +21,9 @@ from rtcp.virtual.protocol import (
     SM_SIZE,
     WRITABLE,
     WRITABLE_DC,
+    AlState,
     EcatEvent,
     Register,
-    State,
 )
 from rtcp.virtual.sii import EepromInterface
 
@@ -349,9 +349,9 @@ class Esc:
         self.raise_event(EcatEvent.AL_STATUS)
 
     @property
-    def state(self) -> State:
+    def state(self) -> AlState:
         """The AL state that the device reports."""
-        return State(self.memory[Register.AL_STATUS] & 0x0F)
+        return AlState(self.memory[Register.AL_STATUS] & 0x0F)
 
     def raise_event(self, event: int, cleared: int = 0) -> None:
         """Set bits of the ECAT event request register, and clear others."""

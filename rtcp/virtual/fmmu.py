@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from rtcp.virtual.esc import Esc, SyncManager
-from rtcp.virtual.protocol import FMMU_COUNT, FMMU_SIZE, Command, Register
+from rtcp.virtual.protocol import FMMU_COUNT, FMMU_SIZE, DatagramCommand, Register
 
-READS = frozenset((Command.LRD, Command.LRW))
-WRITES = frozenset((Command.LWR, Command.LRW))
+READS = frozenset((DatagramCommand.LRD, DatagramCommand.LRW))
+WRITES = frozenset((DatagramCommand.LWR, DatagramCommand.LRW))
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def transfer(esc: Esc, command: int, address: int, data: bytearray, t: int) -> i
             changed = esc.memory[first:end]
             copy_bits(incoming, part.at, changed, part.physical - 8 * first, part.bits)
             wrote |= esc.write(first, bytes(changed), t)
-    return read + (2 * wrote if command == Command.LRW else wrote)
+    return read + (2 * wrote if command == DatagramCommand.LRW else wrote)
 
 
 class Copy(NamedTuple):
@@ -206,7 +206,7 @@ def _fast(plan: Plan, esc: Esc, parts: list[tuple[Fmmu, Overlap]], images: dict[
     plan.outputs += outputs
     plan.inputs += inputs
     plan.written += written
-    share = bool(inputs) + bool(outputs) * (2 if command == Command.LRW else 1)
+    share = bool(inputs) + bool(outputs) * (2 if command == DatagramCommand.LRW else 1)
     plan.counter += share
     plan.shares.append((esc, share))
     return True

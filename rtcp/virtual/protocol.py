@@ -72,7 +72,7 @@ class Register(IntEnum):
     USER_RAM = 0x0F80
 
 
-class State(IntEnum):
+class AlState(IntEnum):
     """AL states in AL control and AL status (ETG.1000.6, table 9)."""
 
     INIT = 1
@@ -140,7 +140,7 @@ DEFAULTS: tuple[tuple[int, bytes], ...] = (
     (Register.RAM, bytes((RAM_SIZE // 1024,))),
     (Register.PORT_DESCRIPTOR, bytes((0x0F,))),  # ports 0 and 1 are MII, 2 and 3 not there
     (Register.DL_CONTROL, bytes((0x01, 0x00, 0x07, 0x00))),
-    (Register.AL_STATUS, bytes((State.INIT, 0x00))),
+    (Register.AL_STATUS, bytes((AlState.INIT, 0x00))),
     (Register.PDI_CONTROL, bytes((0x08, 0x00))),  # 16-bit asynchronous microcontroller interface
     (Register.WATCHDOG_DIVIDER, (0x09C2).to_bytes(2, "little")),  # (2498 + 2) * 40 ns = 100 us a step
     (Register.WATCHDOG_PDI, (1000).to_bytes(2, "little")),
@@ -177,7 +177,7 @@ HEADER = struct.Struct("<BBHHHH")
 """Command, index, address (position or station), offset, length and flags, event request."""
 
 
-class Command(IntEnum):
+class DatagramCommand(IntEnum):
     """Datagram commands (ETG.1000.4, 5.4)."""
 
     NOP = 0

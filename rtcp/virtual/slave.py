@@ -21,7 +21,7 @@ from rtcp.virtual.distributed_clock import Clock
 from rtcp.virtual.esc import CONTROL_ECAT_EVENT, Esc, SyncManager
 from rtcp.virtual.mailbox import MailboxService
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage, SyncManagerLayout
-from rtcp.virtual.protocol import ERROR_FLAG, STATE_MASK, Register, State
+from rtcp.virtual.protocol import ERROR_FLAG, STATE_MASK, AlState, Register
 from rtcp.virtual.sii import build_sii
 
 OP_TIMEOUT = 1_000_000_000
@@ -51,7 +51,7 @@ class Application:
         self._error = False
         self._stepped_at = t
         self.sync = SyncMonitor(esc, device)
-        self.state = State.INIT
+        self.state = AlState.INIT
         esc.on_outputs = self.outputs_written
         for index in (MAILBOX_OUT, MAILBOX_IN, OUTPUTS, INPUTS):
             esc.sync_managers[index].lock(True)
@@ -59,7 +59,7 @@ class Application:
     @property
     def by_sync0(self) -> bool:
         """Whether the device is stepped by SYNC0 now."""
-        return self.state >= State.SAFE_OP and self.sync.active
+        return self.state >= AlState.SAFE_OP and self.sync.active
 
     # What the master did
 
@@ -93,43 +93,43 @@ class Application:
         wanted = request & STATE_MASK
         if self._error:
             # Until it is acknowledged an error keeps the slave where it is, but for INIT (ETG.1000.6, 6.4.1.4).
-            if not request & ERROR_FLAG and wanted != State.INIT:
+            if not request & ERROR_FLAG and wanted != AlState.INIT:
                 return
             self._error = False
-            self._lock_process_data(self.state < State.SAFE_OP)
+            self._lock_process_data(self.state < AlState.SAFE_OP)
         self._op_wanted_at = None
         refusal = self._faults.refusal(wanted) if wanted > self.state else 0
         code = refusal or judge(self.state, wanted, self.esc, self.device)
         if code:
             self._refuse(code)
             return
-        if wanted == State.OP and self.state == State.SAFE_OP:
+        if wanted == AlState.OP and self.state == AlState.SAFE_OP:
             self._op_wanted_at = t
             self.sync.configure()
             self._report(AlStatusCode.NO_ERROR)
             self._try_op(t)
             return
-        self._enter(State(wanted))
+        self._enter(AlState(wanted))
         self._report(AlStatusCode.NO_ERROR)
 
-    def _enter(self, wanted: State) -> None:
+    def _enter(self, wanted: AlState) -> None:
         """Start or stop what lies between the present state and `wanted`."""
         before, self.state = self.state, wanted
-        if before == State.OP and wanted < State.OP:
+        if before == AlState.OP and wanted < AlState.OP:
             self.device.set_outputs_valid(False)
-        if before >= State.SAFE_OP > wanted:
+        if before >= AlState.SAFE_OP > wanted:
             self._lock_process_data(True)
             self.sync.stop()
-        if before >= State.PRE_OP > wanted:
+        if before >= AlState.PRE_OP > wanted:
             # With it go messages, transfers and counters.
             self._mailbox = None
             self._lock(True, MAILBOX_OUT, MAILBOX_IN)
-        if before < State.PRE_OP <= wanted:
+        if before < AlState.PRE_OP <= wanted:
             self._lock(False, MAILBOX_OUT, MAILBOX_IN)
             managers = self.esc.sync_managers
             out, in_ = managers[MAILBOX_OUT], managers[MAILBOX_IN]
             self._mailbox = MailboxService(self.device, out, in_, self._faults)
-        if before < State.SAFE_OP <= wanted:
+        if before < AlState.SAFE_OP <= wanted:
             self._start_process_data()
 
     def _start_process_data(self) -> None:
@@ -157,11 +157,11 @@ class Application:
         self._error = True
         self._report(code)
 
-    def fall(self, state: State, code: int) -> None:
+    def fall(self, state: AlState, code: int) -> None:
         """Leave the state on an error of one's own; the working counter shows it, for the outputs are closed."""
         self._op_wanted_at = None
         self._enter(state)
-        if state == State.SAFE_OP:
+        if state == AlState.SAFE_OP:
             self._lock(True, OUTPUTS if self._rx.byte_length else INPUTS)
             # What the master sent before does not count any more.
             self._received = False
@@ -185,7 +185,7 @@ class Application:
             self._op_wanted_at = None
             self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
             self.sync.start()
-            self.state = State.OP
+            self.state = AlState.OP
             self.device.set_outputs_valid(True)
             self._report(AlStatusCode.NO_ERROR)
         elif t - asked > OP_TIMEOUT:
@@ -204,18 +204,18 @@ class Application:
             esc.memory[Register.WATCHDOG_STATUS] &= 0xFE
             count = esc.memory[Register.WATCHDOG_COUNTERS]
             esc.memory[Register.WATCHDOG_COUNTERS] = min(count + 1, 0xFF)
-            if self.state == State.OP:
-                self.fall(State.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
-        if self.state == State.OP and self.sync.active and not self.sync.running:
-            self.fall(State.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
+            if self.state == AlState.OP:
+                self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_MANAGER_WATCHDOG)
+        if self.state == AlState.OP and self.sync.active and not self.sync.running:
+            self.fall(AlState.SAFE_OP, AlStatusCode.FATAL_SYNC_ERROR)
         if self._op_wanted_at is not None:
             self._try_op(t)
 
     def pulse(self, on_time: bool) -> None:
         """SYNC0 has come: take over the outputs. `on_time` tells that this process was not late in noticing it."""
         self._latched = bytes(self.esc.sync_managers[OUTPUTS].buffer)
-        if self.state == State.OP and self.sync.pulse(on_time):
-            self.fall(State.SAFE_OP, AlStatusCode.SYNC_ERROR)
+        if self.state == AlState.OP and self.sync.pulse(on_time):
+            self.fall(AlState.SAFE_OP, AlStatusCode.SYNC_ERROR)
 
     def latch(self) -> None:
         """Take over the outputs without SYNC0: the frame that brought them has passed."""
@@ -229,7 +229,7 @@ class Application:
         """Let the device's time pass up to `t`: outputs in (in OP), steps, inputs out (from SAFE-OP on)."""
         passed = t - self._stepped_at
         self._stepped_at = max(t, self._stepped_at)
-        if self.state == State.OP:
+        if self.state == AlState.OP:
             if len(self._latched) == self._rx.byte_length:  # the master may have changed the sync manager just now
                 self._rx.unpack(self._latched)
             outputs = self.esc.sync_managers[OUTPUTS]
@@ -242,7 +242,7 @@ class Application:
             part = min(passed, LONGEST_STEP)
             step(part * 1e-9)
             passed -= part
-        if self.state >= State.SAFE_OP:
+        if self.state >= AlState.SAFE_OP:
             inputs = self.esc.sync_managers[INPUTS]
             if inputs.length == self._tx.byte_length:
                 self._tx.pack(inputs.buffer)

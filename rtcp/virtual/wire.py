@@ -16,23 +16,41 @@ from rtcp.virtual.protocol import (
     MORE_FOLLOWS,
     TYPE_DATAGRAMS,
     VLAN_TAG,
-    Command,
+    DatagramCommand,
     Register,
 )
 from rtcp.virtual.slave import Slave
 
 MOST_KNOWN = 256
 """What is worked out for an address is kept for so many of them: what a master may send knows no end."""
-_AUTO = frozenset((Command.APRD, Command.APWR, Command.APRW, Command.ARMW))
-_STATION = frozenset((Command.FPRD, Command.FPWR, Command.FPRW, Command.FRMW))
-_BROADCAST = frozenset((Command.BRD, Command.BWR, Command.BRW))
-_FIRST_LOGICAL, _LAST_LOGICAL = int(Command.LRD), int(Command.LRW)
-_MULTIPLE_WRITE = frozenset((Command.ARMW, Command.FRMW))
+_AUTO = frozenset((DatagramCommand.APRD, DatagramCommand.APWR, DatagramCommand.APRW, DatagramCommand.ARMW))
+_STATION = frozenset((DatagramCommand.FPRD, DatagramCommand.FPWR, DatagramCommand.FPRW, DatagramCommand.FRMW))
+_BROADCAST = frozenset((DatagramCommand.BRD, DatagramCommand.BWR, DatagramCommand.BRW))
+_FIRST_LOGICAL, _LAST_LOGICAL = int(DatagramCommand.LRD), int(DatagramCommand.LRW)
+_MULTIPLE_WRITE = frozenset((DatagramCommand.ARMW, DatagramCommand.FRMW))
 _TIME_LENGTHS = (4, 8)
 _TIME_64 = (1 << 64) - 1
-_READS = frozenset((Command.APRD, Command.APRW, Command.FPRD, Command.FPRW, Command.BRD, Command.BRW))
-_WRITES = frozenset((Command.APWR, Command.APRW, Command.FPWR, Command.FPRW, Command.BWR, Command.BRW))
-_READ_WRITES = frozenset((Command.APRW, Command.FPRW, Command.BRW))
+_READS = frozenset(
+    (
+        DatagramCommand.APRD,
+        DatagramCommand.APRW,
+        DatagramCommand.FPRD,
+        DatagramCommand.FPRW,
+        DatagramCommand.BRD,
+        DatagramCommand.BRW,
+    )
+)
+_WRITES = frozenset(
+    (
+        DatagramCommand.APWR,
+        DatagramCommand.APRW,
+        DatagramCommand.FPWR,
+        DatagramCommand.FPRW,
+        DatagramCommand.BWR,
+        DatagramCommand.BRW,
+    )
+)
+_READ_WRITES = frozenset((DatagramCommand.APRW, DatagramCommand.FPRW, DatagramCommand.BRW))
 
 Miscount = tuple[Slave, Callable[[], bool]]
 """A slave that does not count itself in the working counter of a logical datagram when the second says so."""
@@ -245,7 +263,7 @@ class Wire:
             elif (read := reader.esc.read(offset, length, here)) is not None:
                 frame[data:end] = read
                 count += 1
-        if command == Command.ARMW:
+        if command == DatagramCommand.ARMW:
             self._pass_position(frame, at, address)
         return count
 

@@ -99,7 +99,10 @@ def status() -> dict[str, Any]:
         "exchange_us": times,
         "compute_us": times,
         "dc": {"locked": True, "offset_ns": -3200, "filtered_ns": 410, "offset_us": times, "filtered_us": times},
-        "realtime": {"scheduler": "FIFO 80", "memory_locked": True, "cpu": 1, "notes": []},
+        "realtime": {
+            "scheduler": "FIFO 80", "memory_locked": True, "cpu": 1, "compiled": True, "interpreted_because": "",
+            "notes": [],
+        },
         "start_to_op_s": 1.5,
         "pids": {"loop": 11, "gateway": 12, "segment": 13},
         "lease": {"holder": ""},

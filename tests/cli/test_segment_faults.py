@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli.segment import kinds
-from rtcp.virtual.faults.registry import FAULTS, load_script
+from rtcp.virtual.faults.registry import installed, load_script
 
 pytestmark = pytest.mark.alone
 
@@ -165,7 +165,7 @@ def test_a_script_is_read_before_the_segment_starts(rtcp: Rtcp, config: Path, tm
 
 def test_the_kinds_are_listed_with_their_keys_and_what_is_allowed(rtcp: Rtcp) -> None:
     lines = rtcp("segment", "kinds").out.splitlines()
-    assert [line.partition(":")[0] for line in lines if line[:1].islower()] == list(FAULTS)
+    assert [line.partition(":")[0] for line in lines if line[:1].islower()] == list(installed())
     assert "    ms        a number greater than 0 and at most 1000 (2 if left out)" in lines
     assert "    code      an integer from 1 to 65535 (0x0001 if left out)" in lines
 

@@ -137,6 +137,7 @@ def test_a_joint_that_does_not_follow_ends_in_the_emergency_stop(rig: LoopRig) -
     assert "supervision in assistive_arm.yaml" in rig.messages[-1]
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("cycles", [4, 5])
 def test_a_torque_beyond_its_limit_counts_after_five_cycles_in_a_row(rig: LoopRig, cycles: int) -> None:
     rig.hold()

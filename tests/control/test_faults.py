@@ -245,7 +245,13 @@ def test_every_fault_and_every_key_has_a_case() -> None:
     assert {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in own} - {""} == set(STOPS)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, id=case.name, marks=[pytest.mark.interpreted] if case.kind is GeneratorFailed else [])
+        for case in CASES
+    ],
+)
 def test_an_event_is_reported_takes_its_reaction_and_stays_until_reset_and_enable(
     switch_rig: Callable[..., LoopRig], case: Case
 ) -> None:

@@ -31,6 +31,7 @@ def test_a_record_says_what_left_on_the_wire(rig: LoopRig, mode: int) -> None:
             assert sent(rig, "sent_torque") == pytest.approx([one.effort for one in frame], abs=0.5)
 
 
+@pytest.mark.interpreted
 def test_a_record_says_what_was_commanded_where_the_limiter_sends_less(rig: LoopRig) -> None:
     rig.hold()
 

@@ -14,7 +14,7 @@ from rtcp.ipc.events import MovedSinceFault
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
-from rtcp.virtual.protocol import State as AlState
+from rtcp.virtual.protocol import AlState
 
 CONFIG = load(default_config())
 CONFIG = replace(CONFIG, cycle=replace(CONFIG.cycle, period_us=1000.0))

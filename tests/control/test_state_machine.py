@@ -322,6 +322,7 @@ def test_a_reset_waits_for_the_clock_to_be_followed(rig: LoopRig) -> None:
 # -- moving, stopping, disabling ------------------------------------------------------------------------------------
 
 
+@pytest.mark.interpreted
 def test_set_points_that_jump_reach_the_drives_in_steps_inside_the_speed_limit(rig: LoopRig) -> None:
     rig.hold()
 

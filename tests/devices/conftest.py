@@ -55,7 +55,7 @@ class Wire:
 
 @pytest.fixture
 def drive() -> Cia402Drive:
-    return Cia402Drive(slave(), speed_limit=0.5)
+    return Cia402Drive(slave(), 0.001, speed_limit=0.5)
 
 
 @pytest.fixture

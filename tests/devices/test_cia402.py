@@ -213,7 +213,7 @@ def test_values_are_in_si_units(drive, wire):
 def test_widths_and_order_are_those_of_the_description():
     tpdo = (("torque", 0x6077, "int16", 0.1), TPDO[0], ("error_code", 0x603F, "uint16", 1.0), *TPDO[1:3], TPDO[4])
     rpdo = (RPDO[4], ("target_torque", 0x6071, "int16", 0.1), *RPDO[:3], ("offset", 0x60B1, "int32", 1.0))
-    drive = Cia402Drive(slave(rpdo, tpdo))
+    drive = Cia402Drive(slave(rpdo, tpdo), 0.001)
     drive.decode(struct.pack("<hHHiib", -5, ENABLED, 0x8611, 20000, 1, 10))
     assert (drive.torque, drive.error_code, drive.position) == pytest.approx((-0.5, 0x8611, 2.0))
     drive.mode, drive.target_torque, drive.target_position, drive.controlword = 10, 3.0, 2.0, 0x0F
@@ -222,16 +222,16 @@ def test_widths_and_order_are_those_of_the_description():
 
 def test_missing_channels_are_all_named_at_the_start():
     with pytest.raises(DeviceError, match=r"`rpdo` maps no target_position, modes_of_operation"):
-        Cia402Drive(slave(rpdo=RPDO[:1]))
+        Cia402Drive(slave(rpdo=RPDO[:1]), 0.001)
     with pytest.raises(DeviceError, match=r"`tpdo` maps no modes_of_operation_display"):
-        Cia402Drive(slave(tpdo=TPDO[:4]))
+        Cia402Drive(slave(tpdo=TPDO[:4]), 0.001)
 
 
 CSP_ONLY = slave((*RPDO[:2], RPDO[4]), (*TPDO[:2], TPDO[4]))
 
 
 def test_a_drive_with_the_entries_of_csp_alone_is_driven_in_csp():
-    drive = Cia402Drive(CSP_ONLY, speed_limit=0.5)
+    drive = Cia402Drive(CSP_ONLY, 0.001, speed_limit=0.5)
     for status in (SWITCHED_ON, ENABLED, ENABLED):
         drive.decode(struct.pack("<Hib", status, 10000, 8))
         drive.advance(T.ENABLED)
@@ -258,5 +258,5 @@ def test_a_velocity_that_is_not_mapped_is_the_mean_over_20_ms():
 )
 def test_a_drive_serves_the_modes_whose_entries_it_maps(without, modes):
     rpdo, tpdo = ([row for row in rows if row[0] != without] for rows in (RPDO, TPDO))
-    drive = Cia402Drive(slave(tuple(rpdo), tuple(tpdo)))
+    drive = Cia402Drive(slave(tuple(rpdo), tuple(tpdo)), 0.001)
     assert [mode for mode in (8, 9, 10) if drive.supports(mode)] == modes

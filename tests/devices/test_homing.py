@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
+from rtcp.control.homing import ENDED, HOMING, SHOWN, START, Homing, HomingPhase, Shown
 from rtcp.devices import Cia402Drive, DriveState, TargetState
-from rtcp.devices.homing import ENDED, HOMING, SHOWN, START, Homing, HomingPhase, Shown
 from rtcp.virtual.models import create
 from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 
@@ -243,7 +243,7 @@ class Line:
         self.model.step(0.2)
         self._rx = PdoImage.from_assignment(self.model.objects, RX_ASSIGN)
         self._tx = PdoImage.from_assignment(self.model.objects, TX_ASSIGN)
-        self.drive = Cia402Drive(slave(), speed_limit=0.5, zero=zero)
+        self.drive = Cia402Drive(slave(), 0.001, speed_limit=0.5, zero=zero)
         self._on_the_way = [self._packed()] * 2
         self.cycle()
         while not self.drive.advance(TargetState.ENABLED):

@@ -13,7 +13,7 @@ INPUTS = (PdoEntry(0x6000, 1, "uint16", "inputs"), PdoEntry(0x6010, 1, "int32", 
 
 def make_box(outputs=OUTPUTS, inputs=INPUTS) -> IoBox:
     device = DeviceDescription("a box", "io", 1, 2, (Pdo(0x1600, outputs),), (Pdo(0x1A00, inputs),))
-    return IoBox(SlaveConfig("io", device))
+    return IoBox(SlaveConfig("io", device), 0.001)
 
 
 def test_inputs_and_counter_are_decoded():

@@ -15,7 +15,7 @@ SWITCHED_ON, ENABLED = 0x0233, 0x0237
 
 @pytest.fixture
 def shifted() -> Wire:
-    return Wire(Cia402Drive(slave(), speed_limit=0.5, zero=0.25))
+    return Wire(Cia402Drive(slave(), 0.001, speed_limit=0.5, zero=0.25))
 
 
 def test_the_position_counts_from_the_joints_zero(shifted):
@@ -50,7 +50,7 @@ def test_the_end_of_the_field_is_the_wires_and_not_the_joints(shifted):
 
 @given(zero=st.floats(-100, 100), counts=st.integers(-1_000_000, 1_000_000))
 def test_a_target_latched_at_the_position_is_sent_as_the_very_counts_that_came(zero, counts):
-    wire = Wire(Cia402Drive(slave(), zero=zero))
+    wire = Wire(Cia402Drive(slave(), 0.001, zero=zero))
     wire.says(SWITCHED_ON, counts)
     wire.drive.advance(TargetState.ENABLED)
     assert wire.hears()[1] == counts
@@ -58,7 +58,7 @@ def test_a_target_latched_at_the_position_is_sent_as_the_very_counts_that_came(z
 
 @given(before=st.floats(-100, 100), after=st.floats(-100, 100), counts=st.integers(-1_000_000, 1_000_000))
 def test_another_zero_moves_what_is_shown_and_not_what_is_sent(before, after, counts):
-    wire = Wire(Cia402Drive(slave(), zero=before))
+    wire = Wire(Cia402Drive(slave(), 0.001, zero=before))
     wire.says(SWITCHED_ON, counts)
     wire.drive.advance(TargetState.ENABLED)
     wire.drive.zero = after

@@ -14,7 +14,7 @@ import pytest
 
 from rtcp.ipc.runtime_directory import segment_control
 from rtcp.ipc.session import read_session
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import inputs, outputs
 

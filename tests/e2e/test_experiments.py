@@ -25,7 +25,9 @@ def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform)
     with recording(blackboard_file(enabled.directory)) as made:
         enabled.rtcp("move", *(f"{q:.6f}" for q in target), "--speed", "0.2")
     assert made.lost == 0
-    commanded, actual = made.column("commanded_position")[:, 0], made.column("actual_position")[:, 0]
+    # A cycle whose frame does not return holds the setpoints: its time is the host's and not the arm's.
+    whole = made.column("wkc") == made.column("wkc_expected")
+    commanded, actual = made.column("commanded_position")[whole, 0], made.column("actual_position")[whole, 0]
     moving = np.flatnonzero(np.abs(np.diff(commanded)) > 0)
     begun = moving[0]
     away = np.flatnonzero(np.abs(actual - target[0]) > 0.0007)

@@ -13,7 +13,7 @@ import pytest
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, segment_control
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import PERIOD_US, Platform
 from tests.e2e.wire import outputs
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rtcp.fieldbus.registers import Answer, Command, RegisterPort, build_frame
+from rtcp.fieldbus.registers import Answer, DatagramCommand, RegisterPort, build_frame
 from rtcp.virtual.segment import Segment
 
 
@@ -12,14 +12,21 @@ class Direct(RegisterPort):
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._t = 0
-        self.lost: set[tuple[Command, int]] = set()
+        self.lost: set[tuple[DatagramCommand, int]] = set()
         """Command and register of datagrams that get lost."""
         self.hole = 0
         """How many of the next frames get lost, whatever is in them."""
 
     def exchange(
-        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
-    ) -> Answer:  # fmt: skip
+        self,
+        command: DatagramCommand,
+        station: int,
+        address: int,
+        data: bytes,
+        *,
+        timeout_s: float = 0.02,
+        tries: int = 3,
+    ) -> Answer:
         if (command, address) in self.lost:
             return Answer(b"", -1)
         if self.hole:

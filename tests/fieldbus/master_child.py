@@ -310,7 +310,7 @@ def emergency(bus: SoemBus, count: int) -> Any:
     slaves = arm(count)
     data = bus.configure(slaves, 1_000_000)
     cycle = Cycle(data, 1_000_000)
-    drive = Cia402Drive(slaves[1])
+    drive = Cia402Drive(slaves[1], 0.001)
     steps = []
 
     def control() -> None:

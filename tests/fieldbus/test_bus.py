@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 
 pytestmark = pytest.mark.alone
 

@@ -10,7 +10,7 @@ from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import clocks
 from rtcp.fieldbus.clocks import settle_clock, start_sync, take_over_time
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import Command, finish
+from rtcp.fieldbus.registers import DatagramCommand, finish
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 from tests.fieldbus.master_child import arm, with_device
@@ -46,7 +46,7 @@ def test_a_clock_that_has_settled_at_last_is_believed(port: Direct, monkeypatch:
 
 
 def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Direct) -> None:
-    port.lost = {(Command.BWR, 0x0900)}
+    port.lost = {(DatagramCommand.BWR, 0x0900)}
     before = port.read(STATION, 0x0920, 8)
     with pytest.raises(BusError, match=r"slave 3 \(drive2\): the local times could not be latched"):
         take_over_time(port, 3, LABEL, bytes(4), (1, 2), always=True)
@@ -55,7 +55,7 @@ def test_a_broadcast_that_got_lost_latches_no_times_and_sets_no_clock(port: Dire
 
 @pytest.mark.parametrize("register", [0x0981, 0x0980, 0x0990, 0x09A0])
 def test_sync0_is_not_started_with_half_of_its_settings(port: Direct, register: int) -> None:
-    port.lost = {(Command.FPWR, register)}
+    port.lost = {(DatagramCommand.FPWR, register)}
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* 0x{register:04X}"):
         start_sync(port, STATION, LABEL, arm(3)[2].device, PERIOD)
     assert port.read(STATION, 0x0981, 1) == b"\0"

@@ -9,7 +9,7 @@ import pytest
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus import port_errors
 from rtcp.fieldbus.port_errors import ErrorCounters
-from rtcp.fieldbus.registers import Command
+from rtcp.fieldbus.registers import DatagramCommand
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
 
@@ -127,7 +127,7 @@ def test_errors_that_are_no_cables_are_not_cleared_for_ever(bench: Bench) -> Non
 
 
 def test_links_whose_clearing_got_lost_are_not_counted_twice(bench: Bench) -> None:
-    bench.port.lost = {(Command.FPWR, 0x0310)}
+    bench.port.lost = {(DatagramCommand.FPWR, 0x0310)}
     bench.set(2, 0x00, 130)
     for _ in range(3):
         # Not all slave controllers clear the links with the first write.

@@ -12,7 +12,7 @@ from rtcp.fieldbus import recovery, supervision
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import Answer, Command, Register, RegisterPort, Steps
+from rtcp.fieldbus.registers import Answer, DatagramCommand, Register, RegisterPort, Steps
 from rtcp.fieldbus.supervision import SlaveWatcher
 
 NAMES = ("io", "drive1", "drive2")
@@ -35,19 +35,26 @@ class Slaves(RegisterPort):
         """Positions whose answers get lost."""
 
     def exchange(
-        self, command: Command, station: int, address: int, data: bytes, *, timeout_s: float = 0.02, tries: int = 3
-    ) -> Answer:  # fmt: skip
-        if command is Command.BRD:
+        self,
+        command: DatagramCommand,
+        station: int,
+        address: int,
+        data: bytes,
+        *,
+        timeout_s: float = 0.02,
+        tries: int = 3,
+    ) -> Answer:
+        if command is DatagramCommand.BRD:
             together = 0
             for one in self.al:
                 together |= one
             return Answer(bytes((together, 0)), len(self.al))
         index = station - station_of(1)
-        if command is Command.FPRD and address == Register.AL_STATUS:
+        if command is DatagramCommand.FPRD and address == Register.AL_STATUS:
             if index + 1 in self.lost:
                 return Answer(b"", -1)
             return Answer(bytes((self.al[index], 0, 0, 0, 0x1A if self.al[index] & 0x10 else 0, 0)), 1)
-        if command is Command.FPWR and address == Register.AL_CONTROL:
+        if command is DatagramCommand.FPWR and address == Register.AL_CONTROL:
             if index + 1 in self.deaf:
                 return Answer(data, 0)
             self.requests.append((index + 1, data[0] & 0x0F))

@@ -8,7 +8,7 @@ import pytest
 
 from rtcp.config.segment import SegmentConfig, SegmentSlave
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.registers import Command, finish
+from rtcp.fieldbus.registers import DatagramCommand, finish
 from rtcp.fieldbus.slave_setup import SlaveRestorer, SlaveSetup
 from rtcp.virtual.segment import make_segment
 from tests.fieldbus.direct import Direct
@@ -29,7 +29,7 @@ def port() -> Direct:
 
 @pytest.mark.parametrize("register", [0x0500, 0x0502, 0x0981, 0x0928, 0x0920, 0x0930])
 def test_a_write_that_got_lost_ends_the_attempt(port: Direct, register: int) -> None:
-    port.lost = {(Command.APWR, register)}
+    port.lost = {(DatagramCommand.APWR, register)}
     set_up = SlaveSetup(bytes(0x80), (bytes(8),) * 8, bytes(4), 0)
     restorer = SlaveRestorer(port, arm(3), [set_up] * 3, lambda position: pytest.fail("too far"), PERIOD)
     with pytest.raises(BusError, match=rf"slave 3 \(drive2\) did not take .* register 0x{register:04X}"):

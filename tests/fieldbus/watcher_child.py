@@ -16,7 +16,7 @@ from rtcp.fieldbus.bus import station_of
 from rtcp.fieldbus.slave_setup import SlaveRestorer, read_set_up
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.fieldbus.supervision import SlaveWatcher
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 
 PERIOD = 1_000_000
 PATIENCE_S = 20.0

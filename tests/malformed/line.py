@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 from rtcp.config.segment import load_segment
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import make_segment
 from rtcp.virtual.server import BUFFER
 from tests.malformed.cable import CONFIG
@@ -73,19 +73,19 @@ class Line:
 
     # -- a sane master ----------------------------------------------------------------------------------------------
 
-    def ask(self, command: Command, address: int, offset: int, data: bytes) -> Datagram:
+    def ask(self, command: DatagramCommand, address: int, offset: int, data: bytes) -> Datagram:
         answer = self.give(build(Datagram(command, 0, address, offset, data)))
         assert answer is not None
         return next(parse(answer))
 
     def write_all(self, offset: int, data: bytes) -> None:
-        assert self.ask(Command.BWR, 0, offset, data).counter == len(SIZES), hex(offset)
+        assert self.ask(DatagramCommand.BWR, 0, offset, data).counter == len(SIZES), hex(offset)
 
     def write(self, slave: int, offset: int, data: bytes) -> None:
-        assert self.ask(Command.FPWR, STATION + slave, offset, data).counter == 1, (slave, hex(offset))
+        assert self.ask(DatagramCommand.FPWR, STATION + slave, offset, data).counter == 1, (slave, hex(offset))
 
     def read(self, slave: int, offset: int, length: int) -> bytes:
-        answer = self.ask(Command.FPRD, STATION + slave, offset, bytes(length))
+        answer = self.ask(DatagramCommand.FPRD, STATION + slave, offset, bytes(length))
         assert answer.counter == 1, (slave, hex(offset))
         return answer.data
 
@@ -130,7 +130,10 @@ class Line:
         ):  # fmt: skip
             self.write_all(offset, data)
         for slave in range(len(SIZES)):
-            assert self.ask(Command.APWR, -slave & 0xFFFF, 0x0010, (STATION + slave).to_bytes(2, "little")).counter == 1
+            assert (
+                self.ask(DatagramCommand.APWR, -slave & 0xFFFF, 0x0010, (STATION + slave).to_bytes(2, "little")).counter
+                == 1
+            )
         self.request(INIT | ACK)
 
     def start(self, state: int) -> None:
@@ -180,6 +183,6 @@ class Line:
         """One LRW, a period after the last; return its working counter."""
         drive = _DRIVE.pack(controlword, target, 20_000, 0, 8)
         data = bytes(SIZES[0][0]) + drive * (len(SIZES) - 1) + bytes(_IMAGE_IN)
-        answer = self.give(build(Datagram(Command.LRW, 0, 0, 0, data)), PERIOD_NS)
+        answer = self.give(build(Datagram(DatagramCommand.LRW, 0, 0, 0, data)), PERIOD_NS)
         assert (answer is not None) == (self.segment.chain.returns and self.segment.chain.reach > 0)
         return next(parse(answer)).counter if answer else 0

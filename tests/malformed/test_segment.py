@@ -8,7 +8,7 @@ from random import Random
 import pytest
 
 from rtcp.virtual.distributed_clock import SyncGenerator
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.malformed.corpus import frames
 from tests.malformed.line import OP, SAFE_OP, Line
 from tests.malformed.mutate import MUTATIONS, mutated, shape
@@ -22,9 +22,19 @@ MOST_OBJECTS = 20_000
 
 def test_the_corpus_holds_all_that_a_master_does() -> None:
     kinds = {(datagram.command, datagram.offset) for frame in frames() for datagram in parse(frame)}
-    assert {(Command.BRD, 0x0000), (Command.APWR, 0x0010), (Command.FPWR, 0x0120), (Command.FPWR, 0x0800)} <= kinds
-    assert {(Command.FPWR, 0x1000), (Command.FPRD, 0x1080), (Command.FRMW, 0x0910), (Command.BWR, 0x0300)} <= kinds
-    assert any(command in (Command.LRW, Command.LRD, Command.LWR) for command, _ in kinds)
+    assert {
+        (DatagramCommand.BRD, 0x0000),
+        (DatagramCommand.APWR, 0x0010),
+        (DatagramCommand.FPWR, 0x0120),
+        (DatagramCommand.FPWR, 0x0800),
+    } <= kinds
+    assert {
+        (DatagramCommand.FPWR, 0x1000),
+        (DatagramCommand.FPRD, 0x1080),
+        (DatagramCommand.FRMW, 0x0910),
+        (DatagramCommand.BWR, 0x0300),
+    } <= kinds
+    assert any(command in (DatagramCommand.LRW, DatagramCommand.LRD, DatagramCommand.LWR) for command, _ in kinds)
     assert len({shape(frame) for frame in frames()}) == len(frames())
 
 
@@ -52,10 +62,10 @@ def test_nothing_is_kept_for_every_address_that_a_master_makes_up() -> None:
     def sweep(first: int) -> int:
         for number in range(first, first + 2000):
             half = number & 0xFFFF
-            line.give(build(Datagram(Command.LRW, 0, half, number % 7, bytes(1 + number % 50)),
-                            Datagram(Command.FPRD, 0, half, 0x0130, bytes(2)),
-                            Datagram(Command.FRMW, 0, half, 0x0910, bytes(4)),
-                            Datagram(Command.ARMW, 0, half, 0x0910, bytes(4))), 1000)  # fmt: skip
+            line.give(build(Datagram(DatagramCommand.LRW, 0, half, number % 7, bytes(1 + number % 50)),
+                            Datagram(DatagramCommand.FPRD, 0, half, 0x0130, bytes(2)),
+                            Datagram(DatagramCommand.FRMW, 0, half, 0x0910, bytes(4)),
+                            Datagram(DatagramCommand.ARMW, 0, half, 0x0910, bytes(4))), 1000)  # fmt: skip
         gc.collect()
         return len(gc.get_objects())
 
@@ -92,7 +102,7 @@ def test_only_a_datagram_that_is_whole_moves_a_target() -> None:
     line = Line()
     line.start(OP)
     before = line.targets()
-    whole = build(Datagram(Command.LRW, 0, 0, 0, b"\x11" * 92 + bytes(96)))
+    whole = build(Datagram(DatagramCommand.LRW, 0, 0, 0, b"\x11" * 92 + bytes(96)))
     # One byte short of what the datagram says; a frame header that ends in the middle; another ethertype.
     for wrong in (whole[:-1], whole[:14] + b"\x40\x10" + whole[16:], whole[:12] + b"\x88\xa5" + whole[14:]):
         line.give(wrong)

@@ -115,6 +115,7 @@ def test_a_command_that_is_repeated_changes_nothing(motion):
     assert all(one == two for one, two in path[:1500])
 
 
+@pytest.mark.interpreted
 @pytest.mark.parametrize("wanted", [float("nan"), float("inf"), -float("inf"), 1e300, 5.0, -5.0, 0.51])
 def test_no_set_point_passes_that_is_not_one_step_away(motion, monkeypatch, wanted):
     motion.grip(False)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from kinematics import singularity_distances
 from kinematics.forward import frames
 from kinematics.model import ArmModel
-from rtcp.motion.guards.singularities import Singularities
+from rtcp.motion.controllers.line import Singularities
 
 from .guard_checker import MODEL
 

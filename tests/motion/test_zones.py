@@ -149,6 +149,7 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     assert 0.0 <= here < 0.004
 
 
+@pytest.mark.interpreted
 def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[Sequence[float]] = []
 
@@ -224,6 +225,7 @@ def test_boxes_that_close_in_are_kept_or_refused(shares: list[float], direction:
         checker.change(replace(limits.widest, box=(*WIDE[:3], *walls)))
 
 
+@pytest.mark.interpreted
 def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytest.MonkeyPatch) -> None:
     counted = []
     monkeypatch.setattr(

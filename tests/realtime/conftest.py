@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from kinematics.compiled import Build
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
@@ -171,6 +172,7 @@ class Patient:
             priority=80,
             interface="eth0",
             wait_us=150.0,
+            build=Build(True, ""),
         )
 
     def put(self, files: dict[str, str | None]) -> None:

@@ -8,6 +8,7 @@ import re
 import shutil
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from kinematics.compiled import Build
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime import host
 from rtcp.realtime.doctor import CHECKS, Case, Severity, examine
@@ -170,8 +172,17 @@ def test_a_check_finds_what_the_files_say(
 
 
 def test_every_check_that_can_stand_in_the_way_is_in_the_table() -> None:
-    tested = {row[0] for row in ROWS if row[3] is not OK} | {"coalescing", "skipped-ticks"}
+    tested = {row[0] for row in ROWS if row[3] is not OK} | {"coalescing", "compiled", "skipped-ticks"}
     assert {check.key for check in CHECKS} == tested
+
+
+@pytest.mark.parametrize(("is_stale", "severity"), [(True, WARNING), (False, NOTE)])
+def test_a_cycle_that_runs_as_source_is_reported_with_the_reason(good: Any, is_stale: bool, severity: Severity) -> None:
+    good.case = replace(good.case, build=Build(False, "rtcp/control/arm.py changed since it was compiled", is_stale))
+    finding = good.finding("compiled")
+    assert finding.severity is severity
+    assert finding.found == "the cycle runs as source: rtcp/control/arm.py changed since it was compiled"
+    assert "make fast" in "\n".join(finding.remedy)
 
 
 def test_the_page_lists_the_checks_in_their_order() -> None:

@@ -9,7 +9,7 @@ from rtcp.virtual.faults.fault import Fault, Frames
 from rtcp.virtual.faults.registry import ActiveFault, Planned
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import make_slaves
 from tests.virtual.frames import Datagram, build, parse
@@ -101,20 +101,20 @@ class Line:
         assert answer is not None
         return list(parse(answer))
 
-    def one(self, command: Command, address: int, offset: int, data: bytes) -> Datagram:
+    def one(self, command: DatagramCommand, address: int, offset: int, data: bytes) -> Datagram:
         return self.send(Datagram(command, 0, address, offset, data))[0]
 
-    def logical(self, command: Command, address: int, data: bytes) -> Datagram:
+    def logical(self, command: DatagramCommand, address: int, data: bytes) -> Datagram:
         return self.one(command, address & 0xFFFF, address >> 16, data)
 
     def read(self, slave: int, offset: int, length: int) -> bytes:
         """FPRD from slave number `slave`, counted from 0."""
-        answer = self.one(Command.FPRD, STATION + slave, offset, bytes(length))
+        answer = self.one(DatagramCommand.FPRD, STATION + slave, offset, bytes(length))
         assert answer.counter == 1
         return answer.data
 
     def write(self, slave: int, offset: int, data: bytes) -> None:
-        assert self.one(Command.FPWR, STATION + slave, offset, data).counter == 1
+        assert self.one(DatagramCommand.FPWR, STATION + slave, offset, data).counter == 1
 
     def number(self, slave: int, offset: int, length: int) -> int:
         return int.from_bytes(self.read(slave, offset, length), "little")
@@ -131,7 +131,7 @@ class Line:
     def address(self) -> None:
         for number in range(len(self.devices)):
             station = (STATION + number).to_bytes(2, "little")
-            assert self.one(Command.APWR, -number & 0xFFFF, 0x0010, station).counter == 1
+            assert self.one(DatagramCommand.APWR, -number & 0xFFFF, 0x0010, station).counter == 1
 
     def to_pre_op(self) -> None:
         self.address()
@@ -159,7 +159,7 @@ class Line:
         count = len(self.devices)
         values = list(outputs) + [0] * (count - len(outputs))
         data = b"".join(value.to_bytes(2, "little") for value in values) + bytes(2 * count)
-        answer = self.send(Datagram(Command.LRW, 0, 0, 0, data), after=after)[0]
+        answer = self.send(Datagram(DatagramCommand.LRW, 0, 0, 0, data), after=after)[0]
         inputs = answer.data[2 * count :]
         return [int.from_bytes(inputs[2 * n : 2 * n + 2], "little") for n in range(count)], answer.counter
 

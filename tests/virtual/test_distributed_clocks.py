@@ -7,7 +7,7 @@ from itertools import pairwise
 import pytest
 
 from rtcp.virtual.distributed_clock import Clock, SyncGenerator
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import default_delays
 from tests.virtual.frames import Datagram
 from tests.virtual.line import MS, STATION, Line, TinyDevice, start_sync0
@@ -25,7 +25,7 @@ def arm() -> Line:
 
 def set_up_time(line: Line) -> None:
     """What a master does: latch, offsets from the processing units' times, delays."""
-    line.one(Command.BWR, 0, 0x0900, bytes(4))
+    line.one(DatagramCommand.BWR, 0, 0x0900, bytes(4))
     for slave, delay in enumerate(FACTS):
         latched = line.number(slave, 0x0918, 8)
         line.write(slave, 0x0920, ((10**15 - latched) % 2**64).to_bytes(8, "little"))
@@ -34,7 +34,7 @@ def set_up_time(line: Line) -> None:
 
 def follow(line: Line, seconds: float, period: int = 500_000) -> None:
     for _ in range(int(seconds * 1e9 / period)):
-        answer = line.send(Datagram(Command.FRMW, 0, STATION, 0x0910, bytes(8)), after=period)[0]
+        answer = line.send(Datagram(DatagramCommand.FRMW, 0, STATION, 0x0910, bytes(8)), after=period)[0]
         assert answer.counter == len(FACTS)
 
 
@@ -50,7 +50,7 @@ def test_the_delays_are_those_of_the_robot_and_840_ns_for_each_further_slave() -
 
 
 def test_a_write_to_0x0900_latches_times_whose_differences_give_the_delays(arm: Line) -> None:
-    assert arm.one(Command.BWR, 0, 0x0900, bytes(4)).counter == 7
+    assert arm.one(DatagramCommand.BWR, 0, 0x0900, bytes(4)).counter == 7
     ports = [(arm.number(n, 0x0900, 4), arm.number(n, 0x0904, 4)) for n in range(7)]
     around = [back - there for there, back in ports[:-1]] + [0]
     assert ports[-1][1] == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rtcp.virtual.device import Emergency
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram
 from tests.virtual.line import (
     INIT,
@@ -60,13 +60,13 @@ def test_a_write_to_an_error_counter_clears_its_group_alone(line: Line, written:
 def test_clock_registers_of_a_slave_without_a_clock_do_not_count() -> None:
     line = Line([TinyDevice(supports_dc=False), TinyDevice()])
     line.address()
-    assert line.one(Command.BRD, 0, 0x0910, bytes(8)).counter == 1
-    assert line.one(Command.FPWR, STATION, 0x0980, b"\0").counter == 0
-    assert line.one(Command.FPRD, STATION, 0x0910, bytes(8)).counter == 0
+    assert line.one(DatagramCommand.BRD, 0, 0x0910, bytes(8)).counter == 1
+    assert line.one(DatagramCommand.FPWR, STATION, 0x0980, b"\0").counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION, 0x0910, bytes(8)).counter == 0
 
 
 def test_al_control_written_again_before_the_firmware_has_looked_does_not_count(line: Line) -> None:
-    control = [Datagram(Command.FPWR, number, STATION, 0x0120, bytes((PRE_OP, 0))) for number in range(2)]
+    control = [Datagram(DatagramCommand.FPWR, number, STATION, 0x0120, bytes((PRE_OP, 0))) for number in range(2)]
     assert [answer.counter for answer in line.send(*control)] == [1, 0]
 
 
@@ -80,11 +80,11 @@ def test_a_sync_manager_with_the_event_bit_mirrors_it_in_0x0210(line: Line, cont
 
 
 def test_a_loop_that_is_closed_by_0x0101_cuts_the_rest_off_until_it_opens_again(line: Line) -> None:
-    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 3
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 3
     line.write(0, 0x0101, bytes((0x0C,)))  # port 1 always closed
-    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 1
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 1
     line.write(0, 0x0101, b"\0")
-    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 3
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 3
 
 
 def test_the_reset_sequence_takes_a_slave_back_to_power_on(line: Line) -> None:
@@ -93,8 +93,8 @@ def test_the_reset_sequence_takes_a_slave_back_to_power_on(line: Line) -> None:
     for byte in b"RES":
         line.write(0, 0x0040, bytes((byte,)))
     line.pass_time(MS)
-    assert line.one(Command.FPRD, STATION, 0x0130, bytes(2)).counter == 0, "its station address is gone"
-    answer = line.one(Command.APRD, 0, 0x0130, bytes(2))
+    assert line.one(DatagramCommand.FPRD, STATION, 0x0130, bytes(2)).counter == 0, "its station address is gone"
+    answer = line.one(DatagramCommand.APRD, 0, 0x0130, bytes(2))
     assert (answer.counter, answer.data[0]) == (1, INIT)
 
 
@@ -115,7 +115,7 @@ def test_the_identity_stands_at_words_8_to_15_of_the_eeprom(line: Line) -> None:
 
 def test_the_eeprom_is_busy_right_after_a_command(line: Line) -> None:
     line.write(0, 0x0502, bytes.fromhex("0001 08000000"))
-    busy = line.send(Datagram(Command.FPRD, 0, STATION, 0x0502, bytes(2)), after=5_000)
+    busy = line.send(Datagram(DatagramCommand.FPRD, 0, STATION, 0x0502, bytes(2)), after=5_000)
     assert busy[0].data[1] & 0x80
     assert line.number(0, 0x0502, 2) & 0x8000 == 0
 
@@ -135,7 +135,7 @@ def test_an_unknown_eeprom_command_and_a_command_while_busy_set_the_error_bit(li
     assert line.number(0, 0x0502, 2) & 0x2000
     line.write(0, 0x0502, bytes.fromhex("0001 08000000"))
     assert line.number(0, 0x0502, 2) & 0x2000 == 0
-    read = Datagram(Command.FPWR, 0, STATION, 0x0502, bytes.fromhex("0001 08000000"))
+    read = Datagram(DatagramCommand.FPWR, 0, STATION, 0x0502, bytes.fromhex("0001 08000000"))
     line.send(read, after=100_000)
     line.send(read, after=1_000)
     assert line.number(0, 0x0502, 2) & 0x2000
@@ -154,7 +154,7 @@ def test_a_damaged_eeprom_shows_as_a_checksum_error_and_its_alias_is_not_used(li
 
 def test_the_eeprom_that_belongs_to_the_device_is_closed_to_the_master_until_it_is_taken_back(line: Line) -> None:
     line.write(0, 0x0500, b"\x01")
-    assert line.one(Command.FPWR, STATION, 0x0502, b"\x00\x01").counter == 0
+    assert line.one(DatagramCommand.FPWR, STATION, 0x0502, b"\x00\x01").counter == 0
     line.write(0, 0x0500, b"\x02")
     line.write(0, 0x0500, b"\x00")
     line.write(0, 0x0502, b"\x00\x01")
@@ -174,23 +174,23 @@ def test_a_sync_manager_that_is_on_cannot_be_set_up_anew(line: Line) -> None:
 
 def test_mailboxes_are_closed_in_init(line: Line) -> None:
     line.write(0, 0x0800, SM_MAILBOXES)
-    assert line.one(Command.FPWR, STATION, 0x1000, bytes(128)).counter == 0
+    assert line.one(DatagramCommand.FPWR, STATION, 0x1000, bytes(128)).counter == 0
     assert line.request(0, PRE_OP) == (PRE_OP, 0)
     line.write(0, 0x1000, bytes(128))
     assert line.request(0, INIT) == (INIT, 0)
-    assert line.one(Command.FPWR, STATION, 0x1000, bytes(128)).counter == 0
+    assert line.one(DatagramCommand.FPWR, STATION, 0x1000, bytes(128)).counter == 0
 
 
 def test_a_request_through_the_mailbox_is_answered_and_the_mailbox_empty_after_reading(line: Line) -> None:
     line.to_pre_op()
     assert line.read(0, 0x080D, 1)[0] & 0x08 == 0
-    assert line.one(Command.FPRD, STATION, 0x1080, bytes(128)).counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION, 0x1080, bytes(128)).counter == 0
     line.write(0, 0x1000, SDO_READ_NAME.ljust(128, b"\0"))
     assert line.read(0, 0x080D, 1)[0] & 0x08
     answer = line.read(0, 0x1080, 128)
     assert answer[6:16] == bytes.fromhex("0030 43 1810 01 ad0b0000")
     assert line.read(0, 0x080D, 1)[0] & 0x08 == 0
-    assert line.one(Command.FPRD, STATION, 0x1080, bytes(128)).counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION, 0x1080, bytes(128)).counter == 0
 
 
 def test_a_slave_that_went_to_init_has_forgotten_messages_emergencies_transfers_and_the_masters_counter(
@@ -213,15 +213,15 @@ def test_a_full_mailbox_refuses_a_second_message(line: Line) -> None:
     line.to_pre_op()
     message = SDO_READ_NAME.ljust(128, b"\0")
     # Both in one frame: the device has not looked in between.
-    both = line.send(Datagram(Command.FPWR, 1, STATION, 0x1000, message),
-                     Datagram(Command.FPWR, 2, STATION, 0x1000, message))  # fmt: skip
+    both = line.send(Datagram(DatagramCommand.FPWR, 1, STATION, 0x1000, message),
+                     Datagram(DatagramCommand.FPWR, 2, STATION, 0x1000, message))  # fmt: skip
     assert [datagram.counter for datagram in both] == [1, 0]
 
 
 def test_a_mailbox_written_in_parts_is_full_with_its_last_byte_and_wants_its_first_one_first(line: Line) -> None:
     line.to_pre_op()
     message = SDO_READ_NAME.ljust(128, b"\0")
-    assert line.one(Command.FPWR, STATION, 0x1040, message[64:]).counter == 0
+    assert line.one(DatagramCommand.FPWR, STATION, 0x1040, message[64:]).counter == 0
     line.write(0, 0x1000, message[:64])
     assert line.read(0, 0x080D, 1)[0] & 0x08 == 0
     line.write(0, 0x1040, message[64:])
@@ -263,8 +263,8 @@ def test_a_buffer_is_handed_over_only_when_its_last_byte_is_written(line: Line) 
 
 def test_the_master_can_neither_read_the_outputs_nor_write_the_inputs(line: Line) -> None:
     line.to_op()
-    assert line.one(Command.FPRD, STATION, 0x1100, bytes(2)).counter == 0
-    assert line.one(Command.FPWR, STATION, 0x1400, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION, 0x1100, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.FPWR, STATION, 0x1400, bytes(2)).counter == 0
 
 
 # FMMUs
@@ -276,7 +276,7 @@ def test_bits_are_mapped_to_bits_and_those_beside_them_stay(line: Line) -> None:
     # Slave 0: three bits from logical bit 2 to physical bit 1; slave 1: six bits across two logical bytes, to bit 0.
     line.write(0, 0x0600, fmmu(0x100, 1, USER_RAM, write=True, start_bit=2, end_bit=4, physical_bit=1))
     line.write(1, 0x0600, fmmu(0x100, 2, USER_RAM, write=True, start_bit=5, end_bit=2))
-    answer = line.logical(Command.LWR, 0x100, bytes((0b1011_0100, 0b0000_0010)))
+    answer = line.logical(DatagramCommand.LWR, 0x100, bytes((0b1011_0100, 0b0000_0010)))
     assert answer.counter == 2
     assert line.read(0, USER_RAM, 1)[0] == 0b1100_1011
     assert line.read(1, USER_RAM, 1)[0] == 0b1101_0101
@@ -287,14 +287,14 @@ def test_bits_of_several_slaves_are_read_into_one_byte(line: Line) -> None:
         line.write(slave, USER_RAM, bytes((0b0101_0000 << (slave == 1),)))
         line.write(slave, 0x0600, fmmu(0x200, 1, USER_RAM, write=False, start_bit=2 * slave, end_bit=2 * slave + 1,
                                        physical_bit=4))  # fmt: skip
-    answer = line.logical(Command.LRD, 0x200, b"\xff")
+    answer = line.logical(DatagramCommand.LRD, 0x200, b"\xff")
     assert answer.counter == 3
     assert answer.data[0] == 0b1101_1001
 
 
 def test_a_datagram_that_covers_part_of_an_fmmu_moves_that_part(line: Line) -> None:
     line.write(0, 0x0600, fmmu(0x300, 8, USER_RAM, write=True))
-    assert line.logical(Command.LWR, 0x304, b"\xa1\xa2\xa3\xa4\xa5\xa6").counter == 1
+    assert line.logical(DatagramCommand.LWR, 0x304, b"\xa1\xa2\xa3\xa4\xa5\xa6").counter == 1
     assert line.read(0, USER_RAM, 8) == bytes(4) + b"\xa1\xa2\xa3\xa4"
 
 
@@ -302,7 +302,7 @@ def test_a_slave_passes_on_what_the_one_before_it_has_put_into_the_datagram(line
     line.write(0, USER_RAM, b"\x77")
     line.write(0, 0x0600, fmmu(0x400, 1, USER_RAM, write=False))
     line.write(1, 0x0600, fmmu(0x400, 1, USER_RAM, write=True))
-    assert line.logical(Command.LRW, 0x400, b"\x11").counter == 3
+    assert line.logical(DatagramCommand.LRW, 0x400, b"\x11").counter == 3
     assert line.read(1, USER_RAM, 1) == b"\x77"
 
 
@@ -311,7 +311,7 @@ def test_a_slave_takes_its_outputs_before_it_puts_its_inputs_into_the_same_bytes
     line.write(0, 0x0600, fmmu(0x500, 2, 0x1100, write=True))
     line.write(0, 0x0610, fmmu(0x500, 2, 0x1400, write=False))
     line.write(0, 0x0120, b"\x08\x00")
-    answers = [line.logical(Command.LRW, 0x500, b"\x41\x00") for _ in range(3)]
+    answers = [line.logical(DatagramCommand.LRW, 0x500, b"\x41\x00") for _ in range(3)]
     assert [answer.counter for answer in answers] == [3, 3, 3]
     assert answers[2].data == b"\x42\x00"
 
@@ -332,8 +332,8 @@ def test_the_copies_made_ahead_do_what_a_datagram_does_byte_by_byte(line: Line) 
     whole = line.exchange(0x0102, 0x0304, 0x0506)
     # The same bytes in datagrams that cut through the buffers go the exact way.
     outputs = bytes.fromhex("0201 0403 0605")
-    counters = [line.logical(Command.LRW, at, outputs[at : at + 3]).counter for at in (0, 3)]
-    inputs = b"".join(line.logical(Command.LRD, 6 + at, bytes(3)).data for at in (0, 3))
+    counters = [line.logical(DatagramCommand.LRW, at, outputs[at : at + 3]).counter for at in (0, 3)]
+    inputs = b"".join(line.logical(DatagramCommand.LRD, 6 + at, bytes(3)).data for at in (0, 3))
     assert whole == ([0x0103, 0x0305, 0x0507], 9)
     assert sum(counters) == 8  # each of slaves 0 and 2 once, slave 1 in both
     assert [int.from_bytes(inputs[n : n + 2], "little") for n in (0, 2, 4)] == whole[0]

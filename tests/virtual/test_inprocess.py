@@ -21,7 +21,7 @@ from rtcp.ipc.states import State as MachineState
 from rtcp.launch.inprocess import InProcessBus, InProcessData
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.virtual.models import create
-from rtcp.virtual.protocol import State
+from rtcp.virtual.protocol import AlState
 
 PERIOD_NS = 1_000_000
 MS = 1_000_000
@@ -65,7 +65,7 @@ class Master:
             self.bus.now_ns = 0
             self.now = (-self.bus.offset_ns) % PERIOD_NS + PERIOD_NS // 2
             self.exchange()
-            self.bus.request_state(State.OP)
+            self.bus.request_state(AlState.OP)
 
     def exchange(self, cycles: int = 1) -> int:
         """Send and receive once a cycle; return the last working counter."""
@@ -90,7 +90,7 @@ class Master:
         """A drive's statusword, position, velocity, torque and mode in the last answer."""
         return DRIVE.unpack(self.data.input(slot))
 
-    def states(self) -> list[tuple[State, bool, int]]:
+    def states(self) -> list[tuple[AlState, bool, int]]:
         return [(slave.state, slave.error, slave.code) for slave in self.bus.read_states()]
 
 
@@ -124,16 +124,16 @@ def test_it_has_every_attribute_of_the_protocols(master: Master) -> None:
 
 def test_the_slaves_go_from_init_over_safe_op_to_op(config: ArmConfig) -> None:
     master = Master(config, start=False)
-    assert [slave.state for slave in master.bus.read_states()] == [State.INIT] * 3
+    assert [slave.state for slave in master.bus.read_states()] == [AlState.INIT] * 3
     assert [facts.state for facts in master.bus.scan()] == ["PRE-OP"] * 3
     master.data = master.bus.configure(config.slaves, PERIOD_NS)
-    assert [slave.state for slave in master.bus.read_states()] == [State.SAFE_OP] * 3
-    master.bus.request_state(State.OP)
+    assert [slave.state for slave in master.bus.read_states()] == [AlState.SAFE_OP] * 3
+    master.bus.request_state(AlState.OP)
     master.now = PERIOD_NS
     master.exchange(2)
-    assert master.bus.wait_for_state(State.OP, 1.0) == ()
+    assert master.bus.wait_for_state(AlState.OP, 1.0) == ()
     master.bus.close()
-    assert [slave.state for slave in master.bus.read_states()] == [State.INIT] * 3
+    assert [slave.state for slave in master.bus.read_states()] == [AlState.INIT] * 3
 
 
 def test_every_slave_counts_three_in_the_working_counter(master: Master) -> None:
@@ -163,12 +163,12 @@ def test_a_description_that_a_fixed_mapping_does_not_fit_is_refused(config: ArmC
 
 
 def test_op_needs_outputs_that_have_come_lately(master: Master) -> None:
-    master.bus.request_state(State.SAFE_OP)
+    master.bus.request_state(AlState.SAFE_OP)
     master.silence(WATCHDOG_MS + 1)
-    master.bus.request_state(State.OP, [2])
+    master.bus.request_state(AlState.OP, [2])
     master.silence(1001)
-    assert master.states()[1] == (State.SAFE_OP, True, 0x001B)
-    assert "slave 2 (drive1) is in SAFE-OP + ERROR (0x001B" in master.bus.wait_for_state(State.OP, 0.0, [2])[0]
+    assert master.states()[1] == (AlState.SAFE_OP, True, 0x001B)
+    assert "slave 2 (drive1) is in SAFE-OP + ERROR (0x001B" in master.bus.wait_for_state(AlState.OP, 0.0, [2])[0]
 
 
 # -- an exchange ----------------------------------------------------------------------------------------------------
@@ -252,11 +252,11 @@ def test_sync0_comes_at_whole_cycles_of_the_reference_clock(master: Master) -> N
 
 def test_outputs_do_not_count_below_op(config: ArmConfig) -> None:
     master = Master(config)
-    master.bus.request_state(State.SAFE_OP, [2])
+    master.bus.request_state(AlState.SAFE_OP, [2])
     master.tell(1, 0x06, position=77)
     assert master.exchange(3) == 9
     assert master.drives[0].objects[0x607A, 0].value == 0
-    master.bus.request_state(State.OP, [2])
+    master.bus.request_state(AlState.OP, [2])
     master.exchange(3)
     assert master.drives[0].objects[0x607A, 0].value == 77
 
@@ -271,7 +271,7 @@ def test_a_drive_without_sync0_steps_with_the_frames_and_knows_no_sync_error(con
     for _ in range(SYNC_LIMIT):
         master.data.lose(1, heard=False)
         master.exchange(2)
-    assert master.states()[1:] == [(State.OP, False, 0), (State.SAFE_OP, True, 0x001A)]
+    assert master.states()[1:] == [(AlState.OP, False, 0), (AlState.SAFE_OP, True, 0x001A)]
 
 
 # -- what goes wrong ------------------------------------------------------------------------------------------------
@@ -282,23 +282,23 @@ def test_without_frames_the_watchdog_takes_the_drives_out_of_op_and_their_output
 ) -> None:
     master.exchange()
     master.silence(WATCHDOG_MS)
-    assert [state for state, _, _ in master.states()] == [State.OP] * 3
+    assert [state for state, _, _ in master.states()] == [AlState.OP] * 3
     master.silence(2)
     # The box's own watchdog takes 100 ms.
-    assert master.states() == [(State.OP, False, 0), *[(State.SAFE_OP, True, 0x001B)] * 2]
+    assert master.states() == [(AlState.OP, False, 0), *[(AlState.SAFE_OP, True, 0x001B)] * 2]
     assert master.exchange() == 3 + 1 + 1
     assert not master.shown(1)[0] & 0x0200
 
 
 def test_a_slave_whose_error_is_acknowledged_takes_outputs_again_and_goes_to_op(master: Master) -> None:
-    master.bus.drop(2, State.SAFE_OP, 0x001A)
+    master.bus.drop(2, AlState.SAFE_OP, 0x001A)
     assert master.exchange() == 7
-    master.bus.request_state(State.OP, [2])
-    assert master.states()[1] == (State.SAFE_OP, True, 0x001A)
+    master.bus.request_state(AlState.OP, [2])
+    assert master.states()[1] == (AlState.SAFE_OP, True, 0x001A)
     master.bus.acknowledge(2)
     assert master.exchange() == 9
-    master.bus.request_state(State.OP, [2])
-    assert master.states()[1] == (State.OP, False, 0)
+    master.bus.request_state(AlState.OP, [2])
+    assert master.states()[1] == (AlState.OP, False, 0)
 
 
 def test_a_slave_that_comes_back_to_op_does_not_obey_what_it_was_sent_before(master: Master) -> None:
@@ -306,11 +306,11 @@ def test_a_slave_that_comes_back_to_op_does_not_obey_what_it_was_sent_before(mas
     master.tell(1, 0x06)
     master.exchange(3)
     assert master.drives[0].state == 2
-    master.bus.drop(2, State.SAFE_OP, 0x001A)
+    master.bus.drop(2, AlState.SAFE_OP, 0x001A)
     master.exchange(2)
     assert master.drives[0].state == 1
     master.bus.acknowledge(2)
-    master.bus.request_state(State.OP, [2])
+    master.bus.request_state(AlState.OP, [2])
     master.silence(2)
     assert master.drives[0].state == 1
 
@@ -318,14 +318,14 @@ def test_a_slave_that_comes_back_to_op_does_not_obey_what_it_was_sent_before(mas
 def test_more_missed_sync0_than_the_limit_allows_are_a_sync_error(master: Master) -> None:
     master.exchange()
     missed = 0
-    while master.states()[1][0] == State.OP:
+    while master.states()[1][0] == AlState.OP:
         master.data.lose(1, heard=False)
         master.exchange(2)
         missed += 1
     # Three for each that is missed, less one for each that is met.
     assert missed == SYNC_LIMIT // 2
-    assert master.states()[1] == (State.SAFE_OP, True, 0x001A)
-    assert master.states()[0] == (State.OP, False, 0)
+    assert master.states()[1] == (AlState.SAFE_OP, True, 0x001A)
+    assert master.states()[0] == (AlState.OP, False, 0)
 
 
 def test_a_drive_that_loses_its_outputs_while_enabled_faults_and_sends_an_emergency(master: Master) -> None:
@@ -334,7 +334,7 @@ def test_a_drive_that_loses_its_outputs_while_enabled_faults_and_sends_an_emerge
         master.tell(1, word, 5000)
         master.exchange(2)
     assert master.shown(1)[0] & 0x6F == 0x27
-    master.bus.drop(2, State.SAFE_OP, 0x001A)
+    master.bus.drop(2, AlState.SAFE_OP, 0x001A)
     master.exchange(3)
     assert [(sent.position, sent.error_code) for sent in master.bus.emergencies()] == [(2, 0x8130)]
     assert master.bus.emergencies() == ()
@@ -403,7 +403,7 @@ def test_slaves_that_left_op_are_found_and_come_back_after_a_reset_and_not_befor
     with Simulation(patient, 1, segment=segment) as simulation:
         simulation.acquire()
         to_holding(simulation)
-        simulation.bus.drop(2, State.SAFE_OP, 0x001A)
+        simulation.bus.drop(2, AlState.SAFE_OP, 0x001A)
         assert simulation.until(lambda: simulation.state is MachineState.FAULT, 0.3)
         assert [record.event for record in simulation.events if record.event.is_fault] == [SlaveLost(2)]
         simulation.run(0.5)

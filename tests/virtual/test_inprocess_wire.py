@@ -11,7 +11,7 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.models import CubemarsDrive, create
-from rtcp.virtual.protocol import Command, State
+from rtcp.virtual.protocol import AlState, DatagramCommand
 from tests.virtual.frames import Datagram
 from tests.virtual.line import MS, OP, SAFE_OP, Line, fmmu, start_sync0
 
@@ -58,7 +58,7 @@ def over_the_wire(told: Sequence[bytes], lost: Sequence[int]) -> list[bytes]:
     line.pass_time(CYCLE - 100_000)
 
     def exchange(outputs: bytes) -> bytes:
-        answer = line.send(Datagram(Command.LRW, 0, 0, 0, outputs + bytes(SIZE)), after=CYCLE)[0]
+        answer = line.send(Datagram(DatagramCommand.LRW, 0, 0, 0, outputs + bytes(SIZE)), after=CYCLE)[0]
         return answer.data[SIZE:]
 
     for _ in range(100):
@@ -83,7 +83,7 @@ def in_process(told: Sequence[bytes], lost: Sequence[int]) -> list[bytes]:
     heard = []
     for n, outputs in enumerate([bytes(SIZE)] * 100 + list(told)):
         if n == 1:
-            bus.request_state(State.OP)
+            bus.request_state(AlState.OP)
         bus.advance_to(now)
         now += CYCLE
         if n - 100 in lost:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from rtcp.virtual.segment import REPLAYED_PULSES
 from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, Line, TinyDevice, start_sync0
 
@@ -187,6 +187,6 @@ def test_after_a_stop_of_the_process_few_pulses_are_made_up_for_and_none_counts_
 def test_a_slave_without_clocks_has_no_clock_registers_and_works_by_frames() -> None:
     line = Line([TinyDevice(supports_dc=False)])
     line.to_op()
-    assert line.one(Command.FPWR, 0x1001, 0x0981, b"\x03").counter == 0
+    assert line.one(DatagramCommand.FPWR, 0x1001, 0x0981, b"\x03").counter == 0
     assert line.exchange(3)[1] == 3
     assert line.exchange(3)[0] == [4]

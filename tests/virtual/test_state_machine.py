@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from rtcp.virtual.objects import DataType, Entry
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.line import (
     ACK,
     BOOT,
@@ -262,4 +262,4 @@ def test_a_device_without_outputs_goes_to_op_without_any() -> None:
 
 
 def test_al_status_cannot_be_asked_of_a_station_that_is_not_there() -> None:
-    assert reach(INIT).one(Command.FPRD, STATION + 9, 0x0130, bytes(2)).counter == 0
+    assert reach(INIT).one(DatagramCommand.FPRD, STATION + 9, 0x0130, bytes(2)).counter == 0

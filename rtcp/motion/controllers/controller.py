@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from math import isfinite
 from typing import ClassVar
 
-from rtcp.config.model import ArmConfig
+from mypy_extensions import mypyc_attr
+
+from rtcp.config.find import load_class, registered
+from rtcp.config.model import ArmConfig, ConfigError
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import ControllerFailed, MotionEnded
 from rtcp.ipc.layout import PLANS
@@ -44,6 +46,7 @@ class ControllerSetup:
     """Returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`)."""
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)
 class Controller:
     """Base of all controllers: phases, the stop of the joints, checks that commands have in common.
 
@@ -191,17 +194,9 @@ def installed() -> tuple[type[Controller], ...]:
     """Return the classes of all controllers that are installed.
 
     Raises:
-        RuntimeError: an entry point is not a controller, or there is none: the package's metadata is out of date.
+        PluginError: an entry point is not a controller.
     """
-    found: list[type[Controller]] = []
-    for entry in sorted(entry_points(group=ENTRY_POINTS)):
-        loaded = entry.load()
-        if not (isinstance(loaded, type) and issubclass(loaded, Controller)):
-            raise RuntimeError(f"entry point {entry.name} = {entry.value} of {ENTRY_POINTS} is not a Controller")
-        found.append(loaded)
-    if not found:
-        raise RuntimeError(f"no entry points {ENTRY_POINTS}: the package is older than its metadata; run `make setup`")
-    return tuple(dict.fromkeys(found))
+    return tuple(load_class(entry, Controller) for entry in registered(ENTRY_POINTS).values())
 
 
 def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
@@ -211,7 +206,7 @@ def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
     `rtcp.ipc.refusals.NoGeometry`.
 
     Raises:
-        RuntimeError: two controllers accept the same command, or `installed` raises it.
+        ConfigError: two controllers accept the same command, or `installed` raises it.
     """
     made: dict[type[Command], Controller] = {}
     for kind in installed():
@@ -220,6 +215,6 @@ def load_controllers(setup: ControllerSetup) -> dict[type[Command], Controller]:
         controller = kind(setup)
         for command in kind.commands:
             if command in made:
-                raise RuntimeError(f"{kind.name} and {made[command].name} both accept {command.name}")
+                raise ConfigError([f"the controllers {made[command].name} and {kind.name} both accept {command.name}"])
             made[command] = controller
     return made

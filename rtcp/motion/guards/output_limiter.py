@@ -52,16 +52,18 @@ class OutputLimiter:
 
     def check(self, drives: Sequence[Commanded]) -> None:
         """Clamp every target of every drive in place."""
-        sent = self.sent
+        sent, lows, highs, steps, changes = self.sent, self._low, self._high, self._step, self._change
+        fastest, strongest, velocity = self._speed, self._torque, self._velocity
         held = 0
         for i, drive in enumerate(drives):
             wanted = drive.target_position
             before = sent[i]
-            lowest, highest = self._low[i], self._high[i]
+            lowest, highest = lows[i], highs[i]
             if lowest <= before <= highest:
-                step = self._step[i]
-                low = max(lowest, before - step)
-                high = min(highest, before + step)
+                step = steps[i]
+                low, high = before - step, before + step
+                low = low if low > lowest else lowest
+                high = high if high < highest else highest
             else:
                 low = high = self._led_back(i)
             # A comparison with NaN is false: what is no number fails the first test and the target stays.
@@ -70,32 +72,33 @@ class OutputLimiter:
                 wanted = high if wanted > high else low if wanted < low else min(max(before, low), high)
             sent[i] = drive.target_position = wanted
             speed = drive.target_velocity
-            bound = self._speed[i]
+            bound = fastest[i]
             if not (-bound <= speed <= bound):
                 held |= 1 << i
                 speed = bound if speed > bound else -bound if speed < -bound else 0.0
             torque = drive.target_torque
-            bound = self._torque[i]
+            bound = strongest[i]
             if not (-bound <= torque <= bound):
                 held |= 1 << i
                 torque = bound if torque > bound else -bound if torque < -bound else 0.0
             # Beyond the range nothing drives further out.
-            if drive.position > highest:
+            position = drive.position
+            if position > highest:
                 outward = speed > 0.0 or torque > 0.0
                 speed, torque = min(speed, 0.0), min(torque, 0.0)
-            elif drive.position < lowest:
+            elif position < lowest:
                 outward = speed < 0.0 or torque < 0.0
                 speed, torque = max(speed, 0.0), max(torque, 0.0)
             else:
                 outward = False
             if outward:
                 held |= 1 << i
-            before, change = self._velocity[i], self._change[i]
+            before, change = velocity[i], changes[i]
             if speed > before + change:
                 speed = before + change
             elif speed < before - change:
                 speed = before - change
-            self._velocity[i] = drive.target_velocity = speed
+            velocity[i] = drive.target_velocity = speed
             drive.target_torque = torque
         self.held = held
 

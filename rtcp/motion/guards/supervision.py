@@ -32,30 +32,33 @@ class Supervision:
 
     def check(self, state: ArmState) -> EmergencyStop | None:
         """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
-        limits, error = self._limits, self._error
+        limits, error, speed, torque, cycles = self._limits, self._error, self._speed, self._torque, self._cycles
         speeds, torques, errors = self._counts
+        fastest, strongest = limits.velocity, limits.torque
+        actual, commanded = state.actual, state.commanded
+        actual_velocity, actual_torque = state.actual_velocity, state.actual_torque
         for i in self._joints:
-            bound = self._speed * limits.velocity[i]
-            value = state.actual_velocity[i]
+            bound = speed * fastest[i]
+            value = actual_velocity[i]
             if -bound <= value <= bound:
                 speeds[i] = 0
             else:
                 speeds[i] += 1
-                if speeds[i] >= self._cycles:
+                if speeds[i] >= cycles:
                     return OverSpeed(i, value, bound)
-            bound = self._torque * limits.torque[i]
-            value = state.actual_torque[i]
+            bound = torque * strongest[i]
+            value = actual_torque[i]
             if -bound <= value <= bound:
                 torques[i] = 0
             else:
                 torques[i] += 1
-                if torques[i] >= self._cycles:
+                if torques[i] >= cycles:
                     return OverTorque(i, value, bound)
-            value = state.actual[i] - state.commanded[i]
+            value = actual[i] - commanded[i]
             if -error <= value <= error:
                 errors[i] = 0
             else:
                 errors[i] += 1
-                if errors[i] >= self._cycles:
+                if errors[i] >= cycles:
                     return FollowingError(i, value, error)
         return None

@@ -12,25 +12,17 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from rtcp.config.document import Finding, dotted, read, shown
-from rtcp.config.model import ConfigError
+from rtcp.config.find import load_class, registered
+from rtcp.config.model import ConfigError, PluginError
 from rtcp.config.validation import Checker, unknown_key
-from rtcp.virtual.faults import frames, slaves
 from rtcp.virtual.faults.fault import FOR_EVER, Fault, FaultRefused, Frames, Send
 from rtcp.virtual.segment import Segment
 
-FAULTS: Mapping[str, type[Fault]] = MappingProxyType({
-    kind.name: kind
-    for module in (slaves, frames)
-    for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, Fault) and "name" in vars(kind)
-})  # fmt: skip
-"""Every kind of fault of this package by the name that commands and scripts give it."""
 ENTRY_POINTS = "rtcp.faults"
 MOST_ACTIVE = 50
 LONGEST_S = 86_400.0
@@ -40,23 +32,19 @@ Report = Callable[[str], None]
 
 @cache
 def installed() -> Mapping[str, type[Fault]]:
-    """Return every kind of fault by its name: those of this package, then those of packages outside.
+    """Return every kind of fault by its name.
 
     Raises:
-        RuntimeError: an entry point is not a dataclass that extends `Fault`, or its name is taken.
+        PluginError: an entry point is not a dataclass that extends `Fault`, or its name differs from the fault's.
     """
-    found = dict(FAULTS)
-    for entry in sorted(entry_points(group=ENTRY_POINTS)):
-        loaded = entry.load()
-        if not (isinstance(loaded, type) and issubclass(loaded, Fault) and "__dataclass_fields__" in vars(loaded)):
-            raise RuntimeError(
-                f"entry point {entry.name} = {entry.value} of {ENTRY_POINTS} is no dataclass that extends Fault"
-            )
-        if found.setdefault(loaded.name, loaded) is not loaded:
-            raise RuntimeError(
-                f"entry point {entry.name} = {entry.value} of {ENTRY_POINTS}: there is another fault {loaded.name}; "
-                "change its `name`"
-            )
+    found: dict[str, type[Fault]] = {}
+    for entry in registered(ENTRY_POINTS).values():
+        loaded = load_class(entry, Fault)
+        if "__dataclass_fields__" not in vars(loaded):
+            raise PluginError(entry, "is not a dataclass")
+        if loaded.name != entry.name:
+            raise PluginError(entry, f"has the `name` {loaded.name}: the two must be the same")
+        found[entry.name] = loaded
     return MappingProxyType(found)
 
 

@@ -27,7 +27,7 @@ from rtcp.virtual.faults.fault import (
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox
 from rtcp.virtual.models.diewu import BrokenTerminals
 from rtcp.virtual.models.protection import ErrorCode
-from rtcp.virtual.protocol import State
+from rtcp.virtual.protocol import AlState
 from rtcp.virtual.segment import Damage, Segment
 from rtcp.virtual.slave import Slave
 
@@ -149,7 +149,7 @@ class AlFall(SlaveFault):
 
     def begin(self, slave: Slave, t: int) -> None:
         """Leave OP."""
-        if slave.application.state != State.OP:
+        if slave.application.state != AlState.OP:
             state = slave.application.state.name.replace("_", "-")
             raise FaultRefused(f"slave {self.slave} is in {state}: al_fall takes a slave out of OP")
         slave.application.fall(_state(self.state), self.code)
@@ -197,8 +197,8 @@ class WorkingCounter(StrikingFault):
         return self.listed(segment.miscounts, (slave_at(segment, self.slave), self.strikes))
 
 
-def _state(name: str) -> State:
-    return State[name.replace("-", "_")]
+def _state(name: str) -> AlState:
+    return AlState[name.replace("-", "_")]
 
 
 # -- clocks ---------------------------------------------------------------------------------------------------------
@@ -282,7 +282,7 @@ def _sync0(slave: Slave) -> SyncGenerator | None:
 
 
 @dataclass(frozen=True)
-class DriveFault(DeviceFault):
+class DriveErrorFault(DeviceFault):
     """A drive meets an error, sends its emergency message and reacts as its fault reaction says.
 
     While the fault lasts a fault reset is refused; `lasts` left out: a single occurrence, which a reset clears.

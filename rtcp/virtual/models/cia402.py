@@ -6,7 +6,7 @@ from enum import IntEnum, IntFlag
 from types import MappingProxyType
 
 
-class State(IntEnum):
+class DriveState(IntEnum):
     """States of the power state machine (CiA 402-2, power drive system)."""
 
     NOT_READY_TO_SWITCH_ON = 0
@@ -19,7 +19,7 @@ class State(IntEnum):
     FAULT = 7
 
 
-class Command(IntEnum):
+class ControlCommand(IntEnum):
     """What a controlword asks for; switch on and disable operation share one bit pattern (CiA 402-2, object 0x6040)."""
 
     NONE = 0
@@ -46,44 +46,44 @@ class Status(IntFlag):
 
 
 STATE_BITS = MappingProxyType({
-    State.NOT_READY_TO_SWITCH_ON: 0x00,
-    State.SWITCH_ON_DISABLED: 0x40,
-    State.READY_TO_SWITCH_ON: 0x21,
-    State.SWITCHED_ON: 0x23,
-    State.OPERATION_ENABLED: 0x27,
-    State.QUICK_STOP_ACTIVE: 0x07,
-    State.FAULT_REACTION_ACTIVE: 0x0F,
-    State.FAULT: 0x08,
+    DriveState.NOT_READY_TO_SWITCH_ON: 0x00,
+    DriveState.SWITCH_ON_DISABLED: 0x40,
+    DriveState.READY_TO_SWITCH_ON: 0x21,
+    DriveState.SWITCHED_ON: 0x23,
+    DriveState.OPERATION_ENABLED: 0x27,
+    DriveState.QUICK_STOP_ACTIVE: 0x07,
+    DriveState.FAULT_REACTION_ACTIVE: 0x0F,
+    DriveState.FAULT: 0x08,
 })  # fmt: skip
 """Statusword bits 0..3, 5 and 6 of each state (CiA 402-2, object 0x6041)."""
 
 _COMMANDS = (
-    (0x87, 0x06, Command.SHUTDOWN),
-    (0x8F, 0x07, Command.SWITCH_ON),
-    (0x8F, 0x0F, Command.ENABLE_OPERATION),
-    (0x82, 0x00, Command.DISABLE_VOLTAGE),
-    (0x86, 0x02, Command.QUICK_STOP),
+    (0x87, 0x06, ControlCommand.SHUTDOWN),
+    (0x8F, 0x07, ControlCommand.SWITCH_ON),
+    (0x8F, 0x0F, ControlCommand.ENABLE_OPERATION),
+    (0x82, 0x00, ControlCommand.DISABLE_VOLTAGE),
+    (0x86, 0x02, ControlCommand.QUICK_STOP),
 )
 """Mask and value of the controlword for each command (CiA 402-2, 0x6040); the fault reset is an edge, see below."""
 
 TRANSITIONS = MappingProxyType({
-    (State.SWITCH_ON_DISABLED, Command.SHUTDOWN): (2, State.READY_TO_SWITCH_ON),
-    (State.READY_TO_SWITCH_ON, Command.SWITCH_ON): (3, State.SWITCHED_ON),
+    (DriveState.SWITCH_ON_DISABLED, ControlCommand.SHUTDOWN): (2, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.READY_TO_SWITCH_ON, ControlCommand.SWITCH_ON): (3, DriveState.SWITCHED_ON),
     # 0x0F in Ready To Switch On is transition 3 with an automatic transition 4 behind it.
-    (State.READY_TO_SWITCH_ON, Command.ENABLE_OPERATION): (3, State.SWITCHED_ON),
-    (State.SWITCHED_ON, Command.ENABLE_OPERATION): (4, State.OPERATION_ENABLED),
-    (State.OPERATION_ENABLED, Command.SWITCH_ON): (5, State.SWITCHED_ON),
-    (State.SWITCHED_ON, Command.SHUTDOWN): (6, State.READY_TO_SWITCH_ON),
-    (State.READY_TO_SWITCH_ON, Command.DISABLE_VOLTAGE): (7, State.SWITCH_ON_DISABLED),
-    (State.READY_TO_SWITCH_ON, Command.QUICK_STOP): (7, State.SWITCH_ON_DISABLED),
-    (State.OPERATION_ENABLED, Command.SHUTDOWN): (8, State.READY_TO_SWITCH_ON),
-    (State.OPERATION_ENABLED, Command.DISABLE_VOLTAGE): (9, State.SWITCH_ON_DISABLED),
-    (State.SWITCHED_ON, Command.DISABLE_VOLTAGE): (10, State.SWITCH_ON_DISABLED),
-    (State.SWITCHED_ON, Command.QUICK_STOP): (10, State.SWITCH_ON_DISABLED),
-    (State.OPERATION_ENABLED, Command.QUICK_STOP): (11, State.QUICK_STOP_ACTIVE),
-    (State.QUICK_STOP_ACTIVE, Command.DISABLE_VOLTAGE): (12, State.SWITCH_ON_DISABLED),
-    (State.FAULT, Command.FAULT_RESET): (15, State.SWITCH_ON_DISABLED),
-    (State.QUICK_STOP_ACTIVE, Command.ENABLE_OPERATION): (16, State.OPERATION_ENABLED),
+    (DriveState.READY_TO_SWITCH_ON, ControlCommand.ENABLE_OPERATION): (3, DriveState.SWITCHED_ON),
+    (DriveState.SWITCHED_ON, ControlCommand.ENABLE_OPERATION): (4, DriveState.OPERATION_ENABLED),
+    (DriveState.OPERATION_ENABLED, ControlCommand.SWITCH_ON): (5, DriveState.SWITCHED_ON),
+    (DriveState.SWITCHED_ON, ControlCommand.SHUTDOWN): (6, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.READY_TO_SWITCH_ON, ControlCommand.DISABLE_VOLTAGE): (7, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.READY_TO_SWITCH_ON, ControlCommand.QUICK_STOP): (7, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.OPERATION_ENABLED, ControlCommand.SHUTDOWN): (8, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.OPERATION_ENABLED, ControlCommand.DISABLE_VOLTAGE): (9, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.SWITCHED_ON, ControlCommand.DISABLE_VOLTAGE): (10, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.SWITCHED_ON, ControlCommand.QUICK_STOP): (10, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.OPERATION_ENABLED, ControlCommand.QUICK_STOP): (11, DriveState.QUICK_STOP_ACTIVE),
+    (DriveState.QUICK_STOP_ACTIVE, ControlCommand.DISABLE_VOLTAGE): (12, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.FAULT, ControlCommand.FAULT_RESET): (15, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.QUICK_STOP_ACTIVE, ControlCommand.ENABLE_OPERATION): (16, DriveState.OPERATION_ENABLED),
 })  # fmt: skip
 """(state, command) -> (number of the transition, next state) (CiA 402-2, power drive system).
 
@@ -91,29 +91,29 @@ The drive itself makes 0 and 1 (start, self-test), 12 (end of a quick stop that 
 fault reaction)."""
 
 
-def _decode(low_byte: int) -> Command:
+def _decode(low_byte: int) -> ControlCommand:
     for mask, value, command in _COMMANDS:
         if low_byte & mask == value:
             return command
-    return Command.NONE
+    return ControlCommand.NONE
 
 
 _DECODED = tuple(_decode(low_byte) for low_byte in range(256))
 
 
-class StateMachine:
+class DriveStateMachine:
     """Where the drive is, and what a controlword asks of it there."""
 
     def __init__(self) -> None:
-        self.state = State.NOT_READY_TO_SWITCH_ON
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self._previous = 0
 
-    def request(self, controlword: int) -> tuple[int, State] | None:
+    def request(self, controlword: int) -> tuple[int, DriveState] | None:
         """Return the transition (its number, the next state) that `controlword` asks for now; None where it asks none.
 
         To be called for every controlword: the fault reset is the rising edge of bit 7 (CiA 402-2, object 0x6040).
         """
         rising = controlword & ~self._previous & 0x80
         self._previous = controlword
-        command = Command.FAULT_RESET if rising else _DECODED[controlword & 0xFF]
+        command = ControlCommand.FAULT_RESET if rising else _DECODED[controlword & 0xFF]
         return TRANSITIONS.get((self.state, command))

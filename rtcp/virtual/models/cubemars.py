@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import ClassVar
 
 from rtcp.virtual.device import DeviceModel, Option, number
-from rtcp.virtual.models.cia402 import STATE_BITS, State, StateMachine, Status
+from rtcp.virtual.models.cia402 import STATE_BITS, DriveState, DriveStateMachine, Status
 from rtcp.virtual.models.cyclic_modes import (
     ERROR,
     LIMIT,
@@ -94,7 +94,7 @@ class CubemarsDrive(DeviceModel):
         self.axis.offset = self.axis.torque_limit = 0.0
         self.axis.synchronise()
         self._supplied = True
-        self._machine = StateMachine()
+        self._machine = DriveStateMachine()
         self._stop = Stop(self.axis)
         self._profile = Profile(objects)
         self._modes: dict[int, Motion] = {
@@ -139,7 +139,7 @@ class CubemarsDrive(DeviceModel):
         self._fault_option = number(objects, 0x605E)
 
     @property
-    def state(self) -> State:
+    def state(self) -> DriveState:
         """The state of the power state machine."""
         return self._machine.state
 
@@ -152,7 +152,7 @@ class CubemarsDrive(DeviceModel):
         """The supply goes: no torque, the brake closes."""
         self._supplied = False
         self.outputs_valid = False
-        self._switch_off(State.NOT_READY_TO_SWITCH_ON)
+        self._switch_off(DriveState.NOT_READY_TO_SWITCH_ON)
 
     def set_outputs_valid(self, valid: bool) -> None:
         """Set whether process data outputs are valid (OP) or ignored; ignored, the controlword counts as 0.
@@ -177,7 +177,7 @@ class CubemarsDrive(DeviceModel):
     def begin_fault(self, code: int) -> None:
         """Let the fault `code` happen now, and its cause last until `end_fault`: no fault reset succeeds."""
         self._lasting.append(code)
-        if self._supplied and self._machine.state is not State.NOT_READY_TO_SWITCH_ON:
+        if self._supplied and self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
             self._fail(code)
 
     def end_fault(self, code: int) -> None:
@@ -260,7 +260,7 @@ class CubemarsDrive(DeviceModel):
     def _compose(self) -> None:
         """Work out the bits of the statusword that do not change from step to step."""
         bits = STATE_BITS[self._machine.state]
-        if self._machine.state is not State.NOT_READY_TO_SWITCH_ON:
+        if self._machine.state is not DriveState.NOT_READY_TO_SWITCH_ON:
             bits |= Status.VOLTAGE_ENABLED
         if self.condition.warning:
             bits |= Status.WARNING
@@ -268,7 +268,7 @@ class CubemarsDrive(DeviceModel):
             bits |= Status.REMOTE
         self._bits = int(bits)
 
-    def _enter(self, state: State) -> None:
+    def _enter(self, state: DriveState) -> None:
         self._machine.state = state
         self._compose()
 
@@ -276,29 +276,29 @@ class CubemarsDrive(DeviceModel):
         """Walk at most one transition of the state machine; start and end the stops that go with it."""
         before = self._machine.state
         asked = self._machine.request(controlword)
-        if before is State.NOT_READY_TO_SWITCH_ON:
+        if before is DriveState.NOT_READY_TO_SWITCH_ON:
             self._self_test -= dt
             if self._self_test <= 0.0:
-                self._enter(State.SWITCH_ON_DISABLED)
+                self._enter(DriveState.SWITCH_ON_DISABLED)
                 if self._lasting:
                     self._fail(self._lasting[-1])
-        elif before is State.FAULT_REACTION_ACTIVE:
+        elif before is DriveState.FAULT_REACTION_ACTIVE:
             if self._motion is None or self._stop.done:
-                self._switch_off(State.FAULT)
-        elif before is State.QUICK_STOP_ACTIVE:
+                self._switch_off(DriveState.FAULT)
+        elif before is DriveState.QUICK_STOP_ACTIVE:
             self._control_quick_stop(asked)
         elif asked is not None:
             self._follow_transition(*asked)
         elif self._pending and controlword & 0x8F == 0x0F:
             # Enabled again before the ramp of transition 5 or 8 has ended.
             self._start_mode()
-        if self._machine.state is State.OPERATION_ENABLED and not self._pending:
+        if self._machine.state is DriveState.OPERATION_ENABLED and not self._pending:
             self._control_halt(controlword)
         self._busy = self._pending or self._machine.state is not before or self._machine.state in (
-            State.NOT_READY_TO_SWITCH_ON, State.FAULT_REACTION_ACTIVE, State.QUICK_STOP_ACTIVE,
+            DriveState.NOT_READY_TO_SWITCH_ON, DriveState.FAULT_REACTION_ACTIVE, DriveState.QUICK_STOP_ACTIVE,
         )  # fmt: skip
 
-    def _follow_transition(self, transition: int, state: State) -> None:
+    def _follow_transition(self, transition: int, state: DriveState) -> None:
         if transition == 4:
             self.axis.release()
             self._enter(state)
@@ -315,13 +315,13 @@ class CubemarsDrive(DeviceModel):
             self._enter(state)
             self._start_stop(quick=self._quick_stop_option.value in (2, 6))
         elif transition == 11:
-            self._switch_off(State.SWITCH_ON_DISABLED)
+            self._switch_off(DriveState.SWITCH_ON_DISABLED)
         elif transition == 15:
             self._reset()
         else:
             self._switch_off(state)
 
-    def _control_quick_stop(self, asked: tuple[int, State] | None) -> None:
+    def _control_quick_stop(self, asked: tuple[int, DriveState] | None) -> None:
         stays = self._quick_stop_option.value in (5, 6)
         if asked is not None and asked[0] == 12:
             self._switch_off(asked[1])
@@ -329,7 +329,7 @@ class CubemarsDrive(DeviceModel):
             self._enter(asked[1])
             self._start_mode()
         elif self._stop.done and not stays:
-            self._switch_off(State.SWITCH_ON_DISABLED)
+            self._switch_off(DriveState.SWITCH_ON_DISABLED)
 
     def _control_halt(self, controlword: int) -> None:
         halted = self._motion is self._stop
@@ -353,7 +353,7 @@ class CubemarsDrive(DeviceModel):
         self._stop.enter()
         self._motion = self._stop
 
-    def _switch_off(self, state: State) -> None:
+    def _switch_off(self, state: DriveState) -> None:
         self._motion = None
         self._pending = False
         self._enter(state)
@@ -373,7 +373,7 @@ class CubemarsDrive(DeviceModel):
         """Transition 13: tell the fault and begin the reaction to it (0x605E)."""
         state = self._machine.state
         at_once = code in AT_ONCE
-        if state is State.FAULT or (state is State.FAULT_REACTION_ACTIVE and not at_once):
+        if state is DriveState.FAULT or (state is DriveState.FAULT_REACTION_ACTIVE and not at_once):
             return
         self._errors.add(code)
         self._pending = False
@@ -382,7 +382,7 @@ class CubemarsDrive(DeviceModel):
             self._start_stop(quick=self._fault_option.value == 2)
         else:
             self._motion = None
-        self._enter(State.FAULT_REACTION_ACTIVE)
+        self._enter(DriveState.FAULT_REACTION_ACTIVE)
         self._busy = True
 
     def _reset(self) -> None:
@@ -396,7 +396,7 @@ class CubemarsDrive(DeviceModel):
         if abs(mechanics.velocity) > self._max_speed.value * UNIT:
             return
         self._errors.reset()
-        self._enter(State.SWITCH_ON_DISABLED)
+        self._enter(DriveState.SWITCH_ON_DISABLED)
 
 
 class CubemarsOrh40(CubemarsDrive):

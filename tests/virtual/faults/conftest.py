@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import pytest
 
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 
 ROOT = Path(__file__).parents[3]
 CHILD = Path(__file__).with_name("raw_child.py")

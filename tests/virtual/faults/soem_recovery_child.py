@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pysoem
 
-from rtcp.virtual.faults.client import SegmentClient
+from rtcp.virtual.faults.control import SegmentClient
 from tests.virtual.soem_child import join, without_blocking
 
 PERIOD = 0.002

@@ -15,15 +15,14 @@ from typing import Any
 
 import pytest
 
-from rtcp.virtual.faults.client import SegmentAway, SegmentRefused
-from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS, SegmentAway, SegmentRefused
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
 from tests.virtual.frames import Datagram, build, parse
 
 pytestmark = pytest.mark.alone
 
-BROADCASTS = [build(Datagram(Command.BRD, number, 0, 0, bytes(2))) for number in range(20)]
+BROADCASTS = [build(Datagram(DatagramCommand.BRD, number, 0, 0, bytes(2))) for number in range(20)]
 
 
 def connect(path: Path) -> socket.socket:
@@ -69,12 +68,12 @@ def test_slaves_see_what_is_lost_behind_them_and_not_what_is_lost_before(
     address = (0x2000 + seed).to_bytes(2, "little")
     with segment.client() as client:
         client.fault({"fault": "loss", "rate": 1.0, "seed": seed})
-        assert exchange([build(Datagram(Command.APWR, 0, 0xFFFF, 0x0010, address))], answers=0).came == []
+        assert exchange([build(Datagram(DatagramCommand.APWR, 0, 0xFFFF, 0x0010, address))], answers=0).came == []
         while not (counts := client.faults()[0]["counts"])[lost]:
             time.sleep(0.01)
         assert counts[lost] == 1
         client.clear()
-    (_, answer), *_ = exchange([build(Datagram(Command.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).came
+    (_, answer), *_ = exchange([build(Datagram(DatagramCommand.FPRD, 0, 0x2000 + seed, 0, bytes(1)))]).came
     assert next(parse(answer)).counter == written
 
 

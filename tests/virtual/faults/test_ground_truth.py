@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config.segment import load_segment
-from rtcp.virtual.faults.client import SegmentClient
-from rtcp.virtual.faults.control import PATIENCE, GroundTruth
+from rtcp.virtual.faults.control import PATIENCE, GroundTruth, SegmentClient
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.segment import Segment, make_segment
 from rtcp.virtual.slave import Slave

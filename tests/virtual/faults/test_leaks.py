@@ -12,8 +12,8 @@ import pytest
 
 from rtcp.virtual.faults.control import Control, GroundTruth, control_socket
 from rtcp.virtual.faults.fault import FaultRefused
-from rtcp.virtual.faults.registry import FAULTS, FaultRegistry, load_script, parse
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.faults.registry import FaultRegistry, installed, load_script, parse
+from rtcp.virtual.protocol import DatagramCommand
 from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
 from tests.virtual.frames import Datagram, build
 
@@ -61,7 +61,9 @@ class Bench:
         self.line.start(OP)
         self.sent = 0
         self.registry = FaultRegistry(self.line.segment, self._send, self.line.now)
-        self._frame = build(Datagram(Command.LRW, 0, 0, 0, bytes(184)), Datagram(Command.BRD, 0, 0, 0x0130, bytes(2)))
+        self._frame = build(
+            Datagram(DatagramCommand.LRW, 0, 0, 0, bytes(184)), Datagram(DatagramCommand.BRD, 0, 0, 0x0130, bytes(2))
+        )
 
     def _send(self, frame: bytes) -> None:
         self.sent += 1
@@ -88,7 +90,7 @@ class Bench:
 
     def again_in_op(self) -> None:
         for state in (ACK | SAFE_OP, OP):
-            self.line.ask(Command.FPWR, STATION + 1, 0x0120, bytes((state, 0)))
+            self.line.ask(DatagramCommand.FPWR, STATION + 1, 0x0120, bytes((state, 0)))
             self.line.pass_time(MS)
             self.frames(1)
 
@@ -119,12 +121,12 @@ def left_by(play: Callable[[], object]) -> int:
 
 
 def test_every_kind_of_fault_is_tried_here() -> None:
-    assert set(KINDS) == set(FAULTS)
+    assert set(KINDS) == set(installed())
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_fault_that_is_mended_or_ends_at_its_time_leaves_nothing_to_collect(bench: Bench, name: str) -> None:
-    once = FAULTS[name].once
+    once = installed()[name].once
 
     def play() -> None:
         bench.again_in_op()

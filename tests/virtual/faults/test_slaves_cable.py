@@ -13,7 +13,7 @@ from rtcp.virtual.faults.registry import ActiveFault
 from rtcp.virtual.faults.slaves import CableFault, PowerFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from rtcp.virtual.objects import Value
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram, build
 from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
 
@@ -34,7 +34,7 @@ def cut(line: Line, after: int) -> ActiveFault:
 
 def count(line: Line) -> int:
     """How many slaves answer a broadcast."""
-    return line.one(Command.BRD, 0, 0x0000, bytes(1)).counter
+    return line.one(DatagramCommand.BRD, 0, 0x0000, bytes(1)).counter
 
 
 def exchange_for(line: Line, ns: int) -> list[int]:
@@ -46,10 +46,10 @@ def test_frames_turn_round_at_a_broken_cable_and_only_the_slaves_before_it_count
     line = in_op()
     end = cut(line, 2)
     assert count(line) == 2
-    assert line.one(Command.APRD, 0, 0x0130, bytes(2)).counter == 1
-    assert line.one(Command.APRD, -2 & 0xFFFF, 0x0130, bytes(2)).counter == 0
-    assert line.one(Command.FPRD, STATION + 2, 0x0130, bytes(2)).counter == 0
-    assert line.one(Command.BRD, 0, 0, bytes(1)).address == 2
+    assert line.one(DatagramCommand.APRD, 0, 0x0130, bytes(2)).counter == 1
+    assert line.one(DatagramCommand.APRD, -2 & 0xFFFF, 0x0130, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION + 2, 0x0130, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).address == 2
     assert exchange_for(line, 20 * MS) == [6] * 20
     end(line.now)
     assert count(line) == 4
@@ -85,19 +85,19 @@ def test_the_watchdog_takes_the_slaves_behind_a_broken_cable_out_of_op_and_they_
 def test_what_the_slaves_before_a_broken_cable_are_set_to_meanwhile_is_kept() -> None:
     line = in_op()
     end = cut(line, 2)
-    line.one(Command.APWR, 0, 0x0010, b"\x77\x00")
-    line.one(Command.FPWR, 0x77, 0x0600, bytes(32))
+    line.one(DatagramCommand.APWR, 0, 0x0010, b"\x77\x00")
+    line.one(DatagramCommand.FPWR, 0x77, 0x0600, bytes(32))
     assert line.exchange()[1] == 3
     end(line.now)
     assert line.exchange()[1] == 9
-    assert line.one(Command.FPRD, 0x77, 0x0130, bytes(2)).counter == 1
-    assert line.one(Command.FPRD, STATION, 0x0130, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.FPRD, 0x77, 0x0130, bytes(2)).counter == 1
+    assert line.one(DatagramCommand.FPRD, STATION, 0x0130, bytes(2)).counter == 0
 
 
 def test_between_master_and_slave_1_a_broken_cable_brings_nothing_back_and_no_slave_sees_the_frame() -> None:
     line = in_op()
     end = cut(line, 0)
-    frame = build(Datagram(Command.BWR, 0, 0, 0x0F80, b"\x55"))
+    frame = build(Datagram(DatagramCommand.BWR, 0, 0, 0x0F80, b"\x55"))
     assert line.raw(frame) is None
     line.pass_time(150 * MS)
     assert line.raw(frame) is None
@@ -142,11 +142,11 @@ def test_a_lost_link_raises_the_event_of_the_dl_status_until_it_is_read() -> Non
     line = in_op()
     line.read(1, DL_STATUS, 2)
     line.write(1, 0x0200, b"\x04\x00")
-    assert line.one(Command.BRD, 0, 0, bytes(1)).event == 0
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).event == 0
     cut(line, 2)
-    assert line.one(Command.FPRD, STATION, 0, bytes(1)).event == 0x04
+    assert line.one(DatagramCommand.FPRD, STATION, 0, bytes(1)).event == 0x04
     line.read(1, DL_STATUS, 2)
-    assert line.one(Command.FPRD, STATION, 0, bytes(1)).event == 0
+    assert line.one(DatagramCommand.FPRD, STATION, 0, bytes(1)).event == 0
 
 
 def test_lost_links_are_counted_to_255() -> None:
@@ -160,7 +160,7 @@ def test_the_delays_measured_are_those_of_the_slaves_reached_and_afterwards_as_b
     line = in_op()
 
     def around() -> list[int]:
-        reached = line.one(Command.BWR, 0, 0x0900, bytes(4)).counter
+        reached = line.one(DatagramCommand.BWR, 0, 0x0900, bytes(4)).counter
         ports = [(line.number(n, 0x0900, 4), line.number(n, 0x0904, 4)) for n in range(reached)]
         return [back - there if back else 0 for there, back in ports]
 
@@ -224,14 +224,14 @@ def test_with_its_supply_back_a_slave_is_in_init_with_the_registers_of_power_on(
     back(line.now)
     line.pass_time(10 * MS)
     assert count(line) == 3
-    assert line.one(Command.FPRD, STATION + 1, 0x0130, bytes(2)).counter == 0
+    assert line.one(DatagramCommand.FPRD, STATION + 1, 0x0130, bytes(2)).counter == 0
     there = -1 & 0xFFFF
-    assert line.one(Command.APRD, there, 0x0010, bytes(4)).data == b"\0\0\6\0"
-    assert line.one(Command.APRD, there, 0x0130, bytes(6)).data == b"\1\0\0\0\0\0"
-    assert line.one(Command.APRD, there, 0x0600, bytes(16)).data == bytes(16)
-    assert line.one(Command.APRD, there, 0x0F80, bytes(1)).data == b"\0"
-    assert line.one(Command.APRD, there, LOST_LINKS, bytes(2)).data == bytes(2)
-    local = int.from_bytes(line.one(Command.APRD, there, 0x0910, bytes(8)).data, "little")
+    assert line.one(DatagramCommand.APRD, there, 0x0010, bytes(4)).data == b"\0\0\6\0"
+    assert line.one(DatagramCommand.APRD, there, 0x0130, bytes(6)).data == b"\1\0\0\0\0\0"
+    assert line.one(DatagramCommand.APRD, there, 0x0600, bytes(16)).data == bytes(16)
+    assert line.one(DatagramCommand.APRD, there, 0x0F80, bytes(1)).data == b"\0"
+    assert line.one(DatagramCommand.APRD, there, LOST_LINKS, bytes(2)).data == bytes(2)
+    local = int.from_bytes(line.one(DatagramCommand.APRD, there, 0x0910, bytes(8)).data, "little")
     assert 10 * MS < local < 20 * MS
     assert line.exchange()[1] == 6
     assert line.al(0) == (OP, 0)
@@ -240,7 +240,7 @@ def test_with_its_supply_back_a_slave_is_in_init_with_the_registers_of_power_on(
 def test_with_its_supply_back_a_slave_can_be_brought_to_op_again() -> None:
     line = in_op()
     begin(line.segment, PowerFault(2), line.now)(line.now)
-    assert line.one(Command.APWR, -1 & 0xFFFF, 0x0010, (STATION + 1).to_bytes(2, "little")).counter == 1
+    assert line.one(DatagramCommand.APWR, -1 & 0xFFFF, 0x0010, (STATION + 1).to_bytes(2, "little")).counter == 1
     line.write(1, 0x0800, bytes.fromhex("0010 8000 26 00 01 00  8010 8000 22 00 01 00"))
     assert line.request(1, PRE_OP) == (PRE_OP, 0)
     line.configure_process_data()
@@ -273,7 +273,7 @@ def test_without_supply_behind_a_broken_cable_both_must_be_mended() -> None:
 def test_slave_1_without_supply_is_a_master_without_an_answer() -> None:
     line = in_op()
     back = begin(line.segment, PowerFault(1), line.now)
-    assert line.raw(build(Datagram(Command.BRD, 0, 0, 0, bytes(1)))) is None
+    assert line.raw(build(Datagram(DatagramCommand.BRD, 0, 0, 0, bytes(1)))) is None
     back(line.now)
     assert count(line) == 4
 

@@ -6,7 +6,7 @@ import pytest
 
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import ClockDrift, ClockJump, PowerFault, Sync0Lost
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram
 from tests.virtual.line import ACK, ERROR, MS, OP, SAFE_OP, STATION, Line, TinyDevice, begin, start_sync0
 
@@ -122,7 +122,7 @@ def test_drift_compensation_takes_a_jump_back() -> None:
     begin(line.segment, ClockJump(2, 100.0), line.now)
     found = []
     for _ in range(2000):
-        line.send(Datagram(Command.FRMW, 0, STATION, 0x0910, bytes(8)), after=MS)
+        line.send(Datagram(DatagramCommand.FRMW, 0, STATION, 0x0910, bytes(8)), after=MS)
         found.append(line.slaves[1].clock.difference)
     assert abs(found[0]) > 90_000
     assert max(map(abs, found[-10:])) < 1000

@@ -11,7 +11,7 @@ import pytest
 from rtcp.launch.inprocess import InProcessBus
 from rtcp.virtual.device import DeviceModel
 from rtcp.virtual.faults.fault import DeviceFault, End, FaultRefused, Position
-from rtcp.virtual.faults.slaves import DriveFault, InputsFrozen, JoystickCode, PowerFault, TerminalFault
+from rtcp.virtual.faults.slaves import DriveErrorFault, InputsFrozen, JoystickCode, PowerFault, TerminalFault
 from rtcp.virtual.models import CubemarsDrive, DiewuIoBox, create
 from tests.virtual.line import MS, Line, begin
 
@@ -92,7 +92,7 @@ class Joint:
 @pytest.mark.parametrize("error", CODES)
 def test_a_drive_tells_its_error_stops_and_can_be_reset_when_the_cause_is_gone(error: str) -> None:
     joint = Joint()
-    end = begin(joint.line.segment, DriveFault(2, error), joint.line.now, lasts=2.0)
+    end = begin(joint.line.segment, DriveErrorFault(2, error), joint.line.now, lasts=2.0)
     assert not end.over
     assert joint.drive.powered is (error not in AT_ONCE), "by a ramp, or at once"
     joint.line.pass_time(1000 * MS)
@@ -112,7 +112,7 @@ def test_a_drive_tells_its_error_stops_and_can_be_reset_when_the_cause_is_gone(e
 
 def test_without_a_time_the_error_of_a_drive_is_a_single_occurrence_that_a_reset_clears() -> None:
     joint = Joint()
-    undo = begin(joint.line.segment, DriveFault(2, "over-current"), joint.line.now)
+    undo = begin(joint.line.segment, DriveErrorFault(2, "over-current"), joint.line.now)
     assert undo.over
     joint.line.pass_time(1000 * MS)
     assert joint.state == "FAULT"
@@ -123,13 +123,13 @@ def test_without_a_time_the_error_of_a_drive_is_a_single_occurrence_that_a_reset
 def test_the_reaction_to_an_error_is_the_one_chosen() -> None:
     joint = Joint()
     joint.put(0x605E, 0)
-    begin(joint.line.segment, DriveFault(2, "over-temperature"), joint.line.now)
+    begin(joint.line.segment, DriveErrorFault(2, "over-temperature"), joint.line.now)
     assert not joint.drive.powered
 
 
 def test_an_error_that_lasts_is_met_again_after_a_loss_of_supply() -> None:
     joint = Joint()
-    begin(joint.line.segment, DriveFault(2, "encoder"), joint.line.now, lasts=9.0)
+    begin(joint.line.segment, DriveErrorFault(2, "encoder"), joint.line.now, lasts=9.0)
     begin(joint.line.segment, PowerFault(2), joint.line.now)(joint.line.now)
     assert joint.state == "NOT_READY_TO_SWITCH_ON"
     joint.line.pass_time(150 * MS)
@@ -141,7 +141,7 @@ def test_a_drive_without_supply_meets_an_error_when_it_is_back() -> None:
     joint = Joint()
     back = begin(joint.line.segment, PowerFault(2), joint.line.now)
     joint.line.pass_time(5 * MS)
-    begin(joint.line.segment, DriveFault(2, "over-voltage"), joint.line.now, lasts=9.0)
+    begin(joint.line.segment, DriveErrorFault(2, "over-voltage"), joint.line.now, lasts=9.0)
     joint.line.pass_time(5 * MS)
     assert (joint.state, joint.emergencies()) == ("NOT_READY_TO_SWITCH_ON", [])
     back(joint.line.now)
@@ -152,9 +152,9 @@ def test_a_drive_without_supply_meets_an_error_when_it_is_back() -> None:
 def test_who_is_no_drive_has_no_errors_of_a_drive() -> None:
     joint = Joint()
     with pytest.raises(FaultRefused, match=r"slave 1 \(DIEWU 16DI16DO\) is no drive"):
-        begin(joint.line.segment, DriveFault(1, "encoder"), joint.line.now)
+        begin(joint.line.segment, DriveErrorFault(1, "encoder"), joint.line.now)
     with pytest.raises(FaultRefused, match="no slave 3: the segment has slaves 1 to 2"):
-        begin(joint.line.segment, DriveFault(3, "encoder"), joint.line.now)
+        begin(joint.line.segment, DriveErrorFault(3, "encoder"), joint.line.now)
 
 
 # -- the IO box -------------------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def test_on_the_bus_inprocess_drives_and_inputs_fail_alike() -> None:
     bus = InProcessBus([create("diewu-io"), create("cubemars-orh70")])
     models = [slave.device for slave in bus.slaves]
     undo = JoystickCode(0).begin(models)
-    DriveFault(2, "over-voltage").begin(models)
+    DriveErrorFault(2, "over-voltage").begin(models)
     for model in models:
         for _ in range(120):
             model.step(0.001)

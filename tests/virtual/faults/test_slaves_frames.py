@@ -10,7 +10,7 @@ from rtcp.fieldbus.port_errors import ErrorCounters
 from rtcp.fieldbus.registers import Answer, RegisterPort
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import CableFault, Corrupt, WorkingCounter
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.frames import Datagram, build
 from tests.virtual.line import MS, STATION, Line, TinyDevice, begin
 
@@ -25,7 +25,7 @@ class Direct(RegisterPort):
 
     def exchange(self, command: int, station: int, address: int, data: bytes, *, timeout_s: float = 0.02,
                  tries: int = 3) -> Answer:  # fmt: skip
-        answer = self._line.one(Command(command), station, address, data)
+        answer = self._line.one(DatagramCommand(command), station, address, data)
         return Answer(answer.data, answer.counter)
 
 
@@ -37,7 +37,7 @@ def in_op(count: int = 4) -> Line:
 
 def lrw(*outputs: int) -> bytes:
     data = b"".join(value.to_bytes(2, "little") for value in outputs)
-    return build(Datagram(Command.LRW, 0, 0, 0, data + bytes(len(data))))
+    return build(Datagram(DatagramCommand.LRW, 0, 0, 0, data + bytes(len(data))))
 
 
 def errors(line: Line) -> list[tuple[int, int, int]]:
@@ -66,8 +66,8 @@ def test_a_slave_before_the_damage_does_what_a_request_asks_and_a_slave_behind_i
     line = in_op()
     begin(line.segment, Corrupt(2, burst=3), line.now)
     for slave in (0, 3):
-        line.raw(build(Datagram(Command.FPWR, 0, STATION + slave, 0x0120, b"\x04\x00")))
-    line.raw(build(Datagram(Command.FRMW, 0, STATION, 0x0910, bytes(8))))
+        line.raw(build(Datagram(DatagramCommand.FPWR, 0, STATION + slave, 0x0120, b"\x04\x00")))
+    line.raw(build(Datagram(DatagramCommand.FRMW, 0, STATION, 0x0910, bytes(8))))
     assert [line.al(n)[0] for n in range(4)] == [4, 8, 8, 8]
 
 
@@ -121,7 +121,7 @@ def test_a_request_in_a_frame_that_is_damaged_on_its_way_back_is_done() -> None:
     line = in_op()
     begin(line.segment, Corrupt(2, "back", burst=2), line.now)
     for slave in (0, 3):
-        assert line.raw(build(Datagram(Command.FPWR, 0, STATION + slave, 0x0120, b"\x04\x00"))) is None
+        assert line.raw(build(Datagram(DatagramCommand.FPWR, 0, STATION + slave, 0x0120, b"\x04\x00"))) is None
     assert [line.al(n)[0] for n in range(4)] == [4, 8, 8, 4]
 
 
@@ -171,7 +171,7 @@ def test_a_frame_that_turns_round_before_the_damage_is_sound(after: int) -> None
     line = in_op()
     begin(line.segment, Corrupt(after, rate=1.0), line.now)
     begin(line.segment, CableFault(2), line.now)
-    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 2
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 2
 
 
 def test_a_burst_that_has_passed_costs_nothing_more() -> None:
@@ -190,19 +190,22 @@ def test_there_is_no_cable_to_damage_frames_behind_the_last_slave() -> None:
         begin(in_op().segment, Corrupt(4, burst=1), 0)
 
 
-@pytest.mark.parametrize(("command", "share", "full"), [(Command.LRW, 3, 12), (Command.LRD, 1, 4), (Command.LWR, 1, 4)])
-def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: Command, share: int, full: int) -> None:
+@pytest.mark.parametrize(
+    ("command", "share", "full"),
+    [(DatagramCommand.LRW, 3, 12), (DatagramCommand.LRD, 1, 4), (DatagramCommand.LWR, 1, 4)],
+)
+def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: DatagramCommand, share: int, full: int) -> None:
     line = in_op()
     line.exchange(1, 2, 3, 4)
     end = begin(line.segment, WorkingCounter(2, rate=1.0), line.now)
     data = bytes.fromhex("0500 0600 0700 0800") + bytes(8)
     answer = line.logical(command, 0, data)
     assert answer.counter == full - share
-    if command != Command.LWR:
+    if command != DatagramCommand.LWR:
         assert answer.data[8:] == bytes.fromhex("0200 0300 0400 0500")
     line.pass_time(MS)
-    assert line.devices[1].out.value == (2 if command == Command.LRD else 6)
-    assert line.one(Command.BRD, 0, 0, bytes(1)).counter == 4
+    assert line.devices[1].out.value == (2 if command == DatagramCommand.LRD else 6)
+    assert line.one(DatagramCommand.BRD, 0, 0, bytes(1)).counter == 4
     end(line.now)
     assert line.logical(command, 0, data).counter == full
 
@@ -210,9 +213,9 @@ def test_the_counter_lacks_the_share_of_a_slave_that_took_part(command: Command,
 @pytest.mark.parametrize("slave", [2, 3])
 def test_the_share_is_missing_also_where_a_datagram_holds_half_a_buffer(slave: int) -> None:
     line = in_op()
-    assert line.logical(Command.LRD, 10, bytes(3)).counter == 2
+    assert line.logical(DatagramCommand.LRD, 10, bytes(3)).counter == 2
     begin(line.segment, WorkingCounter(slave, rate=1.0), line.now)
-    assert line.logical(Command.LRD, 10, bytes(3)).counter == 1
+    assert line.logical(DatagramCommand.LRD, 10, bytes(3)).counter == 1
 
 
 def test_a_slave_without_outputs_taken_lacks_only_what_it_counts() -> None:
@@ -225,7 +228,7 @@ def test_a_slave_without_outputs_taken_lacks_only_what_it_counts() -> None:
 def test_a_burst_is_so_many_process_data_datagrams_and_no_others() -> None:
     line = in_op()
     undo = begin(line.segment, WorkingCounter(2, burst=2), line.now)
-    line.one(Command.BRD, 0, 0, bytes(1))
+    line.one(DatagramCommand.BRD, 0, 0, bytes(1))
     assert [line.exchange()[1] for _ in range(4)] == [9, 9, 12, 12]
     assert undo.over
     assert undo.counts == {"not_counted": 2}

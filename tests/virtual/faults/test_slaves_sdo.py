@@ -9,7 +9,7 @@ import pytest
 from rtcp.virtual.device import Emergency
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import PowerFault, SdoAbort, SdoLate
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.line import MS, PRE_OP, SM_MAILBOXES, STATION, Line, TinyDevice, begin
 
 OUT, IN, SIZE = 0x1000, 0x1080, 0x80
@@ -33,7 +33,7 @@ class Master:
 
     def answer(self) -> bytes | None:
         """What SM1 holds behind the mailbox header; None: nothing."""
-        found = self.line.one(Command.FPRD, STATION, IN, bytes(SIZE))
+        found = self.line.one(DatagramCommand.FPRD, STATION, IN, bytes(SIZE))
         return found.data[6 : 6 + found.data[0]] if found.counter else None
 
     def wait(self, ms: int) -> tuple[bytes, int]:

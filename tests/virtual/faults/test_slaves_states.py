@@ -6,7 +6,7 @@ import pytest
 
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.slaves import AlFall, AlHang, AlRefuse, PowerFault
-from rtcp.virtual.protocol import Command
+from rtcp.virtual.protocol import DatagramCommand
 from tests.virtual.line import ACK, ERROR, INIT, MS, OP, PRE_OP, SAFE_OP, SM_MAILBOXES, STATION, Line, TinyDevice, begin
 
 REFUSED = 0x0042
@@ -48,7 +48,7 @@ def test_a_slave_that_hangs_neither_follows_nor_refuses_and_does_it_afterwards()
     line = in_op()
     end = begin(line.segment, AlHang(2), line.now)
     assert line.request(1, INIT) == (OP, 0)
-    assert line.one(Command.FPWR, STATION + 1, 0x0120, b"\x02\x00").counter == 0, "AL control was not read yet"
+    assert line.one(DatagramCommand.FPWR, STATION + 1, 0x0120, b"\x02\x00").counter == 0, "AL control was not read yet"
     for _ in range(200):
         assert line.exchange()[1] == 6
     assert line.request(0, SAFE_OP) == (SAFE_OP, 0)

@@ -6,61 +6,61 @@ from typing import Any
 import pytest
 
 from rtcp.virtual.device import create, models
-from rtcp.virtual.models.cia402 import State, StateMachine
+from rtcp.virtual.models.cia402 import DriveState, DriveStateMachine
 from rtcp.virtual.objects import SdoAbort
 from rtcp.virtual.pdo import PdoImage
 
 Maker = Callable[..., Any]
 
 TRANSITIONS = [
-    (State.SWITCH_ON_DISABLED, 0x06, 2, State.READY_TO_SWITCH_ON),
-    (State.READY_TO_SWITCH_ON, 0x07, 3, State.SWITCHED_ON),
-    (State.READY_TO_SWITCH_ON, 0x0F, 3, State.SWITCHED_ON),
-    (State.SWITCHED_ON, 0x0F, 4, State.OPERATION_ENABLED),
-    (State.OPERATION_ENABLED, 0x07, 5, State.SWITCHED_ON),
-    (State.SWITCHED_ON, 0x06, 6, State.READY_TO_SWITCH_ON),
-    (State.READY_TO_SWITCH_ON, 0x00, 7, State.SWITCH_ON_DISABLED),
-    (State.READY_TO_SWITCH_ON, 0x02, 7, State.SWITCH_ON_DISABLED),
-    (State.OPERATION_ENABLED, 0x06, 8, State.READY_TO_SWITCH_ON),
-    (State.OPERATION_ENABLED, 0x00, 9, State.SWITCH_ON_DISABLED),
-    (State.SWITCHED_ON, 0x00, 10, State.SWITCH_ON_DISABLED),
-    (State.SWITCHED_ON, 0x02, 10, State.SWITCH_ON_DISABLED),
-    (State.OPERATION_ENABLED, 0x02, 11, State.QUICK_STOP_ACTIVE),
-    (State.OPERATION_ENABLED, 0x0B, 11, State.QUICK_STOP_ACTIVE),
-    (State.QUICK_STOP_ACTIVE, 0x00, 12, State.SWITCH_ON_DISABLED),
-    (State.FAULT, 0x80, 15, State.SWITCH_ON_DISABLED),
-    (State.QUICK_STOP_ACTIVE, 0x0F, 16, State.OPERATION_ENABLED),
+    (DriveState.SWITCH_ON_DISABLED, 0x06, 2, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.READY_TO_SWITCH_ON, 0x07, 3, DriveState.SWITCHED_ON),
+    (DriveState.READY_TO_SWITCH_ON, 0x0F, 3, DriveState.SWITCHED_ON),
+    (DriveState.SWITCHED_ON, 0x0F, 4, DriveState.OPERATION_ENABLED),
+    (DriveState.OPERATION_ENABLED, 0x07, 5, DriveState.SWITCHED_ON),
+    (DriveState.SWITCHED_ON, 0x06, 6, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.READY_TO_SWITCH_ON, 0x00, 7, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.READY_TO_SWITCH_ON, 0x02, 7, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.OPERATION_ENABLED, 0x06, 8, DriveState.READY_TO_SWITCH_ON),
+    (DriveState.OPERATION_ENABLED, 0x00, 9, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.SWITCHED_ON, 0x00, 10, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.SWITCHED_ON, 0x02, 10, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.OPERATION_ENABLED, 0x02, 11, DriveState.QUICK_STOP_ACTIVE),
+    (DriveState.OPERATION_ENABLED, 0x0B, 11, DriveState.QUICK_STOP_ACTIVE),
+    (DriveState.QUICK_STOP_ACTIVE, 0x00, 12, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.FAULT, 0x80, 15, DriveState.SWITCH_ON_DISABLED),
+    (DriveState.QUICK_STOP_ACTIVE, 0x0F, 16, DriveState.OPERATION_ENABLED),
 ]
 REFUSED = [
-    (State.NOT_READY_TO_SWITCH_ON, 0x06),
-    (State.SWITCH_ON_DISABLED, 0x07),
-    (State.SWITCH_ON_DISABLED, 0x0F),
-    (State.SWITCH_ON_DISABLED, 0x00),
-    (State.READY_TO_SWITCH_ON, 0x06),
-    (State.SWITCHED_ON, 0x07),
-    (State.OPERATION_ENABLED, 0x0F),
-    (State.OPERATION_ENABLED, 0x8F),
-    (State.QUICK_STOP_ACTIVE, 0x06),
-    (State.QUICK_STOP_ACTIVE, 0x02),
-    (State.FAULT_REACTION_ACTIVE, 0x80),
-    (State.FAULT, 0x06),
-    (State.FAULT, 0x0F),
-    (State.FAULT, 0x00),
+    (DriveState.NOT_READY_TO_SWITCH_ON, 0x06),
+    (DriveState.SWITCH_ON_DISABLED, 0x07),
+    (DriveState.SWITCH_ON_DISABLED, 0x0F),
+    (DriveState.SWITCH_ON_DISABLED, 0x00),
+    (DriveState.READY_TO_SWITCH_ON, 0x06),
+    (DriveState.SWITCHED_ON, 0x07),
+    (DriveState.OPERATION_ENABLED, 0x0F),
+    (DriveState.OPERATION_ENABLED, 0x8F),
+    (DriveState.QUICK_STOP_ACTIVE, 0x06),
+    (DriveState.QUICK_STOP_ACTIVE, 0x02),
+    (DriveState.FAULT_REACTION_ACTIVE, 0x80),
+    (DriveState.FAULT, 0x06),
+    (DriveState.FAULT, 0x0F),
+    (DriveState.FAULT, 0x00),
 ]
 
 
 @pytest.mark.parametrize(("before", "controlword", "number", "after"), TRANSITIONS)
 def test_a_controlword_walks_the_transition_of_the_standard(
-    before: State, controlword: int, number: int, after: State
+    before: DriveState, controlword: int, number: int, after: DriveState
 ) -> None:
-    machine = StateMachine()
+    machine = DriveStateMachine()
     machine.state = before
     assert machine.request(controlword) == (number, after)
 
 
 @pytest.mark.parametrize(("before", "controlword"), REFUSED)
-def test_a_controlword_out_of_place_asks_for_nothing(before: State, controlword: int) -> None:
-    machine = StateMachine()
+def test_a_controlword_out_of_place_asks_for_nothing(before: DriveState, controlword: int) -> None:
+    machine = DriveStateMachine()
     machine.request(controlword & 0x80)
     machine.state = before
     assert machine.request(controlword) is None
