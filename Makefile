@@ -3,6 +3,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help setup oracles run test test-all fast faults lint format clean
 .DEFAULT_GOAL := help

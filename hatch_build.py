@@ -27,6 +27,17 @@ COMPILED = (
     "rtcp/motion/guards/*.py",
     "rtcp/motion/planning/*.py",
     "rtcp/realtime/discipline.py",
+    "rtcp/virtual/al_state.py",
+    "rtcp/virtual/distributed_clock.py",
+    "rtcp/virtual/esc.py",
+    "rtcp/virtual/fmmu.py",
+    "rtcp/virtual/pdo.py",
+    "rtcp/virtual/segment.py",
+    "rtcp/virtual/slave.py",
+    "rtcp/virtual/wire.py",
+    "rtcp/virtual/models/cyclic_modes.py",
+    "rtcp/virtual/models/mechanics.py",
+    "rtcp/virtual/models/profile_modes.py",
 )
 INTERPRETED = (
     "kinematics/compiled.py",
@@ -87,7 +98,7 @@ def build(target: Path) -> None:
         extensions = mypycify(options, opt_level="2", multi_file=True, target_dir=f"{scratch}/c")
         for extension in extensions:
             # No fused multiplication and addition, as on aarch64: results are those of the interpreter, to the bit.
-            extension.extra_compile_args.append("-ffp-contract=off")
+            extension.extra_compile_args = [*extension.extra_compile_args, "-ffp-contract=off"]
         command: Any = build_ext(Distribution({"name": "rtcp", "ext_modules": extensions}))
         command.build_lib, command.build_temp = f"{scratch}/lib", f"{scratch}/tmp"
         command.parallel = os.cpu_count()

@@ -1,9 +1,11 @@
-"""How fast the virtual segment answers: round trips of a real pysoem master, blocking and polling, 7 and 32 slaves.
+"""How fast the virtual segment answers: round trips of a real pysoem master; 7 to 64 slaves, compiled and as source.
 
-    python benchmarks/segment.py [--seconds 5] [--json]
+    python benchmarks/segment.py [--seconds 5] [--rounds 3] [--peer "simulator -i {interface} ..."] [--json]
 
 The segment runs as users run it, in a process and a network namespace of its own; the master is pysoem with its socket
-set to non-blocking, which polls for the answer. With two CPUs master and segment get one each.
+set to non-blocking, which polls for the answer. With two CPUs master and segment get one each. `--peer` measures
+another segment of 7 slaves on a veth pair in the same way, under SCHED_OTHER and SCHED_FIFO. All alternate, round after
+round.
 """
 
 from __future__ import annotations
@@ -12,19 +14,29 @@ import argparse
 import ctypes
 import json
 import os
+import platform
+import shlex
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from dataclasses import asdict, dataclass
+from datetime import date
 from pathlib import Path
 
 import pysoem
 
+from kinematics.compiled import BUILD, PURE
+
 AF_PACKET_LINK = "socket:"
 RECEIVE_TIMEOUT_US = 2000
 SETTLE_CYCLES = 300
-AIM_P50_US = 80.0
+CLONE_NEWNET = 0x40000000
+MASTER_END, PEER_END = "ecat0", "peer0"
+PEER_STARTS_S = 1.0
+CASES = ((7, 1000, 0), (7, 1000, 1), (7, 500, 0), (7, 500, 1), (32, 2000, 0), (64, 2000, 0), (64, 2000, 1))
+"""Slaves, period in us, whether the segment polls."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +88,7 @@ def tolerates_stalls(slave: pysoem.CdefSlave) -> bool:
     """Switch the sync error off (0x10F1:02 = 0): a stall of this machine is to be measured and not to end it all."""
     try:
         slave.sdo_write(0x10F1, 2, bytes(2))
-    except pysoem.SdoError:
+    except (pysoem.SdoError, pysoem.MailboxError, pysoem.PacketError, pysoem.WkcError):
         return False  # the IO box: it works without SYNC0
     return True
 
@@ -96,16 +108,16 @@ def to_op(master: pysoem.Master, period_ns: int) -> None:
 
 
 def measure(slaves: int, period_us: int, polling: bool, seconds: float) -> Result:
-    cpus = sorted(os.sched_getaffinity(0))
+    master_cpu, segment_cpu = apart()
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "segment.yaml"
         write_config(config, slaves)
         command = [sys.executable, "-m", "rtcp.virtual", "--config", str(config)]
         if polling:
             command += ["--poll"]
-        if len(cpus) > 1:
-            command += ["--cpu", str(cpus[-1])]
-            os.sched_setaffinity(0, {cpus[0]})
+        if segment_cpu is not None:
+            command += ["--cpu", str(segment_cpu)]
+            os.sched_setaffinity(0, {master_cpu})
         segment = subprocess.Popen(command, stdout=subprocess.PIPE)
         try:
             assert segment.stdout is not None
@@ -115,6 +127,39 @@ def measure(slaves: int, period_us: int, polling: bool, seconds: float) -> Resul
         finally:
             segment.terminate()
             segment.wait(10)
+
+
+def measure_peer(command: str, slaves: int, period_us: int, fifo: bool, seconds: float) -> Result:
+    """Measure another segment: `command` answers at the interface that stands for {interface} in it."""
+    from pyroute2 import IPRoute
+
+    if ctypes.CDLL(None, use_errno=True).unshare(CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "a network namespace of its own needs root")
+    with IPRoute() as links:
+        links.link("add", ifname=MASTER_END, kind="veth", peer={"ifname": PEER_END})
+        for name in (MASTER_END, PEER_END):
+            # No frame but EtherCAT on the cable.
+            Path(f"/proc/sys/net/ipv6/conf/{name}/disable_ipv6").write_text("1")
+            links.link("set", index=links.link_lookup(ifname=name)[0], state="up")
+    master_cpu, peer_cpu = apart()
+    peer = subprocess.Popen(shlex.split(command.format(interface=PEER_END)), stdout=subprocess.DEVNULL)
+    try:
+        if peer_cpu is not None:
+            os.sched_setaffinity(peer.pid, {peer_cpu})
+            os.sched_setaffinity(0, {master_cpu})
+        if fifo:
+            os.sched_setscheduler(peer.pid, os.SCHED_FIFO, os.sched_param(70))
+        time.sleep(PEER_STARTS_S)
+        return exchange(peer.pid, slaves, period_us, False, seconds)
+    finally:
+        peer.terminate()
+        peer.wait(10)
+
+
+def apart() -> tuple[int, int | None]:
+    """Return the master's CPU and the segment's; None where there is one CPU only."""
+    cpus = sorted(os.sched_getaffinity(0))
+    return cpus[0], cpus[-1] if len(cpus) > 1 else None
 
 
 def exchange(pid: int, slaves: int, period_us: int, polling: bool, seconds: float) -> Result:
@@ -168,32 +213,50 @@ def exchange(pid: int, slaves: int, period_us: int, polling: bool, seconds: floa
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=5.0, help="how long each measurement lasts")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--peer", help="command of another segment, with {interface} where it is to answer")
     parser.add_argument("--json", action="store_true", help="print the results as JSON")
     parser.add_argument("--one", nargs=3, metavar=("SLAVES", "PERIOD_US", "POLL"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
         slaves, period_us, polling = map(int, arguments.one)
-        print(json.dumps(asdict(measure(slaves, period_us, bool(polling), arguments.seconds))))
+        if arguments.peer:
+            result = measure_peer(arguments.peer, slaves, period_us, bool(polling), arguments.seconds)
+        else:
+            result = measure(slaves, period_us, bool(polling), arguments.seconds)
+        print(json.dumps(asdict(result)))
         return
-    results = []
-    # Joining a namespace cannot be undone: each measurement has a process of its own.
-    for slaves, period_us in ((7, 1000), (7, 500), (32, 2000)):
-        for polling in (0, 1):
-            command = [sys.executable, __file__, "--seconds", str(arguments.seconds)]
-            done = subprocess.run([*command, "--one", str(slaves), str(period_us), str(polling)],
-                                  check=True, stdout=subprocess.PIPE)  # fmt: skip
-            results.append(Result(**json.loads(done.stdout)))
+    table: dict[tuple[str, int, int, str], list[Result]] = {}
+    for _ in range(arguments.rounds):
+        for slaves, period_us, polling in CASES:
+            for pure, who in (("", "ours"), ("1", "as source")):
+                key = (who, slaves, period_us, "polling" if polling else "blocking")
+                table.setdefault(key, []).append(one(arguments, slaves, period_us, polling, pure, ""))
+        if arguments.peer:
+            for fifo in (0, 1):
+                key = ("the peer", 7, 1000, "SCHED_FIFO" if fifo else "SCHED_OTHER")
+                table.setdefault(key, []).append(one(arguments, 7, 1000, fifo, "", arguments.peer))
     if arguments.json:
-        print(json.dumps([asdict(result) for result in results], indent=2))
+        print(json.dumps([{"who": who, **asdict(r)} for (who, *_), found in table.items() for r in found], indent=2))
         return
-    print("slaves  period us  mode      p50 us  p99 us  max us  lost  segment CPU %")
-    for r in results:
-        mode = "polling" if r.polling else "blocking"
-        print(f"{r.slaves:6}  {r.period_us:9}  {mode:8}  {r.p50_us:6.1f}  {r.p99_us:6.1f}  {r.max_us:6.0f}  {r.lost:4}"
-              f"  {r.segment_cpu_percent:13.0f}")  # fmt: skip
-    print(f"aim: p50 of 7 slaves at 1000 us, blocking, at most {AIM_P50_US:.0f} us")
+    state = BUILD.reason or "compiled"
+    print(f"{platform.machine()}, Linux {platform.release()}, {date.today().isoformat()}; ours: {state}")
+    print("            slaves  period us  mode          p50 us (over the rounds)   p99 us  lost  CPU %")
+    for (who, slaves, period_us, mode), found in sorted(table.items(), key=lambda item: item[0][1:3] + item[0][:1]):
+        p50, spread = statistics.median(r.p50_us for r in found), sorted(r.p50_us for r in found)
+        print(f"{who:10}  {slaves:6}  {period_us:9}  {mode:12}  {p50:6.1f} ({spread[0]:.1f} to {spread[-1]:.1f})"
+              f"{statistics.median(r.p99_us for r in found):17.1f}  {sum(r.lost for r in found):4}"
+              f"  {statistics.median(r.segment_cpu_percent for r in found):5.0f}")  # fmt: skip
+
+
+def one(given: argparse.Namespace, slaves: int, period_us: int, flag: int, pure: str, peer: str) -> Result:
+    """Measure once, in a process of its own: joining a namespace cannot be undone."""
+    command = [sys.executable, __file__, "--seconds", str(given.seconds), *(("--peer", peer) if peer else ())]
+    command += ["--one", str(slaves), str(period_us), str(flag)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, env={**os.environ, PURE: pure})
+    return Result(**json.loads(done.stdout))
 
 
 if __name__ == "__main__":

@@ -22,10 +22,8 @@ from types import ModuleType
 MANIFEST = "manifest.json"
 PURE = "RTCP_PURE"
 """Environment variable; anything but empty and 0 runs the source."""
-DEPENDS_ON = (
-    "kinematics/*.py",
-    *(f"rtcp/{folder}/**/*.py" for folder in ("config", "control", "devices", "fieldbus", "ipc", "motion", "realtime")),
-)
+_FOLDERS = ("config", "control", "devices", "fieldbus", "ipc", "motion", "realtime", "virtual")
+DEPENDS_ON = ("kinematics/*.py", *(f"rtcp/{folder}/**/*.py" for folder in _FOLDERS))
 """What a change of makes the compiled code stale: its types are fixed in it, those of interpreted modules too."""
 ABI = EXTENSION_SUFFIXES[0]
 """What the files of extension modules for this interpreter end with."""

@@ -29,8 +29,12 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Leave out what only the interpreter allows where the cycle runs compiled."""
+    """Leave out what only the interpreter allows where the cycle runs compiled; give what runs in real time two further
+    tries, because a shared host may take the CPU away for longer than anything allows. The summary lists them.
+    """
     for item in items:
+        if item.get_closest_marker("alone"):
+            item.add_marker(pytest.mark.flaky(reruns=2))
         if BUILD.is_used and item.get_closest_marker("interpreted"):
             item.add_marker(pytest.mark.skip(reason="it replaces a method, which compiled code does not allow"))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +13,8 @@ from typing import Any
 import pytest
 
 import hatch_build
-from kinematics.compiled import ABI, BUILD, MANIFEST, sources_digest, use
+from kinematics.compiled import ABI, BUILD, MANIFEST, PURE, sources_digest, use
+from tests.samples import SLOW
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -126,3 +128,21 @@ def test_solving_a_quadratic_leaves_no_ring_of_references_where_the_collector_is
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert int(done.stdout) == 0
+
+
+@pytest.mark.skipif(not BUILD.is_used, reason="nothing is compiled, or it is not used")
+def test_compiled_functions_return_what_the_source_does_to_the_bit() -> None:
+    samples = str(1_000_000 if SLOW else 1000)
+    runs = [
+        subprocess.Popen(
+            [sys.executable, "-m", "tests.compiled_results", samples],
+            stdout=subprocess.PIPE,
+            cwd=ROOT,
+            env={**os.environ, PURE: pure},
+        )
+        for pure in ("", "1")
+    ]
+    compiled, source = (json.loads(run.communicate()[0]) for run in runs)
+    assert (compiled.pop("is_compiled"), source.pop("is_compiled")) == (True, False)
+    assert compiled == source
+    assert source["errors"]

@@ -83,8 +83,9 @@ class AsyncRobot(Methods):
         try:
             writer.write(jsonrpc.request(number, call.method, call.params))
             return call.result(jsonrpc.result(await pending.reply(), call.method))
-        except (asyncio.CancelledError, RtcpError):
-            if not pending.answer.done() or pending.answer.cancelled():
+        except BaseException:
+            if pending.is_open:
+                # Cancelled, without an answer in time, or its callback failed: the arm does not move on unattended.
                 writer.write(jsonrpc.line({"method": "cancel", "params": {"request": number}}))
             raise
         finally:
@@ -111,6 +112,8 @@ class _Pending:
         self._call = call
         self._heard = asyncio.Event()
         self.answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
+        self.is_open = True
+        """The platform has not answered and may yet."""
 
     async def reply(self) -> Mapping[str, Any]:
         """Return the answer; raises TimedOut after `ANSWER_TIMEOUT_S` without a word on it."""
@@ -126,17 +129,21 @@ class _Pending:
     def receive(self, progress: Mapping[str, Any] | None, reply: Mapping[str, Any]) -> None:
         """Pass progress on, or keep the answer."""
         self._heard.set()
-        try:
-            if progress is None:
-                self.answer.set_result(reply)
-            elif self._call.progress is not None:
+        self.is_open = progress is not None
+        if self.answer.done():
+            return
+        if progress is None:
+            self.answer.set_result(reply)
+        elif self._call.progress is not None:
+            try:
                 self._call.progress(result(Progress, progress))
-        except Exception as error:  # a callback's own: it ends its request, not the connection
-            self.answer.set_exception(error)
+            except Exception as error:  # a callback's own: it ends its request, not the connection
+                self.answer.set_exception(error)
 
     def lose(self) -> None:
         """The connection has ended before the answer."""
         self._heard.set()
+        self.is_open = False
         if not self.answer.done():
             message = f"the platform closed the connection before it answered {self._call.method!r}"
             self.answer.set_exception(RtcpError("lost", message))

@@ -35,26 +35,26 @@ class Chain:
     def cut(self, cable: int) -> None:
         """Break a cable."""
         self._cuts[cable] += 1
-        self._follow()
+        self.update()
 
     def join(self, cable: int) -> None:
         """Join a cable again."""
         self._cuts[cable] -= 1
-        self._follow()
+        self.update()
 
     def power_off(self, number: int, t: int) -> None:
         """Switch a slave's supply off."""
         self._outages[number - 1] += 1
         if self._outages[number - 1] == 1:
             self._slaves[number - 1].power_off(t)
-        self._follow()
+        self.update()
 
     def power_on(self, number: int, t: int) -> None:
         """Switch a slave's supply on again."""
         self._outages[number - 1] -= 1
         if not self._outages[number - 1]:
             self._slaves[number - 1].power_on(t)
-        self._follow()
+        self.update()
 
     def _linked(self, cable: int) -> bool:
         """Whether the cable is whole and what is at both of its ends has supply."""
@@ -62,7 +62,7 @@ class Chain:
             return False
         return cable == 0 or not self._outages[cable - 1]
 
-    def _follow(self) -> None:
+    def update(self) -> None:
         """Update ports and turnaround times to the state of the chain."""
         links = [self._linked(cable) for cable in range(len(self._slaves) + 1)]
         self.reach, self.returns = 0, True
@@ -89,9 +89,7 @@ class Chain:
         """Reset a slave's controller and device, as its supply going and coming back would."""
         slave.power_off(t)
         slave.power_on(t)
-        self._follow()
-
-    update = _follow
+        self.update()
 
     @staticmethod
     def _turn_round(reached: Sequence[Slave]) -> None:

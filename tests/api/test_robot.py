@@ -184,7 +184,7 @@ def test_an_awaited_call_that_is_cancelled_ends_its_move(directory: Path, loop: 
     run(directory, work)
 
 
-def test_an_error_in_a_progress_callback_ends_its_call_and_not_the_connection(directory: Path, loop: FakeLoop) -> None:
+def test_an_error_in_a_progress_callback_ends_its_move_and_not_the_connection(directory: Path, loop: FakeLoop) -> None:
     loop.state, loop.moves_for = State.HOLDING, LONG
 
     def report(progress: Progress) -> None:
@@ -195,6 +195,7 @@ def test_an_error_in_a_progress_callback_ends_its_call_and_not_the_connection(di
             await robot.move_joints(Q, progress=report)
         while await robot.state() is not State.HOLDING:
             pass
+        assert (await robot.status()).holder == ""
 
     run(directory, work)
 

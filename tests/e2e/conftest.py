@@ -41,6 +41,7 @@ class Platform:
             "RTCP_STATE_DIR": str(self.directory / "state"),
             "COLUMNS": "100",
         }
+        self._begun: list[subprocess.Popen[str]] = []
 
     def be_patient(self, lost_ms: int, period_us: int = PERIOD_US) -> None:
         """Use the shipped configuration, but take `lost_ms` without frames (20 to 2000) for a fault.
@@ -79,14 +80,24 @@ class Platform:
         return done
 
     def background(self, *arguments: str) -> subprocess.Popen[str]:
-        """Start `rtcp` with `arguments`."""
-        return subprocess.Popen(
+        """Start `rtcp` with `arguments`; what a failed test leaves running is ended by `restore`."""
+        begun = subprocess.Popen(
             [sys.executable, "-m", "rtcp.cli", *arguments],
             env=self.environment,
             text=True,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
+        self._begun.append(begun)
+        return begun
+
+    def end_commands(self) -> None:
+        """Kill the commands in the background that still run, so that none holds the arm in the next test."""
+        while self._begun:
+            begun = self._begun.pop()
+            if begun.poll() is None:
+                begun.kill()
+                begun.communicate()
 
     def call(self, verb: str, /, **arguments: Any) -> dict[str, Any]:
         """Ask over the control socket, as `rtcp` does, without the half second that its start takes."""
@@ -108,11 +119,15 @@ class Platform:
 
     def restore(self) -> None:
         """Start what a test has ended, leave a fault, and bring the arm to 0 in mode joint, csp, disabled."""
+        self.end_commands()
         if not all(lives(pid) for pid in self.pids().values()):
             self.rtcp("stop", check=None)
             self.rtcp("start", "--detach")
+        if self.status()["state"] == "emergency_stop":
+            # Its slaves go to OP only then.
+            self.call("reset")
         found = self.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
-        if found["state"] in ("fault", "emergency_stop", "stopped_by_limit"):
+        if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")
         self.call("mode", name="joint")
         self.call("mode", name="csp")
@@ -179,6 +194,7 @@ class Platform:
 
     def end(self) -> None:
         """Stop whatever runs and remove the directory."""
+        self.end_commands()
         self.rtcp("stop", check=None)
         shutil.rmtree(self.directory, ignore_errors=True)
 
@@ -233,7 +249,8 @@ def shared(request: pytest.FixtureRequest) -> Iterator[Platform]:
 @pytest.fixture
 def enabled(shared: Platform) -> Iterator[Platform]:
     """The shared platform, in CSP, enabled; disabled afterwards."""
-    if shared.status()["state"] == "fault":
+    shared.end_commands()
+    if shared.status()["state"] in ("fault", "emergency_stop"):
         shared.call("reset")
     shared.call("mode", name="csp")
     shared.call("enable")

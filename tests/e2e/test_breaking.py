@@ -70,14 +70,6 @@ def test_a_stop_leaves_slaves_in_init_and_nothing_behind(running: Platform) -> N
     assert "no platform is running" in running.rtcp("status", check=4).stderr
 
 
-def test_a_second_run_starts_right_after_the_first(running: Platform) -> None:
-    running.call("enable")
-    running.rtcp("stop")
-    running.rtcp("start", "--detach")
-    running.call("enable")
-    assert running.status()["state"] == "holding"
-
-
 def test_a_segment_that_stands_still_for_50_ms_does_not_take_the_cycle_off_its_grid(running: Platform) -> None:
     running.call("enable")
     moving = running.background("move", "1.0", "0", "0", "0", "0", "0", "--speed", "0.3")

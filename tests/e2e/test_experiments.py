@@ -56,6 +56,7 @@ def test_a_square_of_200_mm_at_50_mm_s_is_driven_within_1_mm_commanded_and_3_mm_
     assert np.percentile(speeds, 90) == pytest.approx(SPEED_M_S, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_demonstration_drives_the_square_in_the_other_plane_as_well_and_draws_it(platform: Platform) -> None:
     platform.be_patient(2000)
     picture = Path(platform.directory) / "square.png"

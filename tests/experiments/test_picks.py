@@ -103,7 +103,9 @@ def person() -> Iterator[Person]:
         yield Person(simulation)
 
 
-@pytest.mark.parametrize("where", ITEMS)
+@pytest.mark.parametrize(
+    "where", ["shelf", *(pytest.param(where, marks=pytest.mark.slow) for where in ("table", "ground"))]
+)
 def test_an_item_is_picked_by_joystick_bytes_alone(person: Person, where: str) -> None:
     item = ITEMS[where]
     person.grip(close=False)

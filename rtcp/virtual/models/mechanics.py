@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import pi, sin, sqrt
 from types import MappingProxyType
+from typing import ClassVar
 
 GRAVITY = 9.80665
 GEAR_RATIO = 100
@@ -138,7 +139,7 @@ class Axis:
     commissioning.
     """
 
-    LONGEST_STEP = 500e-6
+    LONGEST_STEP: ClassVar = 500e-6
 
     __slots__ = (
         "_integral", "_integral_gain", "_velocity_gain", "demand", "mechanics", "offset", "reference",
