@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeAlias
 from kinematics.forward import frames
 from kinematics.jacobian import characteristic_length, gram, jacobian_columns, solve_positive
 from kinematics.model import ArmModel
-from kinematics.pose import Pose, Rotation, Vector, orthonormality_error, require_finite
+from kinematics.pose import Pose, Rotation, Vector, as_floats, orthonormality_error, require_finite
 from kinematics.solution import Six, six
 
 TOLERANCE = 1e-9  # m and rad: a pose with smaller errors is reached
@@ -121,6 +121,7 @@ def solve_numeric(
     pose.require_finite()
     require_finite(q_near, model.joint_names)
     require_rotation(pose)
+    q_near = as_floats(q_near)
     bounds = [(limit.lower, limit.upper) for limit in model.limits] if respect_limits else _UNBOUNDED
     length = characteristic_length(model)
     start = _inside(_wrapped(q_near, q_near, bounds), bounds)

@@ -7,7 +7,7 @@ from math import cos, sin
 from typing import TYPE_CHECKING
 
 from kinematics.model import JOINTS, ArmModel
-from kinematics.pose import IDENTITY, Pose, require_finite
+from kinematics.pose import IDENTITY, Pose, as_floats, require_finite
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ def forward(model: ArmModel, q: Sequence[float]) -> Pose:
     The product of T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d) over the rows, then the tool. Raises ValueError
     for a count other than six, and for an angle that is NaN or infinite, naming the joint.
     """
-    _check(model, q)
+    q = _checked(model, q)
     xx = yy = zz = 1.0
     xy = xz = yx = yz = zx = zy = px = py = pz = 0.0
     for (sa, ca, a, d, offset), angle in zip(model.constants, q, strict=True):
@@ -40,7 +40,7 @@ def forward(model: ArmModel, q: Sequence[float]) -> Pose:
 
 def frames(model: ArmModel, q: Sequence[float]) -> tuple[Pose, ...]:
     """Seven poses in the base frame: frames 1 to 6 (frame i moves with joint i) and the tool; errors as `forward`."""
-    _check(model, q)
+    q = _checked(model, q)
     poses = []
     xx = yy = zz = 1.0
     xy = xz = yx = yz = zx = zy = px = py = pz = 0.0
@@ -100,7 +100,8 @@ def forward_batch(model: ArmModel, q: npt.ArrayLike) -> tuple[npt.NDArray[np.flo
     return positions, rotations
 
 
-def _check(model: ArmModel, q: Sequence[float]) -> None:
+def _checked(model: ArmModel, q: Sequence[float]) -> Sequence[float]:
     if len(q) != JOINTS:
         raise ValueError(f"{len(q)} joint angles given; {JOINTS} are required")
     require_finite(q, model.joint_names)
+    return as_floats(q)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from kinematics.forward import frames
 from kinematics.model import ArmModel, LinkMass
-from kinematics.pose import Pose, require_finite
+from kinematics.pose import Pose, as_floats, require_finite
 
 Torques = tuple[float, float, float, float, float, float]
 
@@ -28,7 +28,7 @@ def gravity_torques(
     """
     if not model.links:
         raise ValueError(f"arm {model.name!r} has no link masses; gravity torques need `links`")
-    gx, gy, gz = gravity
+    gx, gy, gz = as_floats(gravity)
     require_finite((gx, gy, gz), ("gravity x", "gravity y", "gravity z"))
     poses = frames(model, q)
     mass = mx = my = mz = 0.0  # mass (kg) and first moment about the base (kg m) of all bodies beyond the joint

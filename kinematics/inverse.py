@@ -15,7 +15,7 @@ from kinematics.damped_least_squares import (
 )
 from kinematics.forward import forward
 from kinematics.model import JOINTS, ArmModel
-from kinematics.pose import Pose, Rotation, Vector, require_finite
+from kinematics.pose import Pose, Rotation, Vector, as_floats, require_finite
 from kinematics.solution import SINGULARITIES, AngleWrap, Near, Singularity, Solution, Solutions, nearest_turn
 from kinematics.spherical import ObliqueWrist, SphericalArm, has_spherical_wrist
 
@@ -53,7 +53,7 @@ class InverseKinematics:
         zero, or the limit nearest to it). The numeric method gives one solution, found from there, inside the limits
         if possible. Raises ValueError for a value that is not finite, naming it, and for an invalid rotation.
         """
-        near = self._home if q_near is None else q_near
+        near = self._home if q_near is None else as_floats(q_near)
         _require_finite(self.model, pose, near)
         if self._arm is None:
             return self._solve_numeric(pose, near)
@@ -70,6 +70,7 @@ class InverseKinematics:
         is the branch that continues. It may be far away when no near one exists; the caller bounds the step. A joint
         that is free on a singularity keeps its position. Raises ValueError as `solve`.
         """
+        q_near = as_floats(q_near)
         _require_finite(self.model, pose, q_near)
         if self._arm is None:
             return self._near_numeric(pose, q_near)

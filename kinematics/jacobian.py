@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 from kinematics.forward import frames
 from kinematics.model import ArmModel
-from kinematics.pose import Pose, Vector, require_finite
+from kinematics.pose import Pose, Vector, as_floats, require_finite
 from kinematics.spherical import has_spherical_wrist
 
 Row: TypeAlias = tuple[float, float, float, float, float, float]
@@ -152,6 +152,7 @@ def joint_velocity(
     Klein 1988 (by the smallest singular value), Chiaverini, Siciliano and Egeland 1994 (this form of lambda).
     """
     require_finite(twist, _TWIST)
+    twist = as_floats(twist)
     if not threshold > 0.0:
         raise ValueError(f"threshold is {threshold}; a positive number is required")
     rows = jacobian(model, q)

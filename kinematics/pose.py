@@ -6,7 +6,7 @@ A rotation is a 3x3 matrix, row by row in a tuple of nine. Its angles are those 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -14,6 +14,11 @@ Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, flo
 
 # cos(ry) below which the two outer axes coincide: only rx + rz or rx - rz is then defined.
 _SINGULAR_COSINE = 1e-12
+
+
+def as_floats(values: Sequence[float]) -> Sequence[float]:
+    """Floats of any sequence, an array of any type too: compiled code takes no other numbers than float and int."""
+    return values if type(values) is list or type(values) is tuple else [float(value) for value in values]
 
 
 def require_finite(values: Iterable[float], names: Iterable[str]) -> None:

@@ -163,9 +163,14 @@ class JointMotion:
     def _carry_over(self, given: InputParameter, state: ArmState) -> None:
         given.current_position = state.commanded
         given.current_velocity = state.commanded_velocity
-        bounds = self._acceleration_limit
+        bounds, target = self._acceleration_limit, self._target
         given.max_acceleration = bounds
-        given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
+        if self.phase and state.commanded == target.position and state.commanded_velocity == target.velocity:
+            # Nothing was cut: ruckig knows its acceleration, of which the state has the mean of the last cycle. With
+            # that a joint that brakes for the end of its range would come to rest beyond it.
+            given.current_acceleration = self._active.current_acceleration
+        else:
+            given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
         given.target_acceleration = self._zero
 
     def update(self, state: ArmState) -> Setpoint:

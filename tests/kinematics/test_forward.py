@@ -8,7 +8,11 @@ from math import inf, nan, pi
 import numpy as np
 import pytest
 
+from kinematics.damped_least_squares import solve_numeric
 from kinematics.forward import forward, forward_batch, frames
+from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import jacobian, joint_velocity
+from kinematics.model import ArmModel
 from kinematics.pose import IDENTITY, Pose
 from tests.kinematics.arms import chain, matrix, random_configurations, with_general_rows, with_tool
 
@@ -116,3 +120,20 @@ def test_a_value_of_a_batch_that_is_not_finite_is_refused_with_its_place(value, 
     q[2500, 4] = value
     with pytest.raises(ValueError, match=rf"q\[2500, 4\] is {value}"):
         forward_batch(assistive, q)
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32, np.int64])
+def test_angles_in_an_array_of_any_type_are_as_those_in_a_list(assistive: ArmModel, kind: type) -> None:
+    q, pose = np.array([1, 0, 1, -1, 1, 0], kind), forward(assistive, [1.0, 0.1, 1.0, -1.0, 1.0, 0.0])
+    plain = [float(angle) for angle in q]
+    inverse = InverseKinematics(assistive)
+    for function in (
+        lambda given: forward(assistive, given),
+        lambda given: frames(assistive, given),
+        lambda given: jacobian(assistive, given),
+        lambda given: joint_velocity(assistive, given, given),
+        lambda given: inverse.solve(pose, given),
+        lambda given: inverse.solve_near(pose, given),
+        lambda given: solve_numeric(assistive, pose, given),
+    ):
+        assert function(q) == function(plain)

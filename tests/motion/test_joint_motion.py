@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtcp.ipc.commands import MoveJoints
+from rtcp.motion.controllers.joint_move import JointMoveController
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 from tests.samples import examples
@@ -181,3 +186,15 @@ def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> Non
     if made.move_to(target, speed):
         for _ in range(50):
             assert made.update()
+
+
+@pytest.mark.parametrize("cycles", range(1990, 2070, 8))
+def test_a_move_that_is_replaced_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
+    new_drive: Callable[..., Any], cycles: int
+) -> None:
+    drive = new_drive(period_s=0.002).at([0.0] * 6)
+    controller, end = drive.controller(JointMoveController), drive.limits.low[4]
+    assert drive.command(controller, MoveJoints((0.0, 0.0, 0.0, 0.0, end, 0.0), 0.5, False)) is None
+    drive.run(controller, cycles)
+    assert drive.command(controller, MoveJoints((1.0, 0.0, 0.0, 0.0, end, 0.0), 0.2, True)) is None
+    drive.until_rest(controller)
