@@ -46,13 +46,15 @@ def allowed_acceleration(acceleration: float, speed: float, fastest: float, most
 
 
 def allowed_accelerations(
-    state: ArmState, fastest: Sequence[float], most: Sequence[float], jerk: Sequence[float]
+    acceleration: Sequence[float],
+    state: ArmState,
+    fastest: Sequence[float],
+    most: Sequence[float],
+    jerk: Sequence[float],
 ) -> list[float]:
-    """Return `allowed_acceleration` of every joint of a state; bounds of shape (n,)."""
-    return [
-        allowed_acceleration(now, state.commanded_velocity[i], fastest[i], most[i], jerk[i])
-        for i, now in enumerate(state.commanded_acceleration)
-    ]
+    """Return `allowed_acceleration` of every joint of a state; the acceleration and the bounds of shape (n,)."""
+    speed = state.commanded_velocity
+    return [allowed_acceleration(a, speed[i], fastest[i], most[i], jerk[i]) for i, a in enumerate(acceleration)]
 
 
 def stoppable_speed(distance: float, acceleration: float, jerk: float) -> float:
@@ -163,14 +165,13 @@ class JointMotion:
     def _carry_over(self, given: InputParameter, state: ArmState) -> None:
         given.current_position = state.commanded
         given.current_velocity = state.commanded_velocity
-        bounds, target = self._acceleration_limit, self._target
+        bounds, target, now = self._acceleration_limit, self._target, state.commanded_acceleration
         given.max_acceleration = bounds
         if self.phase and state.commanded == target.position and state.commanded_velocity == target.velocity:
             # Nothing was cut: ruckig knows its acceleration, of which the state has the mean of the last cycle. With
             # that a joint that brakes for the end of its range would come to rest beyond it.
-            given.current_acceleration = self._active.current_acceleration
-        else:
-            given.current_acceleration = allowed_accelerations(state, self._velocity_limit, bounds, self._jerk_limit)
+            now = self._active.current_acceleration
+        given.current_acceleration = allowed_accelerations(now, state, self._velocity_limit, bounds, self._jerk_limit)
         given.target_acceleration = self._zero
 
     def update(self, state: ArmState) -> Setpoint:

@@ -143,7 +143,9 @@ class StreamController(Controller):
         # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
         if not self._tracks or state.commanded != self._last:
             way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
-            way.current_acceleration = allowed_accelerations(state, limits.velocity, limits.acceleration, limits.jerk)
+            way.current_acceleration = allowed_accelerations(
+                state.commanded_acceleration, state, limits.velocity, limits.acceleration, limits.jerk
+            )
         self._tracks = True
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk

@@ -133,4 +133,6 @@ class VelocityController(Controller):
         way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
         if moved:
-            way.current_acceleration = allowed_accelerations(state, limits.velocity, limits.acceleration, limits.jerk)
+            way.current_acceleration = allowed_accelerations(
+                state.commanded_acceleration, state, limits.velocity, limits.acceleration, limits.jerk
+            )
