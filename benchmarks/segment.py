@@ -108,7 +108,7 @@ def to_op(master: pysoem.Master, period_ns: int) -> None:
 
 
 def measure(slaves: int, period_us: int, polling: bool, seconds: float) -> Result:
-    master_cpu, segment_cpu = apart()
+    master_cpu, segment_cpu = choose_cpus()
     with tempfile.TemporaryDirectory() as folder:
         config = Path(folder) / "segment.yaml"
         write_config(config, slaves)
@@ -141,7 +141,7 @@ def measure_peer(command: str, slaves: int, period_us: int, fifo: bool, seconds:
             # No frame but EtherCAT on the cable.
             Path(f"/proc/sys/net/ipv6/conf/{name}/disable_ipv6").write_text("1")
             links.link("set", index=links.link_lookup(ifname=name)[0], state="up")
-    master_cpu, peer_cpu = apart()
+    master_cpu, peer_cpu = choose_cpus()
     peer = subprocess.Popen(shlex.split(command.format(interface=PEER_END)), stdout=subprocess.DEVNULL)
     try:
         if peer_cpu is not None:
@@ -156,7 +156,7 @@ def measure_peer(command: str, slaves: int, period_us: int, fifo: bool, seconds:
         peer.wait(10)
 
 
-def apart() -> tuple[int, int | None]:
+def choose_cpus() -> tuple[int, int | None]:
     """Return the master's CPU and the segment's; None where there is one CPU only."""
     cpus = sorted(os.sched_getaffinity(0))
     return cpus[0], cpus[-1] if len(cpus) > 1 else None
@@ -233,11 +233,11 @@ def main() -> None:
         for slaves, period_us, polling in CASES:
             for pure, who in (("", "ours"), ("1", "as source")):
                 key = (who, slaves, period_us, "polling" if polling else "blocking")
-                table.setdefault(key, []).append(one(arguments, slaves, period_us, polling, pure, ""))
+                table.setdefault(key, []).append(measure_in_process(arguments, slaves, period_us, polling, pure, ""))
         if arguments.peer:
             for fifo in (0, 1):
                 key = ("the peer", 7, 1000, "SCHED_FIFO" if fifo else "SCHED_OTHER")
-                table.setdefault(key, []).append(one(arguments, 7, 1000, fifo, "", arguments.peer))
+                table.setdefault(key, []).append(measure_in_process(arguments, 7, 1000, fifo, "", arguments.peer))
     if arguments.json:
         print(json.dumps([{"who": who, **asdict(r)} for (who, *_), found in table.items() for r in found], indent=2))
         return
@@ -251,7 +251,9 @@ def main() -> None:
               f"  {statistics.median(r.segment_cpu_percent for r in found):5.0f}")  # fmt: skip
 
 
-def one(given: argparse.Namespace, slaves: int, period_us: int, flag: int, pure: str, peer: str) -> Result:
+def measure_in_process(
+    given: argparse.Namespace, slaves: int, period_us: int, flag: int, pure: str, peer: str
+) -> Result:
     """Measure once, in a process of its own: joining a namespace cannot be undone."""
     command = [sys.executable, __file__, "--seconds", str(given.seconds), *(("--peer", peer) if peer else ())]
     command += ["--one", str(slaves), str(period_us), str(flag)]

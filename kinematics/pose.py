@@ -17,7 +17,7 @@ _SINGULAR_COSINE = 1e-12
 
 
 def as_floats(values: Sequence[float]) -> Sequence[float]:
-    """Floats of any sequence, an array of any type too: compiled code takes no other numbers than float and int."""
+    """Return the values as compiled code takes them; a list or tuple, of float or int, is returned unchanged."""
     return values if type(values) is list or type(values) is tuple else [float(value) for value in values]
 
 

@@ -13,7 +13,6 @@ import math
 import struct
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from random import Random
 from typing import Any
 
@@ -47,7 +46,6 @@ SPECIAL: tuple[float, ...] = (
 SPECIAL_INTS = (0, 1, -1, 2**31 - 1, -(2**31), 2**62 - 1, 2**62, -(2**62) - 1, 2**63 - 1, 2**63, 2**64, 10**30)
 DT = 0.0005
 CONFIG = load(default_config())
-CONFIG = replace(CONFIG, keep_out=((-0.4, -0.4, -0.2, -0.2, 0.4, 0.6),)) if hasattr(CONFIG, "keep_out") else CONFIG
 ARM = CONFIG.arm
 assert ARM is not None
 

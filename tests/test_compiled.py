@@ -132,7 +132,7 @@ def test_solving_a_quadratic_leaves_no_ring_of_references_where_the_collector_is
 
 @pytest.mark.skipif(not BUILD.is_used, reason="nothing is compiled, or it is not used")
 def test_compiled_functions_return_what_the_source_does_to_the_bit() -> None:
-    samples = str(1_000_000 if SLOW else 1000)
+    samples = str(20_000 if SLOW else 1000)
     runs = [
         subprocess.Popen(
             [sys.executable, "-m", "tests.compiled_results", samples],

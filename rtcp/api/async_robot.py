@@ -92,17 +92,20 @@ class AsyncRobot(Methods):
             del self._pending[number]
 
     async def _receive(self, reader: asyncio.StreamReader) -> None:
-        with contextlib.suppress(ConnectionError):
-            while line := await reader.readline():
-                reply = jsonrpc.read_reply(line, "a request")
-                progress = jsonrpc.progress(reply)
-                pending = self._pending.get(progress["request"] if progress else reply.get("id"))  # type: ignore[arg-type]
-                if pending is not None:
-                    pending.receive(progress, reply)
-        for pending in self._pending.values():
-            pending.lose()
-        if self._writer is not None:
-            self._writer.close()
+        try:
+            with contextlib.suppress(ConnectionError):
+                while line := await reader.readline():
+                    reply = jsonrpc.read_reply(line, "a request")
+                    progress = jsonrpc.progress(reply)
+                    pending = self._pending.get(progress["request"] if progress else reply.get("id"))  # type: ignore[arg-type]
+                    if pending is not None:
+                        pending.receive(progress, reply)
+        finally:
+            # Whatever ends it closes the connection too, and so what it moves.
+            for pending in self._pending.values():
+                pending.lose()
+            if self._writer is not None:
+                self._writer.close()
 
 
 class _Pending:
@@ -110,25 +113,25 @@ class _Pending:
 
     def __init__(self, call: Call[Any]) -> None:
         self._call = call
-        self._heard = asyncio.Event()
+        self._was_heard = False
         self.answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
         self.is_open = True
         """The platform has not answered and may yet."""
 
     async def reply(self) -> Mapping[str, Any]:
-        """Return the answer; raises TimedOut after `ANSWER_TIMEOUT_S` without a word on it."""
+        """Return the answer; raises TimedOut after one to two `ANSWER_TIMEOUT_S` without a word on it."""
         while not self.answer.done():
-            self._heard.clear()
-            try:
-                await asyncio.wait_for(self._heard.wait(), ANSWER_TIMEOUT_S)
-            except asyncio.TimeoutError:
+            self._was_heard = False
+            # Not `wait_for`, which takes an answer that comes with a cancellation and forgets the cancellation.
+            await asyncio.wait([self.answer], timeout=ANSWER_TIMEOUT_S)
+            if not self.answer.done() and not self._was_heard:
                 message = f"the platform has not answered {self._call.method!r} for {ANSWER_TIMEOUT_S:g} s"
-                raise RtcpError("timeout", message) from None
+                raise RtcpError("timeout", message)
         return self.answer.result()
 
     def receive(self, progress: Mapping[str, Any] | None, reply: Mapping[str, Any]) -> None:
         """Pass progress on, or keep the answer."""
-        self._heard.set()
+        self._was_heard = True
         self.is_open = progress is not None
         if self.answer.done():
             return
@@ -142,7 +145,6 @@ class _Pending:
 
     def lose(self) -> None:
         """The connection has ended before the answer."""
-        self._heard.set()
         self.is_open = False
         if not self.answer.done():
             message = f"the platform closed the connection before it answered {self._call.method!r}"

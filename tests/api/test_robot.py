@@ -200,6 +200,40 @@ def test_an_error_in_a_progress_callback_ends_its_move_and_not_the_connection(di
     run(directory, work)
 
 
+@pytest.mark.parametrize("error", [StopIteration, asyncio.CancelledError])
+def test_a_progress_callback_that_raises_what_no_task_may_ends_its_move_too(
+    directory: Path, loop: FakeLoop, error: type[BaseException]
+) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    def report(progress: Progress) -> None:
+        raise error
+
+    async def work(robot: AsyncRobot) -> None:
+        with pytest.raises(BaseException):  # noqa: B017, PT011  which one is Python's
+            await robot.move_joints(Q, progress=report)
+
+    run(directory, work)
+    with rtcp.connect("another", control_socket(directory)) as robot:
+        while robot.state is not State.HOLDING:
+            pass
+        assert robot.status().holder == ""
+
+
+def test_a_call_that_its_own_progress_callback_cancels_ends_its_move(directory: Path, loop: FakeLoop) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+
+    async def work(robot: AsyncRobot) -> None:
+        move = asyncio.create_task(robot.move_joints(Q, progress=lambda progress: move.cancel()))
+        with pytest.raises(asyncio.CancelledError):
+            await move
+        while await robot.state() is not State.HOLDING:
+            pass
+        assert (await robot.status()).holder == ""
+
+    run(directory, work)
+
+
 def test_async_errors_are_the_same(directory: Path, loop: FakeLoop, tmp_path: Path) -> None:
     async def refuse(robot: AsyncRobot) -> None:
         with pytest.raises(rtcp.Invalid):

@@ -124,9 +124,15 @@ class Platform:
             self.rtcp("stop", check=None)
             self.rtcp("start", "--detach")
         if self.status()["state"] == "emergency_stop":
-            # Its slaves go to OP only then.
+            # After an emergency stop the slaves return to OP only after a reset.
             self.call("reset")
-        found = self.until(lambda found: all(slave["state"] == "OP" for slave in found["slaves"]), "OP")
+        found = self.until(
+            lambda found: (
+                all(slave["state"] == "OP" for slave in found["slaves"])
+                and found["state"] not in ("moving", "stopping")
+            ),
+            "OP and rest",
+        )
         if found["state"] in ("fault", "stopped_by_limit"):
             self.call("reset")
         self.call("mode", name="joint")

@@ -65,6 +65,7 @@ def test_the_mapping_that_was_written_is_read_back_over_sdo(shared: Platform) ->
         return [int(printed.split()[0], 0) for printed in read]
 
     assert entries("2", "0x1C12", "uint16", 1) == [0x1600]
+    assert entries("2", "0x1600", "uint32", 5) == [0x60400010, 0x607A0020, 0x60FF0020, 0x60710020, 0x60600008]
     assert entries("drive6", "0x1A00", "uint32", 5) == [0x60410010, 0x60640020, 0x606C0020, 0x60770020, 0x60610008]
 
 

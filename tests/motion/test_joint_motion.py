@@ -198,3 +198,15 @@ def test_a_move_that_is_replaced_while_a_joint_brakes_for_the_end_of_its_range_i
     drive.run(controller, cycles)
     assert drive.command(controller, MoveJoints((1.0, 0.0, 0.0, 0.0, end, 0.0), 0.2, True)) is None
     drive.until_rest(controller)
+
+
+@pytest.mark.parametrize("cycles", range(1990, 2070, 8))
+def test_a_move_that_is_stopped_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
+    new_drive: Callable[..., Any], cycles: int
+) -> None:
+    drive = new_drive(period_s=0.002).at([0.0] * 6)
+    controller, end = drive.controller(JointMoveController), drive.limits.low[4]
+    assert drive.command(controller, MoveJoints((0.0, 0.0, 0.0, 0.0, end, 0.0), 0.5, False)) is None
+    drive.run(controller, cycles)
+    controller.stop(drive.state)
+    drive.until_rest(controller)

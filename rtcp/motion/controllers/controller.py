@@ -117,7 +117,9 @@ class Controller:
 
     def brake(self, state: ArmState) -> None:
         """Bring each joint to rest as fast as its limits allow, whatever the path."""
-        self.motion.hold()
+        if self.motion.phase is Phase.STOP:
+            # An earlier stop; a move under way knows its acceleration.
+            self.motion.hold()
         self.motion.stop(state)
         self.phase, self._braking = Phase.STOP, True
 
