@@ -188,25 +188,17 @@ def test_no_target_and_no_speed_raises(target: list[float], speed: float) -> Non
             assert made.update()
 
 
+@pytest.mark.parametrize("stopped", [False, True], ids=["replaced", "stopped"])
 @pytest.mark.parametrize("cycles", range(1990, 2070, 8))
-def test_a_move_that_is_replaced_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
-    new_drive: Callable[..., Any], cycles: int
+def test_a_move_that_ends_early_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
+    new_drive: Callable[..., Any], cycles: int, stopped: bool
 ) -> None:
     drive = new_drive(period_s=0.002).at([0.0] * 6)
     controller, end = drive.controller(JointMoveController), drive.limits.low[4]
     assert drive.command(controller, MoveJoints((0.0, 0.0, 0.0, 0.0, end, 0.0), 0.5, False)) is None
     drive.run(controller, cycles)
-    assert drive.command(controller, MoveJoints((1.0, 0.0, 0.0, 0.0, end, 0.0), 0.2, True)) is None
-    drive.until_rest(controller)
-
-
-@pytest.mark.parametrize("cycles", range(1990, 2070, 8))
-def test_a_move_that_is_stopped_while_a_joint_brakes_for_the_end_of_its_range_is_cut_by_no_guard(
-    new_drive: Callable[..., Any], cycles: int
-) -> None:
-    drive = new_drive(period_s=0.002).at([0.0] * 6)
-    controller, end = drive.controller(JointMoveController), drive.limits.low[4]
-    assert drive.command(controller, MoveJoints((0.0, 0.0, 0.0, 0.0, end, 0.0), 0.5, False)) is None
-    drive.run(controller, cycles)
-    controller.stop(drive.state)
+    if stopped:
+        controller.stop(drive.state)
+    else:
+        assert drive.command(controller, MoveJoints((1.0, 0.0, 0.0, 0.0, end, 0.0), 0.2, True)) is None
     drive.until_rest(controller)

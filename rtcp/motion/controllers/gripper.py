@@ -26,7 +26,7 @@ class GripperMotion:
         self._motion = JointMotion(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
         self._state = ArmState(1)
         self._period_s = period_s
-        # A way that begins in motion takes the last cycle's mean acceleration for the present one, and errs by so much.
+        # A way that begins where the setpoint was cut takes the last cycle's mean acceleration, and errs by so much.
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
         self._step = joint.velocity * period_s
         self._firm_torque = joint.torque
