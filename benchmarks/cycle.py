@@ -3,6 +3,9 @@
 In one run, alternating: cyclictest (Debian's rt-tests) with the loop's interval, priority and CPU, and the platform on
 its virtual segment with six drives enabled and moving. Then the mean cycle and the average deviation for the ten cycle
 targets of the thesis, beside the thesis' own. Medians over the rounds; the ratio is that of the medians.
+
+`--skipped 500 250` counts the ticks that were skipped, holding and in each motion, beside cyclictest's wake-ups that
+came later than half a period.
 """
 
 from __future__ import annotations
@@ -84,6 +87,8 @@ def cyclictest(cpu: int, priority: int, interval_us: int, seconds: float) -> Arr
     ]
     if not counts:
         return None
+    overflows = re.search(r"^# Histogram Overflows: (\d+)", printed.stdout, re.MULTILINE)
+    counts.append((20000, int(overflows.group(1)) if overflows else 0))
     return np.repeat([bin_us for bin_us, _ in counts], [count for _, count in counts]).astype(float)
 
 
@@ -272,6 +277,41 @@ def compare(
     return result
 
 
+def skipped(periods: list[int], seconds: float, rounds: int, *, poll: bool, console: Console) -> dict[str, object]:
+    """Alternate cyclictest and the platform, holding and moving; print how many ticks were skipped, by period."""
+    config = load(find_config(None))
+    cpu, priority = choose_cpu(config.cycle.cpu), config.cycle.priority
+    table = Table(title=f"skipped ticks, {rounds} rounds of {seconds:g} s, CPU {cpu}, priority {priority}")
+    for heading in ("cycle, us", "", "skipped", "of", "in 1000", "cyclictest late in 1000", "ratio",
+                    "compute p50", "p99, us"):  # fmt: skip
+        table.add_column(heading, justify="right" if heading else "left")
+    result: dict[str, object] = {}
+    for cycle_us in periods:
+        runs: dict[str, list[Round]] = {"hold": [], **{active: [] for active in ACTIVE}}
+        late, wakeups = dict.fromkeys(runs, 0), dict.fromkeys(runs, 0)
+        for _ in range(rounds):
+            for active, done in runs.items():
+                measured = cyclictest(cpu, priority, cycle_us, seconds)
+                if measured is not None:
+                    late[active] += int((measured > cycle_us / 2).sum())
+                    wakeups[active] += measured.size
+                done.append(platform_round(cycle_us, seconds, poll=poll, active=active if active in ACTIVE else None))
+        for active, done in runs.items():
+            reference = 1000 * late[active] / wakeups[active] if wakeups[active] else float("nan")
+            missed = sum(run.missed for run in done)
+            ticks = missed + sum(run.wakeup.size for run in done)
+            share = 1000 * missed / ticks
+            ratio = share / reference if reference else float("nan")
+            compute = figures([run.compute for run in done])
+            result[f"{cycle_us} {active}"] = {"share": share, "reference": reference, "ratio": ratio}
+            table.add_row(
+                str(cycle_us), active, str(missed), str(ticks), f"{share:.2f}", f"{reference:.2f}", f"{ratio:.1f}",
+                f"{compute['p50']:.0f}", f"{compute['p99']:.0f}",
+            )  # fmt: skip
+    console.print(table)
+    return result
+
+
 def targets(seconds: float, *, poll: bool, console: Console) -> dict[str, object]:
     """Run each cycle target of the thesis; print mean and average deviation beside the thesis' own."""
     table = Table(title=f"cycle targets, holding, {seconds:g} s each; us")
@@ -309,6 +349,9 @@ def main() -> int:
     parser.add_argument("--poll", action="store_true", help="let the segment poll on its own CPU")
     parser.add_argument("--no-targets", action="store_true", help="leave out the ten cycle targets")
     parser.add_argument(
+        "--skipped", type=int, nargs="+", metavar="US", help="count the skipped ticks of these cycles, and nothing else"
+    )
+    parser.add_argument(
         "--active", choices=sorted(ACTIVE), default="joint", help="what moves the arm: joint moves, lines, the stick"
     )
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
@@ -323,16 +366,19 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as directory:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
         found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
-        found |= compare(
-            given.cycle_us,
-            given.seconds,
-            given.rounds,
-            Path(directory),
-            poll=given.poll,
-            active=given.active,
-            console=console,
-        )
-        if not given.no_targets:
+        if given.skipped:
+            found |= skipped(given.skipped, given.seconds, given.rounds, poll=given.poll, console=console)
+        else:
+            found |= compare(
+                given.cycle_us,
+                given.seconds,
+                given.rounds,
+                Path(directory),
+                poll=given.poll,
+                active=given.active,
+                console=console,
+            )
+        if not given.no_targets and not given.skipped:
             found["targets"] = targets(given.seconds / 2, poll=given.poll, console=console)
     if given.json:
         given.json.write_text(json.dumps(found, indent=2))

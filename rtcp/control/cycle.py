@@ -87,6 +87,8 @@ class Cycle:
         self._expected = data.expected_wkc
         self._period_ns = round(config.cycle.period_us * 1000)
         self._half_ns = self._period_ns // 2
+        # Half of what is left between the frame and the drives' SYNC0; the other half is for the wire.
+        self._late_ns = round((1 - config.bus.send_phase) / 2 * self._period_ns)
         self._spin_ns = round(config.cycle.spin_us * 1000)
         self._values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * len(self.arm.drives))
         self._locked = False
@@ -153,8 +155,9 @@ class Cycle:
             planned = discipline.next_wakeup(planned)
         finished = self._now()
         self._compute_ns = finished - received
-        # Late: whole ticks are skipped, never replayed in a burst; two frames are never closer than half a period.
-        earliest = max(woken + self._half_ns, finished)
+        # Late: whole ticks are skipped, never replayed in a burst, once their frame could miss the drives' SYNC0; two
+        # frames are never closer than half a period.
+        earliest = max(woken + self._half_ns, finished - self._late_ns)
         if planned < earliest:
             period = self._period_ns
             skipped = (earliest - planned + period - 1) // period

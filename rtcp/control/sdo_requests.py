@@ -80,7 +80,8 @@ class SdoRequests:
             request = json.loads(bytes(memory[SERVICE_TEXT_AT : SERVICE_TEXT_AT + length]))
             return (yield from self._serve(request))
         except SdoAborted as error:
-            return _error("refused", str(error))
+            where = {key: request[key] for key in ("slave", "index", "subindex")}
+            return _error("refused", str(error)) | {"reason": "sdo_aborted", "fields": {**where, "code": error.code}}
         except BusError as error:
             return _error("timeout", "; ".join(error.sentences))
         except Exception as error:

@@ -251,7 +251,7 @@ class MachineActions:
         # A client that goes away takes no request back: the next would be written over one that is being worked on.
         answer = await asyncio.shield(asyncio.ensure_future(self._serve(request)))
         if "error" in answer:
-            raise RtcpError(answer["kind"], str(answer["error"]))
+            raise RtcpError(answer["kind"], str(answer["error"]), answer.get("reason", ""), answer.get("fields"))
         return answer
 
     async def _serve(self, request: Json) -> Json:

@@ -174,6 +174,13 @@ def test_malformed_requests_are_answered_and_end_nothing(shared: Platform) -> No
     assert shared.status()["state"] == "ready"
 
 
+def test_an_abort_of_the_slave_reaches_the_client_with_its_code(shared: Platform) -> None:
+    with pytest.raises(Refused) as refused:
+        shared.call("sdo_read", slave=2, index=0x5FFF, subindex=0)
+    where = {"slave": 2, "index": 0x5FFF, "subindex": 0, "code": 0x06020000}
+    assert (refused.value.reason, refused.value.fields) == ("sdo_aborted", where)
+
+
 def test_a_move_without_enabling_is_refused(shared: Platform) -> None:
     with pytest.raises(Refused) as refused:
         shared.call("move_joints", q=Q)
