@@ -1,19 +1,21 @@
-"""What the loop computes in a cycle: `python benchmarks/compute.py [--seconds N] [--probe] [--profile]`.
+"""What the loop computes in a cycle: `python benchmarks/compute.py [--rounds N] [--seconds N] [--probe] [--profile]`.
 
 The whole loop on the bus `inprocess`, at 500 us, pinned to one CPU: holding, a joint move, straight lines, the
-joystick. A cycle is timed from the answer to its end. `--probe` times the least of it beside, alternating: six drives
-unpacked, 34 trigonometric calls, six drives packed. `--profile` divides a cycle by its parts, each without those that
-it calls.
+joystick; as source and compiled, alternating. A cycle is timed from the answer to its end. `--probe` times the least
+of it beside, cycle by cycle: six drives unpacked, 34 trigonometric calls, six drives packed. `--profile` divides a
+cycle by its parts, each without those that it calls.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import json
 import os
 import platform
 import statistics
 import struct
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -26,6 +28,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from kinematics.compiled import BUILD
 from rtcp.config import default_config, load
 from rtcp.ipc.commands import Enable, MotionCommand, MoveJoints, RunLines
 from rtcp.ipc.states import State
@@ -242,24 +245,42 @@ def profile(cycles: int, console: Console) -> None:
     console.print(table)
 
 
-def compare(cycles: int, rounds: int, console: Console, *, probing: bool) -> None:
-    """Print how long a cycle computes, and how long the probe takes."""
-    table = Table(title=f"compute a cycle, medians over {rounds} rounds of {cycles} cycles; us")
-    for heading in ("", "p5", "p50", "p99", *(("probe p50", "p50 / probe p50", "over the rounds") if probing else ())):
+def measure(name: str, cycles: int, *, probing: bool) -> dict[str, float]:
+    """Return the percentiles of an activity's cycles, us, and with the probe the ratio of the medians."""
+    with activity(name) as running:
+        computed, probed = compute_ns(running, cycles, probe() if probing else None)
+    found = {f"p{hundredth}": quantile(computed, hundredth) for hundredth in (5, 50, 99)}
+    found["p99 / p50"] = found["p99"] / found["p50"]
+    if probing:
+        found["probe p50"] = quantile(probed, 50)
+        found["p50 / probe p50"] = found["p50"] / found["probe p50"]
+    return found
+
+
+def compare(given: argparse.Namespace, console: Console) -> None:
+    """Print how long a cycle computes, as source and compiled, alternating; each figure in a process of its own."""
+    ways = {"source": {"RTCP_PURE": "1"}}
+    if BUILD.is_used:
+        ways["compiled"] = {"RTCP_PURE": ""}
+    else:
+        console.print(f"the cycle compiled is not measured: {BUILD.reason}")
+    found: dict[tuple[str, str], list[dict[str, float]]] = {(name, way): [] for name in ACTIVITIES for way in ways}
+    for _ in range(given.rounds):
+        for (name, way), rows in found.items():
+            command = [sys.executable, __file__, "--one", name, "--seconds", str(given.seconds)]
+            done = subprocess.run(
+                [*command, "--probe"] if given.probe else command,
+                env=os.environ | ways[way], stdout=subprocess.PIPE, text=True, check=True,
+            )  # fmt: skip
+            rows.append(json.loads(done.stdout))
+    headings = list(found["hold", "source"][0])
+    table = Table(title=f"compute a cycle, us: medians over {given.rounds} rounds of {given.seconds:g} s")
+    for heading in ("", *headings, "over the rounds"):
         table.add_column(heading, justify="right" if heading else "left")
-    least = probe() if probing else None
-    for name in ACTIVITIES:
-        rows = []
-        with activity(name) as running:
-            for _ in range(rounds):
-                computed, probed = compute_ns(running, cycles, least)
-                row = [quantile(computed, hundredth) for hundredth in (5, 50, 99)]
-                if probing:
-                    row += [quantile(probed, 50), row[1] / quantile(probed, 50)]
-                rows.append(row)
-        medians = [statistics.median(column) for column in zip(*rows, strict=True)]
-        spread = [f"{min(row[-1] for row in rows):.1f} to {max(row[-1] for row in rows):.1f}"] if probing else []
-        table.add_row(name, *(f"{value:.1f}" for value in medians), *spread)
+    for (name, way), rows in found.items():
+        last = [row[headings[-1]] for row in rows]
+        medians = [f"{statistics.median(row[heading] for row in rows):.1f}" for heading in headings]
+        table.add_row(f"{name}, {way}", *medians, f"{min(last):.1f} to {max(last):.1f}")
     console.print(table)
 
 
@@ -270,18 +291,22 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--probe", action="store_true", help="time the least of a cycle beside")
     parser.add_argument("--profile", action="store_true", help="divide a cycle by its parts")
+    parser.add_argument("--one", choices=ACTIVITIES, help="measure this once, in this process; print JSON")
     given = parser.parse_args()
     cpu = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpu})
     gc.disable()
+    cycles = round(given.seconds * 1e6 / PERIOD_US)
+    if given.one:
+        print(json.dumps(measure(given.one, cycles, probing=given.probe)))
+        return 0
     console = Console()
     machine = f"{platform.machine()}, Linux {platform.release()}, Python {platform.python_version()}, CPU {cpu}"
     console.print(f"{machine}, {date.today().isoformat()}")
-    cycles = round(given.seconds * 1e6 / PERIOD_US)
     if given.profile:
         profile(cycles, console)
     else:
-        compare(cycles, given.rounds, console, probing=given.probe)
+        compare(given, console)
     return 0
 
 
