@@ -40,6 +40,8 @@ from rtcp.realtime.scheduling import Sleeper
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""
 _LONGEST_NS = 2_000_000_000
+_WAY = 20
+"""A frame is on its way for this part of the period at most."""
 _AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 
 
@@ -86,9 +88,11 @@ class Cycle:
         self._now = now
         self._expected = data.expected_wkc
         self._period_ns = round(config.cycle.period_us * 1000)
-        self._half_ns = self._period_ns // 2
-        # Half of what is left between the frame and the drives' SYNC0; the other half is for the wire.
-        self._late_ns = round((1 - config.bus.send_phase) / 2 * self._period_ns)
+        ahead_ns = ahead_of_sync0(config)
+        # Half of what is left to SYNC0; the other half is for the frame's way.
+        self._late_ns = ahead_ns // 2
+        # After a frame that SYNC0 has overtaken, the next tick's would come before the same SYNC0 as that one.
+        self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _WAY)
         self._spin_ns = round(config.cycle.spin_us * 1000)
         self._values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * len(self.arm.drives))
         self._locked = False
@@ -117,6 +121,7 @@ class Cycle:
         """Do one cycle, planned at `planned` and begun at `woken` (ns of the clock); return when the next is due."""
         data, arm, machine, box = self._data, self.arm, self.machine, self.box
         data.send()
+        sent = self._now()
         wkc = data.receive()
         received = self._now()
         good = wkc == self._expected
@@ -155,9 +160,10 @@ class Cycle:
             planned = discipline.next_wakeup(planned)
         finished = self._now()
         self._compute_ns = finished - received
-        # Late: whole ticks are skipped, never replayed in a burst, once their frame could miss the drives' SYNC0; two
-        # frames are never closer than half a period.
-        earliest = max(woken + self._half_ns, finished - self._late_ns)
+        # Late: whole ticks are skipped, never replayed in a burst. At most one frame goes before each SYNC0 of a drive,
+        # or it would do two steps in one; and two frames are never closer than half a period.
+        late = self._late_ns if discipline is None or discipline.locked else 0
+        earliest = max(sent + self._apart_ns, finished - late)
         if planned < earliest:
             period = self._period_ns
             skipped = (earliest - planned + period - 1) // period
@@ -245,6 +251,14 @@ def make_others(config: ArmConfig) -> list[tuple[int, Driver]]:
     period_s = config.cycle.period_us * 1e-6
     made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
     return [(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
+
+
+def ahead_of_sync0(config: ArmConfig) -> int:
+    """Return how long before the first SYNC0 of a drive a frame leaves that is in time, ns; half a period without."""
+    period_ns = round(config.cycle.period_us * 1000)
+    shifts = [round(slave.device.sync0_shift_us * 1000) for slave in config.slaves if slave.device.assign_activate]
+    sent = round(config.bus.send_phase * period_ns)
+    return min([(shift - shifts[0] - sent) % period_ns for shift in shifts], default=period_ns // 2)
 
 
 def make_discipline(config: ArmConfig) -> Discipline | None:

@@ -1,40 +1,107 @@
-"""When the next cycle begins after one that began or ended late, and how many ticks are skipped. In periods."""
+"""When the next cycle begins after one that began, sent or ended late, and how many ticks are skipped. In periods."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from random import Random
+
 import pytest
 
-from .rig import PERIOD_S, LoopRig
+from rtcp.control.cycle import ahead_of_sync0
 
+from .rig import CONFIG, PERIOD_S, LoopRig
+
+NewRig = Callable[..., LoopRig]
 PERIOD_NS = round(PERIOD_S * 1e9)
 
 
+class Late:
+    """A rig whose cycles take the time that the test says.
+
+    Args:
+        phase: instant of the frame between two SYNC0.
+    """
+
+    def __init__(self, new_rig: NewRig, phase: float = 0.5) -> None:
+        config = replace(CONFIG, bus=replace(CONFIG.bus, send_phase=phase))
+        self.rig = rig = new_rig(config)
+        self.sent: list[int] = []
+        self.planned = rig.now_ns
+        self._send, self._receive = rig.data.send, rig.data.receive
+        rig.data.send, rig.data.receive = self._late_send, self._late_receive  # type: ignore[method-assign]
+
+    def cycle(self, woken: float = 0.0, send: float = 0.0, busy: float = 0.0) -> None:
+        """Do a cycle that begins so late after its tick, sends so long after that, and ends so long after that."""
+        self._before, self._after = round(send * PERIOD_NS), round(busy * PERIOD_NS)
+        start = max(self.planned, self.rig.now_ns) + round(woken * PERIOD_NS)
+        self.rig.now_ns = start
+        self.planned = self.rig.loop.cycle(self.planned, start)
+
+    def _late_send(self) -> None:
+        self.rig.now_ns += self._before
+        self.sent.append(self.rig.now_ns)
+        self._send()
+
+    def _late_receive(self) -> int:
+        self.rig.now_ns += self._after
+        return self._receive()
+
+
 @pytest.mark.parametrize(
-    ("late", "busy", "due", "skipped"),
+    ("woken", "send", "busy", "due", "skipped"),
     [
-        (0.0, 0.5, 1, 0),
-        (0.4, 0.2, 1, 0),
-        # Frames are never closer than half a period.
-        (0.6, 0.1, 2, 1),
+        (0.0, 0.0, 0.5, 1, 0),
+        (0.4, 0.0, 0.2, 1, 0),
+        # This frame comes after SYNC0, and the next tick's would come before the same one as it.
+        (0.6, 0.0, 0.1, 2, 1),
+        (0.0, 0.6, 0.1, 2, 1),
         # The frame of the next tick still comes to the drives before their SYNC0, half a period after the tick.
-        (0.0, 1.2, 1, 0),
-        (0.4, 0.8, 1, 0),
-        (0.0, 1.3, 2, 1),
-        (0.0, 3.2, 3, 2),
-        (3.2, 0.1, 4, 3),
+        (0.0, 0.0, 1.2, 1, 0),
+        (0.4, 0.0, 0.8, 1, 0),
+        (0.0, 0.0, 1.3, 2, 1),
+        (0.0, 0.0, 3.2, 3, 2),
+        (3.2, 0.0, 0.1, 4, 3),
     ],
 )
 def test_a_late_cycle_skips_the_ticks_whose_frame_would_be_too_late(
-    rig: LoopRig, late: float, busy: float, due: int, skipped: int
+    new_rig: NewRig, woken: float, send: float, busy: float, due: int, skipped: int
 ) -> None:
-    planned = rig.now_ns
-    woken = planned + round(late * PERIOD_NS)
-    receive = rig.data.receive
+    late = Late(new_rig)
+    began = late.planned
+    late.cycle(woken, send, busy)
+    assert late.planned == began + due * PERIOD_NS
+    assert late.rig.loop.missed == skipped
 
-    def slow() -> int:
-        rig.now_ns = woken + round(busy * PERIOD_NS)
-        return receive()
 
-    rig.data.receive = slow  # type: ignore[method-assign]
-    assert rig.loop.cycle(planned, woken) == planned + due * PERIOD_NS
-    assert rig.loop.missed == skipped
+@pytest.mark.parametrize("phase", [0.1, 0.3, 0.5, 0.8])
+def test_no_drive_gets_two_frames_before_one_sync0_whatever_is_late(new_rig: NewRig, phase: float) -> None:
+    late = Late(new_rig, phase)
+    first = late.planned
+    random = Random(1)
+    for _ in range(3000):
+        one = [random.choice((0.0, 0.0, 0.0, random.random(), 3 * random.random())) for _ in range(3)]
+        late.cycle(*one)
+    windows = [(sent - first - round((1 - phase) * PERIOD_NS)) // PERIOD_NS for sent in late.sent]
+    assert all(after > before for before, after in pairwise(windows))
+    assert min(b - a for a, b in pairwise(late.sent)) >= PERIOD_NS // 2
+
+
+def test_while_the_clock_is_not_followed_no_cycle_begins_late(new_rig: NewRig) -> None:
+    late = Late(new_rig)
+    began = late.planned
+    late.rig.discipline.locked = False
+    late.cycle(busy=1.1)
+    assert late.planned == began + 2 * PERIOD_NS
+
+
+def test_of_several_sync0_the_first_after_the_frame_counts() -> None:
+    slaves = list(CONFIG.slaves)
+    assert sum(1 for slave in slaves if slave.device.assign_activate) >= 2
+    last = slaves[-1]
+    slaves[-1] = replace(last, device=replace(last.device, sync0_shift_us=-0.3 * PERIOD_NS / 1e3))
+    shifted = replace(CONFIG, slaves=tuple(slaves), bus=replace(CONFIG.bus, send_phase=0.5))
+    assert ahead_of_sync0(shifted) == pytest.approx(0.2 * PERIOD_NS, abs=1)
+    none = tuple(replace(slave, device=replace(slave.device, assign_activate=0)) for slave in slaves)
+    assert ahead_of_sync0(replace(shifted, slaves=none)) == PERIOD_NS // 2
