@@ -277,7 +277,9 @@ def compare(
     return result
 
 
-def skipped(periods: list[int], seconds: float, rounds: int, *, poll: bool, console: Console) -> dict[str, object]:
+def skipped(
+    periods: list[int], seconds: float, rounds: int, *, poll: bool, holding: bool, console: Console
+) -> dict[str, object]:
     """Alternate cyclictest and the platform, holding and moving; print how many ticks were skipped, by period."""
     config = load(find_config(None))
     cpu, priority = choose_cpu(config.cycle.cpu), config.cycle.priority
@@ -287,7 +289,7 @@ def skipped(periods: list[int], seconds: float, rounds: int, *, poll: bool, cons
         table.add_column(heading, justify="right" if heading else "left")
     result: dict[str, object] = {}
     for cycle_us in periods:
-        runs: dict[str, list[Round]] = {"hold": [], **{active: [] for active in ACTIVE}}
+        runs: dict[str, list[Round]] = {active: [] for active in ("hold", *(() if holding else ACTIVE))}
         late, lost, wakeups = dict.fromkeys(runs, 0), dict.fromkeys(runs, 0), dict.fromkeys(runs, 0)
         for _ in range(rounds):
             for active, done in runs.items():
@@ -354,6 +356,7 @@ def main() -> int:
     parser.add_argument(
         "--skipped", type=int, nargs="+", metavar="US", help="count the skipped ticks of these cycles, and nothing else"
     )
+    parser.add_argument("--holding", action="store_true", help="with --skipped: only while holding")
     parser.add_argument(
         "--active", choices=sorted(ACTIVE), default="joint", help="what moves the arm: joint moves, lines, the stick"
     )
@@ -370,7 +373,9 @@ def main() -> int:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = directory
         found: dict[str, object] = {"machine": machine, "date": date.today().isoformat()}
         if given.skipped:
-            found |= skipped(given.skipped, given.seconds, given.rounds, poll=given.poll, console=console)
+            found |= skipped(
+                given.skipped, given.seconds, given.rounds, poll=given.poll, holding=given.holding, console=console
+            )
         else:
             found |= compare(
                 given.cycle_us,
