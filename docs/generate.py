@@ -75,7 +75,7 @@ def _shown(default: object) -> str:
     if default in (None, (), {}, ""):
         return "none"
     if isinstance(default, tuple):
-        return f"[{', '.join(f'{value:g}' for value in default)}]"
+        return f"[{', '.join(_shown(value) for value in default)}]"
     if isinstance(default, bool):
         return str(default).lower()
     return f"{default:g}" if isinstance(default, int | float) else str(default)

@@ -134,6 +134,23 @@ class Zero:
 
 
 @dataclass(frozen=True)
+class Recording:
+    """A recording: what it has written so far, or had when it ended."""
+
+    pid: int
+    """Of its process."""
+    files: tuple[str, ...]
+    records: int
+    missing: int
+    """Cycles that were overwritten before they were read; the file says where."""
+    bytes: int
+    seconds: float
+    problem: str
+    """Why it ended early; empty: it did not."""
+    running: bool
+
+
+@dataclass(frozen=True)
 class EventRecord:
     """Something that happened in the loop (`rtcp.ipc.events`)."""
 

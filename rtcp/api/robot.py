@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Status, Streamed, Zero, result
+from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Recording, Status, Streamed, Zero, result
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -88,6 +88,10 @@ def _nothing(answer: Json) -> None:
 
 def _as_is(answer: Json) -> Json:
     return answer
+
+
+def _recordings(answer: Json) -> list[Recording]:
+    return [result(Recording, one) for one in answer["recordings"]]
 
 
 _arrival, _streamed = partial(result, Arrival), partial(result, Streamed)
@@ -382,6 +386,43 @@ class Methods:
             sent_s: as for `jog`.
         """
         return Call("joystick", {"pressed": list(pressed), "byte": byte, **_held(hold_s, sent_s)}, _nothing)
+
+    # -- recordings ---------------------------------------------------------------------------------------------------
+
+    @Method
+    def record_start(
+        self,
+        out: str | Path | None = None,
+        formats: Sequence[str] = ("mcap",),
+        signals: Sequence[str] = (),
+        every: int = 1,
+        seconds: float | None = None,
+    ) -> Call[Recording]:
+        """Start a recording of the cycle; return when it runs.
+
+        Args:
+            out: directory, or a file that ends in the name of its only format; None: the platform's own place.
+            formats: `mcap`, `csv`, or both.
+            signals: names of fields of a cycle record or patterns (`*_position`); none: all, or for CSV the source's.
+            every: each so many-th cycle.
+            seconds: how long; None: until `record_stop`.
+
+        Raises:
+            Refused: the file cannot be made, or there is no such signal.
+        """
+        place = None if out is None else str(Path(out).absolute())
+        params = {"out": place, "formats": list(formats), "signals": list(signals), "every": every, "seconds": seconds}
+        return Call("record_start", params, partial(result, Recording))
+
+    @Method
+    def record_stop(self) -> Call[list[Recording]]:
+        """End all recordings; return what they have written."""
+        return Call("record_stop", {}, _recordings)
+
+    @Method
+    def record_status(self) -> Call[list[Recording]]:
+        """Return the recordings that run, and those that have ended since the platform was started."""
+        return Call("record_status", {}, _recordings)
 
     @Method
     def command(self, name: str, /, progress: OnProgress | None = None, **fields: Any) -> Call[Json]:

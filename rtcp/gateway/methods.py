@@ -26,6 +26,7 @@ from rtcp.gateway.joystick_override import LONGEST_HOLD_S, JoystickOverride
 from rtcp.gateway.limit_settings import LimitSettings
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.motion_actions import MotionActions, Planner
+from rtcp.gateway.recordings import Recordings
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc import commands
 from rtcp.ipc.commands import COMMANDS, Command, MotionCommand
@@ -111,6 +112,7 @@ class Methods:
         self.machine = MachineActions(channel)
         self.joystick_override = JoystickOverride(self.machine, config, session.bus)
         self._streaming = StreamingCommands(channel)
+        self._recordings = Recordings(directory)
         self._limits = LimitSettings(channel, limits, directory)
         self._motion = MotionActions(channel, Planner(config, limits))
         self.table = self._table()
@@ -247,6 +249,31 @@ class Methods:
         _check_age(hold_s, sent_s)
         return await self.joystick_override.force(caller, pressed, byte, hold_s)
 
+    # -- recordings ---------------------------------------------------------------------------------------------------
+
+    @method(at_once=True)
+    async def record_start(
+        self,
+        caller: Caller,
+        out: str | None = None,
+        formats: tuple[Literal["mcap", "csv"], ...] = ("mcap",),
+        signals: tuple[str, ...] = (),
+        every: Annotated[int, Ge(1)] = 1,
+        seconds: Annotated[float, Gt(0)] | None = None,
+    ) -> Json:
+        """Start a recording into `out`, an absolute path; returns what `record_status` lists."""
+        return await self._recordings.start(out, formats or ("mcap",), signals, every, seconds)
+
+    @method(at_once=True)
+    async def record_stop(self, caller: Caller) -> Json:
+        """End all recordings. Returns `recordings`: those that were ended."""
+        return {"recordings": await self._recordings.stop()}
+
+    @method(at_once=True)
+    async def record_status(self, caller: Caller) -> Json:
+        """Return `recordings`: files, records, missing cycles, bytes, seconds, whether it is running, its problem."""
+        return {"recordings": self._recordings.status()}
+
     # -- motion -------------------------------------------------------------------------------------------------------
 
     @method()
@@ -341,7 +368,7 @@ class Methods:
 
 
 class Documented(NamedTuple):
-    """A method as `docs/protocol.md` shows it."""
+    """A method as `docs/methods.md` shows it."""
 
     name: str
     parameters: type

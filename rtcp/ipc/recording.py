@@ -42,11 +42,11 @@ _LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
 _JOINTS_MAX = 10
 _ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian (OMG DDSI-RTPS, 10.5)."""
-_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
+MESSAGE_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
           "h": ("int16", "<i2"), "I": ("uint32", "<u4"), "i": ("int32", "<i4"), "f": ("float32", "<f4"),
           "d": ("float64", "<f8")}  # fmt: skip
 """Struct code to the types of ROS 2 messages and of numpy."""
-_LOG_SCHEMA = {
+LOG_SCHEMA = {
     "type": "object",
     "title": "foxglove.Log",
     "properties": {
@@ -187,7 +187,7 @@ def _fill(path: Path, recording: Recording) -> None:
         metadata = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
         writer.add_metadata(_ABOUT, {"json": json.dumps(metadata)})
         _write_cycles(writer, recording)
-        schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(_LOG_SCHEMA).encode())
+        schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(LOG_SCHEMA).encode())
         channel = writer.register_channel(_LOG, "json", schema)
         for moment in about.timeline:
             sec, nsec = divmod(moment.time_ns, 1_000_000_000)
@@ -217,15 +217,15 @@ def _write_cycles(writer: Writer, recording: Recording) -> None:
 
 def _message_type(joints: int) -> np.dtype[np.void]:
     """Return a cycle's message: CDR aligns each number to its size, as numpy's aligned types do."""
-    fields: list[Any] = [(name, _TYPES[code][1]) for name, code in SCALARS]
-    fields += [(name, _TYPES[code][1], (joints,)) for name, code in PER_JOINT]
+    fields: list[Any] = [(name, MESSAGE_TYPES[code][1]) for name, code in SCALARS]
+    fields += [(name, MESSAGE_TYPES[code][1], (joints,)) for name, code in PER_JOINT]
     return np.dtype(fields, align=True)
 
 
 def _definition(joints: int) -> bytes:
     """Return the same as a ROS 2 message definition."""
-    lines = [f"{_TYPES[code][0]} {name}" for name, code in SCALARS]
-    lines += [f"{_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT]
+    lines = [f"{MESSAGE_TYPES[code][0]} {name}" for name, code in SCALARS]
+    lines += [f"{MESSAGE_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT]
     return ("\n".join(lines) + "\n").encode()
 
 

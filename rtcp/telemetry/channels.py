@@ -1,0 +1,296 @@
+"""What people and tools see of the cycle records: the same channels in a recording and in the live view.
+
+| topic | schema | how often |
+|---|---|---|
+| `/cycle` | `rtcp_msgs/msg/Cycle`: the fields of `rtcp.ipc.layout`, or those that were chosen | each record |
+| `/joint_states` | `sensor_msgs/msg/JointState`: measured | each record |
+| `/joint_commands`, `/joint_targets` | the same: commanded; sent | each record |
+| `/tf` | `tf2_msgs/msg/TFMessage`: the frames from base_link to tool0 | up to 100 Hz |
+| `/machine` | JSON: state, modes, drive states, inputs and outputs in words | each change |
+| `/log` | `foxglove.Log`: events and messages | each |
+| `/robot_description` | `std_msgs/msg/String`: the arm as URDF | once |
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from fnmatch import fnmatchcase
+from itertools import pairwise
+from typing import Any
+
+import foxglove
+import numpy as np
+import numpy.typing as npt
+
+from kinematics.model import ArmModel
+from kinematics.pose import Rotation
+from kinematics.urdf import to_urdf
+from rtcp.config.model import ArmConfig
+from rtcp.devices.cia402 import state_of
+from rtcp.ipc import layout
+from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.recording import LOG_SCHEMA, MESSAGE_TYPES
+from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.telemetry.cdr import CdrTemplate, stamps
+
+Records = npt.NDArray[np.void]
+TF_S = 0.01
+"""Between two transforms."""
+_HEADER = "std_msgs/Header header\n"
+_RULE = "=" * 80 + "\nMSG: "
+_HEADER_TYPES = _RULE + "std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + _RULE + (
+    "builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)  # fmt: skip
+_JOINT_STATE = _HEADER + "string[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort\n" + _HEADER_TYPES
+_TF = (
+    "geometry_msgs/TransformStamped[] transforms\n" + _RULE + "geometry_msgs/TransformStamped\n" + _HEADER
+    + "string child_frame_id\ngeometry_msgs/Transform transform\n" + _RULE + "geometry_msgs/Transform\n"
+    + "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation\n" + _RULE
+    + "geometry_msgs/Vector3\nfloat64 x\nfloat64 y\nfloat64 z\n" + _RULE
+    + "geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n" + _HEADER_TYPES
+)  # fmt: skip
+_JOINTS = {
+    "/joint_states": ("actual_position", "actual_velocity", "actual_torque"),
+    "/joint_commands": ("commanded_position", None, None),
+    "/joint_targets": ("sent_position", "sent_velocity", "sent_torque"),
+}
+_FLAGS = {
+    "clock locked": layout.FLAG_DC_LOCKED, "all slaves in OP": layout.FLAG_ALL_OP, "enabled": layout.FLAG_ENABLED,
+    "mode changing": layout.FLAG_SWITCHING, "emergency stop": layout.FLAG_EMERGENCY_STOP,
+    "motion allowed": layout.FLAG_MOTION_ALLOWED, "arm has joystick": layout.FLAG_ARM_HAS_JOYSTICK,
+}  # fmt: skip
+_WATCHED = ("state", "drive_mode", "control_mode", "flags", "inputs", "outputs")
+
+
+class UnknownSignal(ValueError):
+    """A signal that no record has: the message names it and those that there are."""
+
+
+def fields_of(signals: Sequence[str]) -> list[tuple[str, str, bool]]:
+    """Return name, struct code and whether there is one a joint, of the fields that match; none given: all.
+
+    Args:
+        signals: names of fields or patterns (`*_position`); number and time are always there.
+
+    Raises:
+        UnknownSignal: no field matches.
+    """
+    every = [(name, code, False) for name, code in SCALARS] + [(name, code, True) for name, code in PER_JOINT]
+    for signal in signals:
+        if not any(fnmatchcase(name, signal) for name, _, _ in every):
+            raise UnknownSignal(f"{signal}: there is no such signal; allowed are {', '.join(one[0] for one in every)}")
+    wanted = (*signals, "number", "time_ns") if signals else ("*",)
+    return [one for one in every if any(fnmatchcase(one[0], signal) for signal in wanted)]
+
+
+class Channels:
+    """Publishes cycle records and messages into a context: files and live views listen to that.
+
+    Args:
+        config: the arm.
+        offset_ns: CLOCK_REALTIME less CLOCK_MONOTONIC, ns: one for the whole recording, so that setting the clock
+            does not tear it.
+        signals: of `/cycle`; see `fields_of`.
+        context: where to.
+    """
+
+    def __init__(
+        self, config: ArmConfig, offset_ns: int, signals: Sequence[str] = (), context: foxglove.Context | None = None
+    ) -> None:
+        self._config = config
+        self._offset_ns = offset_ns
+        self._context = context or foxglove.Context()
+        self._fields = fields_of(signals)
+        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", _cycle_definition(config, self._fields))
+        self._cycle_template = _cycle_template(config, self._fields)
+        names = [joint.name for joint in config.joints]
+        self._joints = {
+            topic: (
+                self._ros_channel(topic, "sensor_msgs/msg/JointState", _JOINT_STATE),
+                sources,
+                _joint_template(names, sources),
+            )
+            for topic, sources in _JOINTS.items()
+        }
+        self._frames = None if config.arm is None else Frames(config.arm)
+        self._tf = self._ros_channel("/tf", "tf2_msgs/msg/TFMessage", _TF)
+        self._tf_ns = 0
+        self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
+        self._log = self._json_channel("/log", LOG_SCHEMA)
+        self._last: tuple[Any, ...] = ()
+        self._description = self._ros_channel("/robot_description", "std_msgs/msg/String", "string data\n")
+
+    def _ros_channel(self, topic: str, name: str, definition: str) -> foxglove.Channel:
+        schema = foxglove.Schema(name=name, encoding="ros2msg", data=definition.encode())
+        return foxglove.Channel(topic, schema=schema, message_encoding="cdr", context=self._context)
+
+    def _json_channel(self, topic: str, schema: Mapping[str, Any]) -> foxglove.Channel:
+        return foxglove.Channel(topic, schema=dict(schema), message_encoding="json", context=self._context)
+
+    @property
+    def context(self) -> foxglove.Context:
+        """Where the channels are."""
+        return self._context
+
+    def wall_ns(self, monotonic_ns: int) -> int:
+        """Return an instant of CLOCK_MONOTONIC as these channels have it."""
+        return monotonic_ns + self._offset_ns
+
+    def describe(self, time_ns: int) -> None:
+        """Publish the arm's URDF, where its geometry is known."""
+        if self._config.arm is not None:
+            (message,) = CdrTemplate().string(urdf_of(self._config)).fill(1, {})
+            self._description.log(message, log_time=time_ns)
+
+    def publish(self, records: Records) -> None:
+        """Publish cycle records, oldest first."""
+        if not len(records):
+            return
+        time_ns = records["time_ns"] + self._offset_ns
+        instants = time_ns.tolist()
+        _send(self._cycle, instants, self._cycle_template.fill(len(records), _columns(records, self._fields)))
+        for channel, sources, template in self._joints.values():
+            values = {name: records[name] for name in sources if name}
+            _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
+        if self._frames is not None:
+            self._publish_frames(records, time_ns)
+        self._publish_changes(records, instants)
+
+    def _publish_frames(self, records: Records, time_ns: npt.NDArray[Any]) -> None:
+        assert self._frames is not None
+        chosen = []
+        for at, instant in enumerate(time_ns.tolist()):
+            if instant - self._tf_ns >= TF_S * 1e9:
+                self._tf_ns = instant
+                chosen.append(at)
+        if chosen:
+            _send(self._tf, time_ns[chosen].tolist(),
+                  self._frames.messages(records["actual_position"][chosen], time_ns[chosen]))  # fmt: skip
+
+    def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
+        columns = [records[name].tolist() for name in (*_WATCHED, "statusword")]
+        for at, now in enumerate(zip(*columns, strict=True)):
+            if now != self._last:
+                self._last = now
+                self._machine.log(self._in_words(*now), log_time=instants[at])
+
+    def _in_words(
+        self, state: int, drive_mode: int, control_mode: int, flags: int, inputs: int, outputs: int, words: list[int]
+    ) -> dict[str, Any]:
+        config = self._config
+        drives = {joint.name: state_of(word).value for joint, word in zip(config.joints, words, strict=True)}
+        return {
+            "state": State(state).words,
+            "drive_mode": _name(DriveMode, drive_mode),
+            "control_mode": _name(ControlMode, control_mode),
+            "flags": [name for name, bit in _FLAGS.items() if flags & bit],
+            "drives": drives,
+            "inputs": {name: bool(inputs >> number - 1 & 1) for name, number in terminals(config.inputs).items()},
+            "outputs": {name: bool(outputs >> number - 1 & 1) for name, number in terminals(config.outputs).items()},
+        }
+
+    def log(self, time_ns: int, message: str, level: int = 2) -> None:
+        """Publish a message; `level` as in `foxglove.Log`: 2 information, 3 warning, 4 error."""
+        sec, nsec = divmod(time_ns, 1_000_000_000)
+        entry = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message, "name": "rtcp"}
+        self._log.log(entry, log_time=time_ns)
+
+
+def urdf_of(config: ArmConfig) -> str:
+    """Return the arm as URDF; the geometry must be known."""
+    assert config.arm is not None
+    return to_urdf(config.arm, [joint.torque for joint in config.joints])
+
+
+def terminals(config: Any) -> dict[str, int]:
+    """Return the terminals that a configuration of inputs or outputs names, from 1, by the name of the key."""
+    found: dict[str, int] = {}
+    for key, value in vars(config).items():
+        if isinstance(value, int):
+            found[key] = value
+        elif hasattr(value, "number"):
+            found[key] = value.number
+        elif value is not None:
+            found |= {name: one for name, one in vars(value).items() if isinstance(one, int)}
+    return found
+
+
+def _name(kind: Any, value: int) -> str:
+    return str(kind(value).name).lower() if value in kind._value2member_map_ else str(value)
+
+
+def _send(channel: foxglove.Channel, instants: Sequence[int], messages: Sequence[bytes]) -> None:
+    log: Callable[..., None] = channel.log
+    for instant, message in zip(instants, messages, strict=True):
+        log(message, log_time=instant)
+
+
+def _columns(records: Records, fields: Sequence[tuple[str, str, bool]]) -> dict[str, npt.ArrayLike]:
+    return {name: records[name] for name, _, _ in fields}
+
+
+def _cycle_definition(config: ArmConfig, fields: Sequence[tuple[str, str, bool]]) -> str:
+    several = f"[{len(config.joints)}]"
+    return "".join(f"{MESSAGE_TYPES[code][0]}{several if each else ''} {name}\n" for name, code, each in fields)
+
+
+def _cycle_template(config: ArmConfig, fields: Sequence[tuple[str, str, bool]]) -> CdrTemplate:
+    template = CdrTemplate()
+    for name, code, each in fields:
+        template.numbers(name, MESSAGE_TYPES[code][1], *((len(config.joints),) if each else ()))
+    return template
+
+
+def _joint_template(names: Sequence[str], sources: Sequence[str | None]) -> CdrTemplate:
+    template = CdrTemplate().stamp("base_link").count(len(names))
+    for name in names:
+        template.string(name)
+    for source in sources:
+        if source is None:
+            template.count(0)
+        else:
+            template.count(len(names)).numbers(source, "<f8", len(names))
+    return template
+
+
+class Frames:
+    """The transforms from link to link, base_link to tool0, by the names of the arm's URDF."""
+
+    def __init__(self, model: ArmModel) -> None:
+        self._model = model
+        count = len(model.rows)
+        links = ["base_link", *(f"link{number}" for number in range(1, count + 1)), "tool0"]
+        self._suffixes = [str(at) for at in range(count + 1)]
+        self._template = CdrTemplate().count(count + 1)
+        for at, (parent, child) in enumerate(pairwise(links)):
+            self._template.stamp(parent, str(at)).string(child).numbers(f"place{at}", "<f8", 3)
+            self._template.numbers(f"turn{at}", "<f8", 4)
+
+    def messages(self, q: npt.NDArray[Any], time_ns: npt.NDArray[Any]) -> list[bytes]:
+        """Return the messages for joint positions, shape (N, joints), rad, at instants, shape (N,), ns."""
+        values = dict(stamps(time_ns, self._suffixes))
+        for at, row in enumerate(self._model.rows):
+            # Modified DH: Rx(alpha) Tx(a) Rz(theta) Tz(d).
+            half, theta = row.alpha / 2, (q[:, at] + row.offset) / 2
+            sine, cosine = np.sin(half), np.cos(half)
+            values[f"place{at}"] = np.tile((row.a, -np.sin(row.alpha) * row.d, np.cos(row.alpha) * row.d), (len(q), 1))
+            values[f"turn{at}"] = np.column_stack(
+                (sine * np.cos(theta), -sine * np.sin(theta), cosine * np.sin(theta), cosine * np.cos(theta))
+            )
+        last, tool = len(self._model.rows), self._model.tool
+        values[f"place{last}"] = np.tile(tool.position, (len(q), 1))
+        values[f"turn{last}"] = np.tile(_quaternion(tool.rotation), (len(q), 1))
+        return self._template.fill(len(q), values)
+
+
+def _quaternion(rotation: Rotation) -> tuple[float, float, float, float]:
+    """Return x, y, z, w: the eigenvector of the greatest eigenvalue (Bar-Itzhack 2000), without cases."""
+    (a, b, c), (d, e, f), (g, h, i) = np.reshape(rotation, (3, 3)).tolist()
+    matrix = np.array([
+        [a - e - i, b + d, c + g, h - f],
+        [b + d, e - a - i, f + h, c - g],
+        [c + g, f + h, i - a - e, d - b],
+        [h - f, c - g, d - b, a + e + i],
+    ])  # fmt: skip
+    x, y, z, w = np.linalg.eigh(matrix)[1][:, -1].tolist()
+    return x, y, z, w

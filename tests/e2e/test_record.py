@@ -1,0 +1,72 @@
+"""`rtcp record` on a whole platform: files against the cycles, and what recorder and gateway survive."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from rtcp.ipc.session import read_processes
+
+from .conftest import Platform
+
+pytestmark = pytest.mark.alone
+
+
+def numbers(path: Path) -> list[int]:
+    with open(path, "rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [one.decoded_message.number for one in reader.iter_decoded_messages(topics=["/cycle"])]
+
+
+def recordings(platform: Platform) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = json.loads(platform.rtcp("record", "status", "--json").stdout)["recordings"]
+    return found
+
+
+def test_a_move_is_recorded_cycle_by_cycle_while_the_gateway_is_killed(enabled: Platform) -> None:
+    out = enabled.directory / "kept"
+    enabled.rtcp("record", "start", "--format", "mcap,csv", "--out", str(out))
+    enabled.rtcp("record", "start", "--out", str(out / "second.csv"))
+    enabled.call("move_joints", q=[0.2, 0, 0, 0, 0, 0])
+    os.kill(read_processes(enabled.directory).gateway, signal.SIGKILL)
+    enabled.until(lambda found: found["state"] == "holding", "the gateway", 20.0)
+    enabled.call("move_joints", q=[0.0] * 6)
+    stopped = json.loads(enabled.rtcp("record", "stop", "--json").stdout)["recordings"]
+    assert [(one["missing"], one["problem"], one["running"]) for one in stopped] == [(0, "", False)] * 2
+    (first,) = (one for one in stopped if len(one["files"]) == 2)
+    found = numbers(Path(first["files"][0]))
+    assert len(found) == first["records"]
+    assert found == list(range(found[0], found[-1] + 1))
+    assert len(Path(first["files"][1]).read_text().splitlines()) == 1 + len(found)
+
+
+def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -> None:
+    enabled.rtcp("record", "start", "--out", str(enabled.directory / "killed.mcap"))
+    (running,) = (one for one in recordings(enabled) if one["running"])
+    os.kill(running["pid"], signal.SIGKILL)
+    enabled.call("move_joints", q=[0.1, 0, 0, 0, 0, 0])
+    (killed,) = (one for one in recordings(enabled) if one["pid"] == running["pid"])
+    assert "ended from outside" in killed["problem"]
+    assert enabled.rtcp("record", "stop").stdout == "nothing is being recorded\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--format", "wav"], 2, "--format: found wav, allowed are mcap, csv"),
+        (["--signals", "nothing"], 3, "nothing: there is no such signal"),
+        (["--out", "/proc/nowhere"], 3, "/proc/nowhere cannot be written"),
+        (["--seconds", "-1"], 2, "--seconds: found -1"),
+    ],
+)
+def test_what_cannot_be_recorded_ends_in_one_message(
+    shared: Platform, arguments: list[str], code: int, said: str
+) -> None:
+    assert said in shared.rtcp("record", "start", *arguments, check=code).stderr
