@@ -299,14 +299,22 @@ def skipped(
                     # One late wake-up of cyclictest skips the ticks after it as well.
                     lost[active] += int(np.ceil(np.clip(measured / cycle_us - 0.5, 0, None)).sum())
                     wakeups[active] += measured.size
-                done.append(platform_round(cycle_us, seconds, poll=poll, active=active if active in ACTIVE else None))
+                try:
+                    done.append(
+                        platform_round(cycle_us, seconds, poll=poll, active=None if active == "hold" else active)
+                    )
+                except RtcpError as error:
+                    console.print(f"{cycle_us} us, {active}: {error.message}")
         for active, done in runs.items():
+            if not done:
+                continue
             per_mille = [1000 * count[active] / max(wakeups[active] + lost[active], 1) for count in (late, lost)]
             missed = sum(run.missed for run in done)
             ticks = missed + sum(run.wakeup.size for run in done)
             share = 1000 * missed / ticks
             ratio = share / per_mille[1] if per_mille[1] else None
             compute = figures([run.compute for run in done])
+            console.print(f"{cycle_us} us, {active}: {missed} of {ticks} ticks skipped")
             result[f"{cycle_us} {active}"] = {"share": share, "cyclictest": per_mille, "ratio": ratio}
             table.add_row(
                 str(cycle_us), active, str(missed), str(ticks), f"{share:.2f}", f"{per_mille[0]:.2f}",
