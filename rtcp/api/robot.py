@@ -404,11 +404,12 @@ class Methods:
             out: directory, or a file that ends in the name of its only format; None: the platform's own place.
             formats: `mcap`, `csv`, or both.
             signals: names of fields of a cycle record or patterns (`*_position`); none: all, or for CSV the source's.
-            every: each so many-th cycle.
+            every: N: every Nth cycle.
             seconds: how long; None: until `record_stop`.
 
         Raises:
-            Refused: the file cannot be made, or there is no such signal.
+            Refused: the file cannot be made.
+            Invalid: there is no such signal.
         """
         place = None if out is None else str(Path(out).absolute())
         params = {"out": place, "formats": list(formats), "signals": list(signals), "every": every, "seconds": seconds}

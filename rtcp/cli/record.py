@@ -30,8 +30,8 @@ def _start(
     signals: Annotated[
         str, option("--signals", "NAMES", "Fields of a record or patterns (*_position), separated by commas.")
     ] = "",
-    every: Annotated[int, typer.Option("--every", min=1, help="Record each so many-th cycle.")] = 1,
-    seconds: Annotated[float | None, typer.Option("--seconds", help="End by itself after so long.")] = None,
+    every: Annotated[int, typer.Option("--every", min=1, max=1_000_000, help="Record every Nth cycle.")] = 1,
+    seconds: Annotated[float | None, typer.Option("--seconds", help="Duration, s.")] = None,
 ) -> None:
     """Start a recording; it goes on when this command has ended."""
     ending = "" if out is None else out.suffix.removeprefix(".")

@@ -87,7 +87,8 @@ REACHED: dict[TargetState, frozenset[DriveState]] = {
 }
 
 _TARGET_STANDS = (ENABLE_OPERATION, QUICK_STOP)
-_STATE_BITS = 0x6F
+STATE_BITS = 0x6F
+"""Bits of the statusword that tell the state."""
 _STATE_OF = tuple(
     next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
     for word in range(0x80)
@@ -113,7 +114,7 @@ def _slots(image: ImageLayout, names: Sequence[str]) -> tuple[int, ...]:
 
 def state_of(statusword: int) -> DriveState:
     """Return the state that a statusword shows; UNKNOWN where the standard knows none."""
-    return _STATE_OF[statusword & _STATE_BITS]
+    return _STATE_OF[statusword & STATE_BITS]
 
 
 class Cia402Drive(Driver):
@@ -193,7 +194,7 @@ class Cia402Drive(Driver):
         if torque >= 0:
             self.torque = values[torque] * by_torque
         self.mode_display = int(values[mode])
-        self.state = _STATE_OF[word & _STATE_BITS]
+        self.state = _STATE_OF[word & STATE_BITS]
         if self._error_slot >= 0:
             self.error_code = int(values[self._error_slot])
         if self.controlword not in _TARGET_STANDS:

@@ -112,7 +112,7 @@ class Methods:
         self.machine = MachineActions(channel)
         self.joystick_override = JoystickOverride(self.machine, config, session.bus)
         self._streaming = StreamingCommands(channel)
-        self._recordings = Recordings(directory)
+        self.recordings = Recordings(directory)
         self._limits = LimitSettings(channel, limits, directory)
         self._motion = MotionActions(channel, Planner(config, limits))
         self.table = self._table()
@@ -258,21 +258,21 @@ class Methods:
         out: str | None = None,
         formats: tuple[Literal["mcap", "csv"], ...] = ("mcap",),
         signals: tuple[str, ...] = (),
-        every: Annotated[int, Ge(1)] = 1,
+        every: Annotated[int, Ge(1), Le(1_000_000)] = 1,
         seconds: Annotated[float, Gt(0)] | None = None,
     ) -> Json:
         """Start a recording into `out`, an absolute path; returns what `record_status` lists."""
-        return await self._recordings.start(out, formats or ("mcap",), signals, every, seconds)
+        return await self.recordings.start(out, formats or ("mcap",), signals, every, seconds)
 
     @method(at_once=True)
     async def record_stop(self, caller: Caller) -> Json:
         """End all recordings. Returns `recordings`: those that were ended."""
-        return {"recordings": await self._recordings.stop()}
+        return {"recordings": await self.recordings.stop()}
 
     @method(at_once=True)
     async def record_status(self, caller: Caller) -> Json:
         """Return `recordings`: files, records, missing cycles, bytes, seconds, whether it is running, its problem."""
-        return {"recordings": self._recordings.status()}
+        return {"recordings": self.recordings.status()}
 
     # -- motion -------------------------------------------------------------------------------------------------------
 

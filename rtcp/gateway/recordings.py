@@ -12,9 +12,9 @@ from typing import Any
 from rtcp.config.zero import state_directory
 from rtcp.gateway.command_channel import Json
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.session import Pid, is_running, terminate
+from rtcp.ipc.session import Pid, is_running, terminate, wait_for_exit
 
-_READY_S, _END_S = 30.0, 10.0
+_READY_S, _END_S = 12.0, 10.0
 
 
 def recordings_directory() -> Path:
@@ -43,18 +43,24 @@ class Recordings:
                    "every": every, "seconds": seconds}  # fmt: skip
         command = ("-m", "rtcp.telemetry.recorder", "--directory", str(self._directory),
                    "--options", json.dumps(options))  # fmt: skip
-        process = await asyncio.create_subprocess_exec(sys.executable, *command, stdout=asyncio.subprocess.PIPE)
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, *command, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
+        )
         assert process.stdout is not None
         try:
             line = await asyncio.wait_for(process.stdout.readline(), _READY_S)
-        except asyncio.TimeoutError:
+        except BaseException as error:
+            # Also where the client has gone: nobody would know of this recording.
             process.kill()
-            raise RtcpError("timeout", f"the recorder was not ready within {_READY_S:g} s") from None
+            await process.wait()
+            if isinstance(error, asyncio.TimeoutError):
+                raise RtcpError("timeout", f"the recorder was not ready within {_READY_S:g} s") from None
+            raise
         if not line:
             raise RtcpError("internal", "the recorder ended at once: its reason is in the gateway's log")
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
-            raise RtcpError("refused", str(answer["error"]))
+            raise RtcpError(answer["kind"], str(answer["error"]))
         return _shown(answer["recording"], True)
 
     def status(self) -> list[Json]:
@@ -67,15 +73,22 @@ class Recordings:
         await asyncio.gather(*(asyncio.to_thread(terminate, pid, _END_S) for pid in running))
         return [_shown(found, False) for pid, found in self._recorders() if pid in running]
 
+    async def finish(self) -> None:
+        """Wait until all recorders have completed their files, now that the loop has ended; remove what they told."""
+        running = [pid for pid, _ in self._recorders() if is_running(pid)]
+        await asyncio.gather(*(asyncio.to_thread(wait_for_exit, pid, _END_S) for pid in running))
+        for path in self._directory.glob("recorder-*.json"):
+            path.unlink(missing_ok=True)
+
     def _recorders(self) -> list[tuple[Pid, dict[str, Any]]]:
         found = []
-        for path in sorted(self._directory.glob("recorder-*.json"), key=lambda path: path.stat().st_mtime_ns):
+        for path in self._directory.glob("recorder-*.json"):
             try:
-                said = json.loads(path.read_text())
-                found.append((Pid(int(said["pid"]), int(said["identity"])), said))
+                one = json.loads(path.read_text())
+                found.append((Pid(int(one["pid"]), int(one["identity"])), one))
             except (OSError, ValueError, LookupError, TypeError):
                 continue
-        return found
+        return sorted(found, key=lambda one: str(one[1]["files"]))
 
 
 def _shown(found: dict[str, Any], running: bool) -> Json:

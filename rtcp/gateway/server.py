@@ -298,6 +298,7 @@ class Gateway:
             # The blocking waits run beside, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_for_exit, processes.loop, 6.0):
                 await asyncio.to_thread(terminate, processes.loop, 4.0)
+        await self._methods.recordings.finish()
         await asyncio.to_thread(terminate, processes.segment, 3.0)
         if self._following is not None:
             self._following.cancel()

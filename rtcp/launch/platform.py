@@ -236,8 +236,9 @@ def clear(directory: Path, found: Processes) -> None:
         terminate(pid, _END_TIMEOUT_S)
     processes_file(directory).unlink(missing_ok=True)
     sockets = [path for path in directory.glob("segment*.sock") if not is_listening(path)]
+    recorders = directory.glob("recorder-*.json")
     # Narrowed limits name their loop by its process id, which may come again.
-    for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets):
+    for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets, *recorders):
         path.unlink(missing_ok=True)
 
 

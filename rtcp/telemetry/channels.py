@@ -26,7 +26,7 @@ from kinematics.model import ArmModel
 from kinematics.pose import Rotation
 from kinematics.urdf import to_urdf
 from rtcp.config.model import ArmConfig
-from rtcp.devices.cia402 import state_of
+from rtcp.devices.cia402 import STATE_BITS, state_of
 from rtcp.ipc import layout
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.recording import LOG_SCHEMA, MESSAGE_TYPES
@@ -161,14 +161,16 @@ class Channels:
         chosen = []
         for at, instant in enumerate(time_ns.tolist()):
             if instant - self._tf_ns >= TF_S * 1e9:
-                self._tf_ns = instant
+                # From when it was due: the cycle's jitter does not add up.
+                self._tf_ns = max(self._tf_ns + round(TF_S * 1e9), instant - round(TF_S * 1e9))
                 chosen.append(at)
         if chosen:
             _send(self._tf, time_ns[chosen].tolist(),
                   self._frames.messages(records["actual_position"][chosen], time_ns[chosen]))  # fmt: skip
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
-        columns = [records[name].tolist() for name in (*_WATCHED, "statusword")]
+        # Bits of a statusword that tell no state may change in every cycle.
+        columns = [*(records[name].tolist() for name in _WATCHED), (records["statusword"] & STATE_BITS).tolist()]
         for at, now in enumerate(zip(*columns, strict=True)):
             if now != self._last:
                 self._last = now

@@ -9,10 +9,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import errno
 import io
 import json
 import os
 import platform
+import select
 import signal
 import sys
 import time
@@ -20,7 +22,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol
+from typing import IO, Any, Protocol
 
 import foxglove
 import numpy as np
@@ -40,7 +42,7 @@ FORMATS = ("mcap", "csv")
 FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
-_WARNING, _INFORMATION = 3, 2
+_INFORMATION, _WARNING, _ERROR = 2, 3, 4
 CSV_COLUMNS = ("actual_position", "actual_velocity", "actual_torque", "sent_position")
 """The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 _CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
@@ -111,6 +113,7 @@ class _Disk(io.RawIOBase):
     def commit(self) -> None:
         """Write what has come since the last time; raises OSError, and leaves the file as it was."""
         data = memoryview(self._pending.getvalue())
+        check_linked(self._file)
         try:
             left = data
             while len(left):
@@ -124,6 +127,12 @@ class _Disk(io.RawIOBase):
     def close(self) -> None:
         self._file.close()
         super().close()
+
+
+def check_linked(file: IO[Any]) -> None:
+    """Raise OSError where a file has been removed: what is written to it is for nobody."""
+    if os.fstat(file.fileno()).st_nlink == 0:
+        raise OSError(errno.ENOENT, "it has been removed")
 
 
 class McapWriter:
@@ -203,10 +212,12 @@ class CsvWriter:
         if self._began_ns is None:
             self._began_ns = int(records["time_ns"][0])
         columns = [((records["time_ns"] - self._began_ns) * 1e-9).tolist()]
+        forms = ["%.9f"]
         for name in self._names:
             found = records[name]
             columns += found.T.tolist() if found.ndim == 2 else [found.tolist()]
-        form = ",".join("%.9f" if at == 0 else "%.9g" for at in range(len(columns))) + "\n"
+            forms += ["%.9g" if found.dtype.kind == "f" else "%d"] * (len(columns) - len(forms))
+        form = ",".join(forms) + "\n"
         self._file.write("".join(form % row for row in zip(*columns, strict=True)))
 
     def log(self, time_ns: int, message: str, level: int) -> None:
@@ -214,6 +225,7 @@ class CsvWriter:
 
     def flush(self) -> None:
         """Hand it to the system."""
+        check_linked(self._file)
         self._file.flush()
 
     def close(self) -> None:
@@ -242,12 +254,12 @@ class Options:
     formats: tuple[str, ...] = ("mcap",)
     signals: tuple[str, ...] = ()
     every: int = 1
-    """Each so many-th cycle."""
+    """N: every Nth cycle."""
     seconds: float | None = None
 
     def paths(self) -> dict[str, Path]:
         """Return the new file of each format; raises RecorderError."""
-        if self.out.suffix.removeprefix(".") in FORMATS:
+        if self.out.suffix.removeprefix(".") in FORMATS and not self.out.is_dir():
             if self.formats != (self.out.suffix[1:],):
                 raise RecorderError(f"{self.out}: its ending is not that of the format {', '.join(self.formats)}")
             return {self.formats[0]: self.out}
@@ -272,6 +284,11 @@ class Recorder:
         session = read_session(directory)
         self._directory, self._options, config = directory, options, session.config
         self._observer = Observer(blackboard_file(directory))
+        self._loop = select.poll()
+        try:
+            self._loop.register(os.pidfd_open(self._observer.loop_pid), select.POLLIN)
+        except OSError as error:
+            raise BlackboardError(f"the loop (process {self._observer.loop_pid}) has ended") from error
         self._names = Names(config)
         self._at = self._observer.head
         self._event = self._observer.last_event
@@ -295,7 +312,7 @@ class Recorder:
         import psutil
 
         self.recording = Recording(os.getpid(), hash(psutil.Process()), [str(writer.path) for writer in self._writers])
-        self._say()
+        self._write_status()
 
     def end(self) -> None:
         """Ask for the end of `run`; from a signal handler too."""
@@ -306,22 +323,28 @@ class Recorder:
         made, began = self.recording, time.monotonic()
         until = None if self._options.seconds is None else began + self._options.seconds
         try:
-            while not self._ended and self._loop_lives():
+            while not self._ended and (until is None or time.monotonic() < until):
                 self._turn()
                 made.seconds = time.monotonic() - began
-                if until is not None and time.monotonic() >= until:
-                    break
-                time.sleep(_TURN_S)
+                if self._loop.poll(_TURN_S * 1e3):
+                    break  # the loop's process has ended
             self._turn()
-            self._each(lambda writer: writer.close())
-        except OSError as error:
-            made.problem = f"the recording has ended: {_refused(error, self._options.out)}"
+        except Exception as error:
+            self._failed(error)
+        # Each by itself: a disk that is full for one may have room for the index of the other.
+        for writer in self._writers:
+            try:
+                writer.close()
+            except Exception as error:
+                self._failed(error)
         made.ended = True
-        self._say()
+        self._write_status()
         return 1 if made.problem else 0
 
-    def _loop_lives(self) -> bool:
-        return Path(f"/proc/{self._observer.loop_pid}").exists()
+    def _failed(self, error: Exception) -> None:
+        """Note why the recording ends early; the first reason counts."""
+        reason = _refused(error, self._options.out) if isinstance(error, OSError) else f"{type(error).__name__} {error}"
+        self.recording.problem = self.recording.problem or f"the recording has ended: {reason}"
 
     def _turn(self) -> None:
         """Write what is new."""
@@ -330,15 +353,18 @@ class Recorder:
             self._write(records, missing)
         for event in self._observer.events_since(self._event):
             self._event = event.number
-            self._log(self._offset_ns + event.monotonic_ns, self._names.message(event.event), _INFORMATION)
+            level = _ERROR if type(event.event) in self._names.faults else _INFORMATION
+            self._log(self._offset_ns + event.monotonic_ns, self._names.message(event.event), level)
         for text in self._observer.texts_since(self._text):
             self._text = text.number
-            self._log(text.time_ns, text.sentence, _WARNING if text.is_problem else _INFORMATION)
+            # Its own time is the wall clock, which may have been set meanwhile.
+            level = _WARNING if text.is_problem else _INFORMATION
+            self._log(self._offset_ns + time.monotonic_ns(), text.sentence, level)
         now = time.monotonic()
         if now - self._flushed >= FLUSH_S:
             self._flushed = now
             self._each(lambda writer: writer.flush())
-            self._say()
+            self._write_status()
 
     def _write(self, records: Records, missing: int) -> None:
         made = self.recording
@@ -366,7 +392,7 @@ class Recorder:
         for writer in self._writers:
             writer.log(time_ns, message, level)
 
-    def _say(self) -> None:
+    def _write_status(self) -> None:
         """Write down what it is doing, whole or not at all; a full disk there loses the status, not the recording."""
         made = self.recording
         with contextlib.suppress(OSError):
@@ -378,8 +404,9 @@ class Recorder:
             os.replace(new, path)
 
 
-def _refused(error: OSError, out: Path) -> str:
-    return f"{error.filename or out} cannot be written: {error.strerror or error}"
+def _refused(error: OSError | ValueError, out: Path) -> str:
+    where, why = (error.filename, error.strerror) if isinstance(error, OSError) else (None, None)
+    return f"{where or out} cannot be written: {why or error}"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -392,20 +419,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = Options(
         Path(fields["out"]), tuple(fields["formats"]), tuple(fields["signals"]), fields["every"], fields["seconds"]
     )
-    answer: Callable[[dict[str, Any]], None] = lambda line: print(json.dumps(line), flush=True)  # noqa: E731
-    try:
-        recorder = Recorder(given.directory, options)
-    except (RecorderError, UnknownSignal, BlackboardError, SessionError) as error:
-        answer({"error": str(error)})
-        return 1
+    recorder: Recorder | None = None
+    wanted = False
 
     def end(number: int, frame: FrameType | None) -> None:
-        recorder.end()
+        nonlocal wanted
+        wanted = True
+        if recorder is not None:
+            recorder.end()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, end)
-    answer({"recording": dataclasses.asdict(recorder.recording)})
+    with contextlib.suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("0")  # memory that runs short costs the recording, not the loop
+    try:
+        recorder = Recorder(given.directory, options)
+    except UnknownSignal as error:
+        _answer({"error": str(error), "kind": "invalid"})
+        return 1
+    except (RecorderError, BlackboardError, SessionError) as error:
+        _answer({"error": str(error), "kind": "refused"})
+        return 1
+    if wanted:
+        recorder.end()
+    _answer({"recording": dataclasses.asdict(recorder.recording)})
     return recorder.run()
+
+
+def _answer(line: dict[str, Any]) -> None:
+    """Tell the gateway; it may have gone meanwhile."""
+    with contextlib.suppress(BrokenPipeError):
+        print(json.dumps(line), flush=True)
 
 
 if __name__ == "__main__":

@@ -199,15 +199,26 @@ def whole_cycles(path: str) -> list[int]:
 
 
 def test_a_full_disk_ends_the_recording_with_a_message(loop: Loop) -> None:
-    recorder = record(loop, limit=100_000)
+    recorder = record(loop, limit=1_000_000)
     (path,) = begun(recorder)["recording"]["files"]
     while recorder.poll() is None:
-        loop.publish(200)
+        loop.publish(40)
         time.sleep(0.02)
     assert recorder.returncode == 1
     said = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
     assert said["problem"] == f"the recording has ended: {path} cannot be written: File too large"
     assert len(whole_cycles(path)) > 50
+
+
+def test_a_file_that_is_removed_ends_the_recording(loop: Loop) -> None:
+    recorder = record(loop)
+    (path,) = map(Path, begun(recorder)["recording"]["files"])
+    path.unlink()
+    while recorder.poll() is None:
+        loop.publish(10)
+        time.sleep(0.02)
+    found = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
+    assert found["problem"] == f"the recording has ended: {path} cannot be written: it has been removed"
 
 
 def test_what_was_not_read_in_time_is_a_gap_that_is_reported(loop: Loop) -> None:
@@ -232,7 +243,7 @@ def json_messages(path: Path, topic: str) -> list[Any]:
 
 
 def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
-    recorder = record(loop, formats=["mcap", "csv"], signals=["*_position", "wakeup_ns"], every=10)
+    recorder = record(loop, formats=["mcap", "csv"], signals=["*_position", "time_ns"], every=10)
     mcap_file, csv_file = map(Path, begun(recorder)["recording"]["files"])
     loop.publish(100)
     ended(recorder, loop)
@@ -242,8 +253,8 @@ def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
     assert not hasattr(first, "actual_torque")
     rows = list(csv.reader(csv_file.open()))
     assert len(rows) == 11
-    assert "wakeup_ns" in rows[0]
     assert "J6_pos" in rows[0]
+    assert int(rows[1][rows[0].index("time_ns")]) == first.time_ns
 
 
 @pytest.mark.parametrize(
