@@ -41,18 +41,19 @@ class CdrTemplate:
 
     def fill(self, count: int, values: Mapping[str, npt.ArrayLike]) -> list[bytes]:
         """Return `count` messages; each value has `count` as its first dimension."""
-        blank = np.frombuffer(bytes(self._fixed), np.uint8)
+        blank = np.frombuffer(ENCAPSULATION + bytes(self._fixed), np.uint8)
         rows = np.tile(blank, (count, 1))
         kind = np.dtype({
             "names": list(self._fields),
             "formats": [(code, shape) for code, shape, _ in self._fields.values()],
-            "offsets": [at for _, _, at in self._fields.values()],
+            "offsets": [len(ENCAPSULATION) + at for _, _, at in self._fields.values()],
             "itemsize": len(blank),
         })  # fmt: skip
         filled = rows.view(kind)[:, 0]
         for name in self._fields:
             filled[name] = values[name]
-        return [ENCAPSULATION + row.tobytes() for row in rows]
+        data, size = rows.tobytes(), len(blank)
+        return [data[at : at + size] for at in range(0, count * size, size)]
 
     def _align(self, size: int) -> CdrTemplate:
         return self._append(bytes(-len(self._fixed) % size))

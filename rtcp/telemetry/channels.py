@@ -117,7 +117,7 @@ class Channels:
         self._tf_ns = 0
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
         self._log = self._json_channel("/log", LOG_SCHEMA)
-        self._last: tuple[Any, ...] = ()
+        self._last: npt.NDArray[np.int64] | None = None
         self._description = self._ros_channel("/robot_description", "std_msgs/msg/String", "string data\n")
 
     def _ros_channel(self, topic: str, name: str, definition: str) -> foxglove.Channel:
@@ -170,15 +170,16 @@ class Channels:
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
         # Bits of a statusword that tell no state may change in every cycle.
-        columns = [*(records[name].tolist() for name in _WATCHED), (records["statusword"] & STATE_BITS).tolist()]
-        for at, now in enumerate(zip(*columns, strict=True)):
-            if now != self._last:
-                self._last = now
-                self._machine.log(self._in_words(*now), log_time=instants[at])
+        columns = [*(records[name] for name in _WATCHED), *(records["statusword"] & STATE_BITS).T]
+        rows = np.column_stack([column.astype(np.int64) for column in columns])
+        before = np.vstack([rows[:1] - 1 if self._last is None else self._last, rows[:-1]])
+        for at in np.flatnonzero((rows != before).any(axis=1)).tolist():
+            row = rows[at].tolist()
+            self._machine.log(self._in_words(row[: len(_WATCHED)], row[len(_WATCHED) :]), log_time=instants[at])
+        self._last = rows[-1]
 
-    def _in_words(
-        self, state: int, drive_mode: int, control_mode: int, flags: int, inputs: int, outputs: int, words: list[int]
-    ) -> dict[str, Any]:
+    def _in_words(self, watched: Sequence[int], words: Sequence[int]) -> dict[str, Any]:
+        state, drive_mode, control_mode, flags, inputs, outputs = watched
         config = self._config
         drives = {joint.name: state_of(word).value for joint, word in zip(config.joints, words, strict=True)}
         return {
