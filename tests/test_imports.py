@@ -29,7 +29,13 @@ process from joining the virtual segment's user namespace, so it is not."""
 LET_IN_BY_OTHERS = {"typing_extensions"}
 """annotated_types imports it where it is installed."""
 
-PACKAGES = {"yaml": "pyyaml", "pydantic_core": "pydantic", "ruamel": "ruamel.yaml", "mpl_toolkits": "matplotlib"}
+PACKAGES = {
+    "foxglove": "foxglove_sdk",
+    "yaml": "pyyaml",
+    "pydantic_core": "pydantic",
+    "ruamel": "ruamel.yaml",
+    "mpl_toolkits": "matplotlib",
+}
 """Modules whose package has another name."""
 
 
