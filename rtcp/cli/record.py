@@ -80,14 +80,12 @@ def _listed(text: str) -> list[str]:
 
 
 def _table(recordings: Sequence[Recording]) -> None:
-    rows = table(("", "s", "cycles", "missing", "MB", "file"), ("", "file"), fill="file")
+    rows = table(("", "s", "cycles", "missing", "MB"), ("",))
     for one in recordings:
-        state = "recording" if one.running else "ended" if not one.problem else "ended early"
-        rows.add_row(
-            state, f"{one.seconds:.1f}", str(one.records), str(one.missing), f"{one.bytes / 1e6:.1f}",
-            "\n".join(one.files),
-        )  # fmt: skip
+        state = "recording" if one.running else "ended early" if one.problem else "ended"
+        rows.add_row(state, f"{one.seconds:.1f}", str(one.records), str(one.missing), f"{one.bytes / 1e6:.1f}")
     show(rows)
+    # Below the table, because a path is longer than what a column has.
     for one in recordings:
-        if one.problem:
-            report(one.problem)
+        for line in (*one.files, *([one.problem] if one.problem else [])):
+            report(line)
