@@ -135,7 +135,7 @@ class Zero:
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording: what it has written so far, or had when it ended."""
+    """What a recording has written: so far, or until it ended."""
 
     pid: int
     """Of its process."""

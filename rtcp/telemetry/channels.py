@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from kinematics.model import ArmModel
-from kinematics.pose import Rotation
 from kinematics.urdf import to_urdf
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import STATE_BITS, state_of
@@ -31,6 +30,7 @@ from rtcp.ipc import layout
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.recording import LOG_SCHEMA, MESSAGE_TYPES
 from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.motion.planning.interpolation import quaternion
 from rtcp.telemetry.cdr import CdrTemplate, stamps
 
 Records = npt.NDArray[np.void]
@@ -281,19 +281,7 @@ class Frames:
                 (sine * np.cos(theta), -sine * np.sin(theta), cosine * np.sin(theta), cosine * np.cos(theta))
             )
         last, tool = len(self._model.rows), self._model.tool
+        w, x, y, z = quaternion(tool.rotation)
         values[f"place{last}"] = np.tile(tool.position, (len(q), 1))
-        values[f"turn{last}"] = np.tile(_quaternion(tool.rotation), (len(q), 1))
+        values[f"turn{last}"] = np.tile((x, y, z, w), (len(q), 1))
         return self._template.fill(len(q), values)
-
-
-def _quaternion(rotation: Rotation) -> tuple[float, float, float, float]:
-    """Return x, y, z, w: the eigenvector of the greatest eigenvalue (Bar-Itzhack 2000), without cases."""
-    (a, b, c), (d, e, f), (g, h, i) = np.reshape(rotation, (3, 3)).tolist()
-    matrix = np.array([
-        [a - e - i, b + d, c + g, h - f],
-        [b + d, e - a - i, f + h, c - g],
-        [c + g, f + h, i - a - e, d - b],
-        [h - f, c - g, d - b, a + e + i],
-    ])  # fmt: skip
-    x, y, z, w = np.linalg.eigh(matrix)[1][:, -1].tolist()
-    return x, y, z, w

@@ -25,8 +25,6 @@ from types import FrameType
 from typing import IO, Any, Protocol
 
 import foxglove
-import numpy as np
-import numpy.typing as npt
 from foxglove.mcap import MCAPWriteOptions
 
 import rtcp
@@ -35,7 +33,7 @@ from rtcp.config.serialization import to_json
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
-from rtcp.ipc.session import SessionError, read_session
+from rtcp.ipc.session import SessionError, identify, read_session
 from rtcp.telemetry.channels import Channels, Records, UnknownSignal, fields_of, urdf_of
 
 FORMATS = ("mcap", "csv")
@@ -43,10 +41,8 @@ FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
 _INFORMATION, _WARNING, _ERROR = 2, 3, 4
-CSV_COLUMNS = ("actual_position", "actual_velocity", "actual_torque", "sent_position")
-"""The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 _CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
-Row = npt.NDArray[np.void]
+"""The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 
 
 class RecorderError(Exception):
@@ -81,9 +77,6 @@ class Writer(Protocol):
 
     def write(self, records: Records) -> None:
         """Append records; raises OSError."""
-
-    def log(self, time_ns: int, message: str, level: int) -> None:
-        """Append a message."""
 
     def flush(self) -> None:
         """Hand over to the system what was written; raises OSError."""
@@ -166,10 +159,6 @@ class McapWriter:
         """Publish the records: the writer listens."""
         self._channels.publish(records)
 
-    def log(self, time_ns: int, message: str, level: int) -> None:
-        """Publish a message."""
-        self._channels.log(time_ns, message, level)
-
     def flush(self) -> None:
         """End the chunk, so that a reader finds all of it."""
         self._writer.flush()
@@ -196,7 +185,7 @@ class CsvWriter:
     def __init__(self, path: Path, joints: int, signals: Sequence[str]) -> None:
         self.path = path
         self._file = open(path, "x", newline="")  # noqa: SIM115
-        self._names = [name for name, _, _ in fields_of(signals)] if signals else list(CSV_COLUMNS)
+        self._names = [name for name, _, _ in fields_of(signals)] if signals else list(_CSV_NAMES)
         self._began_ns: int | None = None
         per_joint = {name for name, _, each in fields_of(()) if each}
         header = ["Time"]
@@ -219,9 +208,6 @@ class CsvWriter:
             forms += ["%.9g" if found.dtype.kind == "f" else "%d"] * (len(columns) - len(forms))
         form = ",".join(forms) + "\n"
         self._file.write("".join(form % row for row in zip(*columns, strict=True)))
-
-    def log(self, time_ns: int, message: str, level: int) -> None:
-        """Nothing: the columns are the source's."""
 
     def flush(self) -> None:
         """Hand it to the system."""
@@ -292,8 +278,7 @@ class Recorder:
         self._names = Names(config)
         self._at = self._observer.head
         self._event = self._observer.last_event
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
-        self._channels = Channels(config, self._offset_ns, options.signals)
+        self._channels = Channels(config, time.time_ns() - time.monotonic_ns(), options.signals)
         self._ended = False
         self._flushed = time.monotonic()
         self._writers: list[Writer] = []
@@ -307,11 +292,12 @@ class Recorder:
                     if name == "mcap"
                     else CsvWriter(path, len(config.joints), options.signals)
                 )
-        except OSError as error:
+        except (OSError, ValueError) as error:
+            for writer in self._writers:
+                writer.path.unlink(missing_ok=True)
             raise RecorderError(_refused(error, options.out)) from error
-        import psutil
-
-        self.recording = Recording(os.getpid(), hash(psutil.Process()), [str(writer.path) for writer in self._writers])
+        me = identify(os.getpid())
+        self.recording = Recording(me, me.identity, [str(writer.path) for writer in self._writers])
         self._write_status()
 
     def end(self) -> None:
@@ -354,12 +340,12 @@ class Recorder:
         for event in self._observer.events_since(self._event):
             self._event = event.number
             level = _ERROR if type(event.event) in self._names.faults else _INFORMATION
-            self._log(self._offset_ns + event.monotonic_ns, self._names.message(event.event), level)
+            self._log(event.monotonic_ns, self._names.message(event.event), level)
         for text in self._observer.texts_since(self._text):
             self._text = text.number
             # Its own time is the wall clock, which may have been set meanwhile.
             level = _WARNING if text.is_problem else _INFORMATION
-            self._log(self._offset_ns + time.monotonic_ns(), text.sentence, level)
+            self._log(time.monotonic_ns(), text.sentence, level)
         now = time.monotonic()
         if now - self._flushed >= FLUSH_S:
             self._flushed = now
@@ -374,7 +360,7 @@ class Recorder:
         if missing:
             instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
             text = f"{missing} of the cycles from {first} to {self._at} are missing: they were not read in time"
-            self._log(self._offset_ns + instant, text, _WARNING)
+            self._log(instant, text, _WARNING)
         chosen = records[records["number"] % self._options.every == 0] if self._options.every > 1 else records
         made.records += len(chosen)
         self._each(lambda writer: writer.write(chosen))
@@ -388,9 +374,8 @@ class Recorder:
                 error.filename = error.filename or str(writer.path)
                 raise
 
-    def _log(self, time_ns: int, message: str, level: int) -> None:
-        for writer in self._writers:
-            writer.log(time_ns, message, level)
+    def _log(self, monotonic_ns: int, message: str, level: int) -> None:
+        self._channels.log(self._channels.wall_ns(monotonic_ns), message, level)
 
     def _write_status(self) -> None:
         """Write down what it is doing, whole or not at all; a full disk there loses the status, not the recording."""

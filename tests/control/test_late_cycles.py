@@ -33,7 +33,7 @@ class Late:
         rig.data.send, rig.data.receive = self._late_send, self._late_receive  # type: ignore[method-assign]
 
     def cycle(self, woken: float = 0.0, send: float = 0.0, busy: float = 0.0) -> None:
-        """Do a cycle that begins so late after its tick, sends so long after that, and ends so long after that."""
+        """Do a cycle: its wake-up delay, then the delay until it sends, then the time until it ends."""
         self._before, self._after = round(send * PERIOD_NS), round(busy * PERIOD_NS)
         start = max(self.planned, self.rig.now_ns) + round(woken * PERIOD_NS)
         self.rig.now_ns = start

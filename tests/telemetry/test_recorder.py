@@ -262,9 +262,10 @@ def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
     [
         ({"signals": ["nothing"]}, "nothing: there is no such signal; allowed are number, cycle"),
         ({"out": "/proc/nowhere"}, "/proc/nowhere cannot be written"),
+        ({"out": "/tmp/a\0b"}, "/tmp/a\0b cannot be written: "),
         ({"out": "/tmp/one.csv"}, "/tmp/one.csv: its ending is not that of the format mcap"),
     ],
-    ids=["no such signal", "no such directory", "another format"],
+    ids=["no such signal", "no such directory", "no path", "another format"],
 )
 def test_what_cannot_be_recorded_is_refused(loop: Loop, given: dict[str, Any], said: str) -> None:
     recorder = record(loop, **given)
