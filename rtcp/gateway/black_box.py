@@ -7,8 +7,6 @@ own, so that the gateway goes on answering.
 from __future__ import annotations
 
 import logging
-import os
-import platform
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -19,12 +17,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-import rtcp
 from rtcp.ipc.events import ResetDone
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
-from rtcp.ipc.recording import About, Moment, Recording, RecordingError, listed, write
+from rtcp.ipc.recording import About, Moment, Recording, RecordingError, listed, versions, write
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
 
@@ -303,7 +300,7 @@ class BlackBox:
             bus=session.bus,
             period_ns=self._observer.period_ns,
             joints=joints,
-            versions=_versions(),
+            versions=versions(),
             began_ns=session.began_ns,
             event=fault.number,
             at=at,
@@ -379,12 +376,3 @@ def _lacking(records: npt.NDArray[np.void], at: int, silent_s: float) -> list[st
     if lost := int(numbers[-1] - numbers[0]) + 1 - len(numbers):
         notes.append(f"{lost} cycles were overwritten before they were read, or torn")
     return notes
-
-
-def _versions() -> dict[str, str]:
-    return {
-        "rtcp": rtcp.__version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "kernel": os.uname().release,
-    }

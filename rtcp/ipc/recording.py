@@ -12,8 +12,9 @@ import fcntl
 import json
 import math
 import os
+import platform
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -26,6 +27,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
+import rtcp
 from rtcp.config.zero import state_directory
 from rtcp.ipc.layout import PER_JOINT, SCALARS
 
@@ -40,9 +42,9 @@ _NAME = re.compile(r"fault-(\d{1,12})-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap")
 _LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
 """Bytes of one record of the file, and of all messages, unpacked: three times a whole ring of ten joints."""
 _JOINTS_MAX = 10
-_ENCAPSULATION = b"\x00\x01\x00\x00"
+ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian (OMG DDSI-RTPS, 10.5)."""
-MESSAGE_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
+_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
           "h": ("int16", "<i2"), "I": ("uint32", "<u4"), "i": ("int32", "<i4"), "f": ("float32", "<f4"),
           "d": ("float64", "<f8")}  # fmt: skip
 """Struct code to the types of ROS 2 messages and of numpy."""
@@ -59,7 +61,9 @@ LOG_SCHEMA = {
         "name": {"type": "string"},
     },
 }
-_INFO = 2
+INFORMATION, WARNING, ERROR = 2, 3, 4
+"""Levels of `foxglove.Log`."""
+FIELDS = tuple(name for name, _ in (*SCALARS, *PER_JOINT))
 
 Records = dict[str, npt.NDArray[Any]]
 
@@ -190,9 +194,8 @@ def _fill(path: Path, recording: Recording) -> None:
         schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(LOG_SCHEMA).encode())
         channel = writer.register_channel(_LOG, "json", schema)
         for moment in about.timeline:
-            sec, nsec = divmod(moment.time_ns, 1_000_000_000)
-            log = {"timestamp": {"sec": sec, "nsec": nsec}, "level": _INFO, "message": moment.message, "name": "rtcp"}
-            writer.add_message(channel, moment.time_ns, json.dumps(log).encode(), moment.time_ns)
+            entry = json.dumps(log_entry(moment.time_ns, moment.message)).encode()
+            writer.add_message(channel, moment.time_ns, entry, moment.time_ns)
         writer.finish()  # type: ignore[no-untyped-call]
         file.flush()
         os.fsync(file.fileno())
@@ -200,33 +203,55 @@ def _fill(path: Path, recording: Recording) -> None:
 
 def _write_cycles(writer: Writer, recording: Recording) -> None:
     about, records = recording.about, recording.records
-    kind = _message_type(len(about.joints))
-    rows = np.zeros(len(records["number"]), dtype=kind)
-    for name in rows.dtype.names or ():
-        rows[name] = records[name]
-    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", _definition(len(about.joints)))
+    messages = cycle_messages(records, cycle_type(len(about.joints)))
+    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", cycle_definition(len(about.joints)))
     channel = writer.register_channel(_CYCLE, "cdr", schema)
     # The record's clock is CLOCK_MONOTONIC; the file's is that of the fault's instant, CLOCK_REALTIME.
-    offset_ns = about.time_ns - int(records["time_ns"][about.at]) if len(rows) else 0
-    packed, size = rows.tobytes(), kind.itemsize
-    for at, (number, time_ns) in enumerate(zip(records["number"], records["time_ns"], strict=True)):
-        data = _ENCAPSULATION + packed[at * size : (at + 1) * size]
+    offset_ns = about.time_ns - int(records["time_ns"][about.at]) if messages else 0
+    for data, number, time_ns in zip(messages, records["number"], records["time_ns"], strict=True):
         when = max(int(time_ns) + offset_ns, 0)
         writer.add_message(channel, when, data, when, int(number) & 0xFFFF_FFFF)
 
 
-def _message_type(joints: int) -> np.dtype[np.void]:
+def cycle_type(joints: int, names: Collection[str] = FIELDS) -> np.dtype[np.void]:
     """Return a cycle's message: CDR aligns each number to its size, as numpy's aligned types do."""
-    fields: list[Any] = [(name, MESSAGE_TYPES[code][1]) for name, code in SCALARS]
-    fields += [(name, MESSAGE_TYPES[code][1], (joints,)) for name, code in PER_JOINT]
+    fields: list[Any] = [(name, _TYPES[code][1]) for name, code in SCALARS if name in names]
+    fields += [(name, _TYPES[code][1], (joints,)) for name, code in PER_JOINT if name in names]
     return np.dtype(fields, align=True)
 
 
-def _definition(joints: int) -> bytes:
+def cycle_definition(joints: int, names: Collection[str] = FIELDS) -> bytes:
     """Return the same as a ROS 2 message definition."""
-    lines = [f"{MESSAGE_TYPES[code][0]} {name}" for name, code in SCALARS]
-    lines += [f"{MESSAGE_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT]
+    lines = [f"{_TYPES[code][0]} {name}" for name, code in SCALARS if name in names]
+    lines += [f"{_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT if name in names]
     return ("\n".join(lines) + "\n").encode()
+
+
+def cycle_messages(
+    records: Mapping[str, npt.NDArray[Any]] | npt.NDArray[np.void], kind: np.dtype[np.void]
+) -> list[bytes]:
+    """Return a message of the type `kind` (`cycle_type`) for each of some cycle records."""
+    rows = np.zeros(len(records["number"]), dtype=kind)
+    for name in rows.dtype.names or ():
+        rows[name] = records[name]
+    packed, size = rows.tobytes(), kind.itemsize
+    return [ENCAPSULATION + packed[at : at + size] for at in range(0, len(packed), size)]
+
+
+def log_entry(time_ns: int, message: str, level: int = INFORMATION) -> dict[str, Any]:
+    """Return a message of `LOG_SCHEMA`; `time_ns`: CLOCK_REALTIME."""
+    sec, nsec = divmod(time_ns, 1_000_000_000)
+    return {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message, "name": "rtcp"}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what makes a recording."""
+    return {
+        "rtcp": rtcp.__version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "kernel": os.uname().release,
+    }
 
 
 def _seconds(records: Records) -> float:
@@ -342,16 +367,16 @@ def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
 
 def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
     """Return the cycles of a file, oldest first."""
-    kind, channel, schema, found = _message_type(joints), 0, 0, []
+    kind, channel, schema, found = cycle_type(joints), 0, 0, []
     for record in _records(file):
-        if isinstance(record, Schema) and record.data == _definition(joints):
+        if isinstance(record, Schema) and record.data == cycle_definition(joints):
             schema = record.id
         elif isinstance(record, Channel) and record.topic == _CYCLE and record.schema_id == schema:
             channel = record.id
         elif isinstance(record, Message) and record.channel_id == channel:
-            if len(record.data) != len(_ENCAPSULATION) + kind.itemsize:
+            if len(record.data) != len(ENCAPSULATION) + kind.itemsize:
                 raise ValueError(f"a cycle of {len(record.data)} bytes")
-            found.append(record.data[len(_ENCAPSULATION) :])
+            found.append(record.data[len(ENCAPSULATION) :])
     if not channel:
         raise ValueError(f"no cycles of this version and {joints} joints")
     return np.frombuffer(b"".join(found), dtype=kind)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-ENCAPSULATION = b"\x00\x01\x00\x00"
-"""CDR, little endian; alignment counts from after it."""
+from rtcp.ipc.recording import ENCAPSULATION
 
 
 class CdrTemplate:

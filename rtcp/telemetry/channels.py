@@ -27,8 +27,15 @@ from kinematics.urdf import to_urdf
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import STATE_BITS, state_of
 from rtcp.ipc import layout
-from rtcp.ipc.layout import PER_JOINT, SCALARS
-from rtcp.ipc.recording import LOG_SCHEMA, MESSAGE_TYPES
+from rtcp.ipc.recording import (
+    FIELDS,
+    INFORMATION,
+    LOG_SCHEMA,
+    cycle_definition,
+    cycle_messages,
+    cycle_type,
+    log_entry,
+)
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.telemetry.cdr import CdrTemplate, stamps
@@ -66,8 +73,8 @@ class UnknownSignal(ValueError):
     """A signal that no record has: the message names it and those that there are."""
 
 
-def fields_of(signals: Sequence[str]) -> list[tuple[str, str, bool]]:
-    """Return name, struct code and whether there is one a joint, of the fields that match; none given: all.
+def fields_of(signals: Sequence[str]) -> list[str]:
+    """Return the fields of a record that match; none given: all.
 
     Args:
         signals: names of fields or patterns (`*_position`); number and time are always there.
@@ -75,12 +82,11 @@ def fields_of(signals: Sequence[str]) -> list[tuple[str, str, bool]]:
     Raises:
         UnknownSignal: no field matches.
     """
-    every = [(name, code, False) for name, code in SCALARS] + [(name, code, True) for name, code in PER_JOINT]
     for signal in signals:
-        if not any(fnmatchcase(name, signal) for name, _, _ in every):
-            raise UnknownSignal(f"{signal}: there is no such signal; allowed are {', '.join(one[0] for one in every)}")
+        if not any(fnmatchcase(name, signal) for name in FIELDS):
+            raise UnknownSignal(f"{signal}: there is no such signal; allowed are {', '.join(FIELDS)}")
     wanted = (*signals, "number", "time_ns") if signals else ("*",)
-    return [one for one in every if any(fnmatchcase(one[0], signal) for signal in wanted)]
+    return [name for name in FIELDS if any(fnmatchcase(name, signal) for signal in wanted)]
 
 
 class Channels:
@@ -100,9 +106,9 @@ class Channels:
         self._config = config
         self._offset_ns = offset_ns
         self._context = context or foxglove.Context()
-        self._fields = fields_of(signals)
-        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", _cycle_definition(config, self._fields))
-        self._cycle_template = _cycle_template(config, self._fields)
+        fields, joints = fields_of(signals), len(config.joints)
+        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", cycle_definition(joints, fields).decode())
+        self._cycle_type = cycle_type(joints, fields)
         names = [joint.name for joint in config.joints]
         self._joints = {
             topic: (
@@ -148,7 +154,7 @@ class Channels:
             return
         time_ns = records["time_ns"] + self._offset_ns
         instants = time_ns.tolist()
-        _send(self._cycle, instants, self._cycle_template.fill(len(records), _columns(records, self._fields)))
+        _send(self._cycle, instants, cycle_messages(records, self._cycle_type))
         for channel, sources, template in self._joints.values():
             values = {name: records[name] for name in sources if name}
             _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
@@ -192,11 +198,9 @@ class Channels:
             "outputs": {name: bool(outputs >> number - 1 & 1) for name, number in terminals(config.outputs).items()},
         }
 
-    def log(self, time_ns: int, message: str, level: int = 2) -> None:
+    def log(self, time_ns: int, message: str, level: int = INFORMATION) -> None:
         """Publish a message; `level` as in `foxglove.Log`: 2 information, 3 warning, 4 error."""
-        sec, nsec = divmod(time_ns, 1_000_000_000)
-        entry = {"timestamp": {"sec": sec, "nsec": nsec}, "level": level, "message": message, "name": "rtcp"}
-        self._log.log(entry, log_time=time_ns)
+        self._log.log(log_entry(time_ns, message, level), log_time=time_ns)
 
 
 def urdf_of(config: ArmConfig) -> str:
@@ -226,22 +230,6 @@ def _send(channel: foxglove.Channel, instants: Sequence[int], messages: Sequence
     log: Callable[..., None] = channel.log
     for instant, message in zip(instants, messages, strict=True):
         log(message, log_time=instant)
-
-
-def _columns(records: Records, fields: Sequence[tuple[str, str, bool]]) -> dict[str, npt.ArrayLike]:
-    return {name: records[name] for name, _, _ in fields}
-
-
-def _cycle_definition(config: ArmConfig, fields: Sequence[tuple[str, str, bool]]) -> str:
-    several = f"[{len(config.joints)}]"
-    return "".join(f"{MESSAGE_TYPES[code][0]}{several if each else ''} {name}\n" for name, code, each in fields)
-
-
-def _cycle_template(config: ArmConfig, fields: Sequence[tuple[str, str, bool]]) -> CdrTemplate:
-    template = CdrTemplate()
-    for name, code, each in fields:
-        template.numbers(name, MESSAGE_TYPES[code][1], *((len(config.joints),) if each else ()))
-    return template
 
 
 def _joint_template(names: Sequence[str], sources: Sequence[str | None]) -> CdrTemplate:

@@ -13,7 +13,6 @@ import errno
 import io
 import json
 import os
-import platform
 import select
 import signal
 import sys
@@ -27,11 +26,12 @@ from typing import IO, Any, Protocol
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
-import rtcp
 from rtcp.config.model import ArmConfig
 from rtcp.config.serialization import to_json
+from rtcp.ipc.layout import PER_JOINT
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.recording import ERROR, INFORMATION, WARNING, versions
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.session import SessionError, identify, read_session
 from rtcp.telemetry.channels import Channels, Records, UnknownSignal, fields_of, urdf_of
@@ -40,7 +40,6 @@ FORMATS = ("mcap", "csv")
 FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
-_INFORMATION, _WARNING, _ERROR = 2, 3, 4
 _CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
 """The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 
@@ -185,9 +184,9 @@ class CsvWriter:
     def __init__(self, path: Path, joints: int, signals: Sequence[str]) -> None:
         self.path = path
         self._file = open(path, "x", newline="")  # noqa: SIM115
-        self._names = [name for name, _, _ in fields_of(signals)] if signals else list(_CSV_NAMES)
+        self._names = fields_of(signals) if signals else list(_CSV_NAMES)
         self._began_ns: int | None = None
-        per_joint = {name for name, _, each in fields_of(()) if each}
+        per_joint = {name for name, _ in PER_JOINT}
         header = ["Time"]
         for name in self._names:
             short = _CSV_NAMES.get(name, name)
@@ -225,9 +224,7 @@ def about(config: ArmConfig) -> dict[str, str]:
         "arm": config.name,
         "joints": ", ".join(joint.name for joint in config.joints),
         "period_us": f"{config.cycle.period_us:g}",
-        "rtcp": rtcp.__version__,
-        "python": platform.python_version(),
-        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        **versions(),
     }
 
 
@@ -339,12 +336,12 @@ class Recorder:
             self._write(records, missing)
         for event in self._observer.events_since(self._event):
             self._event = event.number
-            level = _ERROR if type(event.event) in self._names.faults else _INFORMATION
+            level = ERROR if type(event.event) in self._names.faults else INFORMATION
             self._log(event.monotonic_ns, self._names.message(event.event), level)
         for text in self._observer.texts_since(self._text):
             self._text = text.number
             # Its own time is the wall clock, which may have been set meanwhile.
-            level = _WARNING if text.is_problem else _INFORMATION
+            level = WARNING if text.is_problem else INFORMATION
             self._log(time.monotonic_ns(), text.sentence, level)
         now = time.monotonic()
         if now - self._flushed >= FLUSH_S:
@@ -360,7 +357,7 @@ class Recorder:
         if missing:
             instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
             text = f"{missing} of the cycles from {first} to {self._at} are missing: they were not read in time"
-            self._log(instant, text, _WARNING)
+            self._log(instant, text, WARNING)
         chosen = records[records["number"] % self._options.every == 0] if self._options.every > 1 else records
         made.records += len(chosen)
         self._each(lambda writer: writer.write(chosen))

@@ -174,9 +174,9 @@ def _written(path: Path, about: Any = None, **options: Any) -> None:
         writer.start()
         if about is not False:
             writer.add_metadata(options.get("metadata", "rtcp/about"), {"json": options.get("json", json.dumps(told))})
-        definition = options.get("definition", module._definition(2))
+        definition = options.get("definition", module.cycle_definition(2))
         channel = writer.register_channel("/cycle", "cdr", writer.register_schema("a", "ros2msg", definition))
-        size = options.get("size", 4 + module._message_type(2).itemsize)
+        size = options.get("size", 4 + module.cycle_type(2).itemsize)
         for number in range(options.get("cycles", CYCLES)):
             writer.add_message(channel, number, bytes(size), number)
         writer.finish()
@@ -187,7 +187,7 @@ FOREIGN: dict[str, dict[str, Any]] = {
     "metadata of another name": {"metadata": "other"},
     "metadata that is no JSON": {"json": "{"},
     "metadata that is no object": {"json": "[]"},
-    "other joints": {"definition": module._definition(3)},
+    "other joints": {"definition": module.cycle_definition(3)},
     "a cycle too short": {"size": 20},
     "another compression": {"compression": CompressionType.LZ4},
     "another format": {"about": {"format": 1}},
