@@ -21,7 +21,7 @@ from rtcp.ipc.events import ResetDone
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
-from rtcp.ipc.recording import About, Moment, Recording, RecordingError, listed, versions, write
+from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, listed, versions, write
 from rtcp.ipc.session import Session
 from rtcp.ipc.states import State
 
@@ -278,7 +278,7 @@ class BlackBox:
 
     def _recording(
         self, fault: FaultRecord, before: npt.NDArray[np.void], after: npt.NDArray[np.void], ends_ns: int
-    ) -> Recording:
+    ) -> FaultRecording:
         records = np.concatenate([before, after])
         at = _place(records, fault, len(before) - 1)
         instants, silent_s = records["time_ns"], 0.0
@@ -307,7 +307,7 @@ class BlackBox:
             notes=(*_lacking(records, at, silent_s), *notes),
             timeline=timeline,
         )
-        return Recording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
+        return FaultRecording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
 
     def _timeline(self, fault: FaultRecord, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""

@@ -1,4 +1,4 @@
-"""Cycle records on disk: one MCAP file a fault, written whole or not at all, and read with distrust.
+"""Cycle records on disk: the form of their files, read with distrust; one MCAP file a fault, whole or not at all.
 
 Foxglove, PlotJuggler and `ros2 bag` open them. Topic `/cycle` has a message a cycle (schema `rtcp_msgs/msg/Cycle`, the
 fields of `rtcp.ipc.layout`, in CDR), `/log` the messages of the loop (schema `foxglove.Log`); the metadata `rtcp/about`
@@ -9,22 +9,27 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import io
 import json
 import math
 import os
 import platform
 import re
+import struct
+import zlib
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import zstandard
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Metadata, Schema
+from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 import rtcp
@@ -34,13 +39,16 @@ from rtcp.ipc.layout import PER_JOINT, SCALARS
 FORMAT = 2
 KEPT = 100
 """Files: more than anyone reads, of about 2 MB each (20 000 cycles of six joints)."""
-_ABOUT = "rtcp/about"
+ABOUT = "rtcp/about"
 _CYCLE, _LOG = "/cycle", "/log"
 _LAST = "last"
 """File with the last number that was given: none is given twice, also where its file was removed."""
 _NAME = re.compile(r"fault-(\d{1,12})-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.mcap")
 _LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
-"""Bytes of one record of the file, and of all messages, unpacked: three times a whole ring of ten joints."""
+"""Bytes of one record of a file, and of all messages of a fault, unpacked: three times a whole ring of ten joints."""
+_MAGIC = b"\x89MCAP0\r\n"
+_RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
+"""Opcode and length of a record in a chunk; channel, sequence, log and publish time before the data of a message."""
 _JOINTS_MAX = 10
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian (OMG DDSI-RTPS, 10.5)."""
@@ -69,15 +77,29 @@ Records = dict[str, npt.NDArray[Any]]
 
 
 class RecordingError(Exception):
-    """A recording cannot be written or read; the message names file and defect."""
+    """A recording cannot be written or read; the message names file and defect.
+
+    Attributes:
+        kind: refused (by the system), damaged (cut off, or no recording), empty (no cycles, or none in the span asked
+            for), signals (there is none of that name), exists (it would be overwritten).
+        path: of the file or the directory.
+        fields: what was found and what is allowed, by name.
+    """
+
+    def __init__(
+        self, kind: Literal["refused", "damaged", "empty", "signals", "exists"], path: Path, defect: str, **fields: Any
+    ) -> None:
+        super().__init__(f"{path}: {defect}")
+        self.kind, self.path, self.fields = kind, path, fields
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A message of the loop and its instant, CLOCK_REALTIME ns."""
+    """A message of the loop and its instant, CLOCK_REALTIME ns; `level` as in `foxglove.Log`."""
 
     time_ns: int
     message: str
+    level: int = INFORMATION
 
 
 @dataclass(frozen=True)
@@ -114,7 +136,7 @@ class About:
 
 
 @dataclass(frozen=True)
-class Recording:
+class FaultRecording:
     """A fault: what it is, and the cycle records around it, oldest first, by field."""
 
     about: About
@@ -141,7 +163,7 @@ def faults_directory(state: Path | None = None) -> Path:
 # -- writing --------------------------------------------------------------------------------------------------------
 
 
-def write(directory: Path, recording: Recording) -> tuple[int, Path]:
+def write(directory: Path, recording: FaultRecording) -> tuple[int, Path]:
     """Write a recording under the next number, remove the oldest beyond `KEPT`, and return number and file.
 
     Raises:
@@ -167,7 +189,8 @@ def write(directory: Path, recording: Recording) -> tuple[int, Path]:
         finally:
             os.close(descriptor)
     except OSError as error:
-        raise RecordingError(f"{directory}: no recording can be written there: {error.strerror or error}") from error
+        defect = f"no recording can be written there: {error.strerror or error}"
+        raise RecordingError("refused", directory, defect) from error
     return number, path
 
 
@@ -183,13 +206,13 @@ def _next_number(directory: Path) -> int:
     return number
 
 
-def _fill(path: Path, recording: Recording) -> None:
+def _fill(path: Path, recording: FaultRecording) -> None:
     about = recording.about
     with open(path, "xb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start("ros2", f"rtcp {about.versions.get('rtcp', '')}")
         metadata = {"format": FORMAT, "seconds": _seconds(recording.records), **asdict(about)}
-        writer.add_metadata(_ABOUT, {"json": json.dumps(metadata)})
+        writer.add_metadata(ABOUT, {"json": json.dumps(metadata)})
         _write_cycles(writer, recording)
         schema = writer.register_schema("foxglove.Log", "jsonschema", json.dumps(LOG_SCHEMA).encode())
         channel = writer.register_channel(_LOG, "json", schema)
@@ -201,7 +224,7 @@ def _fill(path: Path, recording: Recording) -> None:
         os.fsync(file.fileno())
 
 
-def _write_cycles(writer: Writer, recording: Recording) -> None:
+def _write_cycles(writer: Writer, recording: FaultRecording) -> None:
     about, records = recording.about, recording.records
     messages = cycle_messages(records, cycle_type(len(about.joints)))
     schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", cycle_definition(len(about.joints)))
@@ -280,12 +303,10 @@ def listed(directory: Path) -> list[Listed]:
     found = []
     for number, path in files(directory):
         try:
-            with _opened(path) as file:
+            with opened(path) as file:
                 about, seconds = next(_abouts(file), (None, 0.0))
-                file.seek(-8, os.SEEK_END)
-                whole = file.read() == b"\x89MCAP0\r\n"
-            if about is None or not whole:
-                raise RecordingError(f"{path}: the file is cut off, damaged or no recording")
+                if about is None or not is_complete(file):
+                    raise ValueError("it has no end" if about else f"it has no metadata {ABOUT}")
         except RecordingError as error:
             found.append(Listed(number, path, None, str(error)))
         else:
@@ -293,21 +314,21 @@ def listed(directory: Path) -> list[Listed]:
     return found
 
 
-def read(path: Path) -> Recording:
+def read(path: Path) -> FaultRecording:
     """Read a recording.
 
     Raises:
         RecordingError: it is cut off, is none, or was written by another version.
     """
-    with _opened(path) as file:
+    with opened(path) as file:
         about, _ = next(_abouts(file), (None, 0.0))
         if about is None:
-            raise RecordingError(f"{path}: the metadata {_ABOUT} is missing: it is no recording")
+            raise ValueError(f"it has no metadata {ABOUT}")
         file.seek(0)
         rows = _cycles(file, len(about.joints))
-    if not (0 <= about.at < len(rows) or (about.at == -1 and not len(rows))):
-        raise RecordingError(f"{path}: it gives {about.at} as the cycle of the fault, and has {len(rows)} cycles")
-    return Recording(about, {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()})
+        if not (0 <= about.at < len(rows) or (about.at == -1 and not len(rows))):
+            raise ValueError(f"it gives {about.at} as the cycle of the fault, and has {len(rows)} cycles")
+    return FaultRecording(about, {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()})
 
 
 def files(directory: Path) -> list[tuple[int, Path]]:
@@ -321,44 +342,121 @@ def files(directory: Path) -> list[tuple[int, Path]]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        raise RecordingError(f"{directory}: the directory cannot be read: {error.strerror}") from error
+        raise RecordingError("refused", directory, f"the directory cannot be read: {error.strerror}") from error
     found = [(int(match[1]), directory / match[0]) for match in map(_NAME.fullmatch, names) if match]
     return sorted(found)
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes]]:
+def opened(path: Path) -> Iterator[IO[bytes]]:
+    """Open a recording; whatever is raised about its contents becomes a `RecordingError` of the kind damaged."""
     try:
         with open(path, "rb") as file:
             yield file
     except OSError as error:
-        raise RecordingError(f"{path}: the file cannot be read: {error.strerror or error}") from error
+        raise RecordingError("refused", path, f"the file cannot be read: {error.strerror or error}") from error
     except RecordingError:
         raise
     except Exception as error:
         # The reader lets through whatever its parts, zstandard and json raise about bytes that are not theirs.
         defect = f"{type(error).__name__} {error}".rstrip()
-        raise RecordingError(f"{path}: the file is cut off, damaged or no recording: {defect}") from error
+        raise RecordingError("damaged", path, f"the file is cut off, damaged or no recording: {defect}") from error
 
 
-def _records(file: IO[bytes]) -> Iterator[McapRecord]:
-    """Return the records of a file, chunks unpacked and checked."""
-    left = _LARGEST
-    for record in StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD).records:
-        if not isinstance(record, Chunk):
-            yield record
-            continue
-        left -= record.uncompressed_size
-        size = zstandard.frame_content_size(record.data) if record.compression == "zstd" else len(record.data)
-        if size != record.uncompressed_size or left < 0 or record.compression not in ("zstd", ""):
-            raise ValueError(f"a chunk of {size} bytes, {record.uncompressed_size} announced, {left} allowed after it")
-        yield from breakup_chunk(record, validate_crc=True)
+def is_complete(file: IO[bytes]) -> bool:
+    """Whether an MCAP file has its end; the place in it is kept."""
+    at = file.tell()
+    file.seek(max(0, file.seek(0, os.SEEK_END) - len(_MAGIC)))
+    end = file.read()
+    file.seek(at)
+    return end == _MAGIC
+
+
+def contents(file: IO[bytes]) -> Iterator[McapRecord]:
+    """Return the records of a file, chunks as they are, none of them larger than allowed."""
+    yield from StreamReader(file, emit_chunks=True, validate_crcs=True, record_size_limit=_LARGEST_RECORD).records
+
+
+class Batch(NamedTuple):
+    """What a chunk has: cycles (`cycle_type`), the CLOCK_REALTIME of the first of them, ns, and log messages."""
+
+    cycles: npt.NDArray[np.void]
+    time_ns: int
+    log: list[Moment]
+
+
+class ChunkDecoder:
+    """Decodes the chunks of one file in turn: each may announce channels for those that follow.
+
+    Attributes:
+        joints: of a cycle.
+        kind: of a cycle; without fields until the channel of the cycles is announced.
+        cycle_channel, log_channel: their numbers; -1: not announced.
+    """
+
+    def __init__(self) -> None:
+        self.joints = 0
+        self.kind: np.dtype[np.void] = np.dtype([])
+        self._schemas: dict[int, bytes] = {}
+        self.cycle_channel = self.log_channel = -1
+
+    def decode(self, chunk: Chunk, allowed: int = _LARGEST_RECORD) -> Batch:
+        """Return what a chunk has; raises whatever its bytes cause.
+
+        Args:
+            chunk: checked before it is unpacked, and its CRC afterwards.
+            allowed: its largest size, unpacked.
+        """
+        size = chunk.uncompressed_size
+        packed = zstandard.frame_content_size(chunk.data) if chunk.compression == "zstd" else len(chunk.data)
+        # -1: the frame does not say, as from a writer that streams.
+        if packed not in (size, -1) or size > allowed or chunk.compression not in ("zstd", ""):
+            raise ValueError(f"a chunk of {packed} bytes, {size} announced, {allowed} allowed")
+        data = (
+            zstandard.ZstdDecompressor().decompress(chunk.data, max_output_size=size)
+            if chunk.compression
+            else chunk.data
+        )
+        if len(data) != size or chunk.uncompressed_crc not in (0, zlib.crc32(data)):
+            raise ValueError("a chunk has another size or CRC than announced")
+        cycles, log, first_ns, at = [], [], 0, 0
+        while at < size:
+            opcode, length = _RECORD.unpack_from(data, at)
+            begin = at + _RECORD.size
+            at = begin + length
+            if opcode == Opcode.MESSAGE:
+                channel, _, time_ns, _ = _MESSAGE.unpack_from(data, begin)
+                if channel == self.cycle_channel:
+                    first_ns = first_ns or time_ns
+                    cycles.append(data[begin + _MESSAGE.size + len(ENCAPSULATION) : at])
+                elif channel == self.log_channel:
+                    entry = json.loads(data[begin + _MESSAGE.size : at])
+                    log.append(Moment(time_ns, str(entry["message"]), int(entry["level"])))
+            elif opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(io.BytesIO(data[begin:at])))
+                self._schemas[schema.id] = schema.data
+            elif opcode == Opcode.CHANNEL:
+                self._announce(Channel.read(ReadDataStream(io.BytesIO(data[begin:at]))))
+        if at != size or {len(one) for one in cycles} - {self.kind.itemsize}:
+            raise ValueError(f"a cycle of another size than {self.kind.itemsize} bytes, or cut off")
+        return Batch(np.frombuffer(b"".join(cycles), self.kind) if cycles else np.empty(0, self.kind), first_ns, log)
+
+    def _announce(self, channel: Channel) -> None:
+        if channel.topic == _LOG:
+            self.log_channel = channel.id
+        elif channel.topic == _CYCLE:
+            definition = self._schemas[channel.schema_id]
+            names = re.findall(r"(\w+)$", definition.decode(), re.MULTILINE)
+            self.joints = int(next(iter(re.findall(r"\[(\d{1,2})\]", definition.decode())), 0))
+            if self.joints > _JOINTS_MAX or definition != cycle_definition(self.joints, names):
+                raise ValueError("its cycles are none of this version")
+            self.kind, self.cycle_channel = cycle_type(self.joints, names), channel.id
 
 
 def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
     """Return what a file says about itself, and the seconds from its first cycle to its last."""
-    for record in _records(file):
-        if isinstance(record, Metadata) and record.name == _ABOUT:
+    for record in contents(file):
+        if isinstance(record, Metadata) and record.name == ABOUT:
             metadata = json.loads(record.metadata["json"])
             if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
                 raise ValueError(f"allowed is format {FORMAT}")
@@ -367,19 +465,14 @@ def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
 
 def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
     """Return the cycles of a file, oldest first."""
-    kind, channel, schema, found = cycle_type(joints), 0, 0, []
-    for record in _records(file):
-        if isinstance(record, Schema) and record.data == cycle_definition(joints):
-            schema = record.id
-        elif isinstance(record, Channel) and record.topic == _CYCLE and record.schema_id == schema:
-            channel = record.id
-        elif isinstance(record, Message) and record.channel_id == channel:
-            if len(record.data) != len(ENCAPSULATION) + kind.itemsize:
-                raise ValueError(f"a cycle of {len(record.data)} bytes")
-            found.append(record.data[len(ENCAPSULATION) :])
-    if not channel:
+    decoder, left, found = ChunkDecoder(), _LARGEST, []
+    for record in contents(file):
+        if isinstance(record, Chunk):
+            found.append(decoder.decode(record, left).cycles)
+            left -= record.uncompressed_size
+    if decoder.kind != cycle_type(joints):
         raise ValueError(f"no cycles of this version and {joints} joints")
-    return np.frombuffer(b"".join(found), dtype=kind)
+    return np.concatenate([rows for rows in found if rows.dtype.names])
 
 
 def _checked(metadata: Mapping[str, Any]) -> About:

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from rtcp.ipc.recording import Recording
+from rtcp.ipc.recording import FaultRecording
 from rtcp.ipc.states import State
 from rtcp.telemetry.recording import target_steps
 
@@ -38,14 +38,14 @@ class Entry(NamedTuple):
     message: str
 
 
-def seconds(recording: Recording) -> npt.NDArray[np.float64]:
+def seconds(recording: FaultRecording) -> npt.NDArray[np.float64]:
     """Return the instant of each cycle, shape (cycles,), s after the fault."""
     instants = recording.records["time_ns"]
     relative: npt.NDArray[np.float64] = (instants - instants[recording.about.at]) * 1e-9
     return relative
 
 
-def timeline(recording: Recording) -> list[Entry]:
+def timeline(recording: FaultRecording) -> list[Entry]:
     """Return the messages and each change of the machine's state, ordered by time."""
     about = recording.about
     found = [Entry((moment.time_ns - about.time_ns) * 1e-9, moment.message) for moment in about.timeline]
@@ -59,7 +59,7 @@ def timeline(recording: Recording) -> list[Entry]:
     return sorted(found, key=lambda entry: entry.at_s)
 
 
-def summary(recording: Recording) -> dict[str, Any]:
+def summary(recording: FaultRecording) -> dict[str, Any]:
     """Return a recording in SI units, without its cycles."""
     about, records = recording.about, recording.records
     found = {
@@ -97,7 +97,7 @@ def summary(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _largest_step(recording: Recording) -> dict[str, Any] | None:
+def _largest_step(recording: FaultRecording) -> dict[str, Any] | None:
     """Return the largest step of a target between two cycles with enabled drives; None where there is none."""
     cycles, steps = target_steps(recording.records)
     if not steps.size:
@@ -112,7 +112,7 @@ def _largest_step(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def draw(recording: Recording, out: Path) -> None:
+def draw(recording: FaultRecording, out: Path) -> None:
     """Draw a recording into a file; its ending chooses the format.
 
     Raises:
@@ -172,7 +172,7 @@ def _save(figure: Figure, out: Path) -> None:
         new.unlink(missing_ok=True)
 
 
-def _curves(axes: Sequence[Any], recording: Recording, begin: float, end: float) -> None:
+def _curves(axes: Sequence[Any], recording: FaultRecording, begin: float, end: float) -> None:
     records, times = recording.records, seconds(recording)
     positions, velocities, counter, lost = axes
     # Drive data is valid only with the expected working counter: otherwise the last value would be drawn on.

@@ -40,7 +40,7 @@ FORMATS = ("mcap", "csv")
 FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
-_CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
+CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
 """The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 
 
@@ -184,12 +184,12 @@ class CsvWriter:
     def __init__(self, path: Path, joints: int, signals: Sequence[str]) -> None:
         self.path = path
         self._file = open(path, "x", newline="")  # noqa: SIM115
-        self._names = fields_of(signals) if signals else list(_CSV_NAMES)
+        self._names = fields_of(signals) if signals else list(CSV_NAMES)
         self._began_ns: int | None = None
         per_joint = {name for name, _ in PER_JOINT}
         header = ["Time"]
         for name in self._names:
-            short = _CSV_NAMES.get(name, name)
+            short = CSV_NAMES.get(name, name)
             header += [f"J{axis}_{short}" for axis in range(1, joints + 1)] if name in per_joint else [name]
         self._file.write(",".join(header) + "\n")
 

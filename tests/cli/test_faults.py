@@ -14,7 +14,7 @@ import pytest
 from rtcp.cli import faults
 from rtcp.ipc.layout import FLAG_ENABLED, RecordLayout
 from rtcp.ipc.observer import record_type
-from rtcp.ipc.recording import About, Moment, Recording, faults_directory, write
+from rtcp.ipc.recording import About, FaultRecording, Moment, faults_directory, write
 from rtcp.ipc.states import State
 
 JOINTS, PERIOD_NS, CYCLES, AT = 3, 1_000_000, 1200, 800
@@ -28,7 +28,7 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "state"
 
 
-def recording() -> Recording:
+def recording() -> FaultRecording:
     """An arm that moves for 0.8 s and faults; after the fault no frame comes for 40 cycles."""
     whole = np.zeros(CYCLES, dtype=record_type(RecordLayout(JOINTS)))
     cycles = np.arange(CYCLES)
@@ -53,7 +53,7 @@ def recording() -> Recording:
         timeline=(Moment(WHEN_NS - 500_000_000, "a sentence before"), Moment(WHEN_NS, WHAT),
                   Moment(WHEN_NS + 20_000_000, "slave 3 sent emergency 0x8611")),
     )  # fmt: skip
-    return Recording(about, {name: whole[name] for name in names})
+    return FaultRecording(about, {name: whole[name] for name in names})
 
 
 def test_without_a_recording_the_list_says_so(rtcp: Callable[..., Any], state: Path) -> None:
@@ -177,7 +177,7 @@ def test_who_has_recorded_nothing_is_referred_to_where_the_service_records(
 def test_a_fault_without_a_single_cycle_is_shown(rtcp: Callable[..., Any]) -> None:
     made = recording()
     none = {name: array[:0] for name, array in made.records.items()}
-    write(faults_directory(), Recording(replace(made.about, at=-1), none))
+    write(faults_directory(), FaultRecording(replace(made.about, at=-1), none))
     ended = rtcp("faults", "show", "1")
     assert ended.code == 0
     assert "slave 3 sent emergency" in ended.out
@@ -226,7 +226,7 @@ def test_two_faults_that_begin_alike_are_distinct_at_80_columns(rtcp: Callable[.
     made = recording()
     for end in ("drive1 with statusword 0x0218", "drive2 with statusword 0x0208"):
         what = f"a long sentence about something that went wrong with the drive {end}"
-        write(faults_directory(), Recording(replace(made.about, what=what), made.records))
+        write(faults_directory(), FaultRecording(replace(made.about, what=what), made.records))
     ended = rtcp("faults")
     shown = " ".join(ended.out.split())
     assert "0x0218" in shown

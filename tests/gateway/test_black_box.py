@@ -32,7 +32,7 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.recording import Recording, listed, read
+from rtcp.ipc.recording import FaultRecording, listed, read
 from rtcp.ipc.runtime_directory import stop_marker
 from rtcp.ipc.session import Pid, Processes, Session, identify
 from rtcp.ipc.states import State
@@ -81,7 +81,7 @@ class Written:
     def watched(self) -> BlackBox:
         return BlackBox(self.observer, self.session, self.directory, self.reports.append)
 
-    def lost(self, box: BlackBox) -> Recording:
+    def lost(self, box: BlackBox) -> FaultRecording:
         """Let frames be lost; return the one recording that there is once the box has finished."""
         self.board.event(LOST)
         box.finish()
@@ -89,7 +89,7 @@ class Written:
         return recording
 
     @property
-    def recordings(self) -> list[Recording]:
+    def recordings(self) -> list[FaultRecording]:
         return [read(one.path) for one in listed(self.directory)]
 
     def close(self) -> None:
@@ -110,7 +110,7 @@ def write_board(path: Path, tmp_path: Path, config: ArmConfig) -> Iterator[Write
         each.close()
 
 
-def messages(recording: Recording) -> list[str]:
+def messages(recording: FaultRecording) -> list[str]:
     return [moment.message for moment in recording.about.timeline]
 
 

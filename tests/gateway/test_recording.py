@@ -17,12 +17,12 @@ from mcap.writer import CompressionType, Writer
 from rtcp.ipc import recording as module
 from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
-from rtcp.ipc.recording import About, Moment, Recording, RecordingError, files, listed, read, write
+from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, files, listed, read, write
 
 CYCLES = 50
 
 
-def recording(cycles: int = CYCLES, joints: int = 2) -> Recording:
+def recording(cycles: int = CYCLES, joints: int = 2) -> FaultRecording:
     """A recording with other numbers in each cycle."""
     kinds = record_type(RecordLayout(joints))
     whole = np.zeros(cycles, dtype=kinds)
@@ -34,7 +34,7 @@ def recording(cycles: int = CYCLES, joints: int = 2) -> Recording:
         bus="virtual", period_ns=500_000, joints=tuple(f"joint{i}" for i in range(joints)), versions={"rtcp": "1"},
         began_ns=5, event=7, at=cycles // 2 if cycles else -1, notes=("a note",), timeline=(Moment(9, "a sentence"),),
     )  # fmt: skip
-    return Recording(about, records)
+    return FaultRecording(about, records)
 
 
 def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -222,6 +222,6 @@ def test_a_chunk_that_unpacks_to_more_than_allowed_is_not_unpacked(
 ) -> None:
     _, path = write(tmp_path, recording())
     monkeypatch.setattr(module, "_LARGEST", 1000)
-    monkeypatch.setattr(module, "breakup_chunk", None)
+    monkeypatch.setattr(module.zstandard, "ZstdDecompressor", None)
     with pytest.raises(RecordingError, match="a chunk of"):
         read(path)

@@ -1,0 +1,273 @@
+"""Recordings read back: of the recorder (MCAP, CSV) and of the black box, whole or chunk by chunk.
+
+A file that is cut off, as that of a recorder that was killed, is read as far as it is whole, and says so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import chain, islice
+from pathlib import Path
+from re import fullmatch
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mcap.records import Attachment, Chunk, Metadata
+from numpy.lib.recfunctions import repack_fields
+
+from rtcp.config.model import ArmConfig
+from rtcp.config.serialization import from_json
+from rtcp.ipc.layout import PER_JOINT
+from rtcp.ipc.recording import (
+    ABOUT,
+    Batch,
+    ChunkDecoder,
+    Moment,
+    RecordingError,
+    contents,
+    cycle_type,
+    is_complete,
+    opened,
+)
+from rtcp.telemetry.recorder import CSV_NAMES
+
+Records = npt.NDArray[np.void]
+_ALWAYS = ("number", "time_ns")
+_CSV_ROWS, _CSV_HEADER = 20_000, 1 << 16
+
+
+class Part(NamedTuple):
+    """Consecutive records of a recording, and messages of its log."""
+
+    records: Records
+    log: list[Moment]
+
+
+class Reader:
+    """A recording that is read once, from its beginning, part by part: `for part in Reader(path): ...`.
+
+    Args:
+        path: MCAP of a recorder or of the black box, or CSV (`.csv`) of a recorder.
+        signals: fields of `rtcp.ipc.layout` or patterns (`*_position`); none: all that the file has. number and
+            time_ns are always there.
+        start_s: from the first record; None: from it.
+        end_s: from the first record; None: to the last one.
+
+    Attributes:
+        about: what the file says about itself, by name: arm, joints, period_us, versions; of a fault also `fault`.
+        config: the arm at that time; None where the file has none, or that of another version.
+        joints: how many.
+        first_ns: time_ns of the first record of the file.
+        offset_ns: CLOCK_REALTIME less time_ns; 0 in CSV, which has no date.
+        truncated: whether its end is missing or something in it is damaged; known when all parts are read.
+
+    Raises:
+        RecordingError: the file is none, has no record, or none of these signals; while reading: no record in the span.
+    """
+
+    def __init__(
+        self, path: Path, signals: Sequence[str] = (), start_s: float | None = None, end_s: float | None = None
+    ) -> None:
+        self.path = path
+        self.about: dict[str, str] = {}
+        self.config: ArmConfig | None = None
+        self.joints = 0
+        self.first_ns = self.offset_ns = 0
+        self.truncated = False
+        self._signals, self._names = signals, list[str]()
+        self._start_s = -np.inf if start_s is None else start_s
+        self._end_s = np.inf if end_s is None else end_s
+        self._last_s = 0.0
+        self._decoder = ChunkDecoder()
+        self._parts = self._read()
+        # The head is read now: what the caller has to know first.
+        self._first = next(self._parts, None)
+
+    def __iter__(self) -> Iterator[Part]:
+        """Return the parts; they have what is between start and end."""
+        found = 0
+        for part in chain(() if self._first is None else (self._first,), self._parts):
+            found += len(part.records)
+            if len(part.records) or part.log:
+                yield part
+        if not found:
+            span = f"{self._start_s:g} to {self._end_s:g} s"
+            raise RecordingError("empty", self.path, f"it has no record from {span}; it ends at {self._last_s:.3f} s")
+
+    @property
+    def period_s(self) -> float:
+        """Cycle, s; 0: not known."""
+        with suppress(KeyError, ValueError):
+            return float(self.about["period_us"]) * 1e-6
+        return 0.0
+
+    def at_s(self, moment: Moment) -> float:
+        """Return the instant of a message, s from the first record."""
+        return (moment.time_ns - self.offset_ns - self.first_ns) * 1e-9
+
+    def _read(self) -> Iterator[Part]:
+        early: list[Moment] = []
+        batches = self._csv() if self.path.suffix.lower() == ".csv" else self._mcap()
+        try:
+            for batch in batches:
+                early += batch.log
+                if not self._names and not len(batch.cycles):
+                    continue  # when that was is known with the first cycle
+                if not self._names:
+                    self._begin(batch)
+                yield self._cut(batch.cycles, early)
+                early = []
+        except RecordingError as error:
+            if error.kind != "damaged" or not self._names:
+                raise
+            self.truncated = True
+        if not self._names:
+            raise RecordingError("empty", self.path, "the recording has no cycle")
+
+    def _begin(self, batch: Batch) -> None:
+        """Note what the first records tell."""
+        self.first_ns = int(batch.cycles["time_ns"][0])
+        self.offset_ns = batch.time_ns - self.first_ns if batch.time_ns else 0
+        has = batch.cycles.dtype.names or ()
+        for signal in self._signals:
+            if not any(fnmatchcase(name, signal) for name in has):
+                defect = f"there is no signal {signal} in it; it has {', '.join(has)}"
+                raise RecordingError("signals", self.path, defect, found=signal, allowed=has)
+        wanted = (*self._signals, *_ALWAYS) if self._signals else ("*",)
+        self._names = [name for name in has if any(fnmatchcase(name, one) for one in wanted)]
+
+    def _cut(self, cycles: Records, log: list[Moment]) -> Part:
+        seconds = (cycles["time_ns"] - self.first_ns) * 1e-9
+        if len(seconds):
+            self._last_s = float(seconds[-1])
+        inside = cycles[(seconds >= self._start_s) & (seconds <= self._end_s)]
+        # A copy: the fields that nobody asked for do not stay in memory.
+        records = repack_fields(inside[self._names], align=True)
+        return Part(records, [moment for moment in log if self._start_s <= self.at_s(moment) <= self._end_s])
+
+    def _mcap(self) -> Iterator[Batch]:
+        decoder = self._decoder
+        with opened(self.path) as file:
+            self.truncated = not is_complete(file)
+            for record in contents(file):
+                if isinstance(record, Metadata) and record.name == ABOUT:
+                    self.about = _about(record.metadata)
+                elif isinstance(record, Attachment) and record.name == "configuration.json":
+                    with suppress(ValueError, TypeError):
+                        self.config = from_json(ArmConfig, json.loads(record.data))
+                elif isinstance(record, Chunk):
+                    first = self.first_ns + self.offset_ns
+                    if self._names and (record.message_start_time - first) * 1e-9 > self._end_s:
+                        return
+                    last_s = (record.message_end_time - first) * 1e-9
+                    if self._names and last_s < self._start_s and decoder.log_channel >= 0:
+                        self._last_s = last_s
+                        continue
+                    batch = decoder.decode(record)
+                    self.joints = decoder.joints
+                    yield batch
+
+    def _csv(self) -> Iterator[Batch]:
+        with opened(self.path) as file:
+            header = file.readline(_CSV_HEADER).decode().rstrip("\r\n").split(",")
+            columns = _columns(header)
+            self.joints = max(map(len, columns.values()))
+            self.about = {"joints": ", ".join(f"joint{axis}" for axis in range(1, self.joints + 1))}
+            kind, count = cycle_type(self.joints, {*columns, *_ALWAYS}), 0
+            while lines := list(islice(file, _CSV_ROWS)):
+                if not lines[-1].endswith(b"\n"):
+                    self.truncated = True
+                    lines.pop()
+                    if not lines:
+                        return
+                values = np.loadtxt(lines, delimiter=",", ndmin=2)
+                if values.shape[1] != len(header) or not np.isfinite(values).all():
+                    raise ValueError(f"a row in the {len(lines)} after row {count} does not have {len(header)} numbers")
+                rows = np.zeros(len(values), kind)
+                rows["number"] = np.arange(count, count + len(rows)) + 1
+                rows["time_ns"] = np.round(values[:, 0] * 1e9)
+                for name, places in columns.items():
+                    rows[name] = values[:, places if rows[name].ndim == 2 else places[0]]
+                count += len(rows)
+                yield Batch(rows, 0, [])
+
+
+def _about(metadata: dict[str, str]) -> dict[str, str]:
+    """Return the metadata of a recorder as they are, those of the black box by the same names."""
+    if "json" not in metadata:
+        return metadata
+    found: dict[str, Any] = json.loads(metadata["json"])
+    return {
+        "arm": str(found["arm"]),
+        "joints": ", ".join(map(str, found["joints"])),
+        "period_us": f"{found['period_ns'] * 1e-3:g}",
+        "fault": str(found["what"]),
+        **{str(name): str(version) for name, version in found["versions"].items()},
+    }
+
+
+def _columns(header: Sequence[str]) -> dict[str, list[int]]:
+    """Return the places of each field in the columns of a recorder's CSV; raises ValueError."""
+    full = {short: name for name, short in CSV_NAMES.items()}
+    per_joint = {name for name, _ in PER_JOINT}
+    found: dict[str, list[int]] = {}
+    for at, column in enumerate(header):
+        match = fullmatch(r"J\d+_(\w+)", column)
+        if at:
+            found.setdefault(full.get(match[1], match[1]) if match else column, []).append(at)
+    joints = {len(places) for name, places in found.items() if name in per_joint}
+    kind = cycle_type(max(joints, default=0), found).names or ()
+    if header[0] != "Time" or not found or len(joints) > 1 or set(kind) != set(found):
+        raise ValueError(f"its columns begin with {', '.join(header)[:60]}, those of a recording with Time, J1_pos")
+    return found
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recording, or a span of it, in memory.
+
+    Attributes:
+        path, about, config, truncated: as of `Reader`.
+        records: structured array of the fields asked for, oldest first; SI units.
+        seconds: of each record from the first one of the file, s.
+        period_s: between two records, where none is missing, s; of every Nth cycle it is that of N.
+        missing: records that are not there, by the numbers of the others.
+        log: messages and their levels.
+        log_s: their instants, s from the first record of the file.
+    """
+
+    path: Path
+    about: dict[str, str]
+    config: ArmConfig | None
+    records: Records
+    seconds: npt.NDArray[np.float64]
+    period_s: float
+    missing: int
+    log: tuple[Moment, ...]
+    log_s: tuple[float, ...]
+    truncated: bool
+
+    def column(self, name: str) -> npt.NDArray[np.float64]:
+        """Return a field of the records, shape (records,) or (records, joints), as floats."""
+        return self.records[name].astype(np.float64)
+
+
+def read(path: Path, signals: Sequence[str] = (), start_s: float | None = None, end_s: float | None = None) -> Recorded:
+    """Read a recording; arguments and errors as of `Reader`. Only the fields asked for are held in memory."""
+    reader = Reader(path, signals, start_s, end_s)
+    parts = list(reader)
+    records = np.concatenate([part.records for part in parts])
+    log = tuple(moment for part in parts for moment in part.log)
+    seconds = (records["time_ns"] - reader.first_ns) * 1e-9
+    steps = np.diff(records["number"].astype(np.int64))
+    every = max(1, int(steps.min())) if len(steps) else 1
+    period_s = reader.period_s * every or (float(np.median(np.diff(seconds))) if len(steps) else 0.0)
+    return Recorded(
+        path, reader.about, reader.config, records, seconds, period_s, int((steps // every - 1).sum()), log,
+        tuple(map(reader.at_s, log)), reader.truncated,
+    )  # fmt: skip
