@@ -151,7 +151,7 @@ def test_one_field_of_many_cycles_needs_a_fraction_of_the_files_memory(tmp_path:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found.records) == 20_000
-    assert peak < 6e6 < 20_000 * cycle_type(6).itemsize / 2
+    assert peak < 4e6 < 20_000 * cycle_type(6).itemsize / 2
 
 
 def foreign(path: Path) -> Path:
