@@ -49,7 +49,8 @@ class Application:
         self._received = False
         self._op_wanted_at: int | None = None
         self._error = False
-        self._stepped_at = t
+        self.stepped_at = t
+        """Instant up to which the device's time has passed."""
         self.sync = SyncMonitor(esc, device)
         self.state = AlState.INIT
         esc.on_outputs = self.outputs_written
@@ -223,12 +224,12 @@ class Application:
 
     def due(self, t: int, interval: int) -> bool:
         """Whether the device was last stepped `interval` ns before `t` or earlier."""
-        return t - self._stepped_at >= interval
+        return t - self.stepped_at >= interval
 
     def advance(self, t: int) -> None:
         """Let the device's time pass up to `t`: outputs in (in OP), steps, inputs out (from SAFE-OP on)."""
-        passed = t - self._stepped_at
-        self._stepped_at = max(t, self._stepped_at)
+        passed = t - self.stepped_at
+        self.stepped_at = max(t, self.stepped_at)
         if self.state == AlState.OP:
             if len(self._latched) == self._rx.byte_length:  # the master may have changed the sync manager just now
                 self._rx.unpack(self._latched)

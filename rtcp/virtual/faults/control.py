@@ -14,6 +14,7 @@ import select
 import socket
 import stat
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ from rtcp.config.validation import unknown_key
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import FaultRegistry, installed, parse, sentence_of
 from rtcp.virtual.models.cubemars import CubemarsDrive
+from rtcp.virtual.models.diewu import CHANNELS, DiewuIoBox
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
 
@@ -37,7 +39,9 @@ BACKLOG = 16
 STANDSTILL = 0.002
 """A joint slower than this, rad/s, stands."""
 PATIENCE = 10_000_000_000
-"""Without a request for so many ns the joints are not watched any more."""
+"""Without a request for so many ns joints and outputs are not watched any more."""
+EDGES = 1024
+"""Edges of an output that are kept between two questions: what is sent in one answer must not keep a frame waiting."""
 
 
 @contextmanager
@@ -107,6 +111,7 @@ class Control:
             "faults": ((), lambda _, now: registry.listing(now)),
             "truth": ((), lambda _, now: truth.answer(now)),
             "clear_peaks": ((), lambda _, now: truth.clear_peaks(now)),
+            "edges": (("slave", "output"), self._edges),
         }
         """What a request can ask for: its keys, and what answers it."""
         for name in installed():
@@ -193,6 +198,12 @@ class Control:
             raise FaultRefused("at: a fault that is asked for begins at once; only a script has times")
         return {"id": self._registry.begin(planned, now)}
 
+    def _edges(self, request: dict[str, Any], now: int) -> list[int]:
+        slave, output = request.get("slave"), request.get("output")
+        if type(slave) is not int or type(output) is not int:
+            raise FaultRefused(f"found slave {shown(slave)}, output {shown(output)}, allowed are two numbers, from 1")
+        return self._truth.edges(slave, output, now)
+
     def _clear(self, request: dict[str, Any], now: int) -> dict[str, list[int]]:
         number = request.get("id")
         if number is not None and type(number) is not int:
@@ -230,8 +241,27 @@ class _Joint:
             self.peak = max(self.peak, speed)
 
 
+class _Output:
+    """A digital output that is watched: when it changed, ns of its slave's own clock."""
+
+    __slots__ = ("_box", "_level", "_mask", "edges")
+
+    def __init__(self, box: DiewuIoBox, output: int) -> None:
+        self._box = box
+        self._mask = 1 << output - 1
+        self._level = box.outputs & self._mask
+        self.edges: deque[int] = deque(maxlen=EDGES)
+
+    def look(self, slave: Slave) -> None:
+        """Remember the instant where it has changed: the device was stepped up to then."""
+        level = self._box.outputs & self._mask
+        if level != self._level and slave.clock is not None:
+            self._level = level
+            self.edges.append(slave.clock.local(slave.application.stepped_at))
+
+
 class GroundTruth:
-    """Watches the joints from the first question on, for as long as requests come: else a segment pays nothing.
+    """Watches joints and outputs from the first question on, while requests come: else a segment pays nothing.
 
     While `watching`, `look` is to be called after each step of a device.
     """
@@ -246,12 +276,15 @@ class GroundTruth:
         self._joints = {
             slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
         }
+        self._outputs: dict[Slave, dict[int, _Output]] = {}
 
     def look(self, slave: Slave, now: int) -> None:
         """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
         joint = self._joints.get(slave)
         if joint is not None:
             joint.look(now)
+        for output in self._outputs.get(slave, {}).values():
+            output.look(slave)
         if self._asked is not None and now - self._asked > PATIENCE:
             self.watching = False
 
@@ -269,6 +302,23 @@ class GroundTruth:
         self._watch(now)
         for joint in self._joints.values():
             joint.peak = 0.0
+
+    def edges(self, position: int, output: int, now: int) -> list[int]:
+        """Return when an output changed since the last question, ns of its slave's own clock; the first one begins.
+
+        Raises:
+            FaultRefused: there is no such output.
+        """
+        slaves = self._segment.slaves
+        box = slaves[position - 1].device if 1 <= position <= len(slaves) else None
+        if not isinstance(box, DiewuIoBox) or not 1 <= output <= CHANNELS:
+            raise FaultRefused(f"slave {position} has no output {output}: allowed are 1 to {CHANNELS} of an IO box")
+        self._watch(now)
+        slave = slaves[position - 1]
+        watched = self._outputs.setdefault(slave, {}).setdefault(output, _Output(box, output))
+        found = list(watched.edges)
+        watched.edges.clear()
+        return found
 
     def answer(self, now: int) -> dict[str, Any]:
         """Return what is true at instant `now`, slave by slave."""
@@ -369,6 +419,13 @@ class SegmentClient:
     def clear_peaks(self) -> None:
         """Let `peak_rad_s` count from now."""
         self._ask({"do": "clear_peaks"})
+
+    def edges(self, slave: int, output: int) -> list[int]:
+        """Return when an output (from 1) of the IO box at position `slave` changed, ns of the box's own clock.
+
+        The first question begins; each returns what came since the one before it, of which 1024 edges are kept.
+        """
+        return list(self._ask({"do": "edges", "slave": slave, "output": output}))
 
     def _ask(self, request: dict[str, Any]) -> Any:
         try:

@@ -156,7 +156,7 @@ def test_the_truth_is_told_slave_by_slave(segment: Running) -> None:
         (b"9" * 1000, f"found {'9' * 40}"),
         (b"x" * (LONGEST_REQUEST + 1), f"a request has at most {LONGEST_REQUEST} bytes"),
         (b"[1, 2]", "found a list, allowed is an object with the key do"),
-        ({}, "do: found nothing, allowed is one of fault, clear, faults, truth, clear_peaks"),
+        ({}, "do: found nothing, allowed is one of fault, clear, faults, truth, clear_peaks, edges"),
         ({"do": "dance"}, 'do: found the text "dance", allowed is one of fault'),
         ({"do": ["fault"]}, "do: found a list, allowed is one of fault"),
         ({"do": "truth", "slave": 1}, "slave: this key does not exist; allowed are do"),
