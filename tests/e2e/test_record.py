@@ -8,6 +8,7 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -15,14 +16,19 @@ from mcap_ros2.decoder import DecoderFactory
 from rtcp.ipc.session import read_processes
 
 from .conftest import Platform
+from .wire import COUNTS_PER_RAD, inputs, outputs
 
 pytestmark = pytest.mark.alone
 
 
-def numbers(path: Path) -> list[int]:
+def cycles(path: Path) -> list[Any]:
     with open(path, "rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        return [one.decoded_message.number for one in reader.iter_decoded_messages(topics=["/cycle"])]
+        return [one.decoded_message for one in reader.iter_decoded_messages(topics=["/cycle"])]
+
+
+def numbers(path: Path) -> list[int]:
+    return [one.number for one in cycles(path)]
 
 
 def recordings(platform: Platform) -> list[dict[str, Any]]:
@@ -45,6 +51,35 @@ def test_a_move_is_recorded_cycle_by_cycle_while_the_gateway_is_killed(enabled: 
     assert len(found) == first["records"]
     assert found == list(range(found[0], found[-1] + 1))
     assert len(Path(first["files"][1]).read_text().splitlines()) == 1 + len(found)
+
+
+def test_the_columns_of_a_csv_are_those_of_the_frames_captured_at_the_segment(
+    enabled: Platform, tmp_path: Path
+) -> None:
+    captured = tmp_path / "captured"
+    with enabled.capture(captured):
+        enabled.rtcp("record", "start", "--format", "mcap,csv", "--out", str(tmp_path))
+        enabled.call("move_joints", q=[0.1, -0.1, 0.2, 0.1, 0.1, -0.2])
+        enabled.rtcp("record", "stop")
+    (out,), (beside,) = tmp_path.glob("*.csv"), tmp_path.glob("*.mcap")
+    assert out.read_text().partition("\n")[0].split(",") == [
+        "Time", *(f"J{axis}_{name}" for name in ("pos", "vel", "tor", "tpos") for axis in range(1, 7))
+    ]  # fmt: skip
+    counts = np.rint(np.loadtxt(out, delimiter=",", skiprows=1)[:, 1:] * COUNTS_PER_RAD).astype(int)
+    # A cycle whose answer does not come in time has the values of the one before.
+    came = np.array([one.wkc == one.wkc_expected for one in cycles(beside)])
+    shown = np.array([[getattr(one, name) for name in ("position", "velocity", "torque") for one in drives]
+                      for _, drives in inputs(captured)])  # fmt: skip
+    asked = np.array([[one.position for one in drives] for _, drives in outputs(captured)])
+    found = [
+        start
+        for start in range(len(shown) - len(counts))
+        if (shown[start : start + len(counts)] == counts[:, :18])[came].all()
+    ]
+    assert len(found) == 1
+    # A record has the answer to the frame of its cycle, and the targets that left with the next one.
+    assert (asked[found[0] + 1 : found[0] + 1 + len(counts)] == counts[:, 18:]).all()
+    assert np.ptp(counts, axis=0).min() > 0
 
 
 def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -> None:
