@@ -26,7 +26,7 @@ Json = dict[str, Any]
 IN_MOTION = frozenset({State.MOVING, State.STOPPING})
 """States that a motion passes through."""
 _POLL_S = 0.002
-"""Interval at which the blackboard is read while somebody waits, s."""
+"""Interval at which the blackboard is read while somebody waits, s; for the answer to a command half a cycle."""
 _ANSWER_S = 2.0
 """Time for the loop to accept or refuse a command, s."""
 _PROGRESS_S = 0.1
@@ -48,7 +48,10 @@ class Caller:
 
 
 class _Waiter(Generic[T]):
-    def __init__(self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError]) -> None:
+    def __init__(
+        self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError], interval_s: float
+    ) -> None:
+        self.interval_s = interval_s
         self._look = look
         self._until = monotonic() + timeout_s
         self._timed_out = timed_out
@@ -86,6 +89,7 @@ class CommandChannel:
         self.config = config
         self.names = snapshot.names
         self._ring = asyncio.Lock()
+        self._answer_poll_s = min(0.5e-6 * config.cycle.period_us, _POLL_S)
         self._waiters: list[_Waiter[Any]] = []
         self._has_waiters = asyncio.Event()
 
@@ -169,16 +173,7 @@ class CommandChannel:
     ) -> T:
         """Send a command and wait until `outcome` returns something; it is called from the first record on that knows
         of the command, and may raise."""
-        async with self._ring:
-            try:
-                number = self.observer.command(lease, command)
-            except BlackboardError as error:
-                raise RtcpError("fault", str(error)) from None
-            except (ValueError, OverflowError, struct.error) as error:
-                raise RtcpError("invalid", f"{command.name}: a field cannot be sent: {error}") from None
-            late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
-            # The answer is a little older than the record of its cycle.
-            head = await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late)
+        head = await self.accept(lease, command)
 
         def look() -> T | None:
             self.check_loop()
@@ -188,6 +183,19 @@ class CommandChannel:
             return RtcpError("timeout", f"{what} took longer than {timeout_s:.1f} s: the machine is {self.state.words}")
 
         return await self.wait(look, timeout_s, timed_out)
+
+    async def accept(self, lease: int, command: Command) -> int:
+        """Send a command; return, once the loop has accepted it, the number of the last record without it."""
+        async with self._ring:
+            try:
+                number = self.observer.command(lease, command)
+            except BlackboardError as error:
+                raise RtcpError("fault", str(error)) from None
+            except (ValueError, OverflowError, struct.error) as error:
+                raise RtcpError("invalid", f"{command.name}: a field cannot be sent: {error}") from None
+            late = RtcpError("timeout", f"the loop did not answer {command.name} within {_ANSWER_S:g} s")
+            # The answer is a little older than the record of its cycle.
+            return await self.wait(lambda: self._accepted(number), _ANSWER_S, lambda: late, self._answer_poll_s)
 
     def _accepted(self, number: int) -> int | None:
         self.check_loop()
@@ -204,9 +212,15 @@ class CommandChannel:
         async with self._ring:
             self.observer.command(0, command)
 
-    async def wait(self, look: Callable[[], T | None], timeout_s: float, timed_out: Callable[[], RtcpError]) -> T:
-        """Return what `look` returns, once that is not None; it is called every 2 ms and may raise."""
-        waiter = _Waiter(look, timeout_s, timed_out)
+    async def wait(
+        self,
+        look: Callable[[], T | None],
+        timeout_s: float,
+        timed_out: Callable[[], RtcpError],
+        interval_s: float = _POLL_S,
+    ) -> T:
+        """Return what `look` returns, once that is not None; it is called at least every `interval_s` and may raise."""
+        waiter = _Waiter(look, timeout_s, timed_out, interval_s)
         self._waiters.append(waiter)
         self._has_waiters.set()
         try:
@@ -220,7 +234,7 @@ class CommandChannel:
             await self._has_waiters.wait()
             for waiter in list(self._waiters):
                 waiter.update()
-            await asyncio.sleep(_POLL_S)
+            await asyncio.sleep(min((waiter.interval_s for waiter in self._waiters), default=_POLL_S))
             if not self._waiters:
                 self._has_waiters.clear()
 
@@ -302,7 +316,7 @@ class StreamingCommands:
         channel = self._channel
         lease, since = self._lease(caller)
         try:
-            await channel.send(lease, command)
+            await channel.accept(lease, command)
         except RtcpError as error:
             ended = channel.early_end(since)
             if ended is not None and channel.state is not State.HOLDING:
