@@ -12,7 +12,22 @@ import typer
 
 import rtcp
 from rtcp.api import RtcpError
-from rtcp.cli import arm, bus, demo, doctor, faults, jog, motion, platform, record, segment, service, soak, status
+from rtcp.cli import (
+    arm,
+    bus,
+    demo,
+    doctor,
+    experiment,
+    faults,
+    jog,
+    motion,
+    platform,
+    record,
+    segment,
+    service,
+    soak,
+    status,
+)
 from rtcp.cli.output import CommandError, ExitCode, code_of, complain, emit, interruption_code, mute
 from rtcp.config.model import ConfigError
 
@@ -45,7 +60,22 @@ def _root(
             emit(text.rstrip())
 
 
-for _group in (platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults, record):
+for _group in (
+    platform,
+    status,
+    motion,
+    jog,
+    arm,
+    bus,
+    segment,
+    demo,
+    service,
+    doctor,
+    soak,
+    faults,
+    record,
+    experiment,
+):
     app.add_typer(_group.commands)
 
 

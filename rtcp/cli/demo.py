@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,7 +15,7 @@ from rtcp.api import Robot
 from rtcp.cli.arguments import BusName, ConfigFile, check_picture, option, positive
 from rtcp.cli.motion import arrival
 from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, interruptible, report, show, table
-from rtcp.cli.platform import connect, launch, refuse_second_platform
+from rtcp.cli.platform import connect, refuse_second_platform, running_platform
 from rtcp.cli.status import CYCLE_TIMES, clock_state, quantiles, realtime_line
 from rtcp.launch import offline
 
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from rtcp.config.model import ArmConfig, Joint
-    from rtcp.launch.launcher import StartOptions
     from rtcp.telemetry.square import Driven, Square
 
 REACH = 0.35
@@ -35,7 +33,6 @@ MARGIN = 0.05
 """Part of a joint's range that the poses keep from each end."""
 LOCK_TIMEOUT_S = 10.0
 LONGEST_S = 3600.0
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *SUSPENDING)
 
 commands = typer.Typer()
 
@@ -65,29 +62,11 @@ def _demo(
 
     options = StartOptions(config=config, bus=bus, mode="csp")
     stoppable = interruptible("interrupted: the platform has been stopped", *SUSPENDING)
-    with stoppable, _platform(options) as started_s, connect("demo") as robot:
+    with stoppable, running_platform(options) as started_s, connect("demo") as robot:
         status, mean_ns = _run(robot, arm.joints, seconds, drive)
     show(figures(status, started_s, mean_ns))
     if drive is not None:
         drive.report()
-
-
-@contextmanager
-def _platform(options: StartOptions) -> Iterator[float]:
-    """Run a platform and yield the duration of its start, s; stop it on exit, also on a second Ctrl-C."""
-    begun = time.monotonic()
-    running = launch(options)
-    try:
-        yield time.monotonic() - begun
-    finally:
-        handlers = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
-        try:
-            problems = running.stop(report)
-        finally:
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-        if not problems:
-            report("stopped")
 
 
 def _run(
@@ -205,17 +184,19 @@ class SquareDrive:
             RtcpError: the platform ended a motion.
             CommandError: nothing moved.
         """
-        from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
-        from rtcp.telemetry.recording import recording
+        from rtcp.telemetry.reading import read
         from rtcp.telemetry.square import SPEED_M_S, NoSquare, judge
 
         square, model = self._square, self._config.arm
         report(f"first corner: {arrival(robot.move_joints(square.start))}")
-        with recording(blackboard_file(runtime_directory())) as recorded:
-            arrived = robot.move_line(square.poses, SPEED_M_S)
-        report(f"square in {square.plane}: {arrival(arrived)}")
         if model is None:
             raise CommandError("the arm has no geometry (key kinematics)")
+        with TemporaryDirectory() as folder:
+            (path,) = robot.record_start(Path(folder) / "square.mcap").files
+            arrived = robot.move_line(square.poses, SPEED_M_S)
+            robot.record_stop()
+            recorded = read(Path(path))
+        report(f"square in {square.plane}: {arrival(arrived)}")
         try:
             self._driven = judge(model, square, recorded)
         except NoSquare as error:
@@ -229,8 +210,8 @@ class SquareDrive:
             return
         commanded, actual = (1e3 * worst for worst in self._driven.worst)
         report(f"largest deviation from the square: {commanded:.3f} mm commanded, {actual:.2f} mm actual")
-        if self._driven.lost:
-            report(f"{self._driven.lost} cycle records are missing in the recording")
+        if self._driven.missing:
+            report(f"{self._driven.missing} cycle records are missing in the recording")
         try:
             draw(self._driven, self._out)
         except OSError as error:

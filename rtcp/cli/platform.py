@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -36,6 +37,8 @@ _NOT_READY = frozenset({State.STARTING, State.FAULT, State.EMERGENCY_STOP})
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque", "csp", "csv", "cst")
 _TIMEOUT_S = 10.0
 """Time for another command to start the gateway."""
+
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, *SUSPENDING)
 
 commands = typer.Typer()
 
@@ -124,6 +127,24 @@ def launch(options: StartOptions, log: Callable[[str], None] = report) -> Platfo
 
     with interruptible("interrupted while starting: nothing is left running"):
         return launcher.start(options, log, check_segment)
+
+
+@contextmanager
+def running_platform(options: StartOptions) -> Iterator[float]:
+    """Run a platform and yield the duration of its start, s; stop it on exit, also on a second Ctrl-C."""
+    begun = time.monotonic()
+    running = launch(options)
+    try:
+        yield time.monotonic() - begun
+    finally:
+        handlers = {number: signal.signal(number, signal.SIG_IGN) for number in _ENDING}
+        try:
+            problems = running.stop(report)
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        if not problems:
+            report("stopped")
 
 
 def serve(options: StartOptions, announce: Callable[[], None]) -> int:

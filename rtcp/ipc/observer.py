@@ -328,6 +328,16 @@ class Observer:
 
     # -- commands -----------------------------------------------------------------------------------------------
 
+    @property
+    def commands_sent(self) -> int:
+        """Number of the last command in the ring; 0 before the first."""
+        return self._words[COMMAND_HEAD_AT]
+
+    @property
+    def commands_taken(self) -> int:
+        """Number of the last command that the loop has taken out of the ring."""
+        return self._words[COMMAND_TAKEN_AT]
+
     def command(self, lease: int, command: Command) -> int:
         """Put a command into the ring; return its number. The lease's holder is the only writer.
 

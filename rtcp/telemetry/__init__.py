@@ -1,1 +1,1 @@
-"""Analysis of cycle records and fault injection: recordings, the square, fault reports, trials and the soak."""
+"""Recordings, the live view, experiments and their report, fault reports, trials and the soak."""

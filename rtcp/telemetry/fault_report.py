@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from rtcp.ipc.recording import FaultRecording
 from rtcp.ipc.states import State
-from rtcp.telemetry.recording import target_steps
+from rtcp.telemetry.reading import target_steps
 
 COLOURS = ("#1c6dd0", "#e07a1f", "#2f9e44", "#d1322d", "#7b4fb3", "#8a5a33", "#d264a6", "#6b7280", "#a39b1e", "#1fa5b5")
 """One for each joint."""

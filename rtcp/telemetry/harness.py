@@ -17,7 +17,7 @@ from rtcp.ipc.names import Names
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
 from rtcp.ipc.session import read_session
-from rtcp.telemetry.recording import target_steps
+from rtcp.telemetry.reading import target_steps
 from rtcp.virtual.faults.control import SegmentClient
 
 CLIENT_NAME = "a trial"

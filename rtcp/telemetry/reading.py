@@ -6,7 +6,7 @@ A file that is cut off, as that of a recorder that was killed, is read as far as
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -22,7 +22,7 @@ from numpy.lib.recfunctions import repack_fields
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.serialization import from_json
-from rtcp.ipc.layout import PER_JOINT
+from rtcp.ipc.layout import FLAG_ENABLED, PER_JOINT
 from rtcp.ipc.recording import (
     ABOUT,
     Batch,
@@ -271,3 +271,20 @@ def read(path: Path, signals: Sequence[str] = (), start_s: float | None = None, 
         path, reader.about, reader.config, records, seconds, period_s, int((steps // every - 1).sum()), log,
         tuple(map(reader.at_s, log)), reader.truncated,
     )  # fmt: skip
+
+
+def target_steps(
+    records: Mapping[str, npt.NDArray[Any]] | npt.NDArray[np.void],
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return the steps of the targets between consecutive cycles with enabled drives.
+
+    Without enabled drives a target only repeats the position.
+
+    Returns:
+        The index of each step's second cycle, shape (n,), and its size for each joint, shape (n, joints), rad.
+    """
+    numbers = records["number"].astype(np.int64)
+    enabled = (records["flags"] & FLAG_ENABLED) != 0
+    pairs = np.flatnonzero((np.diff(numbers) == 1) & enabled[1:] & enabled[:-1])
+    targets = records["sent_position"]
+    return pairs + 1, np.abs(targets[pairs + 1] - targets[pairs])

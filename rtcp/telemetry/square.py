@@ -20,7 +20,7 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import PlanRefused
-from rtcp.telemetry.recording import Recording
+from rtcp.telemetry.reading import Recorded
 
 Array = npt.NDArray[np.float64]
 
@@ -124,7 +124,7 @@ class Driven:
     joints: Array
     speeds: Array
     torques: Array
-    lost: int
+    missing: int
 
     @property
     def worst(self) -> tuple[float, float]:
@@ -132,7 +132,7 @@ class Driven:
         return float(self.off_commanded.max()), float(self.off_actual.max())
 
 
-def judge(model: ArmModel, square: Square, recorded: Recording) -> Driven:
+def judge(model: ArmModel, square: Square, recorded: Recorded) -> Driven:
     """Return what a recording of the square's lines tells; the records before and after the motion are left out.
 
     Raises:
@@ -157,7 +157,7 @@ def judge(model: ArmModel, square: Square, recorded: Recording) -> Driven:
         position,
         recorded.column("actual_velocity")[span],
         recorded.column("actual_torque")[span],
-        recorded.lost,
+        recorded.missing,
     )
 
 

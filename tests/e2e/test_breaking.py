@@ -15,7 +15,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.ipc.observer import Observer, record_type
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
-from rtcp.telemetry.recording import target_steps
+from rtcp.telemetry.reading import target_steps
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
 from tests.e2e.wire import outputs

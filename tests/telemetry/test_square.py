@@ -14,13 +14,13 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, Box
 from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
-from rtcp.telemetry.recording import Recording
+from rtcp.telemetry.reading import Recorded
 from rtcp.telemetry.square import PLANES, SIDE_M, NoSquare, Square, distance_from, draw, judge, place
 
 CONFIG = load(default_config())
 
 
-def recorded(square: Square, config: ArmConfig, off_m: float) -> Recording:
+def recorded(square: Square, config: ArmConfig, off_m: float) -> Recorded:
     """A recording in which the commanded tool goes along the square and the actual one beside it, in z."""
     from kinematics import InverseKinematics, Pose
 
@@ -38,8 +38,8 @@ def recorded(square: Square, config: ArmConfig, off_m: float) -> Recording:
         assert beside.q is not None
         near = found.q
         records[number]["sent_position"], records[number]["actual_position"] = found.q, beside.q
-        records[number]["cycle"] = number
-    return Recording(0.001, [records])
+    seconds = 0.001 * np.arange(len(records))
+    return Recorded(Path("square.mcap"), {}, config, records, seconds, 0.001, 0, (), (), False)
 
 
 @pytest.mark.parametrize("plane", PLANES)
@@ -86,6 +86,6 @@ def test_what_is_beside_the_square_is_measured_and_drawn(tmp_path: Path) -> None
 def test_a_recording_without_motion_is_none() -> None:
     square = place(CONFIG, "xy")
     assert CONFIG.arm is not None
-    still = Recording(0.001, [np.zeros(10, dtype=record_type(RecordLayout(6)))])
+    still = replace(recorded(square, CONFIG, 0.0), records=np.zeros(10, dtype=record_type(RecordLayout(6))))
     with pytest.raises(NoSquare, match="nothing moved"):
         judge(CONFIG.arm, square, still)

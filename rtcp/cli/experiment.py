@@ -1,0 +1,122 @@
+"""`rtcp experiment` and `rtcp report`: the source's figures repeated, and one page of all of them."""
+
+from __future__ import annotations
+
+import shlex
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rtcp.api import RtcpError
+from rtcp.cli.arguments import BusName, ConfigFile, option
+from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, complain, interruptible, report, show, table
+from rtcp.cli.platform import refuse_second_platform, running_platform
+from rtcp.launch import offline
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from rtcp.telemetry.experiments.experiment import Result
+
+ALL = "all"
+NAMES = ("cycle", "delays", "step", "square", "picks", "latency", "resources", "tracking")
+MISSED = 1
+
+commands = typer.Typer()
+
+
+@commands.command("experiment")
+def _experiment(
+    name: Annotated[str, typer.Argument(metavar="NAME", help=f"{', '.join(NAMES)}, or all of them: {ALL}.")],
+    config: ConfigFile = None,
+    bus: BusName = None,
+    out: Annotated[
+        Path | None, option("--out", "DIR", "New folder for the results. Default: NAME and the time.")
+    ] = None,
+) -> None:
+    """Repeat an experiment of the source documents: a table, pictures, recordings, and for all a page.
+
+    Each starts a platform of its own and stops it. Exit code 1: a figure misses its aim.
+    """
+    if name not in (*NAMES, ALL):
+        raise CommandError(f"there is no experiment {name}: allowed are {', '.join(NAMES)}, {ALL}")
+    refuse_second_platform()
+    offline.configuration(config)  # its mistakes are named before anything begins
+    folder = Path(f"{name}-{time.strftime('%Y-%m-%dT%H-%M-%S')}") if out is None else out
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise CommandError(f"the folder {folder} cannot be made: {error.strerror}") from error
+    results, failed = [], []
+    with interruptible("interrupted: the platform has been stopped", *SUSPENDING):
+        for one in NAMES if name == ALL else (name,):
+            try:
+                results.append(_carry_out(one, config, bus, folder / one if name == ALL else folder))
+                show(result_table(results[-1]))
+            except RtcpError as error:
+                if name != ALL:
+                    raise
+                failed.append(f"{one}: {error}")
+                complain(failed[-1])
+    if name == ALL and results:
+        report(f"report: {_write_report([folder], folder / 'report.html')}")
+    else:
+        report(f"results: {folder}")
+    if failed:
+        raise CommandError("\n".join(failed), ExitCode.FAULT)
+    if not all(result.met for result in results):
+        raise typer.Exit(MISSED)
+
+
+def _carry_out(name: str, config: Path | None, bus: str | None, folder: Path) -> Result:
+    from rtcp.telemetry.experiments import EXPERIMENTS
+    from rtcp.telemetry.experiments.experiment import ExperimentFailed, Setup, carry_out
+
+    folder.mkdir(exist_ok=True)
+    given = [*(["--config", str(config)] if config else []), *(["--bus", bus] if bus else [])]
+    command = shlex.join(["rtcp", "experiment", name, *given])
+    report(f"{name}: {EXPERIMENTS[name].title}")
+    try:
+        return carry_out(EXPERIMENTS[name](), Setup(folder, running_platform, report, config, bus), command)
+    except ExperimentFailed as error:
+        raise RtcpError("fault", f"{name}: {error}") from error
+    except OSError as error:
+        raise CommandError(f"{folder}: the results cannot be written: {error}", ExitCode.FAULT) from error
+
+
+def result_table(result: Result) -> Table:
+    """Return the table of a result: figure, source, here, aim, verdict."""
+    rows = table(("figure", "unit", "source", "here", "aim", ""), ("figure", "unit"), title=result.title)
+    for row in result.rows:
+        source = "" if row.source is None else row.source if isinstance(row.source, str) else f"{row.source:g}"
+        verdict = {None: "", True: "met", False: "MISSED"}[row.met]
+        rows.add_row(row.figure, row.unit, source, f"{row.here:.4g}", row.aim, verdict)
+    return rows
+
+
+@commands.command("report")
+def _report(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="DIR..", help="Of `rtcp experiment`: one, or two to compare.")
+    ],
+    out: Annotated[Path | None, option("--out", "FILE", "The page. Default: report.html in the first folder.")] = None,
+) -> None:
+    """Make the page of a folder of experiments anew, or of two side by side."""
+    report(f"report: {_write_report(folders, folders[0] / 'report.html' if out is None else out)}")
+
+
+def _write_report(folders: Sequence[Path], out: Path) -> Path:
+    from rtcp.telemetry.experiments.experiment import ExperimentFailed
+    from rtcp.telemetry.report import page
+
+    try:
+        text = page(folders)
+        out.write_text(text)
+    except ExperimentFailed as error:
+        raise CommandError(str(error)) from error
+    except OSError as error:
+        raise CommandError(f"{out}: the report cannot be written: {error.strerror}", ExitCode.FAULT) from error
+    return out

@@ -1,0 +1,17 @@
+"""The experiments of the source documents, each repeated by one command: `rtcp experiment NAME`."""
+
+from rtcp.telemetry.experiments.experiment import Experiment
+from rtcp.telemetry.experiments.latency import LatencyExperiment
+from rtcp.telemetry.experiments.motions import PicksExperiment, SquareExperiment, StepExperiment
+from rtcp.telemetry.experiments.resources import ResourcesExperiment
+from rtcp.telemetry.experiments.timing import CycleExperiment, DelaysExperiment
+from rtcp.telemetry.experiments.tracking import TrackingExperiment
+
+EXPERIMENTS: dict[str, type[Experiment]] = {
+    kind.name: kind
+    for kind in (
+        CycleExperiment, DelaysExperiment, StepExperiment, SquareExperiment, PicksExperiment, LatencyExperiment,
+        ResourcesExperiment, TrackingExperiment,
+    )
+}  # fmt: skip
+"""By name, in the order of `rtcp experiment all`."""

@@ -1,0 +1,253 @@
+"""What an experiment is: a platform of its own, recordings, pictures, and rows that stand beside the source's figures.
+
+Its folder holds `recording*.mcap`, each picture as PNG and SVG, and `result.json`, from which a report is made.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ruamel.yaml import YAML
+
+from rtcp.api import Robot
+from rtcp.config.find import find_config
+from rtcp.config.loader import load
+from rtcp.config.model import VIRTUAL, ArmConfig
+from rtcp.ipc.recording import versions
+from rtcp.launch.launcher import StartOptions
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESULT = "result.json"
+LOCK_TIMEOUT_S = 10.0
+Source = float | str | None
+
+
+class ExperimentFailed(Exception):
+    """An experiment cannot be carried out or judged; the message says why."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure: the source's, the one measured here, and between which bounds it is to lie."""
+
+    figure: str
+    unit: str
+    here: float
+    source: Source = None
+    least: float | None = None
+    most: float | None = None
+
+    @property
+    def met(self) -> bool | None:
+        """Whether it lies between its bounds; None: it has none. A figure that is no number misses them."""
+        if self.least is None and self.most is None:
+            return None
+        return (self.least is None or self.here >= self.least) and (self.most is None or self.here <= self.most)
+
+    @property
+    def aim(self) -> str:
+        """Its bounds in words."""
+        if self.least is None:
+            return "" if self.most is None else f"at most {self.most:g}"
+        return f"at least {self.least:g}" if self.most is None else f"{self.least:g} to {self.most:g}"
+
+
+@dataclass(frozen=True)
+class Result:
+    """What came of an experiment."""
+
+    name: str
+    title: str
+    command: str
+    """The command that repeats it."""
+    began: str
+    """ISO 8601, local time."""
+    seconds: float
+    host: Mapping[str, str]
+    rows: tuple[Row, ...]
+    pictures: tuple[str, ...] = ()
+    """Names of the files, without their endings."""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def met(self) -> bool:
+        """Whether no row misses its aim."""
+        return not any(row.met is False for row in self.rows)
+
+    def write(self, folder: Path) -> None:
+        """Write `result.json`; raises OSError."""
+        rows = [{**asdict(row), "met": row.met} for row in self.rows]
+        (folder / RESULT).write_text(json.dumps({**asdict(self), "rows": rows}, indent=1) + "\n")
+
+
+def read_result(folder: Path) -> Result:
+    """Return the result in a folder.
+
+    Raises:
+        ExperimentFailed: there is none, or it is not of this version.
+    """
+    path = folder / RESULT
+    try:
+        found = json.loads(path.read_bytes())
+        rows = tuple(Row(**{name: value for name, value in row.items() if name != "met"}) for row in found["rows"])
+        texts = {name: tuple(found[name]) for name in ("pictures", "notes")}
+        return Result(**{**found, **texts, "rows": rows})
+    except OSError as error:
+        raise ExperimentFailed(f"{path}: it cannot be read: {error.strerror}") from error
+    except (ValueError, TypeError, LookupError) as error:
+        raise ExperimentFailed(f"{path}: it is no result of an experiment: {error}") from error
+
+
+@dataclass
+class Setup:
+    """Where an experiment runs, and what it leaves behind.
+
+    Args:
+        folder: of the experiment; it exists.
+        start: runs a platform while inside, and leaves nothing running.
+        report: receives each step in a sentence.
+        config: file of the arm; None: the one that `rtcp start` takes.
+        bus: name of the bus; None: the configured one.
+    """
+
+    folder: Path
+    start: Callable[[StartOptions], AbstractContextManager[object]]
+    report: Callable[[str], None]
+    config: Path | None = None
+    bus: str | None = None
+    pictures: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def arm(self) -> ArmConfig:
+        """The configuration of the arm; raises ConfigError."""
+        return load(find_config(self.config))
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether the arm is the one in software."""
+        return (self.bus or self.arm.bus.interface) == VIRTUAL
+
+    def note(self, text: str) -> None:
+        """Add a remark to the result, and report it."""
+        self.notes.append(text)
+        self.report(text)
+
+    @contextmanager
+    def platform(self, cycle_us: float | None = None, enabled: bool = True) -> Iterator[Robot]:
+        """Run a platform while inside, its clocks locked and its drives enabled.
+
+        Raises:
+            ExperimentFailed: the clocks do not lock.
+            RtcpError: the platform refuses or fails.
+        """
+        options = StartOptions(config=self.config, bus=self.bus, mode="csp", cycle_us=cycle_us)
+        with self.start(options), Robot(f"rtcp experiment (pid {os.getpid()})") as robot:
+            until = time.monotonic() + LOCK_TIMEOUT_S
+            while not robot.status().raw["dc"]["locked"]:
+                if time.monotonic() > until:
+                    raise ExperimentFailed(f"the clocks have not locked within {LOCK_TIMEOUT_S:g} s")
+                time.sleep(0.05)
+            if enabled:
+                robot.enable()
+            yield robot
+
+    @contextmanager
+    def recording(self, robot: Robot, name: str = "recording", signals: Sequence[str] = ()) -> Iterator[Path]:
+        """Record every cycle while inside; yield the file, which is complete afterwards."""
+        path = self.folder / f"{name}.mcap"
+        robot.record_start(path, signals=signals)
+        try:
+            yield path
+        finally:
+            ended = robot.record_stop()
+        for one in ended:
+            if one.problem or one.missing:
+                self.note(f"{name}: {one.problem or f'{one.missing} cycles are missing in the recording'}")
+
+    def draw(self, name: str, figure: Figure) -> None:
+        """Save a picture as PNG and SVG; raises OSError."""
+        for ending in ("png", "svg"):
+            figure.savefig(self.folder / f"{name}.{ending}", dpi=110)
+        self.pictures.append(name)
+
+    def with_limits(self, joint: int, **limits: float) -> Setup:
+        """Return a setup whose joint (from 0) has at least these limits, on the virtual arm.
+
+        The configuration that says so is copied into the folder; without need, or with a real arm, nothing changes.
+        """
+        found = self.arm.joints[joint]
+        raised = {key: value for key, value in limits.items() if getattr(found, key) < value}
+        if not raised or not self.is_virtual:
+            return self
+        source = find_config(self.config)
+        copy = self.folder / "configuration"
+        shutil.copytree(source.parent, copy, dirs_exist_ok=True)
+        yaml = YAML()
+        document = yaml.load(source)
+        document["joints"][joint].update(raised)
+        yaml.dump(document, copy / source.name)
+        text = ", ".join(f"{key} {value:.3g} instead of {getattr(found, key):g}" for key, value in raised.items())
+        self.note(f"{found.name} of the virtual arm has other limits for this experiment (configuration/): {text}")
+        return replace(self, config=copy / source.name)
+
+
+class Experiment(ABC):
+    """One experiment; a subclass has `name` and `title`."""
+
+    name = ""
+    title = ""
+
+    @abstractmethod
+    def run(self, setup: Setup) -> list[Row]:
+        """Carry it out and return its figures.
+
+        Raises:
+            ExperimentFailed: it cannot be carried out or judged.
+            RtcpError: the platform refuses or fails.
+        """
+
+
+def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
+    """Carry out an experiment in its folder and write its result; errors as of `Experiment.run`, and OSError."""
+    began, begun_s = datetime.now().astimezone(), time.monotonic()
+    rows = experiment.run(setup)
+    result = Result(
+        name=experiment.name,
+        title=experiment.title,
+        command=command,
+        began=began.isoformat(timespec="seconds"),
+        seconds=round(time.monotonic() - begun_s, 1),
+        host=host(setup),
+        rows=tuple(rows),
+        pictures=tuple(setup.pictures),
+        notes=tuple(setup.notes),
+    )
+    result.write(setup.folder)
+    return result
+
+
+def host(setup: Setup) -> dict[str, str]:
+    """Return what figures depend on: machine, versions, arm, bus and cycle."""
+    arm = setup.arm
+    return {
+        "machine": f"{platform.machine()}, {os.cpu_count()} CPUs",
+        "system": platform.platform(),
+        **versions(),
+        "arm": arm.name,
+        "bus": setup.bus or arm.bus.interface,
+        "period_us": f"{arm.cycle.period_us:g}",
+    }

@@ -1,0 +1,272 @@
+"""The latency from a streamed command to the motion: a sine, fitted in the commands and in what the drives did.
+
+The source's second document streams a sine over a range of pi/8 rad with a period of 2 s at 30 Hz, and finds that the
+feedback lags by 455 ms, of which 33 ms are the period of the commands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import cos, pi, tau
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import curve_fit
+
+from rtcp.api import Robot, State
+from rtcp.ipc import jsonrpc
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, runtime_directory
+from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
+from rtcp.telemetry.reading import Recorded, read
+
+Array = npt.NDArray[np.float64]
+Send = Callable[[Sequence[float]], None]
+
+AMPLITUDE_RAD, PERIOD_S = pi / 16, 2.0
+SOURCE_MS = 455.0
+AIM_CYCLES = 3.0
+_JOINT = 0
+_SPARE = 1.3
+"""Limits beside what the sine needs: the way to a target that comes late is faster than the sine."""
+_PROBES, _PROBE_INTERVAL_S = 200, 0.02
+_PROBE_TIMEOUT_NS = 50_000_000
+
+
+@dataclass(frozen=True)
+class Sine:
+    """A fitted sine, amplitude * sin(tau * (t - delay_s) / period_s) + offset, and the standard error of its delay."""
+
+    amplitude: float
+    period_s: float
+    delay_s: float
+    offset: float
+    error_s: float
+
+
+def fit_sine(t: Array, y: Array, period_s: float) -> Sine:
+    """Fit a sine by least squares.
+
+    Args:
+        t: s, shape (n,), n of at least 5.
+        y: shape (n,).
+        period_s: near the true one.
+    """
+    # About the middle of the data the delay does not depend on the error of the period.
+    middle = round(float(t.mean()) / period_s) * period_s
+    x = t - middle
+    w = tau / period_s
+    (a, b, c), *_ = np.linalg.lstsq(np.column_stack((np.sin(w * x), np.cos(w * x), np.ones_like(x))), y, rcond=None)
+
+    def model(x: Array, amplitude: float, period: float, delay: float, offset: float) -> Array:
+        return amplitude * np.sin(tau * (x - delay) / period) + offset
+
+    guess = (float(np.hypot(a, b)), period_s, float(np.arctan2(-b, a)) / w, float(c))
+    (amplitude, period, delay, offset), covariance = curve_fit(model, x, y, guess)
+    return Sine(amplitude, period, delay % period, offset, float(np.sqrt(covariance[2, 2])))
+
+
+def behind(feedback: Sine, command: Sine) -> tuple[float, float]:
+    """Return how far a sine is behind another, s, at most half a period ahead, and the standard error."""
+    delay = (feedback.delay_s - command.delay_s + 0.5 * command.period_s) % command.period_s - 0.5 * command.period_s
+    return delay, float(np.hypot(feedback.error_s, command.error_s))
+
+
+@contextmanager
+def _by_api(robot: Robot) -> Iterator[Send]:
+    def send(q: Sequence[float]) -> None:
+        robot.stream(q, time.monotonic())
+
+    yield send
+
+
+@contextmanager
+def _by_socket(robot: Robot) -> Iterator[Send]:
+    """Write lines of JSON-RPC to the control socket, without waiting for the answers."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.connect(str(control_socket(runtime_directory())))
+        reader = threading.Thread(target=_drain, args=(connection,), daemon=True)
+        reader.start()
+        number = 0
+
+        def send(q: Sequence[float]) -> None:
+            nonlocal number
+            number += 1
+            params = {"q": list(q), "stamp_s": time.monotonic()}
+            connection.sendall(jsonrpc.request(number, "stream_position", params))
+
+        yield send
+        connection.shutdown(socket.SHUT_RDWR)
+        reader.join()
+
+
+def _drain(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while connection.recv(65536):
+            pass
+
+
+WAYS: Mapping[str, Callable[[Robot], contextlib.AbstractContextManager[Send]]] = {
+    "Python API": _by_api,
+    "socket": _by_socket,
+}
+
+
+class LatencyExperiment(Experiment):
+    """The sine, streamed by each way in at each rate.
+
+    Args:
+        rates_hz: of the commands.
+        periods: of the sine; the first one does not count.
+    """
+
+    name = "latency"
+    title = "Latency of streamed joint commands"
+
+    def __init__(self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0), periods: int = 6) -> None:
+        self._rates_hz = rates_hz
+        self._periods = periods
+
+    def run(self, setup: Setup) -> list[Row]:
+        """See `Experiment.run`."""
+        w = tau / PERIOD_S
+        needs = {"velocity": AMPLITUDE_RAD * w, "acceleration": AMPLITUDE_RAD * w**2, "jerk": 10 * AMPLITUDE_RAD * w**3}
+        setup = setup.with_limits(_JOINT, **{key: _SPARE * value for key, value in needs.items()})
+        limits = setup.arm.joints[_JOINT]
+        share = min(1.0, *(getattr(limits, key) / (_SPARE * value) for key, value in needs.items()))
+        if share < 1.0:
+            setup.note(f"the sine has {share:.2f} of its amplitude: the limits of {limits.name} allow no more")
+        rows: list[Row] = []
+        with setup.platform() as robot:
+            for way in WAYS:
+                for rate in self._rates_hz:
+                    rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
+            rows += self._parts(setup, robot)
+        return rows
+
+    def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
+        label = f"{way}, {rate:g} Hz"
+        base = list(robot.status().positions)
+        times: list[float] = []
+        values: list[float] = []
+        with setup.recording(
+            robot, f"recording-{label.replace(', ', '-').replace(' ', '-')}", ("*_position", "exchange_ns")
+        ) as path:
+            with WAYS[way](robot) as send:
+                begun, number = time.monotonic(), 0
+                while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
+                    q = base[_JOINT] + amplitude * (1.0 - cos(tau * now / PERIOD_S))
+                    times.append(begun + now)
+                    values.append(q)
+                    send([q, *base[1:]])
+                    # A tick that was missed is left out: commands are never sent in a burst.
+                    number = max(number + 1, int((time.monotonic() - begun) * rate))
+                    time.sleep(max(0.0, begun + number / rate - time.monotonic()))
+            _wait_until_it_rests(robot)
+        robot.move_joints(base)
+        recorded = read(path, ("time_ns", "*_position"))
+        series = {"command": (np.array(times), np.array(values)), **_recorded_series(recorded)}
+        # Of the times only what lies inside the sine, and not its beginning.
+        first, last = begun + PERIOD_S, times[-1]
+        sines = {}
+        for name, (t, y) in series.items():
+            inside = (t >= first) & (t <= last)
+            sines[name] = fit_sine(t[inside] - begun, y[inside], PERIOD_S)
+        command = sines["command"]
+        latency, error = behind(sines["actual"], command)
+        wire, _ = behind(sines["sent"], command)
+        cycles = wire / recorded.period_s
+        self._draw(setup, label, {name: (t - begun, y) for name, (t, y) in series.items()})
+        setup.report(
+            f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
+        )
+        return [
+            Row(f"{label}: rate", "Hz", (len(times) - 1) / (times[-1] - times[0]), least=0.95 * rate),
+            Row(f"{label}: latency to the motion", "ms", 1e3 * latency, SOURCE_MS if rate == 30.0 else None),
+            Row(f"{label}: its standard error", "ms", 1e3 * error),
+            Row(f"{label}: command to the wire", "cycles", cycles, most=AIM_CYCLES if rate == 1000.0 else None),
+            Row(f"{label}: sent to actual", "ms", 1e3 * behind(sines["actual"], sines["sent"])[0]),
+            Row(f"{label}: amplitude, actual / command", "", sines["actual"].amplitude / command.amplitude),
+        ]
+
+    def _parts(self, setup: Setup, robot: Robot) -> list[Row]:
+        """Measure single commands on their way through socket, ring, cycle and wire."""
+        observer = Observer(blackboard_file(runtime_directory()))
+        base = list(robot.status().positions)
+        into_ring: list[float] = []
+        taken: list[float] = []
+        instants: list[int] = []
+        begun = observer.head
+        with contextlib.closing(observer), _by_socket(robot) as send:
+            for _ in range(_PROBES):
+                number = observer.commands_sent + 1
+                sent = time.monotonic_ns()
+                send(base)
+                ringed = _spin_until(number, lambda: observer.commands_sent)
+                arrived = _spin_until(number, lambda: observer.commands_taken)
+                into_ring.append(1e-3 * (ringed - sent))
+                taken.append(1e-3 * (arrived - ringed))
+                instants.append(arrived)
+                time.sleep(_PROBE_INTERVAL_S)
+            records, _ = observer.since(begun)
+        _wait_until_it_rests(robot)
+        # What a cycle has computed leaves with the beginning of the next one.
+        at = np.searchsorted(records["time_ns"], instants)
+        known = at < len(records)
+        left = records["time_ns"][at[known]] - np.array(instants)[known]
+        parts = {
+            "socket": np.array(into_ring),
+            "ring": np.array(taken),
+            "cycle": 1e-3 * left,
+            "wire": 1e-3 * records["exchange_ns"][at[known]],
+        }
+        rows = []
+        for name, values in parts.items():
+            rows += [Row(f"{name}: p{p}", "us", float(np.percentile(values, p))) for p in (50, 99)]
+        return rows
+
+    @staticmethod
+    def _draw(setup: Setup, label: str, series: Mapping[str, tuple[Array, Array]]) -> None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
+        axes = figure.add_subplot()
+        for name, (t, y) in series.items():
+            shown = (t >= PERIOD_S) & (t <= 2 * PERIOD_S)
+            axes.plot(t[shown], y[shown], "." if name == "command" else "-", ms=4, lw=1.2, label=name)
+        axes.set(xlabel="time, s", ylabel="joint 1, rad", title=label)
+        axes.legend()
+        axes.grid(alpha=0.3)
+        setup.draw(f"latency-{label.replace(', ', '-').replace(' ', '-')}", figure)
+
+
+def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:
+    """Return sent and actual position over the time of CLOCK_MONOTONIC, s."""
+    records = recorded.records
+    t = records["time_ns"] * 1e-9
+    # What a record calls sent leaves with the beginning of the next cycle.
+    leaves = np.append(t[1:], t[-1] + recorded.period_s)
+    return {
+        "sent": (leaves, records["sent_position"][:, _JOINT]),
+        "actual": (t, records["actual_position"][:, _JOINT]),
+    }
+
+
+def _spin_until(number: int, count: Callable[[], int]) -> int:
+    """Return the instant, ns, at which a count has reached a number."""
+    until = time.monotonic_ns() + _PROBE_TIMEOUT_NS
+    while count() < number:
+        if time.monotonic_ns() > until:
+            raise ExperimentFailed("a command did not reach the loop within 50 ms")
+    return time.monotonic_ns()
+
+
+def _wait_until_it_rests(robot: Robot) -> None:
+    while robot.state is not State.HOLDING:
+        time.sleep(0.02)

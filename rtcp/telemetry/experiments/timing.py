@@ -1,0 +1,146 @@
+"""Experiments on time: the cycle, seen from inside and at an output of the IO box, and the propagation delays."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.api import RtcpError
+from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.session import read_session
+from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
+from rtcp.telemetry.reading import read
+from rtcp.virtual.faults.control import SegmentClient
+
+Array = npt.NDArray[np.float64]
+
+SOURCE_CYCLES = {
+    200.0: (218.1, 9.0, 21.4), 300.0: (274.0, 8.6, 23.0), 400.0: (372.0, 7.0, 39.0), 500.0: (463.0, 7.4, 46.0),
+    600.0: (558.0, 7.0, 67.0), 700.0: (654.0, 6.57, 40.0), 800.0: (758.0, 6.5, 42.0), 900.0: (843.0, 6.33, 56.0),
+    1000.0: (940.0, 6.0, 60.0), 2000.0: (1879.0, 6.04, 120.0),
+}  # fmt: skip
+"""Target -> mean, us, percent error, average deviation, us: the source's table 7 and its run of 1000 samples."""
+SOURCE_DELAYS_NS = (0, 820, 1660, 2500, 3320, 4160, 5020)
+_READ_INTERVAL_S = 0.1
+"""The segment keeps 1024 edges: 0.2 s at 200 us."""
+
+
+def spread(intervals_us: Array, target_us: float) -> tuple[float, float, float]:
+    """Return mean, us, percent error of the mean, and average deviation from the mean, us."""
+    mean = float(intervals_us.mean())
+    return mean, 100.0 * abs(mean - target_us) / target_us, float(np.abs(intervals_us - mean).mean())
+
+
+class CycleExperiment(Experiment):
+    """The ten cycle targets of the source, six drives enabled, from inside and from outside.
+
+    Args:
+        targets_us: cycles.
+        seconds: of each.
+    """
+
+    name = "cycle"
+    title = "Cycle time: mean, error and average deviation"
+
+    def __init__(self, targets_us: Sequence[float] = tuple(SOURCE_CYCLES), seconds: float = 5.0) -> None:
+        self._targets_us = targets_us
+        self._seconds = seconds
+
+    def run(self, setup: Setup) -> list[Row]:
+        """See `Experiment.run`; a target that the host cannot keep is a note."""
+        rows: list[Row] = []
+        found: dict[float, dict[str, Array]] = {}
+        for target in self._targets_us:
+            try:
+                found[target] = self._measure(setup, target)
+            except (RtcpError, ExperimentFailed) as error:
+                setup.note(f"{target:g} us: not measured: {error}")
+                continue
+            for side, intervals in found[target].items():
+                mean, percent, deviation = spread(intervals, target)
+                source = SOURCE_CYCLES.get(target, (None, None, None))
+                label = f"{target:g} us, {side}"
+                rows += [
+                    Row(f"{label}: mean", "us", mean, source[0]),
+                    Row(f"{label}: error of the mean", "%", percent, source[1], most=source[1]),
+                    Row(f"{label}: average deviation", "us", deviation, source[2], most=source[2]),
+                ]
+                setup.report(
+                    f"{label}: mean {mean:.2f} us, error {percent:.3f} %, average deviation {deviation:.2f} us"
+                )
+        if not rows:
+            raise ExperimentFailed("no cycle could be measured")
+        self._draw(setup, found)
+        return rows
+
+    def _measure(self, setup: Setup, target_us: float) -> dict[str, Array]:
+        output = setup.arm.outputs.heartbeat
+        with (
+            setup.platform(target_us) as robot,
+            setup.recording(robot, f"recording-{target_us:g}us", ("*_ns", "wkc")) as path,
+        ):
+            edges = self._edges(setup, output) if setup.is_virtual and output else self._wait()
+        inside = np.diff(read(path, ("time_ns",)).column("time_ns")) * 1e-3
+        return {"inside": inside, **({"outside": np.diff(edges) * 1e-3} if len(edges) > 1 else {})}
+
+    def _wait(self) -> Array:
+        time.sleep(self._seconds)
+        return np.empty(0)
+
+    def _edges(self, setup: Setup, output: int) -> Array:
+        """Return when the output changed, ns of the IO box's own clock."""
+        arm = setup.arm
+        slave = next(at for at, one in enumerate(arm.slaves, 1) if one.device.kind == "io")
+        stamps: list[int] = []
+        control = read_session(runtime_directory()).segment_control
+        assert control is not None
+        with SegmentClient(control) as segment:
+            segment.edges(slave, output)  # from the first question on they are kept
+            until = time.monotonic() + self._seconds
+            while time.monotonic() < until:
+                time.sleep(_READ_INTERVAL_S)
+                stamps += segment.edges(slave, output)
+        return np.array(stamps, np.float64)
+
+    @staticmethod
+    def _draw(setup: Setup, found: dict[float, dict[str, Array]]) -> None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(11.0, 5.0), layout="constrained")
+        means, spreads = figure.subplots(1, 2)
+        targets = [target for target in found if target in SOURCE_CYCLES]
+        for at, (axes, unit) in enumerate(((means, "error of the mean, %"), (spreads, "average deviation, us")), 1):
+            axes.plot(targets, [SOURCE_CYCLES[target][at] for target in targets], "o--", label="source")
+            for side in ("inside", "outside"):
+                known = [target for target in found if side in found[target]]
+                if known:
+                    axes.plot(known, [spread(found[target][side], target)[at] for target in known], "o-", label=side)
+            axes.set(xlabel="target, us", ylabel=unit, yscale="log")
+            axes.grid(alpha=0.3)
+            axes.legend()
+        setup.draw("cycle", figure)
+
+
+class DelaysExperiment(Experiment):
+    """The propagation delay from the master to each slave, as the distributed clocks measure it at the start."""
+
+    name = "delays"
+    title = "Propagation delay to each slave"
+
+    def run(self, setup: Setup) -> list[Row]:
+        """See `Experiment.run`."""
+        with setup.platform(enabled=False) as robot:
+            slaves = robot.scan()
+        rows = []
+        for at, slave in enumerate(slaves):
+            source = SOURCE_DELAYS_NS[at] if at < len(SOURCE_DELAYS_NS) else None
+            # The virtual cable has the source's delays; a real one has its own.
+            bounds = {} if source is None or not setup.is_virtual else {"least": source - 20.0, "most": source + 20.0}
+            if slave["dc"]:
+                rows.append(Row(f"{at + 1} {slave['name']}", "ns", float(slave["delay_ns"]), source, **bounds))
+        if not rows:
+            raise ExperimentFailed("no slave has a distributed clock")
+        return rows

@@ -1,0 +1,84 @@
+"""The page of a folder of experiments: one self-contained HTML file, made from what the experiments left there."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from rtcp.telemetry.experiments.experiment import RESULT, ExperimentFailed, Result, Row, read_result
+
+VERDICTS = {None: "", True: "met", False: "missed"}
+_MOST_FOLDERS = 2
+
+
+def page(folders: Sequence[Path]) -> str:
+    """Return the report of a folder, or of two side by side, as HTML.
+
+    Raises:
+        ExperimentFailed: no results, or damaged ones; more than two folders.
+    """
+    if not 1 <= len(folders) <= _MOST_FOLDERS:
+        raise ExperimentFailed(f"found {len(folders)} folders, allowed are 1 or {_MOST_FOLDERS}")
+    found = [_results(folder) for folder in folders]
+    names = list(dict.fromkeys(name for results in found for name in results))
+    sections = []
+    for name in names:
+        ran = [(folder, results[name]) for folder, results in zip(folders, found, strict=True) if name in results]
+        sections.append({
+            "title": ran[0][1].title,
+            "name": name,
+            "runs": [{"folder": folder, "result": one, "pictures": _pictures(folder, one)} for folder, one in ran],
+            "figures": _side_by_side([results.get(name) for results in found]),
+        })  # fmt: skip
+    environment = Environment(
+        loader=PackageLoader("rtcp.telemetry", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+    )
+    environment.filters["shown"] = shown
+    return environment.get_template("report.html").render(
+        folders=[folder.absolute().name for folder in folders],
+        hosts=[next(iter(results.values())).host for results in found],
+        sections=sections,
+        verdicts=VERDICTS,
+    )
+
+
+def shown(value: float | str | None) -> str:
+    """Return a figure as tables show it."""
+    return "" if value is None else value if isinstance(value, str) else f"{value:.4g}"
+
+
+def _results(folder: Path) -> dict[str, Result]:
+    """Return the results of a folder: its own, or those of the folders in it."""
+    files = [folder / RESULT] if (folder / RESULT).exists() else sorted(folder.glob(f"*/{RESULT}"))
+    if not files:
+        raise ExperimentFailed(f"{folder}: there are no results of experiments ({RESULT}) in it or in its folders")
+    results = sorted((read_result(file.parent) for file in files), key=lambda one: one.began)
+    return {one.name: one for one in results}
+
+
+def _side_by_side(results: Sequence[Result | None]) -> list[tuple[Row, list[Row | None]]]:
+    """Return each figure with its row of each folder; the first row that there is has source and aim."""
+    rows = [{row.figure: row for row in result.rows} if result else {} for result in results]
+    figures = dict.fromkeys(figure for found in rows for figure in found)
+    table = []
+    for figure in figures:
+        of_each = [found.get(figure) for found in rows]
+        table.append((next(row for row in of_each if row), of_each))
+    return table
+
+
+def _pictures(folder: Path, result: Result) -> list[str]:
+    """Return the pictures of a result as data URLs; one that has gone is left out."""
+    base = folder if (folder / RESULT).exists() else folder / result.name
+    found = []
+    for name in result.pictures:
+        path = base / f"{name}.png"
+        if path.exists():
+            found.append("data:image/png;base64," + base64.b64encode(path.read_bytes()).decode())
+    return found

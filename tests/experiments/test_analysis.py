@@ -1,0 +1,125 @@
+"""What the experiments compute, on signals whose truth is known."""
+
+from __future__ import annotations
+
+import json
+from math import pi, tau
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rtcp.telemetry.experiments.experiment import ExperimentFailed, Result, Row, read_result
+from rtcp.telemetry.experiments.latency import behind, fit_sine
+from rtcp.telemetry.experiments.timing import spread
+from rtcp.telemetry.experiments.tracking import identify, sweep
+from rtcp.telemetry.report import page
+
+PERIOD_S = 2.0
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.0015, 0.033, 0.455, 0.9])
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3])
+def test_the_sine_fit_finds_the_latency_at_30_hz_within_0_2_ms(latency_s: float, noise: float) -> None:
+    random = np.random.default_rng(7)
+    t = 1234.5 + np.arange(0.0, 10.0, 1 / 30)
+    finer = 1234.5 + np.arange(0.0, 10.0, 1 / 2000)
+    command = fit_sine(t, 0.3 + pi / 16 * np.sin(tau * t / PERIOD_S + 0.4), PERIOD_S)
+    actual = 0.3 + pi / 16 * np.sin(tau * (finer - latency_s) / PERIOD_S + 0.4)
+    feedback = fit_sine(finer, actual + noise * random.standard_normal(len(finer)), PERIOD_S)
+    found, error = behind(feedback, command)
+    assert found == pytest.approx(latency_s, abs=0.2e-3)
+    assert abs(found - latency_s) <= 5 * error + 1e-9
+    assert feedback.amplitude == pytest.approx(pi / 16, rel=1e-3)
+    assert feedback.period_s == pytest.approx(PERIOD_S, rel=1e-4)
+
+
+def test_noise_of_30_hz_samples_themselves_still_gives_the_latency_within_its_standard_error() -> None:
+    random = np.random.default_rng(1)
+    t = np.arange(0.0, 10.0, 1 / 30)
+    misses = []
+    for _ in range(100):
+        command = fit_sine(t, np.sin(tau * t / PERIOD_S), PERIOD_S)
+        feedback = fit_sine(t, np.sin(tau * (t - 0.1) / PERIOD_S) + 0.01 * random.standard_normal(len(t)), PERIOD_S)
+        found, error = behind(feedback, command)
+        misses.append((found - 0.1) / error)
+    assert np.std(misses) == pytest.approx(1.0, abs=0.3)
+
+
+def test_mean_error_and_average_deviation_are_those_of_the_source() -> None:
+    mean, percent, deviation = spread(np.array([450.0, 470.0, 460.0, 480.0]), 500.0)
+    assert (mean, percent, deviation) == pytest.approx((465.0, 7.0, 10.0))
+
+
+def test_a_sweep_begins_and_ends_at_rest_and_its_velocities_are_those_of_its_positions() -> None:
+    t, q, v, a = np.array(sweep({0.5: 0.2, 2.0: 0.01})).T
+    assert (q[0], v[0], q[-1], v[-1]) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-12)
+    assert np.gradient(q, t)[5:90] == pytest.approx(v[5:90], abs=2e-3)
+    assert np.gradient(v, t)[5:90] == pytest.approx(a[5:90], abs=2e-2)
+
+
+def test_inertia_and_friction_come_back_from_the_torque_that_they_take() -> None:
+    h = 0.0005
+    t = np.arange(0.0, 8.0, h)
+    q = 0.3 * (1 - np.cos(tau * 0.5 * t)) + 0.02 * (1 - np.cos(tau * 2 * t))
+    v, acceleration = np.gradient(q, h), np.gradient(np.gradient(q, h), h)
+    torque = 3.0 * acceleration + 2.0 * np.sign(v) + 1.5 * v - 19.6 * np.sin(q)
+    found = identify(np.round(torque, 4), np.round(v, 4), np.round(q, 4), h)
+    assert (found.inertia, found.coulomb, found.viscous) == pytest.approx((3.0, 2.0, 1.5), rel=0.01)
+    assert found.gravity == pytest.approx((19.6, 0.0), abs=0.1)
+
+
+def test_a_joint_that_stands_is_not_identified() -> None:
+    with pytest.raises(ExperimentFailed, match="hardly moved"):
+        identify(*np.zeros((3, 1000)), 0.0005)
+
+
+@pytest.mark.parametrize(
+    ("row", "met"),
+    [
+        (Row("a", "s", 1.0), None),
+        (Row("a", "s", 1.0, most=1.0), True),
+        (Row("a", "s", 1.1, most=1.0), False),
+        (Row("a", "s", 0.9, least=1.0), False),
+        (Row("a", "s", float("nan"), most=1.0), False),
+    ],
+)
+def test_a_row_is_met_between_its_bounds(row: Row, met: bool | None) -> None:
+    assert row.met is met
+
+
+def result(folder: Path, here: float, figure: str = "settling") -> Result:
+    folder.mkdir(parents=True)
+    row = Row(figure, "s", here, "about 6", most=7.5)
+    began = "2026-11-22T20:00:00+00:00"
+    made = Result("step", "A <step>", "rtcp experiment step", began, 3.0, {"arm": "a"}, (row,), ("p",))
+    made.write(folder)
+    (folder / "p.png").write_bytes(b"\x89PNG picture")
+    return made
+
+
+def test_a_result_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    made = result(tmp_path / "step", 6.1)
+    assert read_result(tmp_path / "step") == made
+    assert json.loads((tmp_path / "step" / "result.json").read_text())["rows"][0]["met"] is True
+
+
+def test_a_report_is_one_file_with_figures_verdicts_and_pictures_of_one_or_two_folders(tmp_path: Path) -> None:
+    result(tmp_path / "a" / "step", 6.1)
+    result(tmp_path / "b" / "step", 8.0)
+    one, both = page([tmp_path / "a"]), page([tmp_path / "a", tmp_path / "b"])
+    assert "A &lt;step&gt;" in one
+    assert "about 6" in one
+    assert '<td class="met">met</td>' in one
+    assert "data:image/png;base64," in one
+    assert "http" not in one
+    assert '<td class="missed">missed</td>' in both
+    assert both.count("<img") == 2
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b'{"rows": 3}', b"\xff\xfe"])
+def test_a_folder_without_a_result_is_one_message(tmp_path: Path, content: bytes | None) -> None:
+    if content is not None:
+        (tmp_path / "result.json").write_bytes(content)
+    with pytest.raises(ExperimentFailed, match="result"):
+        page([tmp_path])
