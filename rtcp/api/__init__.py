@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Recording, Status, Streamed, Zero
+from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, RecorderStatus, Status, Streamed, Zero
 from rtcp.api.robot import Robot, connect
 from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
@@ -25,7 +25,7 @@ __all__ = [
     "JogFrame",
     "NotRunning",
     "Progress",
-    "Recording",
+    "RecorderStatus",
     "Refused",
     "Robot",
     "RtcpError",

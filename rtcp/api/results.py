@@ -134,12 +134,15 @@ class Zero:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What a recording has written: so far, or until it ended."""
+class RecorderStatus:
+    """What a recorder has written: so far, or until it ended."""
 
     pid: int
     """Of its process."""
     files: tuple[str, ...]
+    """Those that it writes, or wrote last: one a format."""
+    rotations: int
+    """How many files of each format came before them."""
     records: int
     missing: int
     """Cycles that were overwritten before they were read; the file says where."""

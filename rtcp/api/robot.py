@@ -15,7 +15,17 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
-from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, Recording, Status, Streamed, Zero, result
+from rtcp.api.results import (
+    Arrival,
+    EventRecord,
+    GripperRest,
+    Progress,
+    RecorderStatus,
+    Status,
+    Streamed,
+    Zero,
+    result,
+)
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -90,8 +100,8 @@ def _as_is(answer: Json) -> Json:
     return answer
 
 
-def _recordings(answer: Json) -> list[Recording]:
-    return [result(Recording, one) for one in answer["recordings"]]
+def _recordings(answer: Json) -> list[RecorderStatus]:
+    return [result(RecorderStatus, one) for one in answer["recordings"]]
 
 
 _arrival, _streamed = partial(result, Arrival), partial(result, Streamed)
@@ -393,35 +403,53 @@ class Methods:
     def record_start(
         self,
         out: str | Path | None = None,
-        formats: Sequence[str] = ("mcap",),
+        formats: Sequence[str] = (),
         signals: Sequence[str] = (),
         every: int = 1,
         seconds: float | None = None,
-    ) -> Call[Recording]:
+        max_file_mb: int | None = None,
+        max_file_seconds: float | None = None,
+        keep: int | None = None,
+        reserve_mb: int = 256,
+    ) -> Call[RecorderStatus]:
         """Start a recording of the cycle; return when it runs.
 
         Args:
             out: directory, or a file that ends in the name of its only format; None: the platform's own place.
-            formats: `mcap`, `csv`, or both.
+            formats: `mcap`, `csv`, or both; none: the ending of `out`, or mcap.
             signals: names of fields of a cycle record or patterns (`*_position`); none: all, or for CSV the source's.
             every: N: every Nth cycle.
             seconds: how long; None: until `record_stop`.
+            max_file_mb: size of a file at which the next one begins, MB.
+            max_file_seconds: age of a file at which the next one begins, s.
+            keep: newest files that are kept, of each format; None: all.
+            reserve_mb: free space of the disk below which the recording ends, MB.
 
         Raises:
-            Refused: the file cannot be made.
-            Invalid: there is no such signal.
+            Refused: reason `not_writable` (`file`, `error`), `disk_reserve` (`directory`, `free_mb`, `reserve_mb`).
+            Invalid: reason `unknown_signal` (`signal`, `allowed`), `format_mismatch` (`file`, `formats`),
+                `keep_without_limit` (`keep`).
         """
-        place = None if out is None else str(Path(out).absolute())
-        params = {"out": place, "formats": list(formats), "signals": list(signals), "every": every, "seconds": seconds}
-        return Call("record_start", params, partial(result, Recording))
+        params = {
+            "out": None if out is None else str(Path(out).absolute()),
+            "formats": list(formats),
+            "signals": list(signals),
+            "every": every,
+            "seconds": seconds,
+            "max_file_mb": max_file_mb,
+            "max_file_seconds": max_file_seconds,
+            "keep": keep,
+            "reserve_mb": reserve_mb,
+        }
+        return Call("record_start", params, partial(result, RecorderStatus))
 
     @Method
-    def record_stop(self) -> Call[list[Recording]]:
+    def record_stop(self) -> Call[list[RecorderStatus]]:
         """End all recordings; return what they have written."""
         return Call("record_stop", {}, _recordings)
 
     @Method
-    def record_status(self) -> Call[list[Recording]]:
+    def record_status(self) -> Call[list[RecorderStatus]]:
         """Return the recordings that run, and those that have ended since the platform was started."""
         return Call("record_status", {}, _recordings)
 

@@ -9,12 +9,10 @@ from typing import Annotated
 
 import typer
 
-from rtcp.api import Recording
+from rtcp.api import RecorderStatus
 from rtcp.cli.arguments import AsJson, option
-from rtcp.cli.output import CommandError, ExitCode, emit_json, report, show, table
+from rtcp.cli.output import ExitCode, emit_json, report, show, table
 from rtcp.cli.platform import connect
-
-FORMATS = ("mcap", "csv")
 
 commands = typer.Typer(name="record", help="Record every cycle to the disk.", no_args_is_help=True)
 
@@ -25,24 +23,27 @@ def _start(
         Path | None, option("--out", "DIR|FILE", "Where to. Default: recordings/ beside the faults of the platform.")
     ] = None,
     format: Annotated[
-        str | None, option("--format", "mcap,csv", "Formats, separated by commas. Default: FILE's ending, or mcap.")
-    ] = None,
+        str, option("--format", "mcap,csv", "Formats, separated by commas. Default: FILE's ending, or mcap.")
+    ] = "",
     signals: Annotated[
         str, option("--signals", "NAMES", "Fields of a record or patterns (*_position), separated by commas.")
     ] = "",
     every: Annotated[int, typer.Option("--every", min=1, max=1_000_000, help="Record every Nth cycle.")] = 1,
     seconds: Annotated[float | None, typer.Option("--seconds", help="Duration, s.")] = None,
+    max_file_mb: Annotated[int | None, option("--max-file-mb", "MB", "Size at which the next file begins.")] = None,
+    max_file_seconds: Annotated[
+        float | None, option("--max-file-seconds", "S", "Age at which the next file begins.")
+    ] = None,
+    keep: Annotated[int | None, option("--keep", "N", "Newest files that are kept. Default: all.")] = None,
+    reserve_mb: Annotated[
+        int, option("--reserve-mb", "MB", "Free space of the disk below which the recording ends.")
+    ] = 256,
 ) -> None:
     """Start a recording; it goes on when this command has ended."""
-    ending = "" if out is None else out.suffix.removeprefix(".")
-    formats = _listed(format) if format else [ending if ending in FORMATS else FORMATS[0]]
-    for one in formats:
-        if one not in FORMATS:
-            raise CommandError(f"--format: found {one}, allowed are {', '.join(FORMATS)}")
-    if seconds is not None and not 0.0 < seconds < float("inf"):
-        raise CommandError(f"--seconds: found {seconds:g}, allowed is a number greater than 0")
     with connect("record") as robot:
-        made = robot.record_start(out, formats, _listed(signals), every, seconds)
+        made = robot.record_start(
+            out, _listed(format), _listed(signals), every, seconds, max_file_mb, max_file_seconds, keep, reserve_mb
+        )
     for file in made.files:
         report(f"recording to {file}")
 
@@ -79,7 +80,7 @@ def _listed(text: str) -> list[str]:
     return [one.strip() for one in text.split(",") if one.strip()]
 
 
-def _table(recordings: Sequence[Recording]) -> None:
+def _table(recordings: Sequence[RecorderStatus]) -> None:
     rows = table(("", "s", "cycles", "missing", "MB"), ("",))
     for one in recordings:
         state = "recording" if one.running else "ended early" if one.problem else "ended"

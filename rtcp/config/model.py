@@ -60,6 +60,7 @@ MODE_CHANNELS: dict[DriveModeName, tuple[tuple[str, ...], tuple[str, ...]]] = {
 ControlModeName = Literal["joint", "cartesian", "joystick", "velocity", "torque"]
 FrameName = Literal["base", "tool"]
 Level = Literal["high", "low"]
+RecordingFormat = Literal["mcap", "csv"]
 HardStop = Literal["quick_stop", "torque_off"]
 """Reactions where setpoints cannot be executed or trusted: the drives stop by themselves."""
 AnyStop = Literal["controlled_stop", "quick_stop", "torque_off"]
@@ -452,6 +453,30 @@ class OutputsConfig:
 
 
 @dataclass(frozen=True)
+class RecordingConfig:
+    """What is recorded and where to; as `recording` in the arm's file it starts with the platform."""
+
+    out: str | None = None
+    """Absolute path of a directory, or of a file; none: `recordings/` in the platform's state directory."""
+    formats: tuple[RecordingFormat, ...] = ()
+    """Formats; none: the ending of `out`, or mcap."""
+    signals: tuple[str, ...] = ()
+    """Fields of a cycle record or patterns (`*_position`); none: all, or for CSV those of its usual columns."""
+    every: Annotated[int, Ge(1), Le(1_000_000)] = 1
+    """Every Nth cycle."""
+    seconds: Positive | None = None
+    """Duration of the recording, s; none: until it is stopped, or the platform."""
+    max_file_mb: Annotated[int, Ge(1)] | None = None
+    """Size of a file at which the next one begins, MB; none: no limit."""
+    max_file_seconds: Annotated[float, Ge(1)] | None = None
+    """Age of a file at which the next one begins, s; none: no limit."""
+    keep: Annotated[int, Ge(1)] | None = None
+    """Newest files of the recording that are kept, of each format; none: all."""
+    reserve_mb: Annotated[int, Ge(0)] = 256
+    """Free space of the disk below which the recording ends, MB."""
+
+
+@dataclass(frozen=True)
 class Row:
     """A row of modified (Craig) parameters: T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
 
@@ -531,6 +556,7 @@ class ArmSettings:
     inputs: InputsConfig = field(default_factory=InputsConfig)
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
+    recording: RecordingConfig | None = None
 
     @property
     def axes(self) -> tuple[Joint, ...]:

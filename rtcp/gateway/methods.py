@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 from annotated_types import Ge, Gt, Le
 
 from rtcp.config.find import registered
-from rtcp.config.model import Point, Stop
+from rtcp.config.model import Point, RecordingConfig, RecordingFormat, Stop
 from rtcp.config.validation import Checker
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
 from rtcp.gateway.joystick_override import LONGEST_HOLD_S, JoystickOverride
@@ -256,13 +256,20 @@ class Methods:
         self,
         caller: Caller,
         out: str | None = None,
-        formats: tuple[Literal["mcap", "csv"], ...] = ("mcap",),
+        formats: tuple[RecordingFormat, ...] = (),
         signals: tuple[str, ...] = (),
         every: Annotated[int, Ge(1), Le(1_000_000)] = 1,
         seconds: Annotated[float, Gt(0)] | None = None,
+        max_file_mb: Annotated[int, Ge(1)] | None = None,
+        max_file_seconds: Annotated[float, Ge(1)] | None = None,
+        keep: Annotated[int, Ge(1)] | None = None,
+        reserve_mb: Annotated[int, Ge(0)] = RecordingConfig.reserve_mb,
     ) -> Json:
-        """Start a recording into `out`, an absolute path; returns what `record_status` lists."""
-        return await self.recordings.start(out, formats or ("mcap",), signals, every, seconds)
+        """Start a recording: the keys of `recording` in the arm's file. Returns what `record_status` lists."""
+        rotation = (max_file_mb, max_file_seconds, keep)
+        return await self.recordings.start(
+            RecordingConfig(out, formats, signals, every, seconds, *rotation, reserve_mb)
+        )
 
     @method(at_once=True)
     async def record_stop(self, caller: Caller) -> Json:
@@ -271,7 +278,7 @@ class Methods:
 
     @method(at_once=True)
     async def record_status(self, caller: Caller) -> Json:
-        """Return `recordings`: files, records, missing cycles, bytes, seconds, whether it is running, its problem."""
+        """Return `recordings`: files, rotations, records, missing, bytes, seconds, whether it runs, its problem."""
         return {"recordings": self.recordings.status()}
 
     # -- motion -------------------------------------------------------------------------------------------------------

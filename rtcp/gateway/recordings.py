@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 import json
 import sys
-from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rtcp.config.model import RecordingConfig
+from rtcp.config.serialization import to_json
 from rtcp.config.zero import state_directory
 from rtcp.gateway.command_channel import Json
 from rtcp.ipc.errors import RtcpError
@@ -32,17 +34,29 @@ class Recordings:
     def __init__(self, directory: Path) -> None:
         self._directory = directory
 
-    async def start(
-        self, out: str | None, formats: Sequence[str], signals: Sequence[str], every: int, seconds: float | None
-    ) -> Json:
-        """Start a recorder; return what it is doing. Raises RtcpError: where and why it cannot."""
-        path = recordings_directory() if out is None else Path(out)
+    async def start_once(self, options: RecordingConfig) -> None:
+        """Start the recorder that begins with the platform, unless an earlier gateway has. Raises as `start`."""
+        try:
+            # Removed with what the recorders tell, at the end of the platform.
+            (self._directory / "recorder-begun.json").touch(mode=0o600, exist_ok=False)
+        except FileExistsError:
+            return
+        except OSError as error:
+            raise RtcpError("internal", f"{error.filename} cannot be written: {error.strerror}") from error
+        await self.start(options)
+
+    async def start(self, options: RecordingConfig) -> Json:
+        """Start a recorder; return what it is doing.
+
+        Raises:
+            RtcpError: where and why it cannot: reason `relative_path` (`out`), or one of the recorder's.
+        """
+        path = recordings_directory() if options.out is None else Path(options.out)
         if not path.is_absolute():
-            raise RtcpError("invalid", f'out: found "{out}", allowed is an absolute path')
-        options = {"out": str(path), "formats": list(dict.fromkeys(formats)), "signals": list(signals),
-                   "every": every, "seconds": seconds}  # fmt: skip
+            message = f'out: found "{options.out}", allowed is an absolute path'
+            raise RtcpError("invalid", message, "relative_path", {"out": options.out})
         command = ("-m", "rtcp.telemetry.recorder", "--directory", str(self._directory),
-                   "--options", json.dumps(options))  # fmt: skip
+                   "--options", json.dumps(to_json(replace(options, out=str(path)))))  # fmt: skip
         process = await asyncio.create_subprocess_exec(
             sys.executable, *command, stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE
         )
@@ -60,7 +74,7 @@ class Recordings:
             raise RtcpError("internal", "the recorder ended at once: its reason is in the gateway's log")
         answer: dict[str, Any] = json.loads(line)
         if "error" in answer:
-            raise RtcpError(answer["kind"], str(answer["error"]))
+            raise RtcpError(answer["kind"], str(answer["error"]), answer["reason"], answer["fields"])
         return _shown(answer["recording"], True)
 
     def status(self) -> list[Json]:

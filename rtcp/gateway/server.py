@@ -194,6 +194,7 @@ class Gateway:
         self._snapshot.follow()  # what an earlier gateway has logged, with its time, is not logged again
         self._box = BlackBox(self._observer, session, faults_directory(), self._snapshot.note)
         self._methods = Methods(self._observer, self._snapshot, session, directory, self._end_platform)
+        self._recording = session.config.recording
         self._logged: dict[str, float] = {}
         """When a defect was logged, by what met it."""
         self._connections = 0
@@ -220,6 +221,7 @@ class Gateway:
         # An earlier gateway may have died with inputs forced.
         await joystick.release()
         watching = asyncio.create_task(joystick.watch())
+        recording = asyncio.create_task(self._record())
         ready()
         await self._ended.wait()
         # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
@@ -229,8 +231,20 @@ class Gateway:
             await joystick.release()
         self._following.cancel()
         channel.cancel()
+        recording.cancel()
         path.unlink(missing_ok=True)
         await asyncio.to_thread(self._box.finish)
+
+    async def _record(self) -> None:
+        """Start the recording that the arm's file asks for; one that cannot start costs the platform nothing."""
+        if self._recording is None:
+            return
+        try:
+            await self._methods.recordings.start_once(self._recording)
+        except RtcpError as error:
+            message = f"the recording of the arm's file (recording) does not run: {error}"
+            log.error("%s", message)
+            self._snapshot.note(message)
 
     async def _serve_client(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._connections += 1

@@ -72,6 +72,10 @@ _WATCHED = ("state", "drive_mode", "control_mode", "flags", "inputs", "outputs")
 class UnknownSignal(ValueError):
     """A signal that no record has: the message names it and those that there are."""
 
+    def __init__(self, signal: str) -> None:
+        super().__init__(f"{signal}: there is no such signal; allowed are {', '.join(FIELDS)}")
+        self.signal = signal
+
 
 def fields_of(signals: Sequence[str]) -> list[str]:
     """Return the fields of a record that match; none given: all.
@@ -84,7 +88,7 @@ def fields_of(signals: Sequence[str]) -> list[str]:
     """
     for signal in signals:
         if not any(fnmatchcase(name, signal) for name in FIELDS):
-            raise UnknownSignal(f"{signal}: there is no such signal; allowed are {', '.join(FIELDS)}")
+            raise UnknownSignal(signal)
     wanted = (*signals, "number", "time_ns") if signals else ("*",)
     return [name for name in FIELDS if any(fnmatchcase(name, signal) for signal in wanted)]
 
@@ -143,13 +147,17 @@ class Channels:
         return monotonic_ns + self._offset_ns
 
     def describe(self, time_ns: int) -> None:
-        """Publish the arm's URDF, where its geometry is known."""
+        """Publish the arm's URDF, where its geometry is known; `/machine` follows with the next record."""
+        self._last = None
         if self._config.arm is not None:
             (message,) = CdrTemplate().string(urdf_of(self._config)).fill(1, {})
             self._description.log(message, log_time=time_ns)
 
-    def publish(self, records: Records) -> None:
-        """Publish cycle records, oldest first."""
+    def publish(self, records: Records, chosen: Records | None = None) -> None:
+        """Publish cycle records, oldest first; `chosen`: those whose numbers are wanted, changes come from all."""
+        if len(records):
+            self._publish_changes(records, (records["time_ns"] + self._offset_ns).tolist())
+        records = records if chosen is None else chosen
         if not len(records):
             return
         time_ns = records["time_ns"] + self._offset_ns
@@ -160,7 +168,6 @@ class Channels:
             _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
         if self._frames is not None:
             self._publish_frames(records, time_ns)
-        self._publish_changes(records, instants)
 
     def _publish_frames(self, records: Records, time_ns: npt.NDArray[Any]) -> None:
         assert self._frames is not None

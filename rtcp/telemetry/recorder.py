@@ -1,7 +1,7 @@
 """The recorder: a process that reads the ring of cycle records, as any onlooker may, and writes it to the disk.
 
-It ends with SIGTERM, after `--seconds`, with the platform, or when the disk refuses. What it is doing stands in a file
-of the runtime directory, so that a gateway that was started anew finds it.
+It ends with SIGTERM, after `seconds`, with the platform, or when the disk refuses or has only its reserve left. What it
+is doing stands in a file of the runtime directory, so that a gateway that was started anew finds it.
 """
 
 from __future__ import annotations
@@ -14,47 +14,51 @@ import io
 import json
 import os
 import select
+import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import methodcaller
 from pathlib import Path
 from types import FrameType
-from typing import IO, Any, Protocol
+from typing import IO, Any, Protocol, get_args
 
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
-from rtcp.config.model import ArmConfig
-from rtcp.config.serialization import to_json
+from rtcp.config.model import ArmConfig, RecordingConfig, RecordingFormat
+from rtcp.config.serialization import from_json, to_json
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PER_JOINT
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.recording import ERROR, INFORMATION, WARNING, versions
+from rtcp.ipc.recording import ERROR, FIELDS, INFORMATION, WARNING, versions
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.session import SessionError, identify, read_session
 from rtcp.telemetry.channels import Channels, Records, UnknownSignal, fields_of, urdf_of
 
-FORMATS = ("mcap", "csv")
+FORMATS = get_args(RecordingFormat)
 FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
+_BATCH = 4096
+"""Records at a time: after a stall the whole ring is there."""
 CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
 """The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
 
 
-class RecorderError(Exception):
-    """A recording cannot be begun or continued: a sentence with file and reason."""
-
-
 @dataclass
-class Recording:
+class RecorderStatus:
     """What a recorder is doing; the file `recorder-PID.json` of the runtime directory has these fields."""
 
     pid: int
     identity: int
     files: list[str]
+    """Those that are being written, or were written last: one a format."""
+    rotations: int = 0
+    """How many files of each format came before them."""
     records: int = 0
     missing: int = 0
     """Cycles that were overwritten in the ring before they were read."""
@@ -70,12 +74,16 @@ def status_file(directory: Path, pid: int) -> Path:
 
 
 class Writer(Protocol):
-    """One file of a recording."""
+    """The files of one format, one after the other."""
 
-    path: Path
+    path: Path | None
+    """The file that is being written, or was last."""
 
-    def write(self, records: Records) -> None:
-        """Append records; raises OSError."""
+    def open(self, path: Path) -> None:
+        """Begin a new file, the one before it being closed; raises OSError, ValueError."""
+
+    def write(self, records: Records, chosen: Records) -> None:
+        """Append what changed in the records, and the numbers of the chosen ones; raises OSError."""
 
     def flush(self) -> None:
         """Hand over to the system what was written; raises OSError."""
@@ -131,32 +139,39 @@ class McapWriter:
     """A recording as MCAP.
 
     Args:
-        path: the new file.
         channels: what is published in their context.
-        config: the arm; it goes into the file whole.
+        config: the arm; it goes into each file whole.
     """
 
-    def __init__(self, path: Path, channels: Channels, config: ArmConfig) -> None:
-        self.path = path
-        self._channels = channels
+    def __init__(self, channels: Channels, config: ArmConfig) -> None:
+        self.path: Path | None = None
+        self._channels, self._config = channels, config
+
+    def open(self, path: Path) -> None:
+        """Begin a file with all that explains it."""
         self._disk = _Disk(path)
-        options = MCAPWriteOptions(profile="ros2", compression_level=1, compression_threads=0)
-        self._writer = foxglove.open_mcap(self._disk, context=channels.context, writer_options=options)
+        self.path = path
+        config, options = self._config, MCAPWriteOptions(profile="ros2", compression_level=1, compression_threads=0)
+        self._writer = foxglove.open_mcap(self._disk, context=self._channels.context, writer_options=options)
         self._writer.write_metadata("rtcp/about", about(config))
         text = json.dumps(to_json(config), indent=1).encode()
         self._attach("configuration.json", "application/json", text)
         if config.arm is not None:
             self._attach("arm.urdf", "application/xml", urdf_of(config).encode())
-        channels.describe(time.time_ns())
+        self._channels.describe(self._now())
         self.flush()
 
     def _attach(self, name: str, media_type: str, data: bytes) -> None:
-        now = time.time_ns()
+        now = self._now()
         self._writer.attach(log_time=now, create_time=now, name=name, media_type=media_type, data=data)
 
-    def write(self, records: Records) -> None:
+    def _now(self) -> int:
+        """Return the time as the channels have it: setting the clock does not reach the next file either."""
+        return self._channels.wall_ns(time.monotonic_ns())
+
+    def write(self, records: Records, chosen: Records) -> None:
         """Publish the records: the writer listens."""
-        self._channels.publish(records)
+        self._channels.publish(records, chosen)
 
     def flush(self) -> None:
         """End the chunk, so that a reader finds all of it."""
@@ -176,33 +191,37 @@ class CsvWriter:
     """A recording as CSV, in the source's columns, or those that were chosen.
 
     Args:
-        path: the new file.
         joints: how many.
         signals: of the records; none: the source's.
     """
 
-    def __init__(self, path: Path, joints: int, signals: Sequence[str]) -> None:
-        self.path = path
-        self._file = open(path, "x", newline="")  # noqa: SIM115
+    def __init__(self, joints: int, signals: Sequence[str]) -> None:
+        self.path: Path | None = None
+        self._joints = joints
         self._names = fields_of(signals) if signals else list(CSV_NAMES)
         self._began_ns: int | None = None
+
+    def open(self, path: Path) -> None:
+        """Begin a file with its header."""
+        self._file = open(path, "x", newline="")  # noqa: SIM115
+        self.path = path
         per_joint = {name for name, _ in PER_JOINT}
         header = ["Time"]
         for name in self._names:
             short = CSV_NAMES.get(name, name)
-            header += [f"J{axis}_{short}" for axis in range(1, joints + 1)] if name in per_joint else [name]
+            header += [f"J{axis}_{short}" for axis in range(1, self._joints + 1)] if name in per_joint else [name]
         self._file.write(",".join(header) + "\n")
 
-    def write(self, records: Records) -> None:
-        """Append a line a record; times count from the first, s."""
-        if not len(records):
+    def write(self, records: Records, chosen: Records) -> None:
+        """Append a line a chosen record; times count from the first of the recording, s."""
+        if not len(chosen):
             return
         if self._began_ns is None:
-            self._began_ns = int(records["time_ns"][0])
-        columns = [((records["time_ns"] - self._began_ns) * 1e-9).tolist()]
+            self._began_ns = int(chosen["time_ns"][0])
+        columns = [((chosen["time_ns"] - self._began_ns) * 1e-9).tolist()]
         forms = ["%.9f"]
         for name in self._names:
-            found = records[name]
+            found = chosen[name]
             columns += found.T.tolist() if found.ndim == 2 else [found.tolist()]
             forms += ["%.9g" if found.dtype.kind == "f" else "%d"] * (len(columns) - len(forms))
         form = ",".join(forms) + "\n"
@@ -228,42 +247,20 @@ def about(config: ArmConfig) -> dict[str, str]:
     }
 
 
-@dataclass(frozen=True)
-class Options:
-    """What is recorded, and where to."""
-
-    out: Path
-    """A directory, or a file whose ending is that of its only format."""
-    formats: tuple[str, ...] = ("mcap",)
-    signals: tuple[str, ...] = ()
-    every: int = 1
-    """N: every Nth cycle."""
-    seconds: float | None = None
-
-    def paths(self) -> dict[str, Path]:
-        """Return the new file of each format; raises RecorderError."""
-        if self.out.suffix.removeprefix(".") in FORMATS and not self.out.is_dir():
-            if self.formats != (self.out.suffix[1:],):
-                raise RecorderError(f"{self.out}: its ending is not that of the format {', '.join(self.formats)}")
-            return {self.formats[0]: self.out}
-        stem = time.strftime("recording-%Y-%m-%dT%H-%M-%S") + f"-{os.getpid()}"
-        return {name: self.out / f"{stem}.{name}" for name in self.formats}
-
-
 class Recorder:
     """Reads a blackboard and writes it down.
 
     Args:
         directory: the runtime directory.
-        options: what is recorded.
+        options: what is recorded; `out` is given.
 
     Raises:
-        RecorderError: a file cannot be made.
+        RtcpError: it cannot be recorded; reasons and fields are those of `Robot.record_start`.
         UnknownSignal: a signal that no record has.
         BlackboardError, SessionError: no platform runs there.
     """
 
-    def __init__(self, directory: Path, options: Options) -> None:
+    def __init__(self, directory: Path, options: RecordingConfig) -> None:
         session = read_session(directory)
         self._directory, self._options, config = directory, options, session.config
         self._observer = Observer(blackboard_file(directory))
@@ -275,26 +272,34 @@ class Recorder:
         self._names = Names(config)
         self._at = self._observer.head
         self._event = self._observer.last_event
-        self._channels = Channels(config, time.time_ns() - time.monotonic_ns(), options.signals)
-        self._ended = False
-        self._flushed = time.monotonic()
-        self._writers: list[Writer] = []
+        self._texts_read_ns = time.monotonic_ns()
         texts = self._observer.texts_since(0)
         self._text = texts[-1].number if texts else 0
-        try:
-            for name, path in options.paths().items():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                self._writers.append(
-                    McapWriter(path, self._channels, config)
-                    if name == "mcap"
-                    else CsvWriter(path, len(config.joints), options.signals)
-                )
-        except (OSError, ValueError) as error:
-            for writer in self._writers:
-                writer.path.unlink(missing_ok=True)
-            raise RecorderError(_refused(error, options.out)) from error
+        self._channels = Channels(config, time.time_ns() - time.monotonic_ns(), options.signals)
+        self._ended = False
+        self._rotates = options.max_file_mb is not None or options.max_file_seconds is not None
+        if options.keep is not None and not self._rotates:
+            message = f"keep: found {options.keep} without max_file_mb or max_file_seconds, which begin new files"
+            raise RtcpError("invalid", message, "keep_without_limit", {"keep": options.keep})
+        self._stem, formats = _place(options)
+        self._writers: dict[str, Writer] = {
+            name: McapWriter(self._channels, config)
+            if name == "mcap"
+            else CsvWriter(len(config.joints), options.signals)
+            for name in formats
+        }
         me = identify(os.getpid())
-        self.recording = Recording(me, me.identity, [str(writer.path) for writer in self._writers])
+        self.status = RecorderStatus(me, me.identity, [])
+        self._finished_bytes = 0
+        try:
+            self._stem.parent.mkdir(parents=True, exist_ok=True)
+            self._check_space()
+            self._open()
+        except (OSError, ValueError) as error:
+            for writer in self._writers.values():
+                if writer.path is not None:
+                    writer.path.unlink(missing_ok=True)
+            raise _not_writable(error, self._stem) from error
         self._write_status()
 
     def end(self) -> None:
@@ -303,7 +308,7 @@ class Recorder:
 
     def run(self) -> int:
         """Record until the end; return the exit code."""
-        made, began = self.recording, time.monotonic()
+        made, began = self.status, time.monotonic()
         until = None if self._options.seconds is None else began + self._options.seconds
         try:
             while not self._ended and (until is None or time.monotonic() < until):
@@ -315,7 +320,7 @@ class Recorder:
         except Exception as error:
             self._failed(error)
         # Each by itself: a disk that is full for one may have room for the index of the other.
-        for writer in self._writers:
+        for writer in self._writers.values():
             try:
                 writer.close()
             except Exception as error:
@@ -326,8 +331,10 @@ class Recorder:
 
     def _failed(self, error: Exception) -> None:
         """Note why the recording ends early; the first reason counts."""
-        reason = _refused(error, self._options.out) if isinstance(error, OSError) else f"{type(error).__name__} {error}"
-        self.recording.problem = self.recording.problem or f"the recording has ended: {reason}"
+        if isinstance(error, OSError):
+            error = _not_writable(error, self._stem)
+        reason = str(error) if isinstance(error, RtcpError) else f"{type(error).__name__} {error}"
+        self.status.problem = self.status.problem or f"the recording has ended: {reason}"
 
     def _turn(self) -> None:
         """Write what is new."""
@@ -335,36 +342,88 @@ class Recorder:
         if len(records) or missing:
             self._write(records, missing)
         for event in self._observer.events_since(self._event):
+            self._log_gap("events", self._event + 1, event.number - 1, event.monotonic_ns)
             self._event = event.number
             level = ERROR if type(event.event) in self._names.faults else INFORMATION
             self._log(event.monotonic_ns, self._names.message(event.event), level)
+        now_ns = time.monotonic_ns()
+        ahead_ns = time.time_ns() - now_ns
         for text in self._observer.texts_since(self._text):
+            # Its time is CLOCK_REALTIME, which may have been set since; it came after the last turn and before now.
+            instant = min(max(text.time_ns - ahead_ns, self._texts_read_ns), now_ns)
+            self._log_gap("messages", self._text + 1, text.number - 1, instant)
             self._text = text.number
-            # Its own time is the wall clock, which may have been set meanwhile.
-            level = WARNING if text.is_problem else INFORMATION
-            self._log(time.monotonic_ns(), text.sentence, level)
-        now = time.monotonic()
-        if now - self._flushed >= FLUSH_S:
-            self._flushed = now
-            self._each(lambda writer: writer.flush())
-            self._write_status()
+            self._log(instant, text.sentence, WARNING if text.is_problem else INFORMATION)
+        self._texts_read_ns = now_ns
+        if time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
 
     def _write(self, records: Records, missing: int) -> None:
-        made = self.recording
-        made.missing += missing
+        self.status.missing += missing
         first = self._at + 1
         self._at += len(records) + missing
         if missing:
             instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
-            text = f"{missing} of the cycles from {first} to {self._at} are missing: they were not read in time"
-            self._log(instant, text, WARNING)
-        chosen = records[records["number"] % self._options.every == 0] if self._options.every > 1 else records
-        made.records += len(chosen)
-        self._each(lambda writer: writer.write(chosen))
+            self._log_gap("cycles", first, self._at, instant, missing)
+        for begin in range(0, len(records), _BATCH):
+            part = records[begin : begin + _BATCH]
+            chosen = part[part["number"] % self._options.every == 0] if self._options.every > 1 else part
+            self._each(methodcaller("write", part, chosen))
+            self.status.records += len(chosen)
+
+    def _log_gap(self, what: str, first: int, last: int, monotonic_ns: int, missing: int | None = None) -> None:
+        """Log that all from `first` to `last`, or `missing` of them, were overwritten in their ring; none: nothing."""
+        if count := last - first + 1 if missing is None else missing:
+            text = f"{count} of the {what} from {first} to {last} are missing: they were not read in time"
+            self._log(monotonic_ns, text, WARNING)
+
+    def _flush(self) -> None:
+        """Hand over what was written; go on in new files where these are full, end where the disk is nearly."""
+        self._flushed = time.monotonic()
+        self._each(methodcaller("flush"))
+        self._check_space()
+        reached = (
+            (max(self._sizes()) / 1e6, self._options.max_file_mb),
+            (self._flushed - self._opened, self._options.max_file_seconds),
+        )
+        if any(limit is not None and found >= limit for found, limit in reached):
+            self._rotate()
+        self._write_status()
+
+    def _check_space(self) -> None:
+        place, reserve = self._stem.parent, self._options.reserve_mb
+        free = shutil.disk_usage(place).free / 1e6
+        if free < reserve:
+            message = f"{place}: {free:.0f} MB are free, less than the reserve of {reserve} MB (reserve_mb): free some"
+            fields = {"directory": str(place), "free_mb": round(free), "reserve_mb": reserve}
+            raise RtcpError("refused", message, "disk_reserve", fields)
+
+    def _rotate(self) -> None:
+        """Complete the files, begin the next ones, and remove the oldest beyond those that are kept."""
+        self._each(methodcaller("close"))
+        self._finished_bytes += sum(self._sizes())
+        self.status.rotations += 1
+        self._open()
+        if self._options.keep is not None and (oldest := self.status.rotations - self._options.keep) >= 0:
+            for name in self._writers:
+                self._path(name, oldest).unlink(missing_ok=True)
+
+    def _open(self) -> None:
+        for name, writer in self._writers.items():
+            writer.open(self._path(name, self.status.rotations))
+        self.status.files = [str(writer.path) for writer in self._writers.values()]
+        self._opened = self._flushed = time.monotonic()
+
+    def _path(self, name: str, number: int) -> Path:
+        """Return the file of a format; numbers have a width, so that names sort by age."""
+        return self._stem.with_name(f"{self._stem.name}{f'-{number:06d}' if self._rotates else ''}.{name}")
+
+    def _sizes(self) -> list[int]:
+        return [writer.path.stat().st_size for writer in self._writers.values() if writer.path is not None]
 
     def _each(self, do: Callable[[Writer], None]) -> None:
-        """Do something with every file; an error names its file."""
-        for writer in self._writers:
+        """Do something with the file of every format; an error names its file."""
+        for writer in self._writers.values():
             try:
                 do(writer)
             except OSError as error:
@@ -376,9 +435,9 @@ class Recorder:
 
     def _write_status(self) -> None:
         """Write down what it is doing, whole or not at all; a full disk there loses the status, not the recording."""
-        made = self.recording
+        made = self.status
         with contextlib.suppress(OSError):
-            made.bytes = sum(writer.path.stat().st_size for writer in self._writers)
+            made.bytes = self._finished_bytes + sum(self._sizes())
         path = status_file(self._directory, made.pid)
         new = path.with_suffix(".new")
         with contextlib.suppress(OSError):
@@ -386,9 +445,28 @@ class Recorder:
             os.replace(new, path)
 
 
-def _refused(error: OSError | ValueError, out: Path) -> str:
+def _place(options: RecordingConfig) -> tuple[Path, tuple[str, ...]]:
+    """Return the files' path without number and ending, and the formats: those given, else the file's ending, or mcap.
+
+    Raises:
+        RtcpError: the ending of `out` and the formats are not the same.
+    """
+    assert options.out is not None
+    out, formats = Path(options.out), tuple(dict.fromkeys(options.formats))
+    ending = out.suffix.removeprefix(".")
+    if ending not in FORMATS or out.is_dir():
+        stem = time.strftime("recording-%Y-%m-%dT%H-%M-%S") + f"-{os.getpid()}"
+        return out / stem, formats or FORMATS[:1]
+    if formats not in ((), (ending,)):
+        message = f"{out}: its ending is not that of the format {', '.join(formats)}"
+        raise RtcpError("invalid", message, "format_mismatch", {"file": str(out), "formats": list(formats)})
+    return out.with_suffix(""), (ending,)
+
+
+def _not_writable(error: OSError | ValueError, place: Path) -> RtcpError:
     where, why = (error.filename, error.strerror) if isinstance(error, OSError) else (None, None)
-    return f"{where or out} cannot be written: {why or error}"
+    fields = {"file": str(where or place), "error": str(why or error)}
+    return RtcpError("refused", f"{fields['file']} cannot be written: {fields['error']}", "not_writable", fields)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -397,10 +475,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--directory", type=Path, required=True)
     parser.add_argument("--options", type=json.loads, required=True)
     given = parser.parse_args(arguments)
-    fields = given.options
-    options = Options(
-        Path(fields["out"]), tuple(fields["formats"]), tuple(fields["signals"]), fields["every"], fields["seconds"]
-    )
     recorder: Recorder | None = None
     wanted = False
 
@@ -415,17 +489,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with contextlib.suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("0")  # memory that runs short costs the recording, not the loop
     try:
-        recorder = Recorder(given.directory, options)
+        recorder = Recorder(given.directory, from_json(RecordingConfig, given.options))
     except UnknownSignal as error:
-        _answer({"error": str(error), "kind": "invalid"})
-        return 1
-    except (RecorderError, BlackboardError, SessionError) as error:
-        _answer({"error": str(error), "kind": "refused"})
-        return 1
+        fields = {"signal": error.signal, "allowed": list(FIELDS)}
+        return _refuse(RtcpError("invalid", str(error), "unknown_signal", fields))
+    except RtcpError as error:
+        return _refuse(error)
+    except (BlackboardError, SessionError) as error:
+        return _refuse(RtcpError("refused", str(error)))
     if wanted:
         recorder.end()
-    _answer({"recording": dataclasses.asdict(recorder.recording)})
+    _answer({"recording": dataclasses.asdict(recorder.status)})
     return recorder.run()
+
+
+def _refuse(error: RtcpError) -> int:
+    _answer({"error": error.message, "kind": error.kind, "reason": error.reason, "fields": error.fields})
+    return 1
 
 
 def _answer(line: dict[str, Any]) -> None:

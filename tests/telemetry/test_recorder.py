@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
+import ctypes
 import json
+import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,15 +28,19 @@ from mcap_ros2.decoder import DecoderFactory
 
 from kinematics.forward import forward
 from rtcp.config import default_config, load
+from rtcp.config.model import RecordingConfig
+from rtcp.config.serialization import to_json
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ResetDone
-from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
+from rtcp.ipc.recording import FIELDS
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.session import Session
-from rtcp.telemetry.channels import Channels
 
 CONFIG = load(default_config())
 PERIOD_NS = 2_000_000
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
+HOUR_NS = 3600 * 10**9
 PLACES = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 
 
@@ -45,14 +53,14 @@ class Loop:
         self.board = Blackboard(blackboard_file(directory), 6, PERIOD_NS)
         self.cycles = 0
 
-    def publish(self, count: int = 1) -> None:
+    def publish(self, count: int = 1, inputs: int = 0x3F) -> None:
         """Publish cycles as fast as it goes; every number of a joint tells cycle, field and joint apart."""
         for _ in range(count):
             self.cycles += 1
             values: list[float] = [0] * len(PLACES)
             values[PLACES["cycle"]] = self.cycles
             values[PLACES["time_ns"]] = time.monotonic_ns()
-            values[PLACES["inputs"]] = 0x3F
+            values[PLACES["inputs"]] = inputs
             for field, (_, code) in enumerate(PER_JOINT):
                 values += [0x1237 if code == "H" else 1e-4 * self.cycles + field + 0.1 * axis for axis in range(6)]
             self.board.publish(values)
@@ -66,11 +74,14 @@ def loop(tmp_path: Path) -> Iterator[Loop]:
     blackboard_file(tmp_path).unlink()
 
 
-def record(loop: Loop, limit: int | None = None, **given: Any) -> subprocess.Popen[str]:
-    """Start a recorder; it records when this returns. `limit`: of its files' size, as on a full disk."""
-    options = {"out": str(loop.directory), "formats": ["mcap"], "signals": [], "every": 1, "seconds": None} | given
+def record(
+    loop: Loop, limit: int | None = None, environment: Mapping[str, str] = MappingProxyType({}), **given: Any
+) -> subprocess.Popen[str]:
+    """Start a recorder. `limit`: of its files' size, as on a full disk. Rights of files bind it also as root."""
+    options = to_json(RecordingConfig(**{"out": str(loop.directory)} | given))
 
     def narrow() -> None:
+        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
         if limit is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -78,7 +89,7 @@ def record(loop: Loop, limit: int | None = None, **given: Any) -> subprocess.Pop
     return subprocess.Popen(
         [sys.executable, "-m", "rtcp.telemetry.recorder", "--directory", str(loop.directory),
          "--options", json.dumps(options)],
-        stdout=subprocess.PIPE, text=True, preexec_fn=narrow,  # noqa: PLW1509
+        stdout=subprocess.PIPE, text=True, env={**os.environ, **environment}, preexec_fn=narrow,  # noqa: PLW1509
     )  # fmt: skip
 
 
@@ -103,7 +114,7 @@ def messages(path: Path, topic: str) -> list[Any]:
 
 
 def test_every_cycle_is_in_both_files_with_the_values_of_its_record(loop: Loop) -> None:
-    recorder = record(loop, formats=["mcap", "csv"])
+    recorder = record(loop, formats=("mcap", "csv"))
     mcap_file, csv_file = map(Path, begun(recorder)["recording"]["files"])
     for _ in range(20):
         loop.publish(100)
@@ -228,13 +239,22 @@ def test_what_was_not_read_in_time_is_a_gap_that_is_reported(loop: Loop) -> None
     time.sleep(0.5)
     recorder.send_signal(signal.SIGSTOP)
     loop.publish(40_000)
+    for _ in range(EVENTS + 10):
+        loop.board.event(ResetDone())
+    for number in range(1, TEXTS + 11):
+        loop.board.text(f"message {number}")
     recorder.send_signal(signal.SIGCONT)
     said = ended(recorder, loop)
     numbers = [one.number for one in messages(path, "/cycle")]
     assert said["missing"] > 0
     assert len(numbers) + said["missing"] == loop.cycles == numbers[-1]
-    (logged,) = (one["message"] for one in json_messages(path, "/log"))
-    assert logged.startswith(f"{said['missing']} of the cycles from 11 to 40010 are missing")
+    logged = [
+        one["message"].removesuffix(" are missing: they were not read in time") for one in json_messages(path, "/log")
+    ]
+    assert logged[0] == f"{said['missing']} of the cycles from 11 to 40010"
+    assert logged[1] == "10 of the events from 1 to 10"
+    assert logged[2 + EVENTS] == "10 of the messages from 1 to 10"
+    assert logged[3 + EVENTS :] == [f"message {number}" for number in range(11, TEXTS + 11)]
 
 
 def json_messages(path: Path, topic: str) -> list[Any]:
@@ -243,7 +263,7 @@ def json_messages(path: Path, topic: str) -> list[Any]:
 
 
 def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
-    recorder = record(loop, formats=["mcap", "csv"], signals=["*_position", "time_ns"], every=10)
+    recorder = record(loop, formats=("mcap", "csv"), signals=("*_position", "time_ns"), every=10)
     mcap_file, csv_file = map(Path, begun(recorder)["recording"]["files"])
     loop.publish(100)
     ended(recorder, loop)
@@ -257,22 +277,155 @@ def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
     assert int(rows[1][rows[0].index("time_ns")]) == first.time_ns
 
 
+def test_changes_between_the_chosen_cycles_are_recorded(loop: Loop) -> None:
+    recorder = record(loop, every=10)
+    (path,) = map(Path, begun(recorder)["recording"]["files"])
+    for inputs in (0x3F, 0x3E, 0x3F):
+        loop.publish(3, inputs)
+    loop.publish(11)
+    ended(recorder, loop)
+    assert [one["inputs"]["forward"] for one in json_messages(path, "/machine")] == [True, False, True]
+    assert [one.number for one in messages(path, "/cycle")] == [10, 20]
+
+
+@pytest.mark.parametrize("limit", [{"max_file_mb": 1}, {"max_file_seconds": 1.0}], ids=["size", "age"])
+def test_files_rotate_without_a_lost_or_doubled_cycle(loop: Loop, limit: dict[str, Any]) -> None:
+    recorder = record(loop, formats=("mcap", "csv"), **limit)
+    begun(recorder)
+    while status(loop, recorder)["rotations"] < 3:
+        loop.publish(30)
+        time.sleep(0.02)
+    said = ended(recorder, loop)
+    parts = sorted(loop.directory.glob("recording-*.mcap"))
+    assert str(parts[-1]) == said["files"][0]
+    numbers = [one.number for part in parts for one in messages(part, "/cycle")]
+    assert numbers == list(range(1, loop.cycles + 1))
+    assert said["records"] == loop.cycles
+    assert said["bytes"] == sum(part.stat().st_size for part in loop.directory.glob("recording-*"))
+    rows = [row for part in sorted(loop.directory.glob("recording-*.csv")) for row in csv.reader(part.open())]
+    instants = [float(row[0]) for row in rows if row[0] != "Time"]
+    assert len(instants) == loop.cycles
+    assert instants == sorted(set(instants))
+    for part in parts:
+        explains_itself(part)
+
+
+def explains_itself(path: Path) -> None:
+    with open(path, "rb") as file:
+        reader = make_reader(file)
+        assert {one.name for one in reader.iter_attachments()} == {"configuration.json", "arm.urdf"}
+        assert [one.name for one in reader.iter_metadata()] == ["rtcp/about"]
+        topics = [channel.topic for _, channel, _ in reader.iter_messages(topics=["/robot_description", "/machine"])]
+    assert sorted(topics) == ["/machine", "/robot_description"][0 if messages(path, "/cycle") else 1 :]
+
+
+def test_only_the_newest_files_are_kept(loop: Loop) -> None:
+    recorder = record(loop, out=str(loop.directory / "arm.mcap"), max_file_seconds=1.0, keep=2)
+    begun(recorder)
+    while status(loop, recorder)["rotations"] < 3:
+        loop.publish(10)
+        time.sleep(0.02)
+    said = ended(recorder, loop)
+    names = [f"arm-{said['rotations'] - away:06d}.mcap" for away in (1, 0)]
+    assert sorted(path.name for path in loop.directory.glob("*.mcap")) == names
+
+
+def status(loop: Loop, recorder: subprocess.Popen[str]) -> dict[str, Any]:
+    assert recorder.poll() is None
+    found: dict[str, Any] = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
+    return found
+
+
+def test_a_recording_ends_before_the_disk_is_full(loop: Loop) -> None:
+    reserve_mb = shutil.disk_usage(loop.directory).free // 10**6 - 1000
+    recorder = record(loop, reserve_mb=reserve_mb)
+    (path,) = map(Path, begun(recorder)["recording"]["files"])
+    loop.publish(100)
+    filler = loop.directory / "filler"
+    with filler.open("wb") as file:
+        os.posix_fallocate(file.fileno(), 0, 2 * 10**9)
+    recorder.wait()
+    filler.unlink()
+    said = json.loads((loop.directory / f"recorder-{recorder.pid}.json").read_text())
+    assert said["problem"].startswith(f"the recording has ended: {loop.directory}: ")
+    assert f"less than the reserve of {reserve_mb} MB" in said["problem"]
+    assert len(messages(path, "/cycle")) == 100
+
+
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("given", "reason", "fields"),
     [
-        ({"signals": ["nothing"]}, "nothing: there is no such signal; allowed are number, cycle"),
-        ({"out": "/proc/nowhere"}, "/proc/nowhere cannot be written"),
-        ({"out": "/tmp/a\0b"}, "/tmp/a\0b cannot be written: "),
-        ({"out": "/tmp/one.csv"}, "/tmp/one.csv: its ending is not that of the format mcap"),
+        ({"signals": ("time_ns", "nothing")}, "unknown_signal", {"signal": "nothing", "allowed": list(FIELDS)}),
+        ({"out": "/proc/nowhere"}, "not_writable", {"file": "/proc/nowhere", "error": "No such file or directory"}),
+        (
+            {"out": "/tmp/one.csv", "formats": ("mcap",)},
+            "format_mismatch",
+            {"file": "/tmp/one.csv", "formats": ["mcap"]},
+        ),
+        ({"keep": 3}, "keep_without_limit", {"keep": 3}),
     ],
-    ids=["no such signal", "no such directory", "no path", "another format"],
+    ids=lambda one: one if isinstance(one, str) else "",
 )
-def test_what_cannot_be_recorded_is_refused(loop: Loop, given: dict[str, Any], said: str) -> None:
-    recorder = record(loop, **given)
-    assert begun(recorder)["error"].startswith(said)
+def test_what_cannot_be_recorded_is_refused(
+    loop: Loop, given: dict[str, Any], reason: str, fields: dict[str, Any]
+) -> None:
+    refused_with(record(loop, **given), reason, fields)
+
+
+def refused_with(recorder: subprocess.Popen[str], reason: str, fields: Mapping[str, Any]) -> None:
+    found = begun(recorder)
     assert recorder.wait() == 1
+    assert found["reason"] == reason
+    assert {name: found["fields"][name] for name in fields} == fields
 
 
-def test_times_of_a_recording_do_not_follow_the_wall_clock() -> None:
-    channels = Channels(CONFIG, 10**18)
-    assert channels.wall_ns(5) == 10**18 + 5
+def test_a_directory_without_rights_is_refused(loop: Loop) -> None:
+    closed = loop.directory / "closed"
+    closed.mkdir(mode=0o555)
+    recorder = record(loop, out=str(closed / "one.mcap"))
+    refused_with(recorder, "not_writable", {"file": str(closed / "one.mcap"), "error": "Permission denied"})
+
+
+@pytest.mark.parametrize("given", [{"limit": 2000}, {"reserve_mb": 10**9}], ids=["full disk", "reserve"])
+def test_a_failed_start_leaves_no_file(loop: Loop, given: dict[str, Any]) -> None:
+    recorder = record(loop, formats=("csv", "mcap"), **given)
+    refused_with(recorder, "disk_reserve" if "reserve_mb" in given else "not_writable", {})
+    assert not list(loop.directory.glob("recording-*"))
+
+
+def test_a_failed_start_leaves_the_file_that_is_in_its_way(loop: Loop) -> None:
+    mine = loop.directory / "mine.csv"
+    mine.write_text("mine")
+    refused_with(record(loop, out=str(mine)), "not_writable", {"file": str(mine), "error": "File exists"})
+    assert mine.read_text() == "mine"
+
+
+def test_a_clock_that_is_set_while_recording_does_not_tear_the_file(
+    loop: Loop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # No test may set the host's clock: each process sees it set once the file is there.
+    is_set = loop.directory / "set"
+    (loop.directory / "sitecustomize.py").write_text(
+        "import os, time\n"
+        "_time_ns = time.time_ns\n"
+        f"time.time_ns = lambda: _time_ns() + {HOUR_NS} * os.path.exists({str(is_set)!r})\n"
+    )
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + HOUR_NS * is_set.exists())
+    recorder = record(loop, environment={"PYTHONPATH": str(loop.directory)})
+    (path,) = map(Path, begun(recorder)["recording"]["files"])
+    recorder.send_signal(signal.SIGSTOP)
+    loop.publish(2)
+    loop.board.text("before")
+    is_set.touch()
+    loop.publish(2)
+    recorder.send_signal(signal.SIGCONT)
+    loop.board.text("after")
+    loop.publish()
+    ended(recorder, loop)
+    with open(path, "rb") as file:
+        found = [(one.log_time, channel.topic, one.data) for _, channel, one in make_reader(file).iter_messages()]
+    offsets = {time_ns - int.from_bytes(data[20:28], "little") for time_ns, topic, data in found if topic == "/cycle"}
+    assert len(offsets) == 1
+    assert max(time_ns for time_ns, _, _ in found) - min(time_ns for time_ns, _, _ in found) < HOUR_NS
+    assert len([topic for _, topic, _ in found if topic == "/log"]) == 2
