@@ -12,7 +12,7 @@ from rtcp.config.model import ArmFile, DeviceDescription
 from rtcp.config.segment import SegmentSlave
 
 PAGES = sorted(FOLDER.glob("*.md"))
-OWN = ["configuration.md", "operation.md", "terminals.md", "devices.md", "segment.md"]
+OWN = ["configuration.md", "operation.md", "terminals.md", "recording.md", "devices.md", "segment.md"]
 KEYS = {
     "arm": list(keys_of(ArmFile)),
     "device": list(keys_of(DeviceDescription)),
@@ -30,7 +30,7 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 
 @pytest.mark.parametrize("file", KEYS)
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
-    arm = "".join((FOLDER / name).read_text() for name in OWN[:3])
+    arm = "".join((FOLDER / name).read_text() for name in OWN[:4])
     text = {"arm": arm, "device": (FOLDER / "devices.md").read_text(), "segment": (FOLDER / "segment.md").read_text()}
     written = re.findall(r"^\| `([\w.\[\]]+)` \|.*\|.*\|.*\|$", text[file], re.MULTILINE)
     assert sorted(set(written) & {key.path for key in KEYS[file]}) == sorted(key.path for key in KEYS[file])

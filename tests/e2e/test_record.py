@@ -95,10 +95,12 @@ def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["--format", "wav"], 2, "--format: found wav, allowed are mcap, csv"),
+        (["--format", "wav"], 2, "formats[0]: found"),
         (["--signals", "nothing"], 2, "nothing: there is no such signal"),
         (["--out", "/proc/nowhere"], 3, "/proc/nowhere cannot be written"),
-        (["--seconds", "-1"], 2, "--seconds: found -1"),
+        (["--seconds", "-1"], 2, "seconds: found -1"),
+        (["--seconds", "inf"], 2, "seconds: found inf"),
+        (["--keep", "2"], 2, "keep: found 2 without max_file_mb or max_file_seconds"),
     ],
 )
 def test_what_cannot_be_recorded_ends_in_one_message(
@@ -119,3 +121,43 @@ def test_the_end_of_the_platform_completes_the_file() -> None:
         assert not list(platform.directory.glob("recorder-*.json"))
     finally:
         platform.end()
+
+
+def test_the_recording_of_the_arms_file_runs_once_whatever_becomes_of_the_gateway() -> None:
+    platform = Platform()
+    try:
+        out = start_with(platform, "{out: OUT, formats: [mcap, csv], max_file_seconds: 3600, keep: 2}")
+        platform.until(lambda _: any(one["running"] for one in recordings(platform)), "a recording")
+        (before,) = recordings(platform)
+        assert before["files"] == sorted(map(str, out.iterdir()), reverse=True)
+        os.kill(read_processes(platform.directory).gateway, signal.SIGKILL)
+        platform.rtcp("start", "--detach")
+        (ended,) = json.loads(platform.rtcp("record", "stop", "--json").stdout)["recordings"]
+        assert (ended["pid"], ended["missing"], ended["problem"]) == (before["pid"], 0, "")
+        os.kill(read_processes(platform.directory).gateway, signal.SIGKILL)
+        platform.rtcp("start", "--detach")
+        platform.call("enable")  # what the gateway starts at its own start has been begun by then
+        assert [one["running"] for one in recordings(platform)] == [False]
+    finally:
+        platform.end()
+
+
+def test_a_recording_of_the_arms_file_that_cannot_start_is_reported_and_the_platform_runs() -> None:
+    platform = Platform()
+    try:
+        start_with(platform, "{out: /proc/nowhere}")
+        wanted = "the recording of the arm's file (recording) does not run: /proc/nowhere cannot be written"
+        platform.until(lambda found: any(one.startswith(wanted) for one in found["messages"]), "the message")
+        platform.call("enable")
+    finally:
+        platform.end()
+
+
+def start_with(platform: Platform, recording: str) -> Path:
+    """Start a platform whose arm's file has this `recording`; OUT stands for the directory that is returned."""
+    platform.be_patient(2000)
+    out = platform.directory / "out"
+    with open(platform.environment["RTCP_CONFIG"], "a") as file:
+        file.write(f"\nrecording: {recording.replace('OUT', str(out))}\n")
+    platform.rtcp("start", "--detach")
+    return out
