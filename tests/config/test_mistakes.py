@@ -65,13 +65,14 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      'drive_mode: found the text "cps", allowed is one of csp, csv, cst'),
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
-     "control_mode, enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, "
-     "slaves, kinematics"),
+     "control_mode, enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
+     "recording, slaves, kinematics"),
     (ARM, [("priority: 80", "zzz: 1")],
      "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us"),
     (ARM, [("lease_s: 0.5", "source: here")],
      "source: this key does not exist; allowed are name, joints, cycle, bus, drive_mode, control_mode, "
-     "enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, slaves, kinematics"),
+     "enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, "
+     "slaves, kinematics"),
     (ARM, [("    jerk: 20.0\n", "")],
      "joints[0]: the key jerk is missing; it must be a number of at least 0.001"),
     (ARM, [("{min: -3.1, max: 3.1}", "[-3.1, 3.1]")],
