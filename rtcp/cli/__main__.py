@@ -20,6 +20,7 @@ from rtcp.cli import (
     experiment,
     faults,
     jog,
+    live,
     motion,
     platform,
     record,
@@ -60,7 +61,7 @@ def _root(
             emit(text.rstrip())
 
 
-for _group in (
+_GROUPS = (
     platform,
     status,
     motion,
@@ -74,8 +75,10 @@ for _group in (
     soak,
     faults,
     record,
+    live,
     experiment,
-):
+)
+for _group in _GROUPS:
     app.add_typer(_group.commands)
 
 

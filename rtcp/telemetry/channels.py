@@ -13,6 +13,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import pairwise
@@ -66,7 +67,9 @@ _FLAGS = {
     "mode changing": layout.FLAG_SWITCHING, "emergency stop": layout.FLAG_EMERGENCY_STOP,
     "motion allowed": layout.FLAG_MOTION_ALLOWED, "arm has joystick": layout.FLAG_ARM_HAS_JOYSTICK,
 }  # fmt: skip
-_WATCHED = ("state", "drive_mode", "control_mode", "flags", "inputs", "outputs")
+_WATCHED = ("state", "drive_mode", "control_mode", "flags")
+_WORDS_AT = len(_WATCHED) + 2
+"""Inputs and outputs stand before the statuswords."""
 
 
 class UnknownSignal(ValueError):
@@ -128,6 +131,8 @@ class Channels:
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
         self._log = self._json_channel("/log", LOG_SCHEMA)
         self._last: npt.NDArray[np.int64] | None = None
+        self._inputs, self._outputs = terminals(config.inputs), terminals(config.outputs)
+        self._outputs.pop("heartbeat", None)  # it changes in every cycle
         self._description = self._ros_channel("/robot_description", "std_msgs/msg/String", "string data\n")
 
     def _ros_channel(self, topic: str, name: str, definition: str) -> foxglove.Channel:
@@ -153,20 +158,34 @@ class Channels:
             (message,) = CdrTemplate().string(urdf_of(self._config)).fill(1, {})
             self._description.log(message, log_time=time_ns)
 
+    def repeat(self, topic: str) -> None:
+        """Publish again what came once or with a change, for one who has just subscribed to `topic`."""
+        if topic == self._description.topic():
+            self.describe(time.time_ns())
+        elif topic == self._machine.topic():
+            self._last = None  # the next record is a change
+
     def publish(self, records: Records, chosen: Records | None = None) -> None:
-        """Publish cycle records, oldest first; `chosen`: those whose numbers are wanted, changes come from all."""
-        if len(records):
+        """Publish cycle records, oldest first; a channel that nobody listens to costs nothing.
+
+        Args:
+            records: all: changes come from these.
+            chosen: those whose numbers are wanted; None: all.
+        """
+        if len(records) and self._machine.has_sinks():
             self._publish_changes(records, (records["time_ns"] + self._offset_ns).tolist())
         records = records if chosen is None else chosen
         if not len(records):
             return
         time_ns = records["time_ns"] + self._offset_ns
         instants = time_ns.tolist()
-        _send(self._cycle, instants, cycle_messages(records, self._cycle_type))
+        if self._cycle.has_sinks():
+            _send(self._cycle, instants, cycle_messages(records, self._cycle_type))
         for channel, sources, template in self._joints.values():
-            values = {name: records[name] for name in sources if name}
-            _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
-        if self._frames is not None:
+            if channel.has_sinks():
+                values = {name: records[name] for name in sources if name}
+                _send(channel, instants, template.fill(len(records), {**stamps(time_ns), **values}))
+        if self._frames is not None and self._tf.has_sinks():
             self._publish_frames(records, time_ns)
 
     def _publish_frames(self, records: Records, time_ns: npt.NDArray[Any]) -> None:
@@ -183,12 +202,17 @@ class Channels:
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
         # Bits of a statusword that tell no state may change in every cycle.
-        columns = [*(records[name] for name in _WATCHED), *(records["statusword"] & STATE_BITS).T]
+        columns = [
+            *(records[name] for name in _WATCHED),
+            records["inputs"] & _bits(self._inputs),
+            records["outputs"] & _bits(self._outputs),
+            *(records["statusword"] & STATE_BITS).T,
+        ]
         rows = np.column_stack([column.astype(np.int64) for column in columns])
         before = np.vstack([rows[:1] - 1 if self._last is None else self._last, rows[:-1]])
         for at in np.flatnonzero((rows != before).any(axis=1)).tolist():
             row = rows[at].tolist()
-            self._machine.log(self._in_words(row[: len(_WATCHED)], row[len(_WATCHED) :]), log_time=instants[at])
+            self._machine.log(self._in_words(row[:_WORDS_AT], row[_WORDS_AT:]), log_time=instants[at])
         self._last = rows[-1]
 
     def _in_words(self, watched: Sequence[int], words: Sequence[int]) -> dict[str, Any]:
@@ -201,8 +225,8 @@ class Channels:
             "control_mode": _name(ControlMode, control_mode),
             "flags": [name for name, bit in _FLAGS.items() if flags & bit],
             "drives": drives,
-            "inputs": {name: bool(inputs >> number - 1 & 1) for name, number in terminals(config.inputs).items()},
-            "outputs": {name: bool(outputs >> number - 1 & 1) for name, number in terminals(config.outputs).items()},
+            "inputs": {name: bool(inputs >> number - 1 & 1) for name, number in self._inputs.items()},
+            "outputs": {name: bool(outputs >> number - 1 & 1) for name, number in self._outputs.items()},
         }
 
     def log(self, time_ns: int, message: str, level: int = INFORMATION) -> None:
@@ -227,6 +251,10 @@ def terminals(config: Any) -> dict[str, int]:
         elif value is not None:
             found |= {name: one for name, one in vars(value).items() if isinstance(one, int)}
     return found
+
+
+def _bits(numbers: Mapping[str, int]) -> int:
+    return sum({1 << number - 1 for number in numbers.values()})
 
 
 def _name(kind: Any, value: int) -> str:

@@ -1,0 +1,44 @@
+"""`rtcp live`: the running platform in Foxglove or Lichtblick."""
+
+from __future__ import annotations
+
+import ipaddress
+from typing import Annotated
+
+import typer
+
+from rtcp.cli.arguments import option
+from rtcp.cli.output import CommandError, ExitCode, report, signals_raise
+from rtcp.ipc.runtime_directory import runtime_directory
+
+commands = typer.Typer()
+
+
+@commands.command("live")
+def _live(
+    host: Annotated[
+        str, option("--host", "ADDRESS", "Address to listen at. Default: this machine only.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port; 0: a free one.")] = 8765,
+    every: Annotated[int, typer.Option("--every", min=1, max=1_000_000, help="Show every Nth cycle.")] = 1,
+) -> None:
+    """Show the running platform in Foxglove or Lichtblick, until Ctrl-C or its end."""
+    from rtcp.telemetry.live import LiveView
+
+    try:
+        with signals_raise():
+            view = LiveView(runtime_directory(), host, port, every)
+            report(f"{view.url}: open it in Foxglove or Lichtblick with a layout of config/layouts; Ctrl-C ends it")
+            if not _is_loopback(host):
+                report(f"whoever reaches {host} can watch: nobody is asked for a name")
+            view.run()
+    except KeyboardInterrupt:
+        raise typer.Exit(ExitCode.DONE) from None  # the normal end of a view
+    raise CommandError("the platform has ended", ExitCode.NOT_RUNNING)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
