@@ -9,6 +9,7 @@ import typer
 
 from rtcp.cli.arguments import option
 from rtcp.cli.output import CommandError, ExitCode, report, signals_raise
+from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import runtime_directory
 
 commands = typer.Typer()
@@ -28,7 +29,8 @@ def _live(
     try:
         with signals_raise():
             view = LiveView(runtime_directory(), host, port, every)
-            report(f"{view.url}: open it in Foxglove or Lichtblick with a layout of config/layouts; Ctrl-C ends it")
+            layout = default_config().parent / "layouts" / "foxglove.json"
+            report(f"{view.url}: open it in Foxglove or Lichtblick, with the layout {layout}; Ctrl-C ends it")
             if not _is_loopback(host):
                 report(f"whoever reaches {host} can watch: nobody is asked for a name")
             view.run()

@@ -100,7 +100,9 @@ class LiveView:
         try:
             self._feed = Feed(directory)
         except (BlackboardError, SessionError) as error:
-            raise RtcpError("not running", f"no platform runs in {directory}: {error}") from error
+            raise RtcpError(
+                "not running", f"no platform runs in {directory} ({error}): start one with `rtcp start`"
+            ) from error
         self._every = every
         self._subscriptions = _Subscriptions()
         context = foxglove.Context()
@@ -112,7 +114,7 @@ class LiveView:
             )  # fmt: skip
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2]
-            raise RtcpError("refused", f"nothing can listen at {host} port {port}: {reason}") from error
+            raise RtcpError("refused", f"{host} port {port} cannot be listened at: {reason}: choose another") from error
         address = f"[{host}]" if ":" in host else host
         self.url = f"ws://{address}:{self._server.port}"
 

@@ -1,0 +1,56 @@
+"""The live view as a process beside a blackboard that the test writes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from rtcp.ipc.runtime_directory import blackboard_file
+from tests.telemetry.test_recorder import Loop
+from tests.viewer import Viewer
+
+
+@pytest.fixture
+def loop(tmp_path: Path) -> Iterator[Loop]:
+    made = Loop(tmp_path)
+    yield made
+    made.board.close()
+    blackboard_file(tmp_path).unlink()
+
+
+def memory_of(pid: int) -> int:
+    """Return the memory of its own: without the ring of records, of which it sees more with each cycle."""
+    found = psutil.Process(pid).memory_info()
+    return found.rss - found.shared
+
+
+def test_a_client_that_never_reads_loses_the_oldest_messages_and_takes_nothing_from_others(loop: Loop) -> None:
+    environment = {**os.environ, "RTCP_RUNTIME_DIR": str(loop.directory)}
+    command = [sys.executable, "-m", "rtcp.cli", "live", "--port", "0"]
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().partition(": ")[0]
+        with Viewer(url) as hanging, Viewer(url, ["/cycle"]) as viewer:
+            # A subscription has begun when a description comes.
+            assert hanging.first("/robot_description")
+            viewer.subscribe("/robot_description")
+            assert viewer.first("/robot_description")
+            before = memory_of(process.pid)
+            for published in range(0, 20_000, 100):
+                loop.publish(100)
+                for number in range(published + 1, published + 101):
+                    assert viewer.first("/cycle").number == number
+            # 20 000 cycles of every signal are 27 MB.
+            assert memory_of(process.pid) - before < 10e6
+            last = 0
+            while (number := hanging.first("/cycle").number) == last + 1:
+                last = number
+            assert number > last
+        process.terminate()
+    assert process.returncode == 0
