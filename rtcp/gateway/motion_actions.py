@@ -154,9 +154,11 @@ class MotionActions:
     async def run_trajectory(self, caller: Caller, points: Sequence[Point], approach: bool) -> Json:
         """Run a trajectory; with `approach` the joints first move to its first point."""
         async with self._channel.lease(caller) as lease:
-            if approach and points:
-                await self._move(lease, self._joints(points[0].q), None, True)
-            plan = await asyncio.to_thread(self._planner.trajectory, points, self._start())
+            begin = self._joints(points[0].q) if approach and points else self._start()
+            # Before the approach: of a trajectory that is refused nothing moves.
+            plan = await asyncio.to_thread(self._planner.trajectory, points, begin)
+            if approach:
+                await self._move(lease, begin, None, True)
             return await self._run_plan(lease, RunTrajectory, plan, "the trajectory")
 
     async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:

@@ -156,11 +156,15 @@ def draw(recording: FaultRecording, out: Path) -> None:
     for one in detail:
         one.tick_params(labelleft=False)
     figure.text(0.065, 0.15 / height, legend, fontsize=8.5, va="bottom", linespacing=1.25)
-    _save(figure, out)
+    save(figure, out)
 
 
-def _save(figure: Figure, out: Path) -> None:
-    """Write the picture to a new file and rename it: the target of a link at that place is not overwritten."""
+def save(figure: Figure, out: Path) -> None:
+    """Write a picture to a new file and rename it: the target of a link at that place is not overwritten.
+
+    Raises:
+        OSError: it cannot be written.
+    """
     drawn = io.BytesIO()
     figure.savefig(drawn, format=out.suffix[1:].lower(), dpi=110)
     new = out.with_name(f".{out.stem}-{secrets.token_hex(4)}{out.suffix}")

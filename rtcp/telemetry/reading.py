@@ -61,6 +61,7 @@ class Reader:
     Attributes:
         about: what the file says about itself, by name: arm, joints, period_us, versions; of a fault also `fault`.
         config: the arm at that time; None where the file has none, or that of another version.
+        signals, names: those that were asked for; the fields that its records have.
         joints: how many.
         first_ns: time_ns of the first record of the file.
         offset_ns: CLOCK_REALTIME less time_ns; 0 in CSV, which has no date.
@@ -79,7 +80,7 @@ class Reader:
         self.joints = 0
         self.first_ns = self.offset_ns = 0
         self.truncated = False
-        self._signals, self._names = signals, list[str]()
+        self.signals, self.names = signals, list[str]()
         self._start_s = -np.inf if start_s is None else start_s
         self._end_s = np.inf if end_s is None else end_s
         self._last_s = 0.0
@@ -116,17 +117,17 @@ class Reader:
         try:
             for batch in batches:
                 early += batch.log
-                if not self._names and not len(batch.cycles):
+                if not self.names and not len(batch.cycles):
                     continue  # when that was is known with the first cycle
-                if not self._names:
+                if not self.names:
                     self._begin(batch)
                 yield self._cut(batch.cycles, early)
                 early = []
         except RecordingError as error:
-            if error.kind != "damaged" or not self._names:
+            if error.kind != "damaged" or not self.names:
                 raise
             self.truncated = True
-        if not self._names:
+        if not self.names:
             raise RecordingError("empty", self.path, "the recording has no cycle")
 
     def _begin(self, batch: Batch) -> None:
@@ -134,12 +135,12 @@ class Reader:
         self.first_ns = int(batch.cycles["time_ns"][0])
         self.offset_ns = batch.time_ns - self.first_ns if batch.time_ns else 0
         has = batch.cycles.dtype.names or ()
-        for signal in self._signals:
+        for signal in self.signals:
             if not any(fnmatchcase(name, signal) for name in has):
                 defect = f"there is no signal {signal} in it; it has {', '.join(has)}"
                 raise RecordingError("signals", self.path, defect, found=signal, allowed=has)
-        wanted = (*self._signals, *_ALWAYS) if self._signals else ("*",)
-        self._names = [name for name in has if any(fnmatchcase(name, one) for one in wanted)]
+        wanted = (*self.signals, *_ALWAYS) if self.signals else ("*",)
+        self.names = [name for name in has if any(fnmatchcase(name, one) for one in wanted)]
 
     def _cut(self, cycles: Records, log: list[Moment]) -> Part:
         seconds = (cycles["time_ns"] - self.first_ns) * 1e-9
@@ -147,7 +148,7 @@ class Reader:
             self._last_s = float(seconds[-1])
         inside = cycles[(seconds >= self._start_s) & (seconds <= self._end_s)]
         # A copy: the fields that nobody asked for do not stay in memory.
-        records = repack_fields(inside[self._names], align=True)
+        records = repack_fields(inside[self.names], align=True)
         return Part(records, [moment for moment in log if self._start_s <= self.at_s(moment) <= self._end_s])
 
     def _mcap(self) -> Iterator[Batch]:
@@ -162,10 +163,10 @@ class Reader:
                         self.config = from_json(ArmConfig, json.loads(record.data))
                 elif isinstance(record, Chunk):
                     first = self.first_ns + self.offset_ns
-                    if self._names and (record.message_start_time - first) * 1e-9 > self._end_s:
+                    if self.names and (record.message_start_time - first) * 1e-9 > self._end_s:
                         return
                     last_s = (record.message_end_time - first) * 1e-9
-                    if self._names and last_s < self._start_s and decoder.log_channel >= 0:
+                    if self.names and last_s < self._start_s and decoder.log_channel >= 0:
                         self._last_s = last_s
                         continue
                     batch = decoder.decode(record)

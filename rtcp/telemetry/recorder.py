@@ -141,11 +141,12 @@ class McapWriter:
     Args:
         channels: what is published in their context.
         config: the arm; it goes into each file whole.
+        began_ns: CLOCK_REALTIME at its beginning; None: now.
     """
 
-    def __init__(self, channels: Channels, config: ArmConfig) -> None:
+    def __init__(self, channels: Channels, config: ArmConfig, began_ns: int | None = None) -> None:
         self.path: Path | None = None
-        self._channels, self._config = channels, config
+        self._channels, self._config, self._began_ns = channels, config, began_ns
 
     def open(self, path: Path) -> None:
         """Begin a file with all that explains it."""
@@ -167,7 +168,7 @@ class McapWriter:
 
     def _now(self) -> int:
         """Return the time as the channels have it: setting the clock does not reach the next file either."""
-        return self._channels.wall_ns(time.monotonic_ns())
+        return self._channels.wall_ns(time.monotonic_ns()) if self._began_ns is None else self._began_ns
 
     def write(self, records: Records, chosen: Records) -> None:
         """Publish the records: the writer listens."""

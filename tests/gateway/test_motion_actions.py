@@ -164,6 +164,12 @@ def test_a_file_that_begins_elsewhere_is_approached_only_when_asked(arm: FakePla
     assert arm.loop.received(MoveJoints)[0].q == tuple(first)
 
 
+def test_of_a_trajectory_that_is_refused_the_approach_is_not_begun(arm: FakePlatform) -> None:
+    points = [{"t": 0.0, "q": [0.3, *BENT[1:]]}, {"t": 0.01, "q": [0.4, *BENT[1:]]}]
+    assert "joint1" in str(arm.error("run_trajectory", points=points, approach=True))
+    assert arm.loop.commands == []
+
+
 def test_a_path_is_run_from_its_second_stop_after_an_approach_to_its_first(arm: FakePlatform) -> None:
     arm.loop.ends[RunLines] = end_of_line(arm, beside(arm, 0.1))
     stops = [{"pose": beside(arm, 0.05)}, {"pose": beside(arm, 0.1)}]

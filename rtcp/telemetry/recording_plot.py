@@ -1,0 +1,120 @@
+"""The picture of a recording: one plot a signal over time, all joints in it; peaks of a single cycle stay visible."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+
+from rtcp.ipc.recording import WARNING
+from rtcp.ipc.states import State
+from rtcp.telemetry.fault_report import COLOURS
+from rtcp.telemetry.reading import Part, Reader
+
+Array = npt.NDArray[np.float64]
+SIGNALS = ("sent_position", "actual_position", "following_error", "actual_velocity", "actual_torque", "wakeup_ns")
+"""Drawn where none are chosen; `following_error` is made of the first two."""
+_BINS = 4096
+"""More than a picture has pixels across."""
+_MARKS = 30
+_UNITS = {"position": "rad", "error": "rad", "velocity": "rad/s", "torque": "Nm", "ns": "ns", "s": "s"}
+
+
+class Envelope:
+    """Least and greatest value in each of up to 4096 spans of time; the spans grow with what is added.
+
+    Args:
+        width_s: the first width of a span.
+        columns: values at each instant.
+    """
+
+    def __init__(self, width_s: float, columns: int) -> None:
+        self._width_s = width_s
+        self._low, self._high = np.full((_BINS, columns), np.inf), np.full((_BINS, columns), -np.inf)
+
+    def add(self, seconds: Array, values: Array) -> None:
+        """Add values, shape (n, columns), at rising instants, shape (n,), s, none of them negative."""
+        while seconds[-1] >= self._width_s * _BINS:
+            empty = np.full((_BINS // 2, values.shape[1]), np.inf)
+            self._low = np.vstack((np.minimum(self._low[::2], self._low[1::2]), empty))
+            self._high = np.vstack((np.maximum(self._high[::2], self._high[1::2]), -empty))
+            self._width_s *= 2.0
+        bins = (seconds / self._width_s).astype(np.int64)
+        starts = np.flatnonzero(np.diff(bins, prepend=-1))
+        touched = bins[starts]
+        self._low[touched] = np.minimum(self._low[touched], np.minimum.reduceat(values, starts))
+        self._high[touched] = np.maximum(self._high[touched], np.maximum.reduceat(values, starts))
+
+    def curve(self) -> tuple[Array, Array]:
+        """Return instants, shape (m,), s, and values, shape (m, columns): of each span the least and the greatest."""
+        filled = np.flatnonzero(self._low[:, 0] <= self._high[:, 0])
+        values = np.stack((self._low[filled], self._high[filled]), axis=1)
+        return np.repeat((filled + 0.5) * self._width_s, 2), values.reshape(-1, values.shape[2])
+
+
+def figure(reader: Reader) -> Figure:
+    """Return the picture of what a reader gives: its signals, or `SIGNALS` where none were chosen.
+
+    Raises:
+        RecordingError: while the recording is read.
+    """
+    names = [name for name in reader.names if name not in ("number", "time_ns")] if reader.signals else list(SIGNALS)
+    envelopes: dict[str, Envelope] = {}
+    marks: list[tuple[float, str, str]] = []
+    state, begin_s = -1, -1.0
+    for part in reader:
+        marks += [(reader.at_s(one), one.message, COLOURS[3]) for one in part.log if one.level >= WARNING]
+        if not len(part.records):
+            continue
+        seconds = (part.records["time_ns"] - reader.first_ns) * 1e-9
+        begin_s = float(seconds[0]) if begin_s < 0.0 else begin_s
+        for name in names:
+            if (values := _values(part, name)) is not None:
+                if name not in envelopes:
+                    envelopes[name] = Envelope(reader.period_s or 1e-3, values.shape[1])
+                envelopes[name].add(seconds - begin_s, values)
+        if "state" in reader.names:
+            states = part.records["state"].astype(np.int64)
+            for at in np.flatnonzero(np.diff(states, prepend=state)).tolist():
+                marks.append((float(seconds[at]), State(states[at]).words, COLOURS[7]))
+            state = int(states[-1])
+    return _draw(reader, envelopes, marks, begin_s)
+
+
+def _values(part: Part, name: str) -> Array | None:
+    """Return a signal, shape (records, columns); None: the recording does not have it."""
+    records, has = part.records, part.records.dtype.names or ()
+    if name == "following_error" and {"sent_position", "actual_position"} <= set(has):
+        return np.asarray(records["sent_position"] - records["actual_position"])
+    return records[name].astype(np.float64).reshape(len(records), -1) if name in has else None
+
+
+def _draw(
+    reader: Reader, envelopes: dict[str, Envelope], marks: Sequence[tuple[float, str, str]], begin_s: float
+) -> Figure:
+    made = Figure(figsize=(13.0, 1.0 + 2.2 * len(envelopes)), layout="constrained")
+    plots: Any = made.subplots(len(envelopes), 1, sharex=True, squeeze=False)[:, 0]
+    joints = reader.about.get("joints", "").split(", ")
+    for axes, (name, envelope) in zip(plots, envelopes.items(), strict=True):
+        times, values = envelope.curve()
+        for at, column in enumerate(values.T):
+            label = joints[at] if len(joints) == values.shape[1] > 1 else None
+            axes.plot(times + begin_s, column, color=COLOURS[at % len(COLOURS)], lw=0.9, label=label)
+        unit = _UNITS.get(name.rpartition("_")[2], "")
+        axes.set_ylabel(name.replace("_", " ") + (f"\n{unit}" if unit else ""))
+        axes.grid(alpha=0.25)
+        axes.margins(x=0.0)
+        for at_s, _, colour in marks[:_MARKS]:
+            axes.axvline(at_s, color=colour, lw=0.8, alpha=0.6)
+    for at_s, text, colour in marks[:_MARKS]:
+        plots[0].text(
+            at_s, 1.02, text[:40], transform=plots[0].get_xaxis_transform(), color=colour, fontsize=7, rotation=25
+        )
+    if handles := plots[0].get_legend_handles_labels()[0]:
+        plots[0].legend(handles=handles, ncols=len(handles), fontsize=8, loc="upper right")
+    plots[-1].set_xlabel("s from the first record")
+    made.suptitle(f"{reader.path.name}   {reader.about.get('arm', '')}", fontsize=11)
+    return made
