@@ -24,6 +24,7 @@ from rtcp.cli import (
     motion,
     platform,
     record,
+    recorded,
     segment,
     service,
     soak,
@@ -62,22 +63,9 @@ def _root(
 
 
 _GROUPS = (
-    platform,
-    status,
-    motion,
-    jog,
-    arm,
-    bus,
-    segment,
-    demo,
-    service,
-    doctor,
-    soak,
-    faults,
-    record,
-    live,
+    platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults, record, recorded, live,
     experiment,
-)
+)  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)
 

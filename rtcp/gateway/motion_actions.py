@@ -98,7 +98,7 @@ class Planner:
         try:
             return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
         except PlanRefused as refused:
-            raise RtcpError("refused", str(refused)) from None
+            raise RtcpError("refused", str(refused), PlanRefused.__name__) from None
 
     @staticmethod
     def read(path: str) -> tuple[tuple[Point, ...], tuple[Stop, ...], float | None]:

@@ -76,19 +76,20 @@ FIELDS = tuple(name for name, _ in (*SCALARS, *PER_JOINT))
 Records = dict[str, npt.NDArray[Any]]
 
 
+Kind = Literal["refused", "damaged", "empty", "signals", "exists", "long"]
+
+
 class RecordingError(Exception):
     """A recording cannot be written or read; the message names file and defect.
 
     Attributes:
         kind: refused (by the system), damaged (cut off, or no recording), empty (no cycles, or none in the span asked
-            for), signals (there is none of that name), exists (it would be overwritten).
+            for), signals (there is none of that name), exists (it would be overwritten), long (for what is asked).
         path: of the file or the directory.
         fields: what was found and what is allowed, by name.
     """
 
-    def __init__(
-        self, kind: Literal["refused", "damaged", "empty", "signals", "exists"], path: Path, defect: str, **fields: Any
-    ) -> None:
+    def __init__(self, kind: Kind, path: Path, defect: str, **fields: Any) -> None:
         super().__init__(f"{path}: {defect}")
         self.kind, self.path, self.fields = kind, path, fields
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -32,16 +33,18 @@ def export(reader: Reader, out: Path, replace: bool = False) -> int:
     Raises:
         RecordingError: the recording is damaged or lacks what the format needs; the file exists or cannot be written.
     """
-    if out.exists() and (not replace or out.samefile(reader.path)):
-        raise RecordingError("exists", out, "the file exists" + (", and is the recording itself" if replace else ""))
     new = out.with_name(f".{out.stem}-{secrets.token_hex(4)}{out.suffix}")
     try:
+        if out.exists() and (not replace or out.samefile(reader.path)):
+            defect = "the file exists" + (", and is the recording itself" if replace else "")
+            raise RecordingError("exists", out, defect)
         count = {".csv": _to_csv, ".mcap": _to_mcap, ".npz": _to_npz}[out.suffix](reader, new)
         os.replace(new, out)
     except OSError as error:
         raise RecordingError("refused", out, f"it cannot be written: {error.strerror or error}") from error
     finally:
-        new.unlink(missing_ok=True)
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
     return count
 
 

@@ -178,7 +178,6 @@ class Reader:
             header = file.readline(_CSV_HEADER).decode().rstrip("\r\n").split(",")
             columns = _columns(header)
             self.joints = max(map(len, columns.values()))
-            self.about = {"joints": ", ".join(f"joint{axis}" for axis in range(1, self.joints + 1))}
             kind, count = cycle_type(self.joints, {*columns, *_ALWAYS}), 0
             while lines := list(islice(file, _CSV_ROWS)):
                 if not lines[-1].endswith(b"\n"):
@@ -252,6 +251,11 @@ class Recorded:
     log: tuple[Moment, ...]
     log_s: tuple[float, ...]
     truncated: bool
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Their names, base to tool; CSV has none."""
+        return tuple(self.about["joints"].split(", ")) if "joints" in self.about else ()
 
     def column(self, name: str) -> npt.NDArray[np.float64]:
         """Return a field of the records, shape (records,) or (records, joints), as floats."""

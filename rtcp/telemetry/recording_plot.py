@@ -20,6 +20,7 @@ SIGNALS = ("sent_position", "actual_position", "following_error", "actual_veloci
 _BINS = 4096
 """More than a picture has pixels across."""
 _MARKS = 30
+_STATES = {int(state): state.words for state in State}
 _UNITS = {"position": "rad", "error": "rad", "velocity": "rad/s", "torque": "Nm", "ns": "ns", "s": "s"}
 
 
@@ -78,8 +79,8 @@ def figure(reader: Reader) -> Figure:
                 envelopes[name].add(seconds - begin_s, values)
         if "state" in reader.names:
             states = part.records["state"].astype(np.int64)
-            for at in np.flatnonzero(np.diff(states, prepend=state)).tolist():
-                marks.append((float(seconds[at]), State(states[at]).words, COLOURS[7]))
+            for at in np.flatnonzero(np.diff(states, prepend=states[0] if state < 0 else state)).tolist():
+                marks.append((float(seconds[at]), _STATES.get(int(states[at]), str(states[at])), COLOURS[7]))
             state = int(states[-1])
     return _draw(reader, envelopes, marks, begin_s)
 
@@ -104,7 +105,7 @@ def _draw(
             label = joints[at] if len(joints) == values.shape[1] > 1 else None
             axes.plot(times + begin_s, column, color=COLOURS[at % len(COLOURS)], lw=0.9, label=label)
         unit = _UNITS.get(name.rpartition("_")[2], "")
-        axes.set_ylabel(name.replace("_", " ") + (f"\n{unit}" if unit else ""))
+        axes.set_ylabel(name.removesuffix(f"_{unit}").replace("_", " ") + (f"\n{unit}" if unit else ""))
         axes.grid(alpha=0.25)
         axes.margins(x=0.0)
         for at_s, _, colour in marks[:_MARKS]:

@@ -1,0 +1,91 @@
+"""A recorded joint motion as the few points of a trajectory, which the planner checks like any other."""
+
+from __future__ import annotations
+
+import json
+from math import ceil
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.ipc.jsonrpc import LINE_LIMIT
+from rtcp.ipc.recording import RecordingError
+from rtcp.telemetry.reading import Recorded
+
+Array = npt.NDArray[np.float64]
+POSITIONS = ("sent_position", "commanded_position", "actual_position")
+"""The first of them that a recording has is replayed."""
+TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
+"""Largest distance of the trajectory from the recorded positions; the first whose points fit into a request."""
+_REQUEST = LINE_LIMIT - 1024
+_SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
+"""A velocity is the slope from so long before to so long after; so far apart are two points at least."""
+_AT_REST = 5e-3
+"""Below this velocity, rad/s, the motion counts as at rest where it begins and ends."""
+
+
+def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
+    """Return the points `{"t": s, "q": [rad], "v": [rad/s]}` of what moves in a recording; rest around it is left out.
+
+    Args:
+        recorded: at least one of `POSITIONS`.
+        scale: of the speed; 0.5 takes twice the time.
+
+    Raises:
+        RecordingError: nothing moves in it, or it is too long for a request.
+    """
+    name = next(name for name in POSITIONS if name in (recorded.records.dtype.names or ()))
+    q = recorded.column(name)
+    moving = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > 0.0)
+    if not len(moving):
+        raise RecordingError("empty", recorded.path, f"nothing moves in it ({name}, {recorded.seconds[-1]:.3f} s)")
+    span = slice(max(0, moving[0] - 1), moving[-1] + 2)
+    t, q = recorded.seconds[span] / scale, q[span]
+    v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
+    least = ceil(_SHORTEST_S * scale / recorded.period_s)
+    points: list[dict[str, Any]] = []
+    for tolerance in TOLERANCES_RAD:
+        points = [
+            {"t": round(t[at] - t[0], 6), "q": np.round(q[at], 6).tolist(), "v": np.round(v[at], 5).tolist()}
+            for at in _knots(t, q, v, least, tolerance)
+        ]
+        if len(json.dumps(points)) <= _REQUEST:
+            return points
+    size = len(json.dumps(points))
+    defect = f"its motion of {t[-1] - t[0]:.1f} s needs {len(points)} points, {size} bytes; a request has {_REQUEST}"
+    raise RecordingError("long", recorded.path, f"{defect}: choose a part by --start and --end", found=size)
+
+
+def _velocities(t: Array, q: Array, reach: int) -> Array:
+    at = np.arange(len(t))
+    before, after = np.maximum(at - reach, 0), np.minimum(at + reach, len(t) - 1)
+    found: Array = (q[after] - q[before]) / (t[after] - t[before])[:, None]
+    for end in (0, -1):
+        found[end, np.abs(found[end]) < _AT_REST] = 0.0
+    return found
+
+
+def _knots(t: Array, q: Array, v: Array, least: int, tolerance: float) -> list[int]:
+    """Return the samples that cubics join which stay within `tolerance`, each as far from the one before as it goes."""
+    knots, last = [0], len(t) - 1
+    while (at := knots[-1]) < last:
+        low = least
+        while at + 2 * low <= last and _fits(t, q, v, at, at + 2 * low, tolerance):
+            low *= 2
+        low, high = min(at + low, last), min(at + 2 * low, last)
+        while low < high:
+            middle = (low + high + 1) // 2
+            low, high = (middle, high) if _fits(t, q, v, at, middle, tolerance) else (low, middle - 1)
+        # What is left is long enough for a piece of its own, or part of this one.
+        knots.append(low if low == last or last - low >= least else max(at + 1, last - least))
+    return knots
+
+
+def _fits(t: Array, q: Array, v: Array, begin: int, end: int, tolerance: float) -> bool:
+    length = t[end] - t[begin]
+    x = ((t[begin : end + 1] - t[begin]) / length)[:, None]
+    way = q[end] - q[begin]
+    bend = v[begin] * length * (1 - x) - v[end] * length * x + way * (2 * x - 1)
+    curve = q[begin] + way * x + x * (1 - x) * bend
+    return bool(np.abs(curve - q[begin : end + 1]).max() <= tolerance)

@@ -1,0 +1,96 @@
+"""Recorded motions as trajectories: near what was recorded, few points, accepted by the planner."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ruckig import InputParameter, Ruckig, Trajectory
+
+from rtcp.config.model import Point
+from rtcp.ipc.recording import RecordingError
+from rtcp.motion.limits import Limits
+from rtcp.motion.planning.interpolation import cubic, value
+from rtcp.motion.planning.trajectories import plan_trajectory
+from rtcp.telemetry.reading import Recorded, read
+from rtcp.telemetry.replay import trajectory
+
+from .test_reading import CONFIG, PERIOD_NS, csv, cycles, mcap
+
+LIMITS = Limits(CONFIG)
+TARGETS = ([0.4, -0.3, 0.5, 0.2, -0.4, 1.0], [0.1, 0.2, 0.9, -0.3, 0.2, 0.0], [0.0] * 6)
+
+
+def moved(count_at_rest: int = 400) -> Any:
+    """Cycle records of three moves at the limits of the joints, with rest between, as a controller sends them."""
+    rows, at = [np.zeros((count_at_rest, 6))], [0.0] * 6
+    for target in TARGETS:
+        given = InputParameter(6)
+        given.current_position, given.target_position = at, target
+        given.max_velocity, given.max_acceleration = LIMITS.velocity, LIMITS.acceleration
+        given.max_jerk = LIMITS.jerk
+        made = Trajectory(6)
+        Ruckig(6).calculate(given, made)
+        times = np.arange(0.0, made.duration, PERIOD_NS * 1e-9)
+        rows += [np.array([made.at_time(t)[0] for t in times]), np.tile(target, (count_at_rest, 1))]
+        at = target
+    q = np.concatenate(rows)
+    records = cycles(len(q))
+    records["sent_position"] = q
+    # The instants of real cycles are not those of the grid.
+    records["time_ns"] += np.random.default_rng(2).integers(-30_000, 30_000, len(q))
+    return records
+
+
+def deviation(points: list[dict[str, Any]], recorded: Recorded, scale: float) -> float:
+    """Largest distance of the trajectory's cubics from the recorded positions, rad."""
+    q = recorded.column("sent_position")
+    first = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1))[0] - 1
+    times = (recorded.seconds - recorded.seconds[first]) / scale
+    worst, at = 0.0, 0
+    for t, wanted in zip(times, q, strict=True):
+        if not 0.0 <= t <= points[-1]["t"]:
+            continue
+        while t > points[at + 1]["t"]:
+            at += 1
+        before, after = points[at], points[at + 1]
+        length = after["t"] - before["t"]
+        for joint in range(6):
+            piece = cubic(before["q"][joint], before["v"][joint], after["q"][joint], after["v"][joint], length)
+            worst = max(worst, abs(value(piece, (t - before["t"]) / length) - wanted[joint]))
+    return worst
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.8])
+def test_the_trajectory_deviates_by_less_than_1_mrad_with_few_points(tmp_path: Path, scale: float) -> None:
+    recorded = read(mcap(tmp_path / "a.mcap", moved()), ["*_position"])
+    points = trajectory(recorded, scale)
+    assert len(points) < len(recorded.records) / 50
+    assert deviation(points, recorded, scale) < 1e-3
+    assert points[0]["v"] == points[-1]["v"] == [0.0] * 6
+    assert points[-1]["q"] == pytest.approx(TARGETS[-1], abs=1e-6)
+
+
+def test_a_motion_at_the_limits_of_the_joints_is_accepted_a_little_slower(tmp_path: Path) -> None:
+    points = trajectory(read(mcap(tmp_path / "a.mcap", moved()), ["*_position"]), 0.9)
+    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+
+
+def test_csv_is_replayed_as_mcap_is(tmp_path: Path) -> None:
+    recorded = read(csv(tmp_path / "a.csv", moved()), ["*_position"])
+    assert deviation(trajectory(recorded), recorded, 1.0) < 1e-3
+
+
+def test_where_nothing_moves_or_too_much_there_is_one_sentence(tmp_path: Path) -> None:
+    still = cycles(500)
+    still["sent_position"] = 0.25
+    with pytest.raises(RecordingError, match="nothing moves in it") as raised:
+        trajectory(read(mcap(tmp_path / "a.mcap", still)))
+    assert raised.value.kind == "empty"
+    restless = cycles(8000)
+    restless["sent_position"] = np.random.default_rng(1).normal(size=(8000, 6))
+    with pytest.raises(RecordingError, match="choose a part by --start and --end") as raised:
+        trajectory(read(mcap(tmp_path / "b.mcap", restless)))
+    assert raised.value.kind == "long"
