@@ -41,7 +41,10 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     if not len(moving):
         raise RecordingError("empty", recorded.path, f"nothing moves in it ({name}, {recorded.seconds[-1]:.3f} s)")
     span = slice(max(0, moving[0] - 1), moving[-1] + 2)
-    t, q = recorded.seconds[span] / scale, q[span]
+    # By their numbers: a setpoint is one cycle after the one before, however late a loaded host ran that cycle.
+    number = recorded.column("number")
+    cycles = (number - number[0]) / max(1.0, np.diff(number).min())
+    t, q = cycles[span] * (recorded.period_s / scale), q[span]
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
     least = ceil(_SHORTEST_S * scale / recorded.period_s)
     points: list[dict[str, Any]] = []

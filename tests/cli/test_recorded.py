@@ -14,15 +14,15 @@ from tests.telemetry.test_reading import cycles, mcap
 
 def test_a_recording_is_exported_beside_itself_and_drawn(rtcp: Callable[..., Any], tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", cycles(500))
-    ended = rtcp("export", path, "--to", "csv")
+    ended = rtcp("export", str(path), "--to", "csv")
     assert (ended.code, ended.out) == (0, f"500 records in {tmp_path}/a.csv\n")
-    ended = rtcp("export", path, "--out", tmp_path / "b.npz", "--signals", "wkc,*_position", "--start", "0.1")
+    ended = rtcp("export", str(path), "--out", str(tmp_path / "b.npz"), "--signals", "wkc,*_position", "--start", "0.1")
     assert ended.out == f"300 records in {tmp_path}/b.npz\n"
     with np.load(tmp_path / "b.npz") as found:
         assert "commanded_position" in found
-    assert rtcp("plot", path, "--end", "0.1").out == f"picture: {tmp_path}/a.png\n"
+    assert rtcp("plot", str(path), "--end", "0.1").out == f"picture: {tmp_path}/a.png\n"
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert rtcp("plot", path, "--out", tmp_path / "b.svg", "--signals", "wkc").code == 0
+    assert rtcp("plot", str(path), "--out", str(tmp_path / "b.svg"), "--signals", "wkc").code == 0
     assert "<svg" in (tmp_path / "b.svg").read_text()
 
 
@@ -30,8 +30,8 @@ def test_of_a_recording_that_is_cut_off_the_rest_is_exported_and_that_is_said(
     rtcp: Callable[..., Any], tmp_path: Path
 ) -> None:
     path = mcap(tmp_path / "a.mcap", cycles(1000))
-    path.write_bytes(path.read_bytes()[:-20_000])
-    ended = rtcp("export", path, "--to", "csv")
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    ended = rtcp("export", str(path), "--to", "csv")
     assert (ended.code, ended.out) == (0, f"500 records in {tmp_path}/a.csv\n")
     assert f"{path}: its end is missing or damaged" in ended.trouble
 
