@@ -43,7 +43,7 @@ FORMATS = get_args(RecordingFormat)
 FLUSH_S = 0.5
 """What a killed recorder has not written yet is younger than this and one turn."""
 _TURN_S = 0.1
-_BATCH = 4096
+_BATCH = 1024
 """Records at a time: after a stall the whole ring is there."""
 CSV_NAMES = {"actual_position": "pos", "actual_velocity": "vel", "actual_torque": "tor", "sent_position": "tpos"}
 """The columns of the source's logger: J1_pos.., J1_vel.., J1_tor.., J1_tpos.. ."""
