@@ -33,11 +33,11 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parent))
 
 from cycle import Array, figures, keep_moving, spread
+from rtcp.telemetry.recording import recording
 
 from rtcp.api import RtcpError, connect
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import StartOptions, start
-from rtcp.telemetry.recording import recording
 
 CYCLE_US = 500.0
 AIM_RATIO, AIM_CPU_PERCENT = 1.1, 10.0
