@@ -88,12 +88,13 @@ def _carry_out(name: str, config: Path | None, bus: str | None, folder: Path) ->
 
 
 def result_table(result: Result) -> Table:
-    """Return the table of a result: figure, source, here, aim, verdict."""
-    rows = table(("figure", "unit", "source", "here", "aim", ""), ("figure", "unit"), title=result.title)
+    """Return the table of a result."""
+    from rtcp.telemetry.experiments.experiment import shown
+
+    rows = table(("figure", "source", "here", "aim", ""), fill="figure", title=result.title)
     for row in result.rows:
-        source = "" if row.source is None else row.source if isinstance(row.source, str) else f"{row.source:g}"
         verdict = {None: "", True: "met", False: "MISSED"}[row.met]
-        rows.add_row(row.figure, row.unit, source, f"{row.here:.4g}", row.aim, verdict)
+        rows.add_row(row.figure, shown(row.source), f"{shown(row.here)} {row.unit}", row.aim, verdict)
     return rows
 
 

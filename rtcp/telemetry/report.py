@@ -8,7 +8,7 @@ from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from rtcp.telemetry.experiments.experiment import RESULT, ExperimentFailed, Result, Row, read_result
+from rtcp.telemetry.experiments.experiment import RESULT, ExperimentFailed, Result, Row, read_result, shown
 
 VERDICTS = {None: "", True: "met", False: "missed"}
 _MOST_FOLDERS = 2
@@ -46,11 +46,6 @@ def page(folders: Sequence[Path]) -> str:
         sections=sections,
         verdicts=VERDICTS,
     )
-
-
-def shown(value: float | str | None) -> str:
-    """Return a figure as tables show it."""
-    return "" if value is None else value if isinstance(value, str) else f"{value:.4g}"
 
 
 def _results(folder: Path) -> dict[str, Result]:

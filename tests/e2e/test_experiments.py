@@ -1,68 +1,141 @@
-"""The experiments of the thesis that move the arm (facts, "The experiments to hold the platform against"), on the bus
-`virtual`: real frames between real processes. Time is counted in cycles: a host that takes cycles away stretches it."""
+"""The experiments of the source, each on a whole platform of its own.
+
+What a shared host takes away shows in figures of time: of those a test asks only that they are there and make sense.
+"""
 
 from __future__ import annotations
 
-import re
+import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-import numpy as np
 import pytest
 
-from rtcp.config import default_config, load
-from rtcp.ipc.client import ControlClient
-from rtcp.ipc.runtime_directory import blackboard_file, control_socket
-from rtcp.telemetry.recording import recording
-from rtcp.telemetry.square import SPEED_M_S, judge, place
-from tests.e2e.conftest import Platform
+from rtcp.cli.platform import running_platform
+from rtcp.telemetry.experiments import (
+    CycleExperiment,
+    Experiment,
+    LatencyExperiment,
+    PicksExperiment,
+    ResourcesExperiment,
+    TrackingExperiment,
+)
+from rtcp.telemetry.experiments.experiment import Row, Setup, carry_out, read_result
+
+from .conftest import Platform
 
 pytestmark = pytest.mark.alone
 
 
-def test_a_step_of_1_35_rad_settles_within_7_5_s_at_0_2_rad_s(enabled: Platform) -> None:
-    start = enabled.status()["joints"]["actual_position"]
-    target = [start[0] + (1.35 if start[0] < 0.5 else -1.35), *start[1:]]
-    with recording(blackboard_file(enabled.directory)) as made:
-        enabled.rtcp("move", *(f"{q:.6f}" for q in target), "--speed", "0.2")
-    assert made.lost == 0
-    # A cycle whose frame does not return holds the setpoints: its time is the host's and not the arm's.
-    whole = made.column("wkc") == made.column("wkc_expected")
-    commanded, actual = made.column("commanded_position")[whole, 0], made.column("actual_position")[whole, 0]
-    moving = np.flatnonzero(np.abs(np.diff(commanded)) > 0)
-    begun = moving[0]
-    away = np.flatnonzero(np.abs(actual - target[0]) > 0.0007)
-    settled_s = (away[-1] + 1 - begun) * made.period_s
-    assert abs(commanded[-1] - commanded[begun]) > 1.34
-    assert settled_s <= 7.5
-    assert abs(actual[-1] - target[0]) < 0.0007
-
-
-def test_a_square_of_200_mm_at_50_mm_s_is_driven_within_1_mm_commanded_and_3_mm_actual(enabled: Platform) -> None:
-    config = load(default_config())
-    assert config.arm is not None
-    square = place(config, "xy")
-    with ControlClient("the experiment", control_socket(enabled.directory)) as client:
-        client.call("move_joints", {"q": list(square.start)}, timeout_s=60.0)
-        with recording(blackboard_file(enabled.directory)) as made:
-            client.call("move_line", {"poses": square.poses, "speed": SPEED_M_S}, timeout_s=60.0)
-    driven = judge(config.arm, square, made)
-    commanded, actual = driven.worst
-    assert driven.lost == 0
-    assert commanded < 1e-3
-    assert actual < 3e-3
-    corners = np.array(square.corners)
-    assert max(np.linalg.norm(driven.actual - corner, axis=1).min() for corner in corners) < 3e-3
-    speeds = np.linalg.norm(np.diff(driven.commanded, axis=0), axis=1) / made.period_s
-    assert np.percentile(speeds, 90) == pytest.approx(SPEED_M_S, rel=1e-3)
-
-
-@pytest.mark.slow
-def test_the_demonstration_drives_the_square_in_the_other_plane_as_well_and_draws_it(platform: Platform) -> None:
+@pytest.fixture
+def setup(platform: Platform, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Setup:
+    """A setup whose platforms run in the directory of the test."""
     platform.be_patient(2000)
-    picture = Path(platform.directory) / "square.png"
-    printed = platform.rtcp("demo", "--square", "yz", "--picture", str(picture)).stdout
-    found = re.search(r"largest deviation from the square: ([0-9.]+) mm commanded, ([0-9.]+) mm actual", printed)
-    assert found is not None, printed
-    assert float(found[1]) < 1.0
-    assert float(found[2]) < 3.0
-    assert picture.read_bytes().startswith(b"\x89PNG")
+    for name in ("RTCP_RUNTIME_DIR", "RTCP_STATE_DIR", "RTCP_CONFIG"):
+        monkeypatch.setenv(name, platform.environment[name])
+    return Setup(tmp_path, running_platform, print)
+
+
+def carried_out(experiment: Experiment, setup: Setup) -> dict[str, Row]:
+    """Carry it out; return its rows by their figures, as they are in its folder, with its pictures."""
+    carry_out(experiment, setup, "a test")
+    result = read_result(setup.folder)
+    for name in result.pictures:
+        assert (setup.folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (setup.folder / f"{name}.svg").read_text()
+    return {row.figure: row for row in result.rows}
+
+
+def ran(platform: Platform, name: str, tmp_path: Path) -> tuple[dict[str, Any], str]:
+    """Run an experiment as a user does; return its rows and what was printed."""
+    platform.be_patient(2000)
+    folder = tmp_path / name
+    done = platform.rtcp("experiment", name, "--out", str(folder))
+    result = json.loads((folder / "result.json").read_text())
+    return {row["figure"]: row for row in result["rows"]}, done.stdout
+
+
+def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Platform, tmp_path: Path) -> None:
+    rows, printed = ran(platform, "step", tmp_path)
+    assert all(row["met"] for row in rows.values())
+    assert 6.0 < rows["settling within 0.0007 rad"]["here"] < 7.5
+    assert "steady-state error" in printed
+    page = platform.rtcp("report", str(tmp_path / "step"))
+    assert "report.html" in page.stdout
+    assert "Step of 1.35 rad" in (tmp_path / "step" / "report.html").read_text()
+
+
+def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actual(
+    platform: Platform, tmp_path: Path
+) -> None:
+    rows, _ = ran(platform, "square", tmp_path)
+    assert [row["met"] for row in rows.values()] == [True] * 4
+    assert (tmp_path / "square" / "recording-yz.mcap").stat().st_size > 0
+
+
+def test_the_delays_are_those_of_the_source(platform: Platform, tmp_path: Path) -> None:
+    rows, _ = ran(platform, "delays", tmp_path)
+    assert [row["source"] for row in rows.values()] == [0, 820, 1660, 2500, 3320, 4160, 5020]
+    assert all(row["met"] for row in rows.values())
+
+
+def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup: Setup) -> None:
+    rows = carried_out(CycleExperiment((2000.0,), 2.0), setup)
+    inside, outside = (rows[f"2000 us, {side}: mean"].here for side in ("inside", "outside"))
+    assert outside == pytest.approx(inside, rel=0.02)
+    assert inside == pytest.approx(2000.0, rel=0.05)
+
+
+def test_an_item_is_picked_by_the_joystick_of_the_virtual_arm(setup: Setup) -> None:
+    rows = carried_out(PicksExperiment(("shelf",)), setup)
+    assert rows["shelf: distance to the item"].met
+    assert rows["highest item above ground"].here == pytest.approx(0.8)
+
+
+def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup: Setup) -> None:
+    rows = carried_out(LatencyExperiment((30.0,), 3), setup)
+    for way in ("Python API", "socket"):
+        assert 0.0 < rows[f"{way}, 30 Hz: latency to the motion"].here < 200.0
+        assert rows[f"{way}, 30 Hz: amplitude, actual / command"].here == pytest.approx(1.0, abs=0.05)
+    assert rows["ring: p50"].here < 2 * 2000.0
+    assert any("other limits" in note for note in read_result(setup.folder).notes)
+
+
+def test_inertia_and_friction_of_a_joint_come_back_within_5_percent(setup: Setup) -> None:
+    rows = carried_out(TrackingExperiment((0,), (0.5, 1.0)), setup)
+    assert [rows[f"joint1: {key}"].met for key in ("inertia", "coulomb", "viscous")] == [True] * 3
+    assert rows["joint1, 0.5 Hz: gain"].here == pytest.approx(1.0, abs=0.01)
+
+
+def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> None:
+    rows = carried_out(ResourcesExperiment(3.0), setup)
+    for activity in ("holding", "moving", "jogging", "recording"):
+        assert rows[f"{activity}: loop"].here > 1.0
+    assert rows["recording: recorder"].here > 0.0
+    assert rows["loop: resident"].here > 20.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["experiment", "flight"], 2, "there is no experiment flight: allowed are cycle, delays"),
+        (["experiment", "step", "--out", "/proc/nowhere"], 2, "/proc/nowhere cannot be made"),
+        (["report", "/proc"], 2, "/proc: there are no results of experiments"),
+    ],
+)
+def test_what_cannot_be_carried_out_or_reported_is_one_message(
+    platform: Platform, arguments: list[str], code: int, said: str
+) -> None:
+    done = platform.rtcp(*arguments, check=code)
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_an_experiment_is_refused_while_a_platform_runs(shared: Platform, tmp_path: Path) -> None:
+    assert "a platform runs already" in shared.rtcp("experiment", "step", "--out", str(tmp_path / "x"), check=3).stderr
+
+
+def test_a_real_arm_keeps_its_limits(setup: Setup) -> None:
+    real = replace(setup, bus="eth0")
+    assert real.with_limits(0, velocity=99.0) is real

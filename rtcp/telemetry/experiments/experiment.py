@@ -65,6 +65,11 @@ class Row:
         return f"at least {self.least:g}" if self.most is None else f"{self.least:g} to {self.most:g}"
 
 
+def shown(value: Source) -> str:
+    """Return a figure as tables show it: four digits, and 0 for what is rounding."""
+    return "" if value is None else value if isinstance(value, str) else "0" if abs(value) < 1e-9 else f"{value:.4g}"
+
+
 @dataclass(frozen=True)
 class Result:
     """What came of an experiment."""

@@ -55,7 +55,7 @@ class StepExperiment(Experiment):
                 robot.move_joints([goal, *start[1:]], speed=STEP_SPEED)
                 time.sleep(0.5)
             robot.move_joints(start)
-        recorded = read(path, ("wkc*", "commanded_position", "actual_position", "actual_velocity"))
+        recorded = read(path, ("wkc*", "commanded_position", "actual_position"))
         records = recorded.records[whole(recorded)]
         commanded, actual = records["commanded_position"][:, 0], records["actual_position"][:, 0]
         moving = np.flatnonzero(np.diff(commanded))
@@ -76,7 +76,6 @@ class StepExperiment(Experiment):
             Row(
                 "steady-state error", "rad", float(np.abs(last - goal).mean()), SOURCE_ERROR_RAD, most=SOURCE_ERROR_RAD
             ),
-            Row("largest speed", "rad/s", float(np.abs(records["actual_velocity"][:, 0]).max()), most=1.1 * STEP_SPEED),
         ]
 
     @staticmethod
