@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ pytestmark = pytest.mark.alone
 
 
 def record(platform: Platform, name: str, *command: str, check: int = 0) -> Recorded:
-    """Record what a command does."""
+    """Record what a command does, from position 0."""
+    platform.call("move_joints", q=[0.0] * 6)
     out = platform.directory / name
     out.unlink(missing_ok=True)  # of a test that is run again
     platform.rtcp("record", "start", "--out", str(out))
@@ -34,9 +34,7 @@ def moving(recorded: Recorded) -> Any:
 
 def test_the_sent_positions_of_a_replay_are_the_recorded_ones_at_the_scaled_speed(enabled: Platform) -> None:
     first = record(enabled, "first.mcap", "move", "0.3", "-0.2", "0.25", "0.1", "0", "0.4")
-    enabled.call("move_joints", q=[0.0] * 6)
-    path = Path(first.path)
-    again = record(enabled, "again.mcap", "replay", str(path), "--speed", "0.8")
+    again = record(enabled, "again.mcap", "replay", str(first.path), "--speed", "0.8")
     wanted, found = moving(first), moving(again)
     for joint in range(6):
         then = np.interp(np.arange(len(wanted)) / 0.8, np.arange(len(found)), found[:, joint])
@@ -50,4 +48,3 @@ def test_a_motion_that_the_planner_refuses_moves_nothing_and_says_what_to_do(ena
     assert "allowed is at most" in refused.stderr
     assert "nothing has moved; a motion recorded at its limits passes with --speed 1.8" in refused.stderr
     assert enabled.status()["joints"]["commanded_position"][0] == pytest.approx(0.3)
-    enabled.call("move_joints", q=[0.0] * 6)
