@@ -12,7 +12,7 @@ import pytest
 from rtcp.telemetry.experiments.experiment import ExperimentFailed, Result, Row, read_result
 from rtcp.telemetry.experiments.latency import behind, fit_sine
 from rtcp.telemetry.experiments.timing import spread
-from rtcp.telemetry.experiments.tracking import identify, sweep
+from rtcp.telemetry.experiments.tracking import identify, sine
 from rtcp.telemetry.report import page
 
 PERIOD_S = 2.0
@@ -51,11 +51,11 @@ def test_mean_error_and_average_deviation_are_those_of_the_source() -> None:
     assert (mean, percent, deviation) == pytest.approx((465.0, 7.0, 10.0))
 
 
-def test_a_sweep_begins_and_ends_at_rest_and_its_velocities_are_those_of_its_positions() -> None:
-    t, q, v, a = np.array(sweep({0.5: 0.2, 2.0: 0.01})).T
-    assert (q[0], v[0], q[-1], v[-1]) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-12)
-    assert np.gradient(q, t)[5:90] == pytest.approx(v[5:90], abs=2e-3)
-    assert np.gradient(v, t)[5:90] == pytest.approx(a[5:90], abs=2e-2)
+def test_a_sine_begins_and_ends_at_rest_and_its_velocities_are_those_of_its_positions() -> None:
+    t, q, v, a = np.array(list(sine(0.5, 0.2))).T
+    assert (q[0], v[0], q[-1], v[-1]) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-8)
+    assert np.gradient(q, t)[1:-1] == pytest.approx(v[1:-1], abs=1e-2)
+    assert np.gradient(v, t)[1:-1] == pytest.approx(a[1:-1], abs=3e-2)
 
 
 def test_inertia_and_friction_come_back_from_the_torque_that_they_take() -> None:
@@ -64,14 +64,15 @@ def test_inertia_and_friction_come_back_from_the_torque_that_they_take() -> None
     q = 0.3 * (1 - np.cos(tau * 0.5 * t)) + 0.02 * (1 - np.cos(tau * 2 * t))
     v, acceleration = np.gradient(q, h), np.gradient(np.gradient(q, h), h)
     torque = 3.0 * acceleration + 2.0 * np.sign(v) + 1.5 * v - 19.6 * np.sin(q)
-    found = identify(np.round(torque, 4), np.round(v, 4), np.round(q, 4), h)
+    kept = np.arange(len(t)) % 50 != 3  # some cycles are missing
+    found = identify(*(np.round(values[kept], 4) for values in (t, torque, v, q)))
     assert (found.inertia, found.coulomb, found.viscous) == pytest.approx((3.0, 2.0, 1.5), rel=0.01)
     assert found.gravity == pytest.approx((19.6, 0.0), abs=0.1)
 
 
 def test_a_joint_that_stands_is_not_identified() -> None:
     with pytest.raises(ExperimentFailed, match="hardly moved"):
-        identify(*np.zeros((3, 1000)), 0.0005)
+        identify(np.arange(1000) * 0.0005, *np.zeros((3, 1000)))
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import shutil
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 from ruamel.yaml import YAML
 
-from rtcp.api import Robot
+from rtcp.api import Robot, RtcpError
 from rtcp.config.find import find_config
 from rtcp.config.loader import load
 from rtcp.config.model import VIRTUAL, ArmConfig
@@ -55,7 +55,7 @@ class Row:
         """Whether it lies between its bounds; None: it has none. A figure that is no number misses them."""
         if self.least is None and self.most is None:
             return None
-        return (self.least is None or self.here >= self.least) and (self.most is None or self.here <= self.most)
+        return bool((self.least is None or self.here >= self.least) and (self.most is None or self.here <= self.most))
 
     @property
     def aim(self) -> str:
@@ -94,7 +94,7 @@ class Result:
 
     def write(self, folder: Path) -> None:
         """Write `result.json`; raises OSError."""
-        rows = [{**asdict(row), "met": row.met} for row in self.rows]
+        rows = [{**asdict(row), "here": float(row.here), "met": row.met} for row in self.rows]
         (folder / RESULT).write_text(json.dumps({**asdict(self), "rows": rows}, indent=1) + "\n")
 
 
@@ -177,9 +177,11 @@ class Setup:
         robot.record_start(path, signals=signals)
         try:
             yield path
-        finally:
-            ended = robot.record_stop()
-        for one in ended:
+        except BaseException:
+            with suppress(RtcpError):
+                robot.record_stop()
+            raise
+        for one in robot.record_stop():
             if one.problem or one.missing:
                 self.note(f"{name}: {one.problem or f'{one.missing} cycles are missing in the recording'}")
 

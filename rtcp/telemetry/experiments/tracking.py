@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, pi, sin, tau
 
@@ -26,7 +26,8 @@ _PERIODS_MIN, _SWEEP_S = 3, 2.0
 _SHARE = 0.6
 """Of a joint's limits of velocity, acceleration and jerk that a sweep takes."""
 _REACH_RAD = 0.4
-_SAMPLE_S = 0.02
+_SAMPLES = 24
+"""Points of the trajectory in a period: a spline through them with their velocities and accelerations is the sine."""
 _WINDOW_S = 0.02
 _MOVING_RAD_S = 0.02
 _TOLERANCE = 0.05
@@ -53,37 +54,33 @@ class Response:
     """Largest following error."""
 
 
-def sweep(amplitudes: Mapping[float, float]) -> list[tuple[float, float, float, float]]:
-    """Return a motion of whole sines, each of a frequency (Hz) with its amplitude (rad), that begin and end at rest.
+def sine(frequency_hz: float, amplitude: float) -> Iterator[tuple[float, float, float, float]]:
+    """Yield a motion of whole sines from rest to rest: t, s, and position, velocity, acceleration, from its beginning.
 
-    Returns:
-        t, s, and position, velocity, acceleration there, relative to the beginning.
+    Args:
+        frequency_hz: Hz
+        amplitude: rad; the joint moves by twice that, to one side.
     """
-    points, begun = [], 0.0
-    for f, amplitude in amplitudes.items():
-        w, duration = tau * f, _duration(f)
-        for at in range(round(duration / _SAMPLE_S)):
-            t = at * _SAMPLE_S
-            points.append((begun + t, amplitude * (1.0 - cos(w * t)), amplitude * w * sin(w * t),
-                           amplitude * w * w * cos(w * t)))  # fmt: skip
-        begun += duration
-    return [*points, (begun, 0.0, 0.0, 0.0)]
+    w, periods = tau * frequency_hz, max(_PERIODS_MIN, round(_SWEEP_S * frequency_hz))
+    for at in range(periods * _SAMPLES + 1):
+        t = at / (_SAMPLES * frequency_hz)
+        # Rounded as a request carries it.
+        yield tuple(round(value, 9) for value in (
+            t, amplitude * (1.0 - cos(w * t)), amplitude * w * sin(w * t), amplitude * w * w * cos(w * t),
+        ))  # type: ignore[misc] # fmt: skip
 
 
-def _duration(f: float) -> float:
-    return max(_PERIODS_MIN, round(_SWEEP_S * f)) / f
-
-
-def identify(torque: Array, velocity: Array, position: Array, period_s: float) -> Friction:
-    """Identify a joint by least squares from samples of its motion, shape (n,) each, Nm, rad/s, rad.
+def identify(seconds: Array, torque: Array, velocity: Array, position: Array) -> Friction:
+    """Identify a joint by least squares from samples of its motion, shape (n,) each, s, Nm, rad/s, rad.
 
     torque = J a + c sign(v) + b v - g1 sin(q) - g2 cos(q), each side integrated over short windows: the acceleration
     need not be had from the noise of the velocity. Windows in which the joint hardly moves or turns round tell nothing
-    of dry friction, and are left out.
+    of dry friction, and those with a gap between two samples nothing of what was in it: they are left out.
 
     Raises:
         ExperimentFailed: it hardly moved.
     """
+    period_s = float(np.median(np.diff(seconds)))
     width = max(2, round(_WINDOW_S / period_s))
     count = (len(torque) - 1) // width
     ends = np.arange(count + 1) * width
@@ -95,11 +92,13 @@ def identify(torque: Array, velocity: Array, position: Array, period_s: float) -
         return means
 
     speeds = velocity[: count * width].reshape(count, width)
+    steps = np.diff(seconds[: count * width + 1]).reshape(count, width)
     useful = (np.abs(speeds).min(axis=1) > _MOVING_RAD_S) & (np.abs(np.sign(speeds).sum(axis=1)) == width)
+    useful &= steps.max(axis=1) < 1.5 * period_s
     if np.count_nonzero(useful) < 20:
         raise ExperimentFailed("the joint hardly moved: nothing can be identified")
     columns = np.column_stack((
-        np.diff(velocity[ends]) / (width * period_s), mean(np.sign(velocity)), mean(velocity),
+        np.diff(velocity[ends]) / np.diff(seconds[ends]), mean(np.sign(velocity)), mean(velocity),
         -mean(np.sin(position)), -mean(np.cos(position)),
     ))  # fmt: skip
     (inertia, coulomb, viscous, g1, g2), *_ = np.linalg.lstsq(columns[useful], mean(torque)[useful], rcond=None)
@@ -128,13 +127,13 @@ class TrackingExperiment(Experiment):
         with setup.platform() as robot:
             for joint in range(len(setup.arm.joints)) if self._joints is None else self._joints:
                 name = setup.arm.joints[joint].name
-                amplitudes = self._amplitudes(setup, joint)
-                recorded = _drive(setup, robot, joint, amplitudes)
-                found[name] = _responses(recorded, joint, amplitudes)
+                recorded, found[name] = _drive(setup, robot, joint, self._amplitudes(setup, joint))
+                # A cycle whose frame did not return has the values of the one before.
+                came = recorded.records["wkc"] == recorded.records["wkc_expected"]
                 torque, velocity, position = (
-                    recorded.column(f"actual_{key}")[:, joint] for key in ("torque", "velocity", "position")
+                    recorded.column(f"actual_{key}")[came, joint] for key in ("torque", "velocity", "position")
                 )
-                values = identify(torque, velocity, position, recorded.period_s)
+                values = identify(recorded.seconds[came], torque, velocity, position)
                 setup.report(
                     f"{name}: inertia {values.inertia:.3f} kg m^2, friction {values.coulomb:.3f} Nm and "
                     f"{values.viscous:.3f} Nm s/rad"
@@ -172,44 +171,44 @@ class TrackingExperiment(Experiment):
         setup.draw("bode", figure)
 
 
-def _drive(setup: Setup, robot: Robot, joint: int, amplitudes: Mapping[float, float]) -> Recorded:
-    """Move one joint along its sweep and return the recording of it."""
+def _drive(
+    setup: Setup, robot: Robot, joint: int, amplitudes: Mapping[float, float]
+) -> tuple[Recorded, list[Response]]:
+    """Move one joint at each frequency; return the recording, and how it followed."""
     base = list(robot.status().positions)
-    n, limits = len(base), setup.arm.joints[joint].position
+    n, name = len(base), setup.arm.joints[joint].name
     away = 2 * max(amplitudes.values())
-    sign = 1.0 if base[joint] + away < limits.max else -1.0
-    points = []
-    for t, q, v, a in sweep(amplitudes):
-        positions, velocities, accelerations = list(base), [0.0] * n, [0.0] * n
-        positions[joint] += sign * q
-        velocities[joint], accelerations[joint] = sign * v, sign * a
-        points.append({"t": t, "q": positions, "v": velocities, "a": accelerations})
-    with setup.recording(
-        robot, f"recording-{setup.arm.joints[joint].name}", ("*_position", "*_velocity", "*_torque")
-    ) as path:
-        robot.run_trajectory(points)
-        time.sleep(0.1)
-    return read(path, ("*_position", "actual_velocity", "actual_torque"))
+    sign = 1.0 if base[joint] + away < setup.arm.joints[joint].position.max else -1.0
+    spans = []
+    with setup.recording(robot, f"recording-{name}", ("wkc*", "*_position", "*_velocity", "*_torque")) as path:
+        for f, amplitude in amplitudes.items():
+            points = []
+            for t, q, v, a in sine(f, amplitude):
+                positions, velocities, accelerations = list(base), [0.0] * n, [0.0] * n
+                positions[joint] += sign * q
+                velocities[joint], accelerations[joint] = sign * v, sign * a
+                points.append({"t": t, "q": positions, "v": velocities, "a": accelerations})
+            begun = time.monotonic_ns()
+            robot.run_trajectory(points)
+            spans.append((begun, time.monotonic_ns()))
+    recorded = read(path, ("wkc*", "*_position", "actual_velocity", "actual_torque"))
+    return recorded, [_response(recorded, joint, f, span) for f, span in zip(amplitudes, spans, strict=True)]
 
 
-def _responses(recorded: Recorded, joint: int, amplitudes: Mapping[float, float]) -> list[Response]:
-    sent = recorded.records["sent_position"][:, joint]
-    actual = recorded.records["actual_position"][:, joint]
-    t = recorded.seconds
+def _response(recorded: Recorded, joint: int, f: float, span: tuple[int, int]) -> Response:
+    """Return how a joint followed a sine between two instants, ns."""
+    records = recorded.records[slice(*np.searchsorted(recorded.records["time_ns"], span))]
+    sent, actual = records["sent_position"][:, joint], records["actual_position"][:, joint]
     moving = np.flatnonzero(np.diff(sent))
     if not len(moving):
-        raise ExperimentFailed("the joint was not commanded to move")
-    found, begun = [], float(t[moving[0]])
-    for f in amplitudes:
-        duration = _duration(f)
-        # Without the first period, in which what came before dies down.
-        inside = (t >= begun + 1 / f) & (t < begun + duration)
-        one, other = (fit_sine(t[inside] - begun, values[inside], 1 / f) for values in (actual, sent))
-        delay, _ = behind(one, other)
-        error = float(np.abs(actual - sent)[inside].max())
-        found.append(Response(f, one.amplitude / other.amplitude, -tau * f * delay, error))
-        begun += duration
-    return found
+        raise ExperimentFailed(f"the joint was not commanded to move at {f:g} Hz")
+    # Without the first period, in which what came before dies down.
+    t = (records["time_ns"] - records["time_ns"][moving[0]]) * 1e-9
+    inside = (t >= 1 / f) & (np.arange(len(t)) <= moving[-1])
+    one, other = (fit_sine(t[inside], values[inside], 1 / f) for values in (actual, sent))
+    delay, _ = behind(one, other)
+    error = float(np.abs(actual - sent)[inside].max())
+    return Response(f, one.amplitude / other.amplitude, -tau * f * delay, error)
 
 
 def _truth(setup: Setup) -> dict[str, Friction]:
