@@ -27,12 +27,15 @@ from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, 
 from rtcp.telemetry.reading import Recorded, read
 
 Array = npt.NDArray[np.float64]
-Send = Callable[[Sequence[float]], None]
+Send = Callable[[Sequence[float]], bool]
+"""Sends joint positions, rad; returns whether it did."""
 
 AMPLITUDE_RAD, PERIOD_S = pi / 16, 2.0
 SOURCE_MS = 455.0
 AIM_CYCLES = 3.0
 _JOINT = 0
+_UNDER_WAY = 4
+"""Commands that wait for their answers."""
 _SPARE = 1.3
 """Limits beside what the sine needs: the way to a target that comes late is faster than the sine."""
 _PROBES, _PROBE_INTERVAL_S = 200, 0.02
@@ -80,36 +83,49 @@ def behind(feedback: Sine, command: Sine) -> tuple[float, float]:
 
 @contextmanager
 def _by_api(robot: Robot) -> Iterator[Send]:
-    def send(q: Sequence[float]) -> None:
+    def send(q: Sequence[float]) -> bool:
         robot.stream(q, time.monotonic())
+        return True
 
     yield send
 
 
+class _Answers(threading.Thread):
+    """Counts the answers, lines each, that come from a socket."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        super().__init__(daemon=True)
+        self._connection = connection
+        self.count = 0
+
+    def run(self) -> None:
+        with contextlib.suppress(OSError):
+            while data := self._connection.recv(65536):
+                self.count += data.count(b"\n")
+
+
 @contextmanager
 def _by_socket(robot: Robot) -> Iterator[Send]:
-    """Write lines of JSON-RPC to the control socket, without waiting for the answers."""
+    """Write lines of JSON-RPC to the control socket without waiting for each answer; some may be under way."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
         connection.connect(str(control_socket(runtime_directory())))
-        reader = threading.Thread(target=_drain, args=(connection,), daemon=True)
-        reader.start()
+        answers = _Answers(connection)
+        answers.start()
         number = 0
 
-        def send(q: Sequence[float]) -> None:
+        def send(q: Sequence[float]) -> bool:
             nonlocal number
+            # What waits in the socket would be late: a stream leaves it out.
+            if number - answers.count >= _UNDER_WAY:
+                return False
             number += 1
             params = {"q": list(q), "stamp_s": time.monotonic()}
             connection.sendall(jsonrpc.request(number, "stream_position", params))
+            return True
 
         yield send
         connection.shutdown(socket.SHUT_RDWR)
-        reader.join()
-
-
-def _drain(connection: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        while connection.recv(65536):
-            pass
+        answers.join()
 
 
 WAYS: Mapping[str, Callable[[Robot], contextlib.AbstractContextManager[Send]]] = {
@@ -162,9 +178,9 @@ class LatencyExperiment(Experiment):
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
                     q = base[_JOINT] + amplitude * (1.0 - cos(tau * now / PERIOD_S))
-                    times.append(begun + now)
-                    values.append(q)
-                    send([q, *base[1:]])
+                    if send([q, *base[1:]]):
+                        times.append(begun + now)
+                        values.append(q)
                     # A tick that was missed is left out: commands are never sent in a burst.
                     number = max(number + 1, int((time.monotonic() - begun) * rate))
                     time.sleep(max(0.0, begun + number / rate - time.monotonic()))
