@@ -59,14 +59,14 @@ def _experiment(
             except RtcpError as error:
                 if name != ALL:
                     raise
-                failed.append(f"{one}: {error}")
+                failed.append(str(error))
                 complain(failed[-1])
     if name == ALL and results:
         report(f"report: {_write_report([folder], folder / 'report.html')}")
     else:
         report(f"results: {folder}")
     if failed:
-        raise CommandError("\n".join(failed), ExitCode.FAULT)
+        raise typer.Exit(ExitCode.FAULT)
     if not all(result.met for result in results):
         raise typer.Exit(MISSED)
 

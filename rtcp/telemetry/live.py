@@ -6,10 +6,7 @@ reads too slowly loses its oldest messages, and nobody else waits for it.
 
 from __future__ import annotations
 
-import os
-import select
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from queue import SimpleQueue
 
@@ -17,60 +14,14 @@ import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.names import Names
-from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
-from rtcp.ipc.runtime_directory import blackboard_file
-from rtcp.ipc.session import SessionError, read_session
-from rtcp.telemetry.channels import Channels, Records
+from rtcp.ipc.observer import BlackboardError
+from rtcp.ipc.session import SessionError
+from rtcp.telemetry.channels import Channels
+from rtcp.telemetry.feed import Feed
 
 _TURN_S = 0.025
 _QUEUE = 8192
 """Messages that wait for one client: 1 s of every signal at 500 us, some MB."""
-
-
-class Feed:
-    """What a loop publishes from now on: cycle records, events and sentences, each once.
-
-    Args:
-        directory: the runtime directory.
-
-    Raises:
-        BlackboardError, SessionError: no platform runs there.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        self.config = read_session(directory).config
-        self._observer = Observer(blackboard_file(directory))
-        self._loop = select.poll()
-        try:
-            self._loop.register(os.pidfd_open(self._observer.loop_pid), select.POLLIN)
-        except OSError as error:
-            raise BlackboardError(f"the loop (process {self._observer.loop_pid}) has ended") from error
-        self._names = Names(self.config)
-        self._at, self._event = self._observer.head, self._observer.last_event
-        self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
-
-    def ended(self, wait_s: float) -> bool:
-        """Wait, and return early and true when the loop's process has ended."""
-        return bool(self._loop.poll(wait_s * 1e3))
-
-    def records(self) -> tuple[Records, int]:
-        """Return the new cycle records, and how many were overwritten before they were read."""
-        records, missing = self._observer.since(self._at)
-        self._at += len(records) + missing
-        return records, missing
-
-    def messages(self) -> Iterator[tuple[int, str, int]]:
-        """Yield new events and sentences: instant (CLOCK_MONOTONIC, ns), text and level of `foxglove.Log`."""
-        for event in self._observer.events_since(self._event):
-            self._event = event.number
-            level = ERROR if type(event.event) in self._names.faults else INFORMATION
-            yield event.monotonic_ns, self._names.message(event.event), level
-        for text in self._observer.texts_since(self._text):
-            self._text = text.number
-            # Its own time is the wall clock, which may have been set meanwhile.
-            yield time.monotonic_ns(), text.sentence, WARNING if text.is_problem else INFORMATION
 
 
 class _Subscriptions(ServerListener):
@@ -131,6 +82,6 @@ class LiveView:
         while not self._subscriptions.topics.empty():
             self._channels.repeat(self._subscriptions.topics.get())
         records, _ = self._feed.records()
-        self._channels.publish(records[records["number"] % self._every == 0] if self._every > 1 else records)
+        self._channels.publish(records, records[records["number"] % self._every == 0] if self._every > 1 else None)
         for instant, message, level in self._feed.messages():
             self._channels.log(self._channels.wall_ns(instant), message, level)

@@ -13,7 +13,6 @@ import errno
 import io
 import json
 import os
-import select
 import shutil
 import signal
 import sys
@@ -32,12 +31,11 @@ from rtcp.config.model import ArmConfig, RecordingConfig, RecordingFormat
 from rtcp.config.serialization import from_json, to_json
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PER_JOINT
-from rtcp.ipc.names import Names
-from rtcp.ipc.observer import BlackboardError, Observer
-from rtcp.ipc.recording import ERROR, FIELDS, INFORMATION, WARNING, versions
-from rtcp.ipc.runtime_directory import blackboard_file
-from rtcp.ipc.session import SessionError, identify, read_session
+from rtcp.ipc.observer import BlackboardError
+from rtcp.ipc.recording import FIELDS, versions
+from rtcp.ipc.session import SessionError, identify
 from rtcp.telemetry.channels import Channels, Records, UnknownSignal, fields_of, urdf_of
+from rtcp.telemetry.feed import Feed
 
 FORMATS = get_args(RecordingFormat)
 FLUSH_S = 0.5
@@ -262,20 +260,9 @@ class Recorder:
     """
 
     def __init__(self, directory: Path, options: RecordingConfig) -> None:
-        session = read_session(directory)
-        self._directory, self._options, config = directory, options, session.config
-        self._observer = Observer(blackboard_file(directory))
-        self._loop = select.poll()
-        try:
-            self._loop.register(os.pidfd_open(self._observer.loop_pid), select.POLLIN)
-        except OSError as error:
-            raise BlackboardError(f"the loop (process {self._observer.loop_pid}) has ended") from error
-        self._names = Names(config)
-        self._at = self._observer.head
-        self._event = self._observer.last_event
-        self._texts_read_ns = time.monotonic_ns()
-        texts = self._observer.texts_since(0)
-        self._text = texts[-1].number if texts else 0
+        self._directory, self._options = directory, options
+        self._feed = Feed(directory)
+        config = self._feed.config
         self._channels = Channels(config, time.time_ns() - time.monotonic_ns(), options.signals)
         self._ended = False
         self._rotates = options.max_file_mb is not None or options.max_file_seconds is not None
@@ -315,8 +302,8 @@ class Recorder:
             while not self._ended and (until is None or time.monotonic() < until):
                 self._turn()
                 made.seconds = time.monotonic() - began
-                if self._loop.poll(_TURN_S * 1e3):
-                    break  # the loop's process has ended
+                if self._feed.ended(_TURN_S):
+                    break
             self._turn()
         except Exception as error:
             self._failed(error)
@@ -339,44 +326,17 @@ class Recorder:
 
     def _turn(self) -> None:
         """Write what is new."""
-        records, missing = self._observer.since(self._at)
-        if len(records) or missing:
-            self._write(records, missing)
-        for event in self._observer.events_since(self._event):
-            self._log_gap("events", self._event + 1, event.number - 1, event.monotonic_ns)
-            self._event = event.number
-            level = ERROR if type(event.event) in self._names.faults else INFORMATION
-            self._log(event.monotonic_ns, self._names.message(event.event), level)
-        now_ns = time.monotonic_ns()
-        ahead_ns = time.time_ns() - now_ns
-        for text in self._observer.texts_since(self._text):
-            # Its time is CLOCK_REALTIME, which may have been set since; it came after the last turn and before now.
-            instant = min(max(text.time_ns - ahead_ns, self._texts_read_ns), now_ns)
-            self._log_gap("messages", self._text + 1, text.number - 1, instant)
-            self._text = text.number
-            self._log(instant, text.sentence, WARNING if text.is_problem else INFORMATION)
-        self._texts_read_ns = now_ns
-        if time.monotonic() - self._flushed >= FLUSH_S:
-            self._flush()
-
-    def _write(self, records: Records, missing: int) -> None:
+        records, missing = self._feed.records()
         self.status.missing += missing
-        first = self._at + 1
-        self._at += len(records) + missing
-        if missing:
-            instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
-            self._log_gap("cycles", first, self._at, instant, missing)
         for begin in range(0, len(records), _BATCH):
             part = records[begin : begin + _BATCH]
             chosen = part[part["number"] % self._options.every == 0] if self._options.every > 1 else part
             self._each(methodcaller("write", part, chosen))
             self.status.records += len(chosen)
-
-    def _log_gap(self, what: str, first: int, last: int, monotonic_ns: int, missing: int | None = None) -> None:
-        """Log that all from `first` to `last`, or `missing` of them, were overwritten in their ring; none: nothing."""
-        if count := last - first + 1 if missing is None else missing:
-            text = f"{count} of the {what} from {first} to {last} are missing: they were not read in time"
-            self._log(monotonic_ns, text, WARNING)
+        for instant, message, level in self._feed.messages():
+            self._channels.log(self._channels.wall_ns(instant), message, level)
+        if time.monotonic() - self._flushed >= FLUSH_S:
+            self._flush()
 
     def _flush(self) -> None:
         """Hand over what was written; go on in new files where these are full, end where the disk is nearly."""
@@ -430,9 +390,6 @@ class Recorder:
             except OSError as error:
                 error.filename = error.filename or str(writer.path)
                 raise
-
-    def _log(self, monotonic_ns: int, message: str, level: int) -> None:
-        self._channels.log(self._channels.wall_ns(monotonic_ns), message, level)
 
     def _write_status(self) -> None:
         """Write down what it is doing, whole or not at all; a full disk there loses the status, not the recording."""

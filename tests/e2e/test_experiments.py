@@ -87,12 +87,14 @@ def test_the_cycle_is_the_same_from_inside_and_at_an_output_of_the_io_box(setup:
     assert inside == pytest.approx(2000.0, rel=0.05)
 
 
+@pytest.mark.slow
 def test_an_item_is_picked_by_the_joystick_of_the_virtual_arm(setup: Setup) -> None:
     rows = carried_out(PicksExperiment(("shelf",)), setup)
     assert rows["shelf: distance to the item"].met
     assert rows["highest item above ground"].here == pytest.approx(0.8)
 
 
+@pytest.mark.slow
 def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup: Setup) -> None:
     rows = carried_out(LatencyExperiment((30.0,), 3), setup)
     for way in ("Python API", "socket"):
@@ -108,6 +110,7 @@ def test_inertia_and_friction_of_a_joint_come_back_within_5_percent(setup: Setup
     assert rows["joint1, 0.5 Hz: gain"].here == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_each_process_has_its_share_of_a_core_and_its_memory(setup: Setup) -> None:
     rows = carried_out(ResourcesExperiment(3.0), setup)
     for activity in ("holding", "moving", "jogging", "recording"):

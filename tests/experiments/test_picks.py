@@ -33,6 +33,10 @@ class Joystick:
         assert CONFIG.arm is not None
         return forward(CONFIG.arm, self.simulation.loop.arm.state.actual).position
 
+    @property
+    def mode(self) -> int:
+        return self.simulation.loop.operator.joystick_mode
+
     def hold(self, code: int, seconds: float) -> None:
         assert self.simulation.box is not None
         self.simulation.box.inputs = self.simulation.box.inputs & ~0xFF | code

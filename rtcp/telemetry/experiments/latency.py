@@ -36,8 +36,8 @@ AIM_CYCLES = 3.0
 _JOINT = 0
 _UNDER_WAY = 4
 """Commands that wait for their answers."""
-_SPARE = 1.3
-"""Limits beside what the sine needs: the way to a target that comes late is faster than the sine."""
+_SPARE = 4.0
+"""Limits beside what the sine needs: with less the way to each target, and not the platform, takes the time."""
 _PROBES, _PROBE_INTERVAL_S = 200, 0.02
 _PROBE_TIMEOUT_NS = 50_000_000
 

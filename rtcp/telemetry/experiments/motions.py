@@ -15,6 +15,7 @@ from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.api import Robot
+from rtcp.ipc.events import JOYSTICK_MODES
 from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import Recorded, read
 from rtcp.telemetry.square import SPEED_M_S, NoSquare, draw, judge, place
@@ -150,7 +151,6 @@ LEVEL = Pose.from_xyzrpy(-0.5, 0.0, 0.3, 0.0, -pi / 2, 0.0)
 LIFT_M = 0.1
 _NEAR_M, _FAR_M = 0.004, 0.04
 _MOST_PUSHES = 400
-_MODES = 4
 
 
 def begin_pose(model: ArmModel) -> tuple[float, ...]:
@@ -168,6 +168,10 @@ class Arm(Protocol):
     def tool(self) -> tuple[float, float, float]:
         """Position of the tool, m."""
 
+    @property
+    def mode(self) -> int:
+        """The joystick's mode: X-Y, Z-yaw, roll-pitch, gripper."""
+
     def hold(self, code: int, seconds: float) -> None:
         """Hold the joystick at its byte `code` for so long."""
 
@@ -177,7 +181,6 @@ class Person:
 
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
-        self._mode = 0
 
     def pick(self, item: tuple[float, float, float]) -> float:
         """Pick an item and lift it; return how far from it the gripper closed, m."""
@@ -190,10 +193,12 @@ class Person:
         return away
 
     def _choose(self, mode: int) -> None:
-        while self._mode != mode:
+        for _ in range(_MOST_PUSHES):
+            if self._arm.mode == mode:
+                return
             self._arm.hold(PADDLE_UP, 0.05)
             self._arm.hold(NEUTRAL, 0.05)
-            self._mode = (self._mode + 1) % _MODES
+        raise ExperimentFailed(f"the joystick does not change from mode {self._arm.mode} to {mode}")
 
     def _bring(self, target: tuple[float, float, float]) -> None:
         self._choose(0)
@@ -233,6 +238,10 @@ class _VirtualJoystick:
     @property
     def tool(self) -> tuple[float, float, float]:
         return forward(self._model, self._robot.status().positions).position
+
+    @property
+    def mode(self) -> int:
+        return JOYSTICK_MODES.index(self._robot.status().raw["joystick"]["mode"])
 
     def hold(self, code: int, seconds: float) -> None:
         self._robot.joystick(byte=code, hold_s=min(max(2 * seconds, 0.5), 1.0))

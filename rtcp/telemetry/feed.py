@@ -1,0 +1,83 @@
+"""What a running loop publishes, each cycle record, event and sentence once: for the recorder and the live view."""
+
+from __future__ import annotations
+
+import os
+import select
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import BlackboardError, Observer
+from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
+from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.session import read_session
+from rtcp.telemetry.channels import Records
+
+LogLine = tuple[int, str, int]
+"""Instant (CLOCK_MONOTONIC, ns), text and level of `foxglove.Log`."""
+
+
+class Feed:
+    """Reads a blackboard from now on.
+
+    Args:
+        directory: the runtime directory.
+
+    Raises:
+        BlackboardError, SessionError: no platform runs there.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.config = read_session(directory).config
+        self._observer = Observer(blackboard_file(directory))
+        self._loop = select.poll()
+        try:
+            self._loop.register(os.pidfd_open(self._observer.loop_pid), select.POLLIN)
+        except OSError as error:
+            raise BlackboardError(f"the loop (process {self._observer.loop_pid}) has ended") from error
+        self._names = Names(self.config)
+        self._at, self._event = self._observer.head, self._observer.last_event
+        self._texts_read_ns = time.monotonic_ns()
+        self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
+        self._gaps: list[LogLine] = []
+
+    def ended(self, wait_s: float) -> bool:
+        """Wait, and return early and true when the loop's process has ended."""
+        return bool(self._loop.poll(wait_s * 1e3))
+
+    def records(self) -> tuple[Records, int]:
+        """Return the new cycle records, and how many were overwritten before they were read."""
+        records, missing = self._observer.since(self._at)
+        first, self._at = self._at + 1, self._at + len(records) + missing
+        if missing:
+            instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
+            self._gaps.append(_gap("cycles", first, self._at, missing, instant))
+        return records, missing
+
+    def messages(self) -> Iterator[LogLine]:
+        """Yield new events and sentences, and a warning for all that was overwritten before it was read."""
+        gaps, self._gaps = self._gaps, []
+        yield from gaps
+        for event in self._observer.events_since(self._event):
+            if lost := event.number - self._event - 1:
+                yield _gap("events", self._event + 1, event.number - 1, lost, event.monotonic_ns)
+            self._event = event.number
+            level = ERROR if type(event.event) in self._names.faults else INFORMATION
+            yield event.monotonic_ns, self._names.message(event.event), level
+        now_ns = time.monotonic_ns()
+        ahead_ns = time.time_ns() - now_ns
+        for text in self._observer.texts_since(self._text):
+            # Its time is CLOCK_REALTIME, which may have been set since; it came after the last reading and before now.
+            instant = min(max(text.time_ns - ahead_ns, self._texts_read_ns), now_ns)
+            if lost := text.number - self._text - 1:
+                yield _gap("messages", self._text + 1, text.number - 1, lost, instant)
+            self._text = text.number
+            yield instant, text.sentence, WARNING if text.is_problem else INFORMATION
+        self._texts_read_ns = now_ns
+
+
+def _gap(what: str, first: int, last: int, count: int, monotonic_ns: int) -> LogLine:
+    text = f"{count} of the {what} from {first} to {last} are missing: they were not read in time"
+    return monotonic_ns, text, WARNING
