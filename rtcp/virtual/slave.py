@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rtcp.virtual.al_state import (
     HELD,
@@ -49,8 +49,9 @@ class Application:
         self._received = False
         self._op_wanted_at: int | None = None
         self._error = False
-        self.stepped_at = t
-        """Instant up to which the device's time has passed."""
+        self._stepped_at = t
+        self.outputs_watch: Callable[[memoryview, int], None] | None = None
+        """Called with the outputs and their arrival in OP."""
         self.sync = SyncMonitor(esc, device)
         self.state = AlState.INIT
         esc.on_outputs = self.outputs_written
@@ -84,6 +85,8 @@ class Application:
             return
         self._received = True
         self.sync.outputs_came()
+        if self.outputs_watch is not None and self.state == AlState.OP:
+            self.outputs_watch(manager.buffer, t)
         if manager.watchdog_trigger:
             if self._fed is None:
                 self.esc.memory[Register.WATCHDOG_STATUS] |= 0x01
@@ -224,12 +227,12 @@ class Application:
 
     def due(self, t: int, interval: int) -> bool:
         """Whether the device was last stepped `interval` ns before `t` or earlier."""
-        return t - self.stepped_at >= interval
+        return t - self._stepped_at >= interval
 
     def advance(self, t: int) -> None:
         """Let the device's time pass up to `t`: outputs in (in OP), steps, inputs out (from SAFE-OP on)."""
-        passed = t - self.stepped_at
-        self.stepped_at = max(t, self.stepped_at)
+        passed = t - self._stepped_at
+        self._stepped_at = max(t, self._stepped_at)
         if self.state == AlState.OP:
             if len(self._latched) == self._rx.byte_length:  # the master may have changed the sync manager just now
                 self._rx.unpack(self._latched)

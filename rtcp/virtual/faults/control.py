@@ -242,22 +242,24 @@ class _Joint:
 
 
 class _Output:
-    """A digital output that is watched: when it changed, ns of its slave's own clock."""
+    """A digital output that is watched: when frames changed it, ns of its slave's own clock."""
 
-    __slots__ = ("_box", "_level", "_mask", "edges")
+    __slots__ = ("_byte", "_level", "_mask", "_slave", "edges")
 
-    def __init__(self, box: DiewuIoBox, output: int) -> None:
-        self._box = box
-        self._mask = 1 << output - 1
-        self._level = box.outputs & self._mask
+    def __init__(self, slave: Slave, output: int) -> None:
+        self._slave = slave
+        self._byte, bit = divmod(output - 1, 8)
+        self._mask = 1 << bit
+        self._level: int | None = None
         self.edges: deque[int] = deque(maxlen=EDGES)
 
-    def look(self, slave: Slave) -> None:
-        """Remember the instant where it has changed: the device was stepped up to then."""
-        level = self._box.outputs & self._mask
-        if level != self._level and slave.clock is not None:
+    def look(self, outputs: memoryview, t: int) -> None:
+        """Remember the instant where the outputs that arrived at `t` change it."""
+        level = outputs[self._byte] & self._mask
+        if level != self._level:
+            if self._level is not None and self._slave.clock is not None:
+                self.edges.append(self._slave.clock.local(t))
             self._level = level
-            self.edges.append(slave.clock.local(slave.application.stepped_at))
 
 
 class GroundTruth:
@@ -276,17 +278,16 @@ class GroundTruth:
         self._joints = {
             slave: _Joint(slave.device) for slave in segment.slaves if isinstance(slave.device, CubemarsDrive)
         }
-        self._outputs: dict[Slave, dict[int, _Output]] = {}
+        self._output: tuple[int, int, _Output] | None = None
 
     def look(self, slave: Slave, now: int) -> None:
         """See whether the joint of `slave`, which was stepped, moves at instant `now`."""
         joint = self._joints.get(slave)
         if joint is not None:
             joint.look(now)
-        for output in self._outputs.get(slave, {}).values():
-            output.look(slave)
         if self._asked is not None and now - self._asked > PATIENCE:
             self.watching = False
+            self._release_output()
 
     def requested(self, now: int) -> None:
         """Somebody asked for something: who has once asked for the truth may ask for it again."""
@@ -304,7 +305,9 @@ class GroundTruth:
             joint.peak = 0.0
 
     def edges(self, position: int, output: int, now: int) -> list[int]:
-        """Return when an output changed since the last question, ns of its slave's own clock; the first one begins.
+        """Return when frames changed an output since the last question, ns of its slave's own clock.
+
+        The first question begins; one about another output ends it.
 
         Raises:
             FaultRefused: there is no such output.
@@ -314,11 +317,20 @@ class GroundTruth:
         if not isinstance(box, DiewuIoBox) or not 1 <= output <= CHANNELS:
             raise FaultRefused(f"slave {position} has no output {output}: allowed are 1 to {CHANNELS} of an IO box")
         self._watch(now)
-        slave = slaves[position - 1]
-        watched = self._outputs.setdefault(slave, {}).setdefault(output, _Output(box, output))
-        found = list(watched.edges)
-        watched.edges.clear()
+        slave, watched = slaves[position - 1], self._output
+        if watched is None or watched[:2] != (position, output):
+            self._release_output()
+            self._output = watched = position, output, _Output(slave, output)
+        # A slave that had no supply has a new application.
+        slave.application.outputs_watch = watched[2].look
+        found = list(watched[2].edges)
+        watched[2].edges.clear()
         return found
+
+    def _release_output(self) -> None:
+        if self._output is not None:
+            self._segment.slaves[self._output[0] - 1].application.outputs_watch = None
+            self._output = None
 
     def answer(self, now: int) -> dict[str, Any]:
         """Return what is true at instant `now`, slave by slave."""

@@ -9,6 +9,7 @@ import pytest
 
 from rtcp.config.segment import load_segment
 from rtcp.virtual.faults.control import PATIENCE, GroundTruth, SegmentClient
+from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.models import CubemarsDrive
 from rtcp.virtual.segment import Segment, make_segment
 from rtcp.virtual.slave import Slave
@@ -124,3 +125,25 @@ def test_a_real_segment_tells_of_a_load_that_falls_without_any_master(
     speeds = {abs(each["slaves"][2]["velocity_rad_s"]) for each in told}
     assert fallen["moved_ns"] not in asked or fallen["peak_rad_s"] not in speeds, "it is watched between the questions"
     assert min(asked) < fallen["moved_ns"] < max(asked)
+
+
+def test_an_output_is_stamped_when_frames_change_it_with_the_clock_of_its_slave(config: Path) -> None:
+    truth, segment = watched(config)
+    box = segment.slaves[0]
+    assert truth.edges(1, 10, MS) == []
+    watch = box.application.outputs_watch
+    assert watch is not None
+    assert box.clock is not None
+    for at, outputs in enumerate((b"\x00\x00", b"\x00\x02", b"\xff\x02", b"\x00\x00", b"\x00\x00", b"\x00\x02")):
+        watch(memoryview(outputs), (2 + at) * MS)
+    assert truth.edges(1, 10, 10 * MS) == [box.clock.local(at * MS) for at in (3, 5, 7)]
+    assert truth.edges(1, 10, 10 * MS) == []
+    truth.look(box, 10 * MS + PATIENCE + 1)
+    assert box.application.outputs_watch is None
+
+
+@pytest.mark.parametrize(("slave", "output"), [(1, 0), (1, 17), (2, 1), (0, 1), (9, 1)])
+def test_an_output_that_is_not_there_is_refused(config: Path, slave: int, output: int) -> None:
+    truth, _ = watched(config)
+    with pytest.raises(FaultRefused, match=f"slave {slave} has no output {output}"):
+        truth.edges(slave, output, MS)
