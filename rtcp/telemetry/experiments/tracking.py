@@ -28,7 +28,9 @@ _SHARE = 0.6
 _REACH_RAD = 0.4
 _SAMPLES = 24
 """Points of the trajectory in a period: a spline through them with their velocities and accelerations is the sine."""
-_WINDOW_S = 0.02
+_WINDOW_S = 0.01
+_SETTLING_S = 0.01
+"""What the drive does in a gap between two samples is unknown, and so long after it still shows in the torque."""
 _MOVING_RAD_S = 0.02
 _TOLERANCE = 0.05
 
@@ -75,7 +77,8 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
 
     torque = J a + c sign(v) + b v - g1 sin(q) - g2 cos(q), each side integrated over short windows: the acceleration
     need not be had from the noise of the velocity. Windows in which the joint hardly moves or turns round tell nothing
-    of dry friction, and those with a gap between two samples nothing of what was in it: they are left out.
+    of dry friction, and those with a gap between two samples, or just after one, nothing of what was in it: they are
+    left out.
 
     Raises:
         ExperimentFailed: it hardly moved.
@@ -91,10 +94,12 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
         means: Array = halves.reshape(count, width).mean(axis=1)
         return means
 
+    gaps = np.diff(seconds, prepend=seconds[0]) > 1.5 * period_s
+    settling = np.convolve(gaps, np.ones(round(_SETTLING_S / period_s) + 1))[: count * width + 1] > 0
+    undisturbed = ~(settling[:-1] | settling[1:]).reshape(count, width).any(axis=1)
     speeds = velocity[: count * width].reshape(count, width)
-    steps = np.diff(seconds[: count * width + 1]).reshape(count, width)
-    useful = (np.abs(speeds).min(axis=1) > _MOVING_RAD_S) & (np.abs(np.sign(speeds).sum(axis=1)) == width)
-    useful &= steps.max(axis=1) < 1.5 * period_s
+    moving = (np.abs(speeds).min(axis=1) > _MOVING_RAD_S) & (np.abs(np.sign(speeds).sum(axis=1)) == width)
+    useful = moving & undisturbed
     if np.count_nonzero(useful) < 20:
         raise ExperimentFailed("the joint hardly moved: nothing can be identified")
     columns = np.column_stack((
