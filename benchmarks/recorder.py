@@ -33,9 +33,9 @@ from rich.table import Table
 sys.path.insert(0, str(Path(__file__).parent))
 
 from cycle import Array, figures, keep_moving, spread
-from rtcp.telemetry.recording import recording
 
 from rtcp.api import RtcpError, connect
+from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import StartOptions, start
 
@@ -79,11 +79,16 @@ def recorded(directory: Path, cost: Cost) -> Iterator[psutil.Process]:
 
 def wakeups(seconds: float) -> Array:
     """Return the wake-up latencies of the cycle for a while, us."""
-    with recording(blackboard_file(runtime_directory())) as made:
-        time.sleep(seconds)
-    if made.lost:
-        sys.stderr.write(f"{made.lost} cycle records were not read in time\n")
-    return made.column("wakeup_ns") / 1e3
+    with contextlib.closing(Observer(blackboard_file(runtime_directory()))) as observer:
+        at, parts, lost, until = observer.head, [], 0, time.monotonic() + seconds
+        while time.monotonic() < until:
+            time.sleep(SAMPLE_S)
+            records, missing = observer.since(at)
+            at, lost = at + len(records) + missing, lost + missing
+            parts.append(records["wakeup_ns"] / 1e3)
+    if lost:
+        sys.stderr.write(f"{lost} cycle records were not read in time\n")
+    return np.concatenate(parts)
 
 
 def rounds(directory: Path, seconds: float, count: int, cost: Cost) -> dict[str, list[Array]]:

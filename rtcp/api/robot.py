@@ -444,9 +444,9 @@ class Methods:
         return Call("record_start", params, partial(result, RecorderStatus))
 
     @Method
-    def record_stop(self) -> Call[list[RecorderStatus]]:
-        """End all recordings; return what they have written."""
-        return Call("record_stop", {}, _recordings)
+    def record_stop(self, pid: int | None = None) -> Call[list[RecorderStatus]]:
+        """End all recordings, or the one of the process `pid`; return what they have written."""
+        return Call("record_stop", {"pid": pid}, _recordings)
 
     @Method
     def record_status(self) -> Call[list[RecorderStatus]]:

@@ -192,10 +192,10 @@ class SquareDrive:
         if model is None:
             raise CommandError("the arm has no geometry (key kinematics)")
         with TemporaryDirectory() as folder:
-            (path,) = robot.record_start(Path(folder) / "square.mcap").files
+            begun = robot.record_start(path := Path(folder) / "square.mcap")
             arrived = robot.move_line(square.poses, SPEED_M_S)
-            robot.record_stop()
-            recorded = read(Path(path))
+            robot.record_stop(begun.pid)
+            recorded = read(path)
         report(f"square in {square.plane}: {arrival(arrived)}")
         try:
             self._driven = judge(model, square, recorded)

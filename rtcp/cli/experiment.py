@@ -14,6 +14,7 @@ from rtcp.api import RtcpError
 from rtcp.cli.arguments import BusName, ConfigFile, option
 from rtcp.cli.output import SUSPENDING, CommandError, ExitCode, complain, interruptible, report, show, table
 from rtcp.cli.platform import refuse_second_platform, running_platform
+from rtcp.config.model import VIRTUAL
 from rtcp.launch import offline
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
 ALL = "all"
 NAMES = ("cycle", "delays", "step", "square", "picks", "latency", "resources", "tracking")
+PLANES = ("xy", "yz", "xz")
 MISSED = 1
 
 commands = typer.Typer()
@@ -31,6 +33,9 @@ commands = typer.Typer()
 @commands.command("experiment")
 def _experiment(
     name: Annotated[str, typer.Argument(metavar="NAME", help=f"{', '.join(NAMES)}, or all of them: {ALL}.")],
+    plane: Annotated[
+        str | None, typer.Argument(metavar="[xy|yz|xz]", help="Of the square; left out: xy and yz.")
+    ] = None,
     config: ConfigFile = None,
     bus: BusName = None,
     out: Annotated[
@@ -43,8 +48,13 @@ def _experiment(
     """
     if name not in (*NAMES, ALL):
         raise CommandError(f"there is no experiment {name}: allowed are {', '.join(NAMES)}, {ALL}")
+    if plane is not None and (name != "square" or plane not in PLANES):
+        raise CommandError(f"{plane}: only a square has a plane, one of {', '.join(PLANES)}")
     refuse_second_platform()
-    offline.configuration(config)  # its mistakes are named before anything begins
+    arm = offline.configuration(config)  # its mistakes are named before anything begins
+    if bus is None and arm.bus.interface != VIRTUAL:
+        found = arm.bus.interface
+        raise CommandError(f"the bus of {arm.name} is {found}: a real arm would move. Give --bus {found} where it may")
     folder = Path(f"{name}-{time.strftime('%Y-%m-%dT%H-%M-%S')}") if out is None else out
     try:
         folder.mkdir(parents=True)
@@ -54,14 +64,14 @@ def _experiment(
     with interruptible("interrupted: the platform has been stopped", *SUSPENDING):
         for one in NAMES if name == ALL else (name,):
             try:
-                results.append(_carry_out(one, config, bus, folder / one if name == ALL else folder))
+                results.append(_carry_out(one, plane, config, bus, folder / one if name == ALL else folder))
                 show(result_table(results[-1]))
             except RtcpError as error:
                 if name != ALL:
                     raise
                 failed.append(str(error))
                 complain(failed[-1])
-    if name == ALL and results:
+    if name == ALL:
         report(f"report: {_write_report([folder], folder / 'report.html')}")
     else:
         report(f"results: {folder}")
@@ -71,16 +81,18 @@ def _experiment(
         raise typer.Exit(MISSED)
 
 
-def _carry_out(name: str, config: Path | None, bus: str | None, folder: Path) -> Result:
+def _carry_out(name: str, plane: str | None, config: Path | None, bus: str | None, folder: Path) -> Result:
     from rtcp.telemetry.experiments import EXPERIMENTS
     from rtcp.telemetry.experiments.experiment import ExperimentFailed, Setup, carry_out
+    from rtcp.telemetry.experiments.motions import SquareExperiment
 
     folder.mkdir(exist_ok=True)
     given = [*(["--config", str(config)] if config else []), *(["--bus", bus] if bus else [])]
-    command = shlex.join(["rtcp", "experiment", name, *given])
+    command = shlex.join(["rtcp", "experiment", name, *([plane] if plane else []), *given])
+    experiment = SquareExperiment((plane,)) if plane else EXPERIMENTS[name]()
     report(f"{name}: {EXPERIMENTS[name].title}")
     try:
-        return carry_out(EXPERIMENTS[name](), Setup(folder, running_platform, report, config, bus), command)
+        return carry_out(experiment, Setup(folder, running_platform, report, config, bus), command)
     except ExperimentFailed as error:
         raise RtcpError("fault", f"{name}: {error}") from error
     except OSError as error:

@@ -95,7 +95,9 @@ def _replay(
         from rtcp.telemetry.reading import read
         from rtcp.telemetry.replay import trajectory
 
-        recorded = read(file, ["*_position"], start, end)
+        # A CSV has no flags.
+        signals = ["*_position"] if file.suffix.lower() == ".csv" else ["*_position", "flag*"]
+        recorded = read(file, signals, start, end)
         points = trajectory(recorded, speed)
     if recorded.truncated or recorded.missing:
         complain(f"{file}: {recorded.missing} records are missing{', and its end' if recorded.truncated else ''}")
@@ -108,7 +110,7 @@ def _replay(
         try:
             arrived = robot.run_trajectory(points, True, shown)
         except RtcpError as error:
-            if error.reason != "PlanRefused":
+            if error.reason != "PlanTooFast":
                 raise
             hint = f"nothing has moved; a motion recorded at its limits passes with --speed {0.9 * speed:.2g}"
             raise CommandError(f"{error.message}; {hint}", ExitCode.REFUSED) from error

@@ -310,13 +310,15 @@ class StreamingCommands:
         self._channel = channel
         self._leases: dict[int, tuple[int, int]] = {}
         """Lease and last event before it, by connection."""
+        self._head = 0
+        """Number of the last record without the command that was accepted last."""
 
     async def send(self, caller: Caller, command: Command) -> Json:
         """Send a command; return state and positions."""
         channel = self._channel
         lease, since = self._lease(caller)
         try:
-            await channel.accept(lease, command)
+            self._head = await channel.accept(lease, command)
         except RtcpError as error:
             ended = channel.early_end(since)
             if ended is not None and channel.state is not State.HOLDING:
@@ -333,7 +335,7 @@ class StreamingCommands:
 
         def rested() -> bool | None:
             channel.check_loop()
-            return channel.state not in IN_MOTION or None
+            return (channel.observer.head > self._head and channel.state not in IN_MOTION) or None
 
         with contextlib.suppress(RtcpError):
             await channel.wait(rested, _REST_S, lambda: RtcpError("timeout", "the arm does not come to rest"))

@@ -272,9 +272,9 @@ class Methods:
         )
 
     @method(at_once=True)
-    async def record_stop(self, caller: Caller) -> Json:
-        """End all recordings. Returns `recordings`: those that were ended."""
-        return {"recordings": await self.recordings.stop()}
+    async def record_stop(self, caller: Caller, pid: int | None = None) -> Json:
+        """End all recordings, or that of the process `pid`. Returns `recordings`: those that were ended."""
+        return {"recordings": await self.recordings.stop(pid)}
 
     @method(at_once=True)
     async def record_status(self, caller: Caller) -> Json:

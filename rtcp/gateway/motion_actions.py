@@ -98,7 +98,7 @@ class Planner:
         try:
             return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
         except PlanRefused as refused:
-            raise RtcpError("refused", str(refused), PlanRefused.__name__) from None
+            raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
     @staticmethod
     def read(path: str) -> tuple[tuple[Point, ...], tuple[Stop, ...], float | None]:
@@ -157,9 +157,10 @@ class MotionActions:
             begin = self._joints(points[0].q) if approach and points else self._start()
             # Before the approach: of a trajectory that is refused nothing moves.
             plan = await asyncio.to_thread(self._planner.trajectory, points, begin)
+            slot = self._write(plan)
             if approach:
                 await self._move(lease, begin, None, True)
-            return await self._run_plan(lease, RunTrajectory, plan, "the trajectory")
+            return await self._run_plan(lease, RunTrajectory, plan, slot, "the trajectory")
 
     async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
         """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
@@ -176,7 +177,7 @@ class MotionActions:
                 if not stops:
                     return arrival
             plan = await asyncio.to_thread(self._planner.lines, stops, self._start(), speed)
-            return await self._run_plan(lease, RunLines, plan, "the path")
+            return await self._run_plan(lease, RunLines, plan, self._write(plan), "the path")
 
     async def run_command(self, caller: Caller, command: MotionCommand) -> Json:
         """Send a motion command that needs no planning here; return when the arm holds again."""
@@ -208,11 +209,15 @@ class MotionActions:
         timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
         return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"))
 
-    async def _run_plan(self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, what: str) -> Json:
+    def _write(self, plan: Plan) -> int:
         try:
-            slot = self._channel.observer.write_plan(plan.rows)
+            return self._channel.observer.write_plan(plan.rows)
         except PlanTooLong as error:
             raise RtcpError("refused", str(error)) from None
+
+    async def _run_plan(
+        self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, slot: int, what: str
+    ) -> Json:
         arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
         found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival)

@@ -16,7 +16,8 @@ from rtcp.gateway.command_channel import Json
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import Pid, is_running, terminate, wait_for_exit
 
-_READY_S, _END_S = 12.0, 10.0
+_READY_S, _END_S = 30.0, 30.0
+"""A host that has hardly any time for others than the cycle delays them, and a file is to be completed all the same."""
 
 
 def recordings_directory() -> Path:
@@ -81,9 +82,9 @@ class Recordings:
         """Return what the recorders of this platform do or have done, the oldest first."""
         return [_shown(found, is_running(pid)) for pid, found in self._recorders()]
 
-    async def stop(self) -> list[Json]:
-        """End all recorders that run and return what they have done."""
-        running = [pid for pid, _ in self._recorders() if is_running(pid)]
+    async def stop(self, only: int | None = None) -> list[Json]:
+        """End the recorders that run, or the process `only`, and return what they have done."""
+        running = [pid for pid, _ in self._recorders() if is_running(pid) and only in (None, pid)]
         await asyncio.gather(*(asyncio.to_thread(terminate, pid, _END_S) for pid in running))
         return [_shown(found, False) for pid, found in self._recorders() if pid in running]
 

@@ -76,7 +76,7 @@ FIELDS = tuple(name for name, _ in (*SCALARS, *PER_JOINT))
 Records = dict[str, npt.NDArray[Any]]
 
 
-Kind = Literal["refused", "damaged", "empty", "signals", "exists", "long"]
+Kind = Literal["refused", "damaged", "empty", "signals", "exists", "long", "gap", "disabled"]
 
 
 class RecordingError(Exception):

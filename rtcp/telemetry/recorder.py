@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import dataclasses
 import errno
+import glob
 import io
 import json
 import os
@@ -282,6 +283,7 @@ class Recorder:
         try:
             self._stem.parent.mkdir(parents=True, exist_ok=True)
             self._check_space()
+            self._check_place()
             self._open()
         except (OSError, ValueError) as error:
             for writer in self._writers.values():
@@ -358,6 +360,12 @@ class Recorder:
             message = f"{place}: {free:.0f} MB are free, less than the reserve of {reserve} MB (reserve_mb): free some"
             fields = {"directory": str(place), "free_mb": round(free), "reserve_mb": reserve}
             raise RtcpError("refused", message, "disk_reserve", fields)
+
+    def _check_place(self) -> None:
+        """Refuse a place where files of another rotating recording would be met later."""
+        for name in self._writers if self._rotates else ():
+            for path in self._stem.parent.glob(f"{glob.escape(self._stem.name)}-[0-9]*.{name}"):
+                raise FileExistsError(errno.EEXIST, "File exists", str(path))
 
     def _rotate(self) -> None:
         """Complete the files, begin the next ones, and remove the oldest beyond those that are kept."""

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from rtcp.ipc.recording import WARNING
+from rtcp.ipc.recording import WARNING, RecordingError
 from rtcp.ipc.states import State
 from rtcp.telemetry.fault_report import COLOURS
 from rtcp.telemetry.reading import Part, Reader
@@ -60,7 +60,7 @@ def figure(reader: Reader) -> Figure:
     """Return the picture of what a reader gives: its signals, or `SIGNALS` where none were chosen.
 
     Raises:
-        RecordingError: while the recording is read.
+        RecordingError: none of them can be drawn; while the recording is read.
     """
     names = [name for name in reader.names if name not in ("number", "time_ns")] if reader.signals else list(SIGNALS)
     envelopes: dict[str, Envelope] = {}
@@ -82,6 +82,9 @@ def figure(reader: Reader) -> Figure:
             for at in np.flatnonzero(np.diff(states, prepend=states[0] if state < 0 else state)).tolist():
                 marks.append((float(seconds[at]), _STATES.get(int(states[at]), str(states[at])), COLOURS[7]))
             state = int(states[-1])
+    if not envelopes:
+        allowed = [name for name in reader.names if name not in ("number", "time_ns")]
+        raise RecordingError("signals", reader.path, f"there is nothing to draw; it has {', '.join(allowed)}")
     return _draw(reader, envelopes, marks, begin_s)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.ipc.jsonrpc import LINE_LIMIT
+from rtcp.ipc.layout import FLAG_ENABLED
 from rtcp.ipc.recording import RecordingError
 from rtcp.telemetry.reading import Recorded
 
@@ -33,7 +34,8 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
         scale: of the speed; 0.5 takes twice the time.
 
     Raises:
-        RecordingError: nothing moves in it, or it is too long for a request.
+        RecordingError: nothing moves in it, cycles of the motion are missing, the drives were not enabled in all of it,
+            or it is too long for a request.
     """
     name = next(name for name in POSITIONS if name in (recorded.records.dtype.names or ()))
     q = recorded.column(name)
@@ -43,7 +45,13 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     span = slice(max(0, moving[0] - 1), moving[-1] + 2)
     # By their numbers: a setpoint is one cycle after the one before, however late a loaded host ran that cycle.
     number = recorded.column("number")
-    cycles = (number - number[0]) / max(1.0, np.diff(number).min())
+    every = max(1.0, np.diff(number).min())
+    if gaps := int((np.diff(number[span]) > every).sum()):
+        raise RecordingError("gap", recorded.path, f"cycles are missing at {gaps} places of its motion", found=gaps)
+    if "flags" in (recorded.records.dtype.names or ()) and not (recorded.records["flags"][span] & FLAG_ENABLED).all():
+        defect = "the drives were not enabled in all of its motion: choose a part by --start and --end"
+        raise RecordingError("disabled", recorded.path, defect)
+    cycles = (number - number[0]) / every
     t, q = cycles[span] * (recorded.period_s / scale), q[span]
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
     least = ceil(_SHORTEST_S * scale / recorded.period_s)

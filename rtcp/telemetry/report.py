@@ -26,12 +26,12 @@ def page(folders: Sequence[Path]) -> str:
     names = list(dict.fromkeys(name for results in found for name in results))
     sections = []
     for name in names:
-        ran = [(folder, results[name]) for folder, results in zip(folders, found, strict=True) if name in results]
+        ran = [results[name] for results in found if name in results]
         sections.append({
             "title": ran[0][1].title,
             "name": name,
-            "runs": [{"folder": folder, "result": one, "pictures": _pictures(folder, one)} for folder, one in ran],
-            "figures": _side_by_side([results.get(name) for results in found]),
+            "runs": [{"result": one, "pictures": _pictures(place, one)} for place, one in ran],
+            "figures": _side_by_side([results[name][1] if name in results else None for results in found]),
         })  # fmt: skip
     environment = Environment(
         loader=PackageLoader("rtcp.telemetry", "templates"),
@@ -42,19 +42,19 @@ def page(folders: Sequence[Path]) -> str:
     environment.filters["shown"] = shown
     return environment.get_template("report.html").render(
         folders=[folder.absolute().name for folder in folders],
-        hosts=[next(iter(results.values())).host for results in found],
+        hosts=[next(iter(results.values()))[1].host for results in found],
         sections=sections,
         verdicts=VERDICTS,
     )
 
 
-def _results(folder: Path) -> dict[str, Result]:
-    """Return the results of a folder: its own, or those of the folders in it."""
+def _results(folder: Path) -> dict[str, tuple[Path, Result]]:
+    """Return by name the results of a folder, or of the folders in it, the last of each, with their places."""
     files = [folder / RESULT] if (folder / RESULT).exists() else sorted(folder.glob(f"*/{RESULT}"))
     if not files:
         raise ExperimentFailed(f"{folder}: there are no results of experiments ({RESULT}) in it or in its folders")
-    results = sorted((read_result(file.parent) for file in files), key=lambda one: one.began)
-    return {one.name: one for one in results}
+    results = sorted(((file.parent, read_result(file.parent)) for file in files), key=lambda one: one[1].began)
+    return {result.name: (place, result) for place, result in results}
 
 
 def _side_by_side(results: Sequence[Result | None]) -> list[tuple[Row, list[Row | None]]]:
@@ -68,12 +68,11 @@ def _side_by_side(results: Sequence[Result | None]) -> list[tuple[Row, list[Row 
     return table
 
 
-def _pictures(folder: Path, result: Result) -> list[str]:
+def _pictures(place: Path, result: Result) -> list[str]:
     """Return the pictures of a result as data URLs; one that has gone is left out."""
-    base = folder if (folder / RESULT).exists() else folder / result.name
     found = []
     for name in result.pictures:
-        path = base / f"{name}.png"
+        path = place / f"{name}.png"
         if path.exists():
             found.append("data:image/png;base64," + base64.b64encode(path.read_bytes()).decode())
     return found

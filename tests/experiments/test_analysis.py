@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
 from math import pi, tau
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rtcp.telemetry.experiments.experiment import ExperimentFailed, Result, Row, read_result
+from rtcp.telemetry.experiments.experiment import (
+    Experiment,
+    ExperimentFailed,
+    Result,
+    Row,
+    Setup,
+    carry_out,
+    read_result,
+)
 from rtcp.telemetry.experiments.latency import behind, fit_sine
 from rtcp.telemetry.experiments.timing import spread
 from rtcp.telemetry.experiments.tracking import identify, sine
@@ -24,9 +33,9 @@ def test_the_sine_fit_finds_the_latency_at_30_hz_within_0_2_ms(latency_s: float,
     random = np.random.default_rng(7)
     t = 1234.5 + np.arange(0.0, 10.0, 1 / 30)
     finer = 1234.5 + np.arange(0.0, 10.0, 1 / 2000)
-    command = fit_sine(t, 0.3 + pi / 16 * np.sin(tau * t / PERIOD_S + 0.4), PERIOD_S)
+    command = fit_sine(t, 0.3 + pi / 16 * np.sin(tau * t / PERIOD_S + 0.4), PERIOD_S, 1239.5)
     actual = 0.3 + pi / 16 * np.sin(tau * (finer - latency_s) / PERIOD_S + 0.4)
-    feedback = fit_sine(finer, actual + noise * random.standard_normal(len(finer)), PERIOD_S)
+    feedback = fit_sine(finer, actual + noise * random.standard_normal(len(finer)), PERIOD_S, 1239.5)
     found, error = behind(feedback, command)
     assert found == pytest.approx(latency_s, abs=0.2e-3)
     assert abs(found - latency_s) <= 5 * error + 1e-9
@@ -39,8 +48,9 @@ def test_noise_of_30_hz_samples_themselves_still_gives_the_latency_within_its_st
     t = np.arange(0.0, 10.0, 1 / 30)
     misses = []
     for _ in range(100):
-        command = fit_sine(t, np.sin(tau * t / PERIOD_S), PERIOD_S)
-        feedback = fit_sine(t, np.sin(tau * (t - 0.1) / PERIOD_S) + 0.01 * random.standard_normal(len(t)), PERIOD_S)
+        command = fit_sine(t, np.sin(tau * t / PERIOD_S), PERIOD_S, 5.0)
+        noisy = np.sin(tau * (t - 0.1) / PERIOD_S) + 0.01 * random.standard_normal(len(t))
+        feedback = fit_sine(t, noisy, PERIOD_S, 5.0)
         found, error = behind(feedback, command)
         misses.append((found - 0.1) / error)
     assert np.std(misses) == pytest.approx(1.0, abs=0.3)
@@ -118,7 +128,22 @@ def test_a_report_is_one_file_with_figures_verdicts_and_pictures_of_one_or_two_f
     assert both.count("<img") == 2
 
 
-@pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b'{"rows": 3}', b"\xff\xfe"])
+def test_what_failed_or_could_not_be_measured_is_in_result_and_report_as_a_miss(tmp_path: Path) -> None:
+    class Failing(Experiment):
+        name, title = "failing", "An experiment that fails"
+
+        def run(self, setup: Setup) -> list[Row]:
+            raise ExperimentFailed("the arm has no geometry")
+
+    with pytest.raises(ExperimentFailed, match="no geometry"):
+        carry_out(Failing(), Setup(tmp_path, nullcontext, print), "rtcp experiment failing")
+    found = read_result(tmp_path)
+    assert (found.met, found.notes) == (False, ("the arm has no geometry",))
+    assert "not measured" in page([tmp_path])
+    assert "the arm has no geometry" in page([tmp_path])
+
+
+@pytest.mark.parametrize("content", [None, b"", b"{}", b"[1]", b'{"rows": 3}', b'{"rows": [1]}', b"\xff\xfe"])
 def test_a_folder_without_a_result_is_one_message(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:
         (tmp_path / "result.json").write_bytes(content)

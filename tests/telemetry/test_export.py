@@ -89,7 +89,7 @@ def test_an_error_in_the_middle_leaves_nothing_half_written(tmp_path: Path, monk
     path = mcap(tmp_path / "a.mcap")
     written = 0
 
-    def write(self: object, records: object) -> None:
+    def write(self: object, records: object, chosen: object) -> None:
         nonlocal written
         written += 1
         if written == 3:

@@ -36,10 +36,11 @@ def cycles(count: int = 4000, first: int = 1000) -> Records:
 def mcap(path: Path, records: Records | None = None, signals: tuple[str, ...] = ()) -> Path:
     """Write records as the recorder does, in chunks of 500, with a message in the log after the first of them."""
     channels = Channels(CONFIG, OFFSET_NS, signals)
-    writer = McapWriter(path, channels, CONFIG)
+    writer = McapWriter(channels, CONFIG)
+    writer.open(path)
     given = cycles() if records is None else records
     for at in range(0, len(given), 500):
-        writer.write(given[at : at + 500])
+        writer.write(given[at : at + 500], given[at : at + 500])
         if at == 0:
             channels.log(int(given["time_ns"][250]) + OFFSET_NS, "a warning", WARNING)
         writer.flush()
@@ -48,8 +49,10 @@ def mcap(path: Path, records: Records | None = None, signals: tuple[str, ...] = 
 
 
 def csv(path: Path, records: Records | None = None, signals: tuple[str, ...] = ()) -> Path:
-    writer = CsvWriter(path, 6, signals)
-    writer.write(cycles() if records is None else records)
+    writer = CsvWriter(6, signals)
+    writer.open(path)
+    given = cycles() if records is None else records
+    writer.write(given, given)
     writer.close()
     return path
 

@@ -10,6 +10,7 @@ import pytest
 from ruckig import InputParameter, Ruckig, Trajectory
 
 from rtcp.config.model import Point
+from rtcp.ipc.layout import FLAG_ENABLED
 from rtcp.ipc.recording import RecordingError
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, value
@@ -90,7 +91,22 @@ def test_where_nothing_moves_or_too_much_there_is_one_sentence(tmp_path: Path) -
         trajectory(read(mcap(tmp_path / "a.mcap", still)))
     assert raised.value.kind == "empty"
     restless = cycles(8000)
+    restless["flags"] = FLAG_ENABLED
     restless["sent_position"] = np.random.default_rng(1).normal(size=(8000, 6))
     with pytest.raises(RecordingError, match="choose a part by --start and --end") as raised:
         trajectory(read(mcap(tmp_path / "b.mcap", restless)))
     assert raised.value.kind == "long"
+
+
+def test_a_motion_with_a_gap_or_without_torque_is_not_replayed(tmp_path: Path) -> None:
+    records = moved()
+    middle = len(records) // 2
+    with pytest.raises(RecordingError, match="cycles are missing at 1 places") as raised:
+        trajectory(read(mcap(tmp_path / "gap.mcap", np.delete(records, slice(middle, middle + 9))), ["*_position"]))
+    assert raised.value.kind == "gap"
+    records["flags"] = FLAG_ENABLED
+    assert trajectory(read(mcap(tmp_path / "enabled.mcap", records), ["*_position", "flags"]))
+    records["flags"][middle] = 0
+    with pytest.raises(RecordingError, match="the drives were not enabled") as raised:
+        trajectory(read(mcap(tmp_path / "disabled.mcap", records), ["*_position", "flags"]))
+    assert raised.value.kind == "disabled"

@@ -19,7 +19,7 @@ from rtcp.motion.planning.interpolation import (
     spline_velocities,
     value,
 )
-from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Plan, PlanRefused, ZoneAt
+from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Plan, PlanRefused, PlanTooFast, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -195,7 +195,7 @@ def _check_derivatives(waypoint: _Knot, where: str, limits: Limits, names: Seque
     ):
         for name, number, most in zip(names, found, allowed, strict=True):
             if abs(number) > most * (1.0 + _ROUNDING):
-                raise PlanRefused(f"{where}: {name} {what} {number:.4g} {unit}, allowed is at most {most:g} {unit}")
+                raise PlanTooFast(f"{where}: {name} {what} {number:.4g} {unit}, allowed is at most {most:g} {unit}")
 
 
 def _steps(duration: float, limits: Limits) -> int:
@@ -232,7 +232,7 @@ def _check_piece(
             bound = most * scale * (1.0 + _ROUNDING)
             if (found := beyond(curve, -bound, bound)) is not None:
                 at = before.t + found[1] * length
-                raise PlanRefused(
+                raise PlanTooFast(
                     f"{where}: {name} would {what} {found[0] / scale:.4g} {unit} at {at:.3f} s, "
                     f"allowed is at most {most:g} {unit}"
                 )

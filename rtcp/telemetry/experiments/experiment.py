@@ -15,24 +15,37 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from math import isfinite, nan
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import psutil
 from ruamel.yaml import YAML
 
 from rtcp.api import Robot, RtcpError
 from rtcp.config.find import find_config
 from rtcp.config.loader import load
 from rtcp.config.model import VIRTUAL, ArmConfig
-from rtcp.ipc.recording import versions
+from rtcp.ipc.observer import BlackboardError
+from rtcp.ipc.recording import RecordingError, versions
+from rtcp.ipc.session import SessionError
 from rtcp.launch.launcher import StartOptions
+from rtcp.virtual.faults.control import SegmentAway, SegmentRefused
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESULT = "result.json"
+SPEED_RAD_S = 0.2
+"""Of the moves to and from where something is measured."""
 LOCK_TIMEOUT_S = 10.0
 Source = float | str | None
+
+
+_FAILURES = (
+    RecordingError, SegmentAway, SegmentRefused, SessionError, BlackboardError, psutil.Error, RuntimeError,
+)  # fmt: skip
+"""What a platform that ends meanwhile, or a fit without a solution, may raise."""
 
 
 class ExperimentFailed(Exception):
@@ -67,7 +80,9 @@ class Row:
 
 def shown(value: Source) -> str:
     """Return a figure as tables show it: four digits, and 0 for what is rounding."""
-    return "" if value is None else value if isinstance(value, str) else "0" if abs(value) < 1e-9 else f"{value:.4g}"
+    if value is None or isinstance(value, str):
+        return value or ""
+    return "not measured" if not isfinite(value) else "0" if abs(value) < 1e-9 else f"{value:.4g}"
 
 
 @dataclass(frozen=True)
@@ -94,7 +109,10 @@ class Result:
 
     def write(self, folder: Path) -> None:
         """Write `result.json`; raises OSError."""
-        rows = [{**asdict(row), "here": float(row.here), "met": row.met} for row in self.rows]
+        rows = [
+            {**asdict(row), "here": float(row.here) if isfinite(row.here) else None, "met": row.met}
+            for row in self.rows
+        ]
         (folder / RESULT).write_text(json.dumps({**asdict(self), "rows": rows}, indent=1) + "\n")
 
 
@@ -107,13 +125,19 @@ def read_result(folder: Path) -> Result:
     path = folder / RESULT
     try:
         found = json.loads(path.read_bytes())
-        rows = tuple(Row(**{name: value for name, value in row.items() if name != "met"}) for row in found["rows"])
-        texts = {name: tuple(found[name]) for name in ("pictures", "notes")}
-        return Result(**{**found, **texts, "rows": rows})
+        rows = tuple(map(_row, found["rows"]))
+        texts = {name: tuple(map(str, found[name])) for name in ("pictures", "notes")}
+        typed = {"seconds": float(found["seconds"]), "host": dict(found["host"])}
+        return Result(**{**found, **texts, **typed, "rows": rows})
     except OSError as error:
         raise ExperimentFailed(f"{path}: it cannot be read: {error.strerror}") from error
-    except (ValueError, TypeError, LookupError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise ExperimentFailed(f"{path}: it is no result of an experiment: {error}") from error
+
+
+def _row(found: Mapping[str, Any]) -> Row:
+    values = {name: value for name, value in found.items() if name != "met"}
+    return Row(**{**values, "here": nan if found["here"] is None else float(found["here"])})
 
 
 @dataclass
@@ -174,14 +198,14 @@ class Setup:
     def recording(self, robot: Robot, name: str = "recording", signals: Sequence[str] = ()) -> Iterator[Path]:
         """Record every cycle while inside; yield the file, which is complete afterwards."""
         path = self.folder / f"{name}.mcap"
-        robot.record_start(path, signals=signals)
+        pid = robot.record_start(path, signals=signals).pid
         try:
             yield path
         except BaseException:
             with suppress(RtcpError):
-                robot.record_stop()
+                robot.record_stop(pid)
             raise
-        for one in robot.record_stop():
+        for one in robot.record_stop(pid):
             if one.problem or one.missing:
                 self.note(f"{name}: {one.problem or f'{one.missing} cycles are missing in the recording'}")
 
@@ -202,7 +226,10 @@ class Setup:
             return self
         source = find_config(self.config)
         copy = self.folder / "configuration"
-        shutil.copytree(source.parent, copy, dirs_exist_ok=True)
+        for path in (*source.parent.glob("*.yaml"), *source.parent.glob("devices/*.yaml")):
+            target = copy / path.relative_to(source.parent)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(path, target)
         yaml = YAML()
         document = yaml.load(source)
         document["joints"][joint].update(raised)
@@ -229,9 +256,24 @@ class Experiment(ABC):
 
 
 def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
-    """Carry out an experiment in its folder and write its result; errors as of `Experiment.run`, and OSError."""
+    """Carry out an experiment in its folder and write its result, also where it fails.
+
+    Raises:
+        ExperimentFailed: it could not be carried out or judged.
+        RtcpError: the platform refused or failed.
+        OSError: the result cannot be written.
+    """
     began, begun_s = datetime.now().astimezone(), time.monotonic()
-    rows = experiment.run(setup)
+    failure: Exception | None = None
+    try:
+        rows = experiment.run(setup)
+    except (ExperimentFailed, RtcpError) as error:
+        failure = error
+    except _FAILURES as error:
+        failure = ExperimentFailed(str(error))
+    if failure is not None:
+        rows = [Row("carried out", "", nan, least=1.0)]
+        setup.notes.append(str(failure))
     result = Result(
         name=experiment.name,
         title=experiment.title,
@@ -244,6 +286,8 @@ def carry_out(experiment: Experiment, setup: Setup, command: str) -> Result:
         notes=tuple(setup.notes),
     )
     result.write(setup.folder)
+    if failure is not None:
+        raise failure
     return result
 
 

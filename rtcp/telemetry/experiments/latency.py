@@ -23,7 +23,7 @@ from rtcp.api import Robot, State
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, runtime_directory
-from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
+from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import Recorded, read
 
 Array = npt.NDArray[np.float64]
@@ -36,6 +36,9 @@ AIM_CYCLES = 3.0
 _JOINT = 0
 _UNDER_WAY = 4
 """Commands that wait for their answers."""
+_REFUSED = 10
+"""Commands of a stream that may be refused: a host that stalls makes some come too late."""
+_REST_S = 10.0
 _SPARE = 4.0
 """Limits beside what the sine needs: with less the way to each target, and not the platform, takes the time."""
 _PROBES, _PROBE_INTERVAL_S = 200, 0.02
@@ -53,17 +56,17 @@ class Sine:
     error_s: float
 
 
-def fit_sine(t: Array, y: Array, period_s: float) -> Sine:
+def fit_sine(t: Array, y: Array, period_s: float, origin_s: float) -> Sine:
     """Fit a sine by least squares.
 
     Args:
         t: s, shape (n,), n of at least 5.
         y: shape (n,).
         period_s: near the true one.
+        origin_s: from which delays count, near the middle of the data, where they do not depend on the error of the
+            period; the same for all that are compared.
     """
-    # About the middle of the data the delay does not depend on the error of the period.
-    middle = round(float(t.mean()) / period_s) * period_s
-    x = t - middle
+    x = t - origin_s
     w = tau / period_s
     (a, b, c), *_ = np.linalg.lstsq(np.column_stack((np.sin(w * x), np.cos(w * x), np.ones_like(x))), y, rcond=None)
 
@@ -96,11 +99,12 @@ class _Answers(threading.Thread):
     def __init__(self, connection: socket.socket) -> None:
         super().__init__(daemon=True)
         self._connection = connection
-        self.count = 0
+        self.count = self.refused = 0
 
     def run(self) -> None:
         with contextlib.suppress(OSError):
             while data := self._connection.recv(65536):
+                self.refused += data.count(b'"error"')
                 self.count += data.count(b"\n")
 
 
@@ -118,6 +122,8 @@ def _by_socket(robot: Robot) -> Iterator[Send]:
             # What waits in the socket would be late: a stream leaves it out.
             if number - answers.count >= _UNDER_WAY:
                 return False
+            if answers.refused > _REFUSED:
+                raise ExperimentFailed(f"{answers.refused} of {number} commands of a stream were refused")
             number += 1
             params = {"q": list(q), "stamp_s": time.monotonic()}
             connection.sendall(jsonrpc.request(number, "stream_position", params))
@@ -169,15 +175,14 @@ class LatencyExperiment(Experiment):
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
         label = f"{way}, {rate:g} Hz"
         base = list(robot.status().positions)
+        sign = 1.0 if base[_JOINT] + 2 * amplitude < setup.arm.joints[_JOINT].position.max else -1.0
         times: list[float] = []
         values: list[float] = []
-        with setup.recording(
-            robot, f"recording-{label.replace(', ', '-').replace(' ', '-')}", ("*_position", "exchange_ns")
-        ) as path:
+        with setup.recording(robot, f"recording-{label.replace(', ', '-').replace(' ', '-')}", ("*_position",)) as path:
             with WAYS[way](robot) as send:
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
-                    q = base[_JOINT] + amplitude * (1.0 - cos(tau * now / PERIOD_S))
+                    q = base[_JOINT] + sign * amplitude * (1.0 - cos(tau * now / PERIOD_S))
                     if send([q, *base[1:]]):
                         times.append(begun + now)
                         values.append(q)
@@ -185,7 +190,7 @@ class LatencyExperiment(Experiment):
                     number = max(number + 1, int((time.monotonic() - begun) * rate))
                     time.sleep(max(0.0, begun + number / rate - time.monotonic()))
             _wait_until_it_rests(robot)
-        robot.move_joints(base)
+        robot.move_joints(base, speed=SPEED_RAD_S)
         recorded = read(path, ("time_ns", "*_position"))
         series = {"command": (np.array(times), np.array(values)), **_recorded_series(recorded)}
         # Of the times only what lies inside the sine, and not its beginning.
@@ -193,11 +198,12 @@ class LatencyExperiment(Experiment):
         sines = {}
         for name, (t, y) in series.items():
             inside = (t >= first) & (t <= last)
-            sines[name] = fit_sine(t[inside] - begun, y[inside], PERIOD_S)
+            sines[name] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
         command = sines["command"]
         latency, error = behind(sines["actual"], command)
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
+        aim = (0.0, AIM_CYCLES) if rate == 1000.0 else ()
         self._draw(setup, label, {name: (t - begun, y) for name, (t, y) in series.items()})
         setup.report(
             f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
@@ -206,7 +212,7 @@ class LatencyExperiment(Experiment):
             Row(f"{label}: rate", "Hz", (len(times) - 1) / (times[-1] - times[0]), least=0.95 * rate),
             Row(f"{label}: latency to the motion", "ms", 1e3 * latency, SOURCE_MS if rate == 30.0 else None),
             Row(f"{label}: its standard error", "ms", 1e3 * error),
-            Row(f"{label}: command to the wire", "cycles", cycles, most=AIM_CYCLES if rate == 1000.0 else None),
+            Row(f"{label}: command to the wire", "cycles", cycles, None, *aim),
             Row(f"{label}: sent to actual", "ms", 1e3 * behind(sines["actual"], sines["sent"])[0]),
             Row(f"{label}: amplitude, actual / command", "", sines["actual"].amplitude / command.amplitude),
         ]
@@ -284,5 +290,8 @@ def _spin_until(number: int, count: Callable[[], int]) -> int:
 
 
 def _wait_until_it_rests(robot: Robot) -> None:
-    while robot.state is not State.HOLDING:
+    until = time.monotonic() + _REST_S
+    while (state := robot.state) is not State.HOLDING:
+        if state not in (State.MOVING, State.STOPPING) or time.monotonic() > until:
+            raise ExperimentFailed(f"the arm does not come to rest: the machine is {state.words}")
         time.sleep(0.02)

@@ -16,7 +16,7 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.api import Robot
 from rtcp.ipc.events import JOYSTICK_MODES
-from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
+from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import Recorded, read
 from rtcp.telemetry.square import SPEED_M_S, NoSquare, draw, judge, place
 
@@ -55,7 +55,7 @@ class StepExperiment(Experiment):
             with setup.recording(robot) as path:
                 robot.move_joints([goal, *start[1:]], speed=STEP_SPEED)
                 time.sleep(0.5)
-            robot.move_joints(start)
+            robot.move_joints(start, speed=SPEED_RAD_S)
         recorded = read(path, ("wkc*", "commanded_position", "actual_position"))
         records = recorded.records[whole(recorded)]
         commanded, actual = records["commanded_position"][:, 0], records["actual_position"][:, 0]
@@ -118,7 +118,7 @@ class SquareExperiment(Experiment):
             with setup.platform() as robot:
                 home = robot.status().positions
                 for square in squares:
-                    robot.move_joints(square.start)
+                    robot.move_joints(square.start, speed=SPEED_RAD_S)
                     with setup.recording(robot, f"recording-{square.plane}") as path:
                         robot.move_line(square.poses, SPEED_M_S)
                     driven = judge(model, square, read(path, ("wkc*", "*_position", "*_velocity", "*_torque")))
@@ -130,7 +130,7 @@ class SquareExperiment(Experiment):
                         Row(f"{square.plane}: largest deviation, commanded", "mm", commanded, most=1.0),
                         Row(f"{square.plane}: largest deviation, actual", "mm", actual, "tracked", most=3.0),
                     ]
-                robot.move_joints(home)
+                robot.move_joints(home, speed=SPEED_RAD_S)
         except NoSquare as error:
             raise ExperimentFailed(str(error)) from error
         return rows
@@ -182,15 +182,15 @@ class Person:
     def __init__(self, arm: Arm) -> None:
         self._arm = arm
 
-    def pick(self, item: tuple[float, float, float]) -> float:
-        """Pick an item and lift it; return how far from it the gripper closed, m."""
+    def pick(self, item: tuple[float, float, float]) -> tuple[float, float, float]:
+        """Pick an item and lift it; return where the gripper closed, m."""
         self._grip(close=False)
         self._bring(item)
-        away = dist(self._arm.tool, item)
+        closed_at = self._arm.tool
         self._grip(close=True)
         self._bring((item[0], item[1], item[2] + LIFT_M))
         self._arm.hold(NEUTRAL, 0.5)
-        return away
+        return closed_at
 
     def _choose(self, mode: int) -> None:
         for _ in range(_MOST_PUSHES):
@@ -265,20 +265,20 @@ class PicksExperiment(Experiment):
         """See `Experiment.run`; with a real arm a person holds the joystick, so this needs the virtual one."""
         if not setup.is_virtual:
             raise ExperimentFailed("the picks need the virtual arm: on a real one a person moves the joystick")
-        model, rows, paths = geometry(setup), [], {}
+        model, rows, paths, picked = geometry(setup), [], {}, []
         with setup.platform() as robot:
             for name in self._items:
-                robot.move_joints(begin_pose(model))
+                robot.move_joints(begin_pose(model), speed=SPEED_RAD_S)
                 robot.mode("joystick")
                 person = Person(_VirtualJoystick(robot, model))
                 begun = time.monotonic()
                 with setup.recording(robot, f"recording-{name}", ("actual_position", "outputs", "inputs")) as path:
-                    away = person.pick(ITEMS[name])
+                    picked.append(person.pick(ITEMS[name]))
+                away = dist(picked[-1], ITEMS[name])
                 setup.report(f"{name}: picked {1e3 * away:.1f} mm from the item in {time.monotonic() - begun:.0f} s")
                 rows.append(Row(f"{name}: distance to the item", "mm", 1e3 * away, most=20.0))
                 paths[name] = read(path, ("actual_position",)).records["actual_position"]
                 robot.mode("joint")
-        picked = [ITEMS[name] for name in self._items]
         rows += [
             Row("highest item above ground", "m", max(z for _, _, z in picked) + BASE_ABOVE_GROUND_M, 0.8),
             Row("furthest item", "m", max(float(np.hypot(x, y)) for x, y, _ in picked), 0.692),

@@ -10,14 +10,14 @@ import psutil
 from rtcp.api import Robot
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import read_processes
-from rtcp.telemetry.experiments.experiment import Experiment, Row, Setup
+from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, Row, Setup
 
 SOURCE_PERCENT = 30.0
 """Of a quad core, the platform computer of the source; its slaves were hardware, so a segment in software is apart."""
 SOURCE_CORES = 4
 _REACH_RAD = 0.2
 _JOG_RAD_S, _JOG_INTERVAL_S, _JOG_TURN_S = 0.05, 0.05, 2.0
-_MIB = 2**20
+_MB = 1e6
 
 
 class ResourcesExperiment(Experiment):
@@ -36,15 +36,17 @@ class ResourcesExperiment(Experiment):
     def run(self, setup: Setup) -> list[Row]:
         """See `Experiment.run`."""
         rows: list[Row] = []
+        memory: dict[str, float] = {}
         with setup.platform() as robot:
             activities: Mapping[str, Callable[[float], None]] = {
                 "holding": lambda until: time.sleep(until - time.monotonic()),
                 "moving": lambda until: _move(robot, until),
                 "jogging": lambda until: _jog(robot, until),
-                "recording": lambda until: self._record(setup, robot, until),
+                "recording": lambda until: memory.update(self._record(setup, robot, until)),
             }
             for name, do in activities.items():
-                cores, memory = self._measure(robot, do)
+                cores, resident = self._measure(robot, do)
+                memory |= resident
                 platform = sum(share for process, share in cores.items() if process != "segment")
                 setup.report(f"{name}: {100 * platform:.1f} % of a core")
                 rows += [Row(f"{name}: {process}", "% of a core", 100 * share) for process, share in cores.items()]
@@ -72,12 +74,14 @@ class ResourcesExperiment(Experiment):
             ended = now.children_user + now.children_system - then.children_user - then.children_system
             if ended:
                 cores["recorder"] = ended / seconds  # the gateway's child, begun and ended meanwhile
-        memory = {name: process.memory_info().rss / _MIB for name, process in processes.items()}
+        memory = {name: process.memory_info().rss / _MB for name, process in processes.items()}
         return cores, memory
 
-    def _record(self, setup: Setup, robot: Robot, until: float) -> None:
+    def _record(self, setup: Setup, robot: Robot, until: float) -> dict[str, float]:
         with setup.recording(robot):
             time.sleep(max(0.0, until - time.monotonic()))
+            (pid,) = (one.pid for one in robot.record_status() if one.running)
+            return {"recorder": psutil.Process(pid).memory_info().rss / _MB}
 
     @staticmethod
     def _draw(setup: Setup, rows: list[Row]) -> None:
@@ -104,8 +108,8 @@ def _move(robot: Robot, until: float) -> None:
     here = robot.status().positions
     there = [q + (_REACH_RAD if q < 0 else -_REACH_RAD) for q in here]
     while time.monotonic() < until:
-        robot.move_joints(there)
-        robot.move_joints(here)
+        robot.move_joints(there, speed=SPEED_RAD_S)
+        robot.move_joints(here, speed=SPEED_RAD_S)
 
 
 def _jog(robot: Robot, until: float) -> None:
@@ -114,4 +118,4 @@ def _jog(robot: Robot, until: float) -> None:
         sign = 1.0 if now % (2 * _JOG_TURN_S) < _JOG_TURN_S else -1.0
         robot.jog([sign * _JOG_RAD_S] * len(here), frame="joints")
         time.sleep(_JOG_INTERVAL_S)
-    robot.move_joints(here)
+    robot.move_joints(here, speed=SPEED_RAD_S)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from math import nan
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +14,7 @@ from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import read_session
 from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import read
-from rtcp.virtual.faults.control import SegmentClient
+from rtcp.virtual.faults.control import EDGES, SegmentClient
 
 Array = npt.NDArray[np.float64]
 
@@ -58,6 +59,7 @@ class CycleExperiment(Experiment):
                 found[target] = self._measure(setup, target)
             except (RtcpError, ExperimentFailed) as error:
                 setup.note(f"{target:g} us: not measured: {error}")
+                rows.append(Row(f"{target:g} us: mean", "us", nan, SOURCE_CYCLES.get(target, (None,))[0], least=0.0))
                 continue
             for side, intervals in found[target].items():
                 mean, percent, deviation = spread(intervals, target)
@@ -71,8 +73,8 @@ class CycleExperiment(Experiment):
                 setup.report(
                     f"{label}: mean {mean:.2f} us, error {percent:.3f} %, average deviation {deviation:.2f} us"
                 )
-        if not rows:
-            raise ExperimentFailed("no cycle could be measured")
+        if not found:
+            raise ExperimentFailed("no cycle could be measured: " + "; ".join(setup.notes))
         self._draw(setup, found)
         return rows
 
@@ -102,7 +104,10 @@ class CycleExperiment(Experiment):
             until = time.monotonic() + self._seconds
             while time.monotonic() < until:
                 time.sleep(_READ_INTERVAL_S)
-                stamps += segment.edges(slave, output)
+                found = segment.edges(slave, output)
+                if len(found) >= EDGES:
+                    raise ExperimentFailed("this process was kept waiting: edges of the output were not read in time")
+                stamps += found
         return np.array(stamps, np.float64)
 
     @staticmethod

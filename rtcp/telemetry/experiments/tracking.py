@@ -156,14 +156,13 @@ class TrackingExperiment(Experiment):
             amplitudes[f] = min(_SHARE * most, _REACH_RAD)
         return amplitudes
 
-    @staticmethod
-    def _draw(setup: Setup, found: Mapping[str, Sequence[Response]]) -> None:
+    def _draw(self, setup: Setup, found: Mapping[str, Sequence[Response]]) -> None:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(9.0, 8.0), layout="constrained")
         gain, phase, error = figure.subplots(3, 1, sharex=True)
+        frequencies = self._frequencies_hz
         for name, responses in found.items():
-            frequencies = [one.frequency_hz for one in responses]
             gain.plot(frequencies, [20 * np.log10(one.gain) for one in responses], "o-", label=name)
             phase.plot(frequencies, [np.degrees(one.phase_rad) for one in responses], "o-")
             error.plot(frequencies, [1e3 * one.error_rad for one in responses], "o-")
@@ -171,8 +170,10 @@ class TrackingExperiment(Experiment):
         gain.legend(ncols=3)
         phase.set(ylabel="phase, degrees")
         error.set(ylabel="largest following error, mrad", xlabel="frequency, Hz")
+        error.set_xticks(frequencies, [f"{f:g}" for f in frequencies], minor=False)
+        error.minorticks_off()
         for axes in (gain, phase, error):
-            axes.grid(alpha=0.3, which="both")
+            axes.grid(alpha=0.3)
         setup.draw("bode", figure)
 
 
@@ -203,14 +204,17 @@ def _drive(
 def _response(recorded: Recorded, joint: int, f: float, span: tuple[int, int]) -> Response:
     """Return how a joint followed a sine between two instants, ns."""
     records = recorded.records[slice(*np.searchsorted(recorded.records["time_ns"], span))]
-    sent, actual = records["sent_position"][:, joint], records["actual_position"][:, joint]
+    # What a record has as sent leaves with the next cycle, and a cycle whose frame did not return shows nothing new.
+    came = (records["wkc"] == records["wkc_expected"])[1:]
+    sent, actual = records["sent_position"][:-1, joint][came], records["actual_position"][1:, joint][came]
     moving = np.flatnonzero(np.diff(sent))
     if not len(moving):
         raise ExperimentFailed(f"the joint was not commanded to move at {f:g} Hz")
     # Without the first period, in which what came before dies down.
-    t = (records["time_ns"] - records["time_ns"][moving[0]]) * 1e-9
+    instants = records["time_ns"][1:][came]
+    t = (instants - instants[moving[0]]) * 1e-9
     inside = (t >= 1 / f) & (np.arange(len(t)) <= moving[-1])
-    one, other = (fit_sine(t[inside], values[inside], 1 / f) for values in (actual, sent))
+    one, other = (fit_sine(t[inside], values[inside], 1 / f, t[inside].mean()) for values in (actual, sent))
     delay, _ = behind(one, other)
     error = float(np.abs(actual - sent)[inside].max())
     return Response(f, one.amplitude / other.amplitude, -tau * f * delay, error)
