@@ -26,8 +26,7 @@ from rtcp.ipc.events import Event, UnknownJoystickCode
 from rtcp.ipc.refusals import WrongControlMode
 from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.launch.simulation import Simulation
-
-from .test_picks import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
+from rtcp.telemetry.experiments.motions import BACKWARD, FORWARD, LEFT, NEUTRAL, PADDLE_UP
 
 CONFIG = load(default_config())
 TOGGLE = 0x100
