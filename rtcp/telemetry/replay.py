@@ -39,20 +39,25 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     """
     name = next(name for name in POSITIONS if name in (recorded.records.dtype.names or ()))
     q = recorded.column(name)
-    moving = np.flatnonzero(np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > 0.0)
+    steps = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0)
+    moving = np.flatnonzero(steps)
     if not len(moving):
         raise RecordingError("empty", recorded.path, f"nothing moves in it ({name}, {recorded.seconds[-1]:.3f} s)")
-    span = slice(max(0, moving[0] - 1), moving[-1] + 2)
+    span = slice(moving[0], moving[-1] + 1)
     # By their numbers: a setpoint is one cycle after the one before, however late a loaded host ran that cycle.
-    number = recorded.column("number")
-    every = max(1.0, np.diff(number).min())
-    if gaps := int((np.diff(number[span]) > every).sum()):
+    cycles = np.diff(recorded.column("number"))
+    cycles = cycles[span] / max(1.0, cycles.min())
+    if gaps := int((cycles > 1.0).sum()):
         raise RecordingError("gap", recorded.path, f"cycles are missing at {gaps} places of its motion", found=gaps)
-    if "flags" in (recorded.records.dtype.names or ()) and not (recorded.records["flags"][span] & FLAG_ENABLED).all():
+    whole = slice(moving[0], moving[-1] + 2)
+    if "flags" in (recorded.records.dtype.names or ()) and not (recorded.records["flags"][whole] & FLAG_ENABLED).all():
         defect = "the drives were not enabled in all of its motion: choose a part by --start and --end"
         raise RecordingError("disabled", recorded.path, defect)
-    cycles = (number - number[0]) / every
-    t, q = cycles[span] * (recorded.period_s / scale), q[span]
+    if name != "actual_position":
+        cycles[_sent_again(steps[span] / recorded.period_s)] = 0.0
+    kept = np.append(True, cycles > 0.0)
+    t = np.append(0.0, np.cumsum(cycles))[kept] * (recorded.period_s / scale)
+    q = q[whole][kept]
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
     least = ceil(_SHORTEST_S * scale / recorded.period_s)
     points: list[dict[str, Any]] = []
@@ -66,6 +71,18 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     size = len(json.dumps(points))
     defect = f"its motion of {t[-1] - t[0]:.1f} s needs {len(points)} points, {size} bytes; a request has {_REQUEST}"
     raise RecordingError("long", recorded.path, f"{defect}: choose a part by --start and --end", found=size)
+
+
+def _sent_again(speeds: Array) -> npt.NDArray[np.int64]:
+    """Return the steps without motion, rad/s, before or after which a joint moves: they are no rest.
+
+    Without an answer of the slaves a setpoint is sent again, and the motion goes on afterwards as if nothing had been.
+    """
+    moving, still = np.flatnonzero(speeds), np.flatnonzero(speeds == 0.0)
+    after = np.searchsorted(moving, still)
+    around = np.maximum(speeds[moving[after - 1]], speeds[moving[after]])
+    found: npt.NDArray[np.int64] = still[around > _AT_REST]
+    return found
 
 
 def _velocities(t: Array, q: Array, reach: int) -> Array:

@@ -28,6 +28,7 @@ def record(platform: Platform, name: str, *command: str, check: int = 0) -> Reco
 def moving(recorded: Recorded) -> Any:
     """Sent positions, cycle by cycle, from 1 mrad after the beginning to 1 mrad before the end."""
     q = recorded.column("sent_position")
+    q = q[np.append(True, np.diff(q, axis=0).any(axis=1))]  # less what a loaded host had sent again
     left, there = (np.flatnonzero(np.abs(q - end).max(axis=1) > 1e-3) for end in (q[0], q[-1]))
     return q[left[0] : there[-1] + 1]
 
@@ -38,7 +39,7 @@ def test_the_sent_positions_of_a_replay_are_the_recorded_ones_at_the_scaled_spee
     wanted, found = moving(first), moving(again)
     for joint in range(6):
         then = np.interp(np.arange(len(wanted)) / 0.8, np.arange(len(found)), found[:, joint])
-        assert np.abs(then - wanted[:, joint]).max() < 1.5e-3
+        assert np.abs(then - wanted[:, joint]).max() < 2e-3  # of which 1 mrad is the way of one cycle
     assert len(found) == pytest.approx(len(wanted) / 0.8, rel=0.02)
 
 

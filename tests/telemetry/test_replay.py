@@ -64,6 +64,20 @@ def deviation(points: list[dict[str, Any]], recorded: Recorded, scale: float) ->
     return worst
 
 
+def test_setpoints_that_were_sent_again_without_an_answer_are_no_rest_in_the_motion(tmp_path: Path) -> None:
+    whole = moved()
+    chance = np.random.default_rng(4)
+    again = np.ones(len(whole), int)
+    fast = np.flatnonzero(np.abs(np.diff(whole["sent_position"], axis=0)).max(axis=1) > 5e-5)
+    again[chance.choice(fast, 80)] += chance.integers(1, 30, 80)
+    held = cycles(int(again.sum()))
+    held["sent_position"] = np.repeat(whole["sent_position"], again, axis=0)
+    held["flags"] = FLAG_ENABLED
+    points = trajectory(read(mcap(tmp_path / "a.mcap", held)), 0.9)
+    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+    assert deviation(points, read(mcap(tmp_path / "b.mcap", whole)), 0.9) < 1e-3
+
+
 @pytest.mark.parametrize("scale", [1.0, 0.8])
 def test_the_trajectory_deviates_by_less_than_1_mrad_with_few_points(tmp_path: Path, scale: float) -> None:
     recorded = read(mcap(tmp_path / "a.mcap", moved()), ["*_position"])
