@@ -16,8 +16,8 @@ from rtcp.gateway.command_channel import Json
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import Pid, is_running, terminate, wait_for_exit
 
-_READY_S, _END_S = 30.0, 30.0
-"""A host that has hardly any time for others than the cycle delays them, and a file is to be completed all the same."""
+_READY_S, _END_S = 12.0, 12.0
+"""Less than a client waits for its answer."""
 
 
 def recordings_directory() -> Path:
