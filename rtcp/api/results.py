@@ -135,7 +135,7 @@ class Zero:
 
 @dataclass(frozen=True)
 class RecorderStatus:
-    """What a recorder has written: so far, or until it ended."""
+    """What a recorder has written up to now, or had written when it ended."""
 
     pid: int
     """Of its process."""

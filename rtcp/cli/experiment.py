@@ -105,7 +105,7 @@ def result_table(result: Result) -> Table:
 
     rows = table(("figure", "source", "here", "aim", ""), fill="figure", title=result.title)
     for row in result.rows:
-        verdict = {None: "", True: "met", False: "MISSED"}[row.met]
+        verdict = "MISSED" if row.met is False else row.verdict
         rows.add_row(row.figure, shown(row.source), f"{shown(row.here)} {row.unit}", row.aim, verdict)
     return rows
 

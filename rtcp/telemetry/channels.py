@@ -161,7 +161,7 @@ class Channels:
     def repeat(self, topic: str) -> None:
         """Publish again what came once or with a change, for one who has just subscribed to `topic`."""
         if topic == self._description.topic():
-            self.describe(time.time_ns())
+            self.describe(self.wall_ns(time.monotonic_ns()))
         elif topic == self._machine.topic():
             self._last = None  # the next record is a change
 

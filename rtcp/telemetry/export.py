@@ -17,8 +17,6 @@ from rtcp.telemetry.channels import Channels
 from rtcp.telemetry.reading import Reader
 from rtcp.telemetry.recorder import CSV_NAMES, CsvWriter, McapWriter
 
-FORMATS = ("csv", "mcap", "npz")
-
 
 def export(reader: Reader, out: Path, replace: bool = False) -> int:
     """Write what a reader gives to a file, whole or not at all, and return the number of records.
@@ -27,7 +25,7 @@ def export(reader: Reader, out: Path, replace: bool = False) -> int:
 
     Args:
         reader: nobody has read from it.
-        out: its ending is the format, one of `FORMATS`.
+        out: its ending is the format: .csv, .mcap or .npz.
         replace: a file that exists.
 
     Raises:

@@ -21,7 +21,7 @@ TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
 """Largest distance of the trajectory from the recorded positions; the first whose points fit into a request."""
 _REQUEST = LINE_LIMIT - 1024
 _SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
-"""A velocity is the slope from so long before to so long after; so far apart are two points at least."""
+"""Time before and after a sample over which its velocity is taken; shortest time between two points."""
 _AT_REST = 5e-3
 """Below this velocity, rad/s, the motion counts as at rest where it begins and ends."""
 

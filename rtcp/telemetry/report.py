@@ -10,7 +10,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from rtcp.telemetry.experiments.experiment import RESULT, ExperimentFailed, Result, Row, read_result, shown
 
-VERDICTS = {None: "", True: "met", False: "missed"}
 _MOST_FOLDERS = 2
 
 
@@ -44,7 +43,6 @@ def page(folders: Sequence[Path]) -> str:
         folders=[folder.absolute().name for folder in folders],
         hosts=[next(iter(results.values()))[1].host for results in found],
         sections=sections,
-        verdicts=VERDICTS,
     )
 
 

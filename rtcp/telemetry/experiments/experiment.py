@@ -15,10 +15,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
+from functools import cached_property
 from math import isfinite, nan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 import psutil
 from ruamel.yaml import YAML
 
@@ -69,6 +72,11 @@ class Row:
         if self.least is None and self.most is None:
             return None
         return bool((self.least is None or self.here >= self.least) and (self.most is None or self.here <= self.most))
+
+    @property
+    def verdict(self) -> str:
+        """The same in a word."""
+        return {None: "", True: "met", False: "missed"}[self.met]
 
     @property
     def aim(self) -> str:
@@ -160,7 +168,7 @@ class Setup:
     pictures: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
-    @property
+    @cached_property
     def arm(self) -> ArmConfig:
         """The configuration of the arm; raises ConfigError."""
         return load(find_config(self.config))
@@ -237,6 +245,12 @@ class Setup:
         text = ", ".join(f"{key} {value:.3g} instead of {getattr(found, key):g}" for key, value in raised.items())
         self.note(f"{found.name} of the virtual arm has other limits for this experiment (configuration/): {text}")
         return replace(self, config=copy / source.name)
+
+
+def returned(records: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
+    """Return the cycles whose frame came back whole; of another one a record repeats the values before it."""
+    matches: npt.NDArray[np.bool_] = records["wkc"] == records["wkc_expected"]
+    return matches
 
 
 class Experiment(ABC):

@@ -173,12 +173,12 @@ class LatencyExperiment(Experiment):
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
-        label = f"{way}, {rate:g} Hz"
+        label, name = f"{way}, {rate:g} Hz", f"{way}-{rate:g}-Hz".replace(" ", "-")
         base = list(robot.status().positions)
         sign = 1.0 if base[_JOINT] + 2 * amplitude < setup.arm.joints[_JOINT].position.max else -1.0
         times: list[float] = []
         values: list[float] = []
-        with setup.recording(robot, f"recording-{label.replace(', ', '-').replace(' ', '-')}", ("*_position",)) as path:
+        with setup.recording(robot, f"recording-{name}", ("*_position",)) as path:
             with WAYS[way](robot) as send:
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
@@ -196,15 +196,15 @@ class LatencyExperiment(Experiment):
         # Of the times only what lies inside the sine, and not its beginning.
         first, last = begun + PERIOD_S, times[-1]
         sines = {}
-        for name, (t, y) in series.items():
+        for one, (t, y) in series.items():
             inside = (t >= first) & (t <= last)
-            sines[name] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
+            sines[one] = fit_sine(t[inside], y[inside], PERIOD_S, 0.5 * (first + last))
         command = sines["command"]
         latency, error = behind(sines["actual"], command)
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
         aim = (0.0, AIM_CYCLES) if rate == 1000.0 else ()
-        self._draw(setup, label, {name: (t - begun, y) for name, (t, y) in series.items()})
+        self._draw(setup, name, label, {one: (t - begun, y) for one, (t, y) in series.items()})
         setup.report(
             f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
         )
@@ -254,18 +254,18 @@ class LatencyExperiment(Experiment):
         return rows
 
     @staticmethod
-    def _draw(setup: Setup, label: str, series: Mapping[str, tuple[Array, Array]]) -> None:
+    def _draw(setup: Setup, name: str, title: str, series: Mapping[str, tuple[Array, Array]]) -> None:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(9.0, 4.5), layout="constrained")
         axes = figure.add_subplot()
-        for name, (t, y) in series.items():
+        for one, (t, y) in series.items():
             shown = (t >= PERIOD_S) & (t <= 2 * PERIOD_S)
-            axes.plot(t[shown], y[shown], "." if name == "command" else "-", ms=4, lw=1.2, label=name)
-        axes.set(xlabel="time, s", ylabel="joint 1, rad", title=label)
+            axes.plot(t[shown], y[shown], "." if one == "command" else "-", ms=4, lw=1.2, label=one)
+        axes.set(xlabel="time, s", ylabel="joint 1, rad", title=title)
         axes.legend()
         axes.grid(alpha=0.3)
-        setup.draw(f"latency-{label.replace(', ', '-').replace(' ', '-')}", figure)
+        setup.draw(f"latency-{name}", figure)
 
 
 def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:

@@ -16,8 +16,8 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.api import Robot
 from rtcp.ipc.events import JOYSTICK_MODES
-from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup
-from rtcp.telemetry.reading import Recorded, read
+from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup, returned
+from rtcp.telemetry.reading import read
 from rtcp.telemetry.square import SPEED_M_S, NoSquare, draw, judge, place
 
 Array = npt.NDArray[np.float64]
@@ -32,12 +32,6 @@ def geometry(setup: Setup) -> ArmModel:
     if model is None:
         raise ExperimentFailed("the arm's geometry is not known (key kinematics)")
     return model
-
-
-def whole(recorded: Recorded) -> npt.NDArray[np.bool_]:
-    """Return which cycles count: one whose frame did not return holds its setpoints, and its time is the host's."""
-    matches: npt.NDArray[np.bool_] = recorded.records["wkc"] == recorded.records["wkc_expected"]
-    return matches
 
 
 class StepExperiment(Experiment):
@@ -57,7 +51,8 @@ class StepExperiment(Experiment):
                 time.sleep(0.5)
             robot.move_joints(start, speed=SPEED_RAD_S)
         recorded = read(path, ("wkc*", "commanded_position", "actual_position"))
-        records = recorded.records[whole(recorded)]
+        # A cycle whose frame does not return holds the setpoints: its time is the host's and not the arm's.
+        records = recorded.records[returned(recorded.records)]
         commanded, actual = records["commanded_position"][:, 0], records["actual_position"][:, 0]
         moving = np.flatnonzero(np.diff(commanded))
         if not len(moving):
@@ -173,7 +168,7 @@ class Arm(Protocol):
         """The joystick's mode: X-Y, Z-yaw, roll-pitch, gripper."""
 
     def hold(self, code: int, seconds: float) -> None:
-        """Hold the joystick at its byte `code` for so long."""
+        """Hold the joystick at the byte `code` for a time, s."""
 
 
 class Person:

@@ -78,9 +78,10 @@ class ResourcesExperiment(Experiment):
         return cores, memory
 
     def _record(self, setup: Setup, robot: Robot, until: float) -> dict[str, float]:
-        with setup.recording(robot):
+        with setup.recording(robot) as path:
             time.sleep(max(0.0, until - time.monotonic()))
-            (pid,) = (one.pid for one in robot.record_status() if one.running)
+            # The arm's file may have started another one.
+            pid = next(one.pid for one in robot.record_status() if str(path.absolute()) in one.files)
             return {"recorder": psutil.Process(pid).memory_info().rss / _MB}
 
     @staticmethod

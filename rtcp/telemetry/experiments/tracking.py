@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rtcp.api import Robot
 from rtcp.config.loader import segment_path
 from rtcp.config.segment import load_segment
-from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup
+from rtcp.telemetry.experiments.experiment import Experiment, ExperimentFailed, Row, Setup, returned
 from rtcp.telemetry.experiments.latency import behind, fit_sine
 from rtcp.telemetry.reading import Recorded, read
 from rtcp.virtual.device import create
@@ -30,7 +30,7 @@ _SAMPLES = 24
 """Points of the trajectory in a period: a spline through them with their velocities and accelerations is the sine."""
 _WINDOW_S = 0.01
 _SETTLING_S = 0.01
-"""What the drive does in a gap between two samples is unknown, and so long after it still shows in the torque."""
+"""Time after a gap between two samples during which the torque still shows what happened in the gap, s."""
 _MOVING_RAD_S = 0.02
 _TOLERANCE = 0.05
 
@@ -66,10 +66,8 @@ def sine(frequency_hz: float, amplitude: float) -> Iterator[tuple[float, float, 
     w, periods = tau * frequency_hz, max(_PERIODS_MIN, round(_SWEEP_S * frequency_hz))
     for at in range(periods * _SAMPLES + 1):
         t = at / (_SAMPLES * frequency_hz)
-        # Rounded as a request carries it.
-        yield tuple(round(value, 9) for value in (
-            t, amplitude * (1.0 - cos(w * t)), amplitude * w * sin(w * t), amplitude * w * w * cos(w * t),
-        ))  # type: ignore[misc] # fmt: skip
+        q, v, a = amplitude * (1.0 - cos(w * t)), amplitude * w * sin(w * t), amplitude * w * w * cos(w * t)
+        yield round(t, 9), round(q, 9), round(v, 9), round(a, 9)  # as a request carries them
 
 
 def identify(seconds: Array, torque: Array, velocity: Array, position: Array) -> Friction:
@@ -133,8 +131,7 @@ class TrackingExperiment(Experiment):
             for joint in range(len(setup.arm.joints)) if self._joints is None else self._joints:
                 name = setup.arm.joints[joint].name
                 recorded, found[name] = _drive(setup, robot, joint, self._amplitudes(setup, joint))
-                # A cycle whose frame did not return has the values of the one before.
-                came = recorded.records["wkc"] == recorded.records["wkc_expected"]
+                came = returned(recorded.records)
                 torque, velocity, position = (
                     recorded.column(f"actual_{key}")[came, joint] for key in ("torque", "velocity", "position")
                 )
@@ -205,7 +202,7 @@ def _response(recorded: Recorded, joint: int, f: float, span: tuple[int, int]) -
     """Return how a joint followed a sine between two instants, ns."""
     records = recorded.records[slice(*np.searchsorted(recorded.records["time_ns"], span))]
     # What a record has as sent leaves with the next cycle, and a cycle whose frame did not return shows nothing new.
-    came = (records["wkc"] == records["wkc_expected"])[1:]
+    came = returned(records)[1:]
     sent, actual = records["sent_position"][:-1, joint][came], records["actual_position"][1:, joint][came]
     moving = np.flatnonzero(np.diff(sent))
     if not len(moving):

@@ -39,7 +39,7 @@ BACKLOG = 16
 STANDSTILL = 0.002
 """A joint slower than this, rad/s, stands."""
 PATIENCE = 10_000_000_000
-"""Without a request for so many ns joints and outputs are not watched any more."""
+"""Time without a request after which joints and outputs are no longer watched, ns."""
 EDGES = 1024
 """Edges of an output that are kept between two questions: what is sent in one answer must not keep a frame waiting."""
 
