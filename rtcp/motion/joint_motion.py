@@ -57,14 +57,14 @@ def allowed_accelerations(
     return [allowed_acceleration(a, speed[i], fastest[i], most[i], jerk[i]) for i, a in enumerate(acceleration)]
 
 
-def stoppable_speed(distance: float, acceleration: float, jerk: float) -> float:
-    """Return the speed, rad/s, that comes to rest within `distance` rad, after an acceleration ramp.
+def stoppable_speed(distance: float, acceleration: float, jerk: float, kept_s: float = 0.0) -> float:
+    """Return the speed, rad/s, that comes to rest within `distance` rad, kept for `kept_s`, after an acceleration ramp.
 
-    v^2 / 2a + v a / 2j = distance, solved for v.
+    v kept + v^2 / 2a + v a / 2j = distance, solved for v.
     """
     if not distance > 0.0:
         return 0.0
-    ramp = 0.5 * acceleration * acceleration / jerk
+    ramp = acceleration * (0.5 * acceleration / jerk + kept_s)
     return sqrt(ramp * ramp + 2.0 * acceleration * distance) - ramp
 
 

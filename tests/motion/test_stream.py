@@ -67,9 +67,9 @@ def test_a_stream_is_followed_and_its_end_is_a_stop(drive: Any, mode: StreamCont
 def test_the_last_target_is_reached_and_not_passed_by_much(drive: Any, mode: StreamController) -> None:
     stream(drive, mode, lambda t: [0.3 * t] * 6, 1.0, 0.02)
     drive.until_rest(mode)
-    # A stop from that speed takes v^2 / 2a + v a / 2j.
-    assert max(q[0] for q in drive.path) < 0.3 * 0.98 + 0.3**2 / 4.0 + 0.3 * 0.05 + 0.005
-    assert drive.state.commanded == pytest.approx([0.3 * 0.98] * 6, abs=0.04)
+    # The speed is kept for two and a half intervals; a stop from it takes v^2 / 2a + v a / 2j.
+    assert max(q[0] for q in drive.path) < 0.3 * (0.98 + 2.5 * 0.02) + 0.3**2 / 4.0 + 0.3 * 0.05 + 0.001
+    assert drive.state.commanded == pytest.approx([0.3 * 0.98] * 6, abs=0.054)
 
 
 def test_a_target_that_is_renewed_is_reached_and_held(drive: Any, mode: StreamController) -> None:
@@ -221,13 +221,19 @@ def lag(path: list[list[float]], amplitude: float, omega: float) -> tuple[float,
     return -math.atan2(b, a) / omega, math.hypot(a, b) / amplitude
 
 
-def test_a_sine_at_30_hz_is_followed_a_tenth_of_a_second_late_at_full_amplitude(new_drive: Any) -> None:
-    # pi/8 rad with a period of 2 s needs 1.23 rad/s and 3.9 rad/s^2.
+@pytest.mark.parametrize(
+    ("rate", "jitter", "most_s", "more"),
+    # Measured: 8.4, 1.2 and 1.8 ms; 1.068, 1.013 and 1.015 of the amplitude.
+    [(30, 0.0, 0.012, 0.08), (1000, 0.0, 0.002, 0.02), (1000, 0.003, 0.003, 0.02)],
+)
+def test_a_streamed_sine_is_followed_at_full_amplitude_and_hardly_late(
+    new_drive: Any, rate: int, jitter: float, most_s: float, more: float
+) -> None:
+    # pi/8 rad with a period of 2 s needs 1.23 rad/s, 3.9 rad/s^2 and 12.2 rad/s^3.
     drive = new_drive()
     drive.limits.velocity[:], drive.limits.acceleration[:], drive.limits.jerk[:] = [2.0] * 6, [8.0] * 6, [100.0] * 6
     mode = drive.controller(StreamController)
-    stream(drive, mode, lambda t: [math.pi / 8 * math.sin(math.pi * t)] * 6, 4.0, 1 / 30)
+    stream(drive, mode, lambda t: [math.pi / 8 * math.sin(math.pi * t)] * 6, 4.0, 1 / rate, jitter)
     behind, gain = lag(drive.path, math.pi / 8, math.pi)
-    # Measured: 0.095 s, 1.013.
-    assert 0.02 < behind < 0.12
-    assert gain == pytest.approx(1.0, abs=0.03)
+    assert abs(behind) < most_s
+    assert gain == pytest.approx(1.0, abs=more)

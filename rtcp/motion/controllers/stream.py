@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isfinite
 
-from ruckig import InputParameter, OutputParameter, Result, Ruckig, RuckigError, Trajectory
+from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
 
 from rtcp.ipc.commands import Command, StreamPosition
 from rtcp.ipc.events import ControllerFailed, StreamEnded
@@ -22,6 +22,10 @@ _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """Weight of a new interval in the mean."""
 _SLACK = 1e-6
+_AT_LEAST_S = 0.01
+"""The joints take this long at least to meet a target: in less, what is lost to rounding would take a detour."""
+_LONGER = 1.05
+"""And this much longer than they need, since the shortest way is the only one in its time."""
 _DRIFT = 1e-4
 """The sender's clock may be slower than ours by this fraction."""
 _TIMEOUT_NS = round(TIMEOUT_S * 1e9)
@@ -36,15 +40,20 @@ class StreamController(Controller):
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
         n = len(self._zero)
+        self._period_s = setup.period_s
         self._otg = Ruckig(n, setup.period_s)
-        self._way, self._output, self._found = InputParameter(n), OutputParameter(n), Trajectory(n)
+        self._way, self._found = InputParameter(n), Trajectory(n)
+        # The same way as the moving target sees it, whose duration tells where the two meet.
+        self._relative, self._catch_up = InputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
-        self._last: list[float] = []
+        self._last, self._last_velocity, self._acceleration = [0.0] * n, [0.0] * n, [0.0] * n
         self._stamp_s = 0.0
         self._came_ns = 0
         self._interval_s = 0.0
         self._lag_s = 0.0
+        self._late_s = 0.0
+        self._elapsed_s = 0.0
         self._first = True
         self._fresh = self._tracks = False
 
@@ -81,6 +90,7 @@ class StreamController(Controller):
                 return lag - self._lag_s
         else:
             self._lag_s = lag
+        self._late_s = lag - self._lag_s
         if self._first or step > TIMEOUT_S:
             self._speed = list(self._zero)
             self._interval_s = 0.0
@@ -95,15 +105,10 @@ class StreamController(Controller):
         """Estimate the interval, and with which speed the target moves."""
         interval = self._interval_s
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
-        limits, wanted, speed = self.limits, self._wanted, self._speed
-        over = 1.0 / step
+        wanted, speed, limits = self._wanted, self._speed, self.limits.velocity
         for i in self._joints:
-            v = (q[i] - wanted[i]) * over
-            # Where the target is, the joint must still be able to stop inside its range.
-            stopping_distance = limits.high[i] - q[i] if v > 0.0 else q[i] - limits.low[i]
-            stops = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i])
-            bound = limits.velocity[i] * _INSIDE
-            bound = stops if stops < bound else bound
+            bound = limits[i] * _INSIDE
+            v = (q[i] - wanted[i]) / step
             speed[i] = bound if v > bound else -bound if v < -bound else v
 
     def advance(self, state: ArmState) -> Setpoint:
@@ -117,49 +122,81 @@ class StreamController(Controller):
         elif not self._tracks:
             # It rests at the last target.
             return self.rest(state)
-        output = self._output
-        try:
-            result = self._otg.update(self._way, output)
-        except (RuckigError, ValueError):
-            result = Result.Error
-        if result < 0:
+        elif any(self._way.target_velocity) and not self._may_go_on(state):
+            self._begin(state)
+            self._tracks = self._plan(self._wanted, self._zero)
+        if not self._tracks:
             return self.give_up(state, ControllerFailed())
-        target.position = self._last = output.new_position
-        target.velocity = output.new_velocity
-        if result == Result.Finished:
-            self._tracks = any(self._way.target_velocity)
-            if self._tracks:
-                output.pass_to_input(self._way)
-                # ruckig goes on at the target's speed; where no new one comes, back to rest at the last.
-                if not self._may_go_on(state):
-                    self._aim_to_rest()
-        else:
-            output.pass_to_input(self._way)
+        self._elapsed_s += self._period_s
+        # After its end the way goes on at the target's speed.
+        target.position, target.velocity, self._acceleration = self._found.at_time(self._elapsed_s)
+        self._last, self._last_velocity = target.position, target.velocity
+        self._tracks = self._elapsed_s < self._found.duration or any(self._way.target_velocity)
         return target
 
-    def _aim(self, state: ArmState) -> None:
-        """Plan from the state to the newest target, with the speed that it has; where that cannot be, to rest at it."""
+    def _begin(self, state: ArmState) -> None:
+        """Let the next way begin in the state."""
         way, limits = self._way, self.limits
-        # Where nothing was cut the state is ruckig's own, which knows its acceleration better.
-        if not self._tracks or state.commanded != self._last:
+        # Where nothing was cut the state is the way's own, which knows its acceleration better.
+        if self._tracks and state.commanded == self._last:
+            way.current_position, way.current_velocity = self._last, self._last_velocity
+            way.current_acceleration = self._acceleration
+        else:
             way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
             way.current_acceleration = allowed_accelerations(
                 state.commanded_acceleration, state, limits.velocity, limits.acceleration, limits.jerk
             )
-        self._tracks = True
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
         way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
-        way.target_position, way.target_velocity = self._wanted, self._speed
-        if not self._stays_inside(state):
-            self._aim_to_rest()
 
-    def _stays_inside(self, state: ArmState) -> bool:
-        """Whether there is a way to the target at its speed, and the run-up for it lies inside the range."""
+    def _aim(self, state: ArmState) -> None:
+        """Plan to where the newest target is met if it keeps its speed; where that cannot be, to rest at it."""
+        self._begin(state)
+        wanted, speed, limits = self._wanted, self._speed, self.limits
+        if any(speed):
+            duration = self._time_to_meet()
+            ahead = duration + self._late_s
+            for i in self._joints:
+                v = speed[i]
+                # Where the two meet, the joint must still be able to stop inside its range.
+                stopping_distance = limits.high[i] - wanted[i] if v > 0.0 else wanted[i] - limits.low[i]
+                stops = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i], ahead)
+                speed[i] = stops if v > stops else -stops if v < -stops else v
+            meets = [q + v * ahead for q, v in zip(wanted, speed, strict=True)]
+            if self._plan(meets, speed, duration) and self._stays_inside(state):
+                self._tracks = True
+                return
+        self._tracks = self._plan(wanted, self._zero)
+
+    def _time_to_meet(self) -> float:
+        """Return how long it takes at least to be where the moving target is then, s, up to the timeout."""
+        way, seen, speed = self._way, self._relative, self._speed
+        n = self._joints
+        late_s = self._late_s
+        seen.current_position = [way.current_position[i] - self._wanted[i] - speed[i] * late_s for i in n]
+        seen.current_velocity = [way.current_velocity[i] - speed[i] for i in n]
+        seen.current_acceleration = way.current_acceleration
+        seen.max_velocity = [way.max_velocity[i] - speed[i] for i in n]
+        seen.min_velocity = [-way.max_velocity[i] - speed[i] for i in n]
+        seen.max_acceleration, seen.max_jerk = way.max_acceleration, way.max_jerk
+        duration = self._catch_up.duration if self._calculated(seen, self._catch_up) else 0.0
+        return min(TIMEOUT_S, _AT_LEAST_S + _LONGER * duration)
+
+    def _plan(self, position: list[float], velocity: list[float], duration_s: float | None = None) -> bool:
+        """Find the way to a position and velocity, which takes at least so long."""
+        way = self._way
+        way.target_position, way.target_velocity, way.minimum_duration = position, velocity, duration_s
+        self._elapsed_s = 0.0
+        return self._calculated(way, self._found)
+
+    def _calculated(self, way: InputParameter, found: Trajectory) -> bool:
         try:
-            if self._otg.calculate(self._way, self._found) < 0:
-                return False
+            return bool(self._otg.calculate(way, found) >= 0)
         except (RuckigError, ValueError):
             return False
+
+    def _stays_inside(self, state: ArmState) -> bool:
+        """Whether the run-up to a target that moves lies inside the range."""
         low, high, extrema = self.limits.low, self.limits.high, self._found.position_extrema
         for i in self._joints:
             here = state.commanded[i]
@@ -168,9 +205,11 @@ class StreamController(Controller):
         return True
 
     def _may_go_on(self, state: ArmState) -> bool:
-        """Whether a target may just be late, and the joints can still stop inside their range."""
+        """Whether a target may just be late, and joints that have met it can still stop inside their range."""
         if (state.now_ns - self._came_ns) * 1e-9 > _LATE * self._interval_s:
             return False
+        if self._elapsed_s < self._found.duration:
+            return True
         limits, speed, position = self.limits, self._speed, state.commanded
         for i in self._joints:
             v = speed[i]
@@ -179,7 +218,3 @@ class StreamController(Controller):
             if not -most <= v <= most:
                 return False
         return True
-
-    def _aim_to_rest(self) -> None:
-        way = self._way
-        way.target_position, way.target_velocity = self._wanted, self._zero
