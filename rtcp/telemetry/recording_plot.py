@@ -15,7 +15,8 @@ from rtcp.telemetry.fault_report import COLOURS
 from rtcp.telemetry.reading import Part, Reader
 
 Array = npt.NDArray[np.float64]
-SIGNALS = ("sent_position", "actual_position", "following_error", "actual_velocity", "actual_torque", "wakeup_ns")
+FOLLOWING_ERROR = "following_error"
+SIGNALS = ("sent_position", "actual_position", FOLLOWING_ERROR, "actual_velocity", "actual_torque", "wakeup_ns")
 """Drawn where none are chosen; `following_error` is made of the first two."""
 _BINS = 4096
 """More than a picture has pixels across."""
@@ -66,6 +67,7 @@ def figure(reader: Reader) -> Figure:
     envelopes: dict[str, Envelope] = {}
     marks: list[tuple[float, str, str]] = []
     state, begin_s = -1, -1.0
+    following = _FollowingError()
     for part in reader:
         marks += [(reader.at_s(one), one.message, COLOURS[3]) for one in part.log if one.level >= WARNING]
         if not len(part.records):
@@ -73,7 +75,8 @@ def figure(reader: Reader) -> Figure:
         seconds = (part.records["time_ns"] - reader.first_ns) * 1e-9
         begin_s = float(seconds[0]) if begin_s < 0.0 else begin_s
         for name in names:
-            if (values := _values(part, name)) is not None:
+            values = following.of(part) if name == FOLLOWING_ERROR else _values(part, name)
+            if values is not None:
                 if name not in envelopes:
                     envelopes[name] = Envelope(reader.period_s or 1e-3, values.shape[1])
                 envelopes[name].add(seconds - begin_s, values)
@@ -88,12 +91,29 @@ def figure(reader: Reader) -> Figure:
     return _draw(reader, envelopes, marks, begin_s)
 
 
+class _FollowingError:
+    """Where the drives were told to be less where they were: a frame brings back what the one before it caused."""
+
+    def __init__(self) -> None:
+        self._number = -1
+        self._sent: Array = np.empty((0, 0))
+
+    def of(self, part: Part) -> Array | None:
+        """Return it, shape (records, joints), 0 after a gap; None: the recording does not have both positions."""
+        records = part.records
+        if not {"number", "sent_position", "actual_position"} <= set(records.dtype.names or ()):
+            return None
+        sent, numbers = records["sent_position"], records["number"].astype(np.int64)
+        before = np.vstack((self._sent if len(self._sent) else sent[:1], sent[:-1]))
+        follows = np.diff(numbers, prepend=self._number) == 1
+        self._number, self._sent = int(numbers[-1]), sent[-1:].copy()
+        return np.where(follows[:, None], before - records["actual_position"], 0.0)
+
+
 def _values(part: Part, name: str) -> Array | None:
     """Return a signal, shape (records, columns); None: the recording does not have it."""
-    records, has = part.records, part.records.dtype.names or ()
-    if name == "following_error" and {"sent_position", "actual_position"} <= set(has):
-        return np.asarray(records["sent_position"] - records["actual_position"])
-    return records[name].astype(np.float64).reshape(len(records), -1) if name in has else None
+    records = part.records
+    return records[name].astype(np.float64).reshape(len(records), -1) if name in (records.dtype.names or ()) else None
 
 
 def _draw(

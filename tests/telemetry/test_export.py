@@ -138,6 +138,21 @@ def test_a_peak_of_one_cycle_in_many_is_in_the_picture_with_states_and_warnings(
     assert [axes.get_ylabel() for axes in drawn.axes][2] == "following error\nrad"
 
 
+def test_the_following_error_of_a_joint_that_does_what_the_frame_before_said_is_zero_also_beside_a_gap(
+    tmp_path: Path,
+) -> None:
+    records = cycles(2000)
+    records["actual_position"][1:] = records["sent_position"][:-1]
+    records["actual_position"][0] = records["sent_position"][0]
+    records["actual_position"][1500, 1] += 0.25
+    kept = np.concatenate((records[:700], records[900:]))
+    drawn = figure(Reader(mcap(tmp_path / "a.mcap", kept)))
+    (error,) = (axes for axes in drawn.axes if axes.get_ylabel() == "following error\nrad")
+    lines = {line.get_label(): np.asarray(line.get_ydata()) for line in error.lines}
+    assert np.abs(lines["joint1"]).max() == 0.0
+    assert np.abs(lines["joint2"]).max() == pytest.approx(0.25)
+
+
 def test_chosen_signals_of_a_span_are_drawn_each_by_itself(tmp_path: Path) -> None:
     drawn = figure(Reader(csv(tmp_path / "a.csv"), ["actual_velocity", "sent_position"], 0.5, 1.0))
     assert [axes.get_ylabel() for axes in drawn.axes] == ["actual velocity\nrad/s", "sent position\nrad"]

@@ -154,6 +154,8 @@ class LatencyExperiment(Experiment):
     def __init__(self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0), periods: int = 6) -> None:
         self._rates_hz = rates_hz
         self._periods = periods
+        self._drive_us: Array = np.empty(0)
+        """By how much each actual position of the last stream is behind the sent ones."""
 
     def run(self, setup: Setup) -> list[Row]:
         """See `Experiment.run`."""
@@ -204,6 +206,7 @@ class LatencyExperiment(Experiment):
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
         aim = (0.0, AIM_CYCLES) if rate == 1000.0 else ()
+        self._drive_us = 1e6 * _behind_each(*series["sent"], *series["actual"], first, last)
         self._draw(setup, name, label, {one: (t - begun, y) for one, (t, y) in series.items()})
         setup.report(
             f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
@@ -218,7 +221,7 @@ class LatencyExperiment(Experiment):
         ]
 
     def _parts(self, setup: Setup, robot: Robot) -> list[Row]:
-        """Measure single commands on their way through socket, ring, cycle and wire."""
+        """Measure single commands on their way through socket, ring, cycle and wire, and what the drive adds."""
         observer = Observer(blackboard_file(runtime_directory()))
         base = list(robot.status().positions)
         into_ring: list[float] = []
@@ -247,11 +250,13 @@ class LatencyExperiment(Experiment):
             "ring": np.array(taken),
             "cycle": 1e-3 * left,
             "wire": 1e-3 * records["exchange_ns"][at[known]],
+            "drive": self._drive_us,
         }
-        rows = []
-        for name, values in parts.items():
-            rows += [Row(f"{name}: p{p}", "us", float(np.percentile(values, p))) for p in (50, 99)]
-        return rows
+        return [
+            Row(f"{name}: p{p}", "us", float(np.percentile(values, p)))
+            for name, values in parts.items()
+            for p in (50, 99)
+        ]
 
     @staticmethod
     def _draw(setup: Setup, name: str, title: str, series: Mapping[str, tuple[Array, Array]]) -> None:
@@ -278,6 +283,14 @@ def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:
         "sent": (leaves, records["sent_position"][:, _JOINT]),
         "actual": (t, records["actual_position"][:, _JOINT]),
     }
+
+
+def _behind_each(sent_at: Array, sent: Array, at: Array, actual: Array, first: float, last: float) -> Array:
+    """Return how long each actual position is behind the sent ones, s, while these move at half speed at least."""
+    speed = np.gradient(sent, sent_at)
+    moves = (np.abs(speed) > 0.5 * np.abs(speed).max()) & (at > first) & (at < last)
+    delays: Array = (np.interp(at, sent_at, sent) - actual)[moves] / speed[moves]
+    return delays
 
 
 def _spin_until(number: int, count: Callable[[], int]) -> int:

@@ -140,12 +140,28 @@ class DelaysExperiment(Experiment):
         with setup.platform(enabled=False) as robot:
             slaves = robot.scan()
         rows = []
+        clocks: dict[int, float] = {}
         for at, slave in enumerate(slaves):
             source = SOURCE_DELAYS_NS[at] if at < len(SOURCE_DELAYS_NS) else None
             # The virtual cable has the source's delays; a real one has its own.
             bounds = {} if source is None or not setup.is_virtual else {"least": source - 20.0, "most": source + 20.0}
             if slave["dc"]:
-                rows.append(Row(f"{at + 1} {slave['name']}", "ns", float(slave["delay_ns"]), source, **bounds))
+                clocks[at + 1] = float(slave["delay_ns"])
+                rows.append(Row(f"{at + 1} {slave['name']}", "ns", clocks[at + 1], source, **bounds))
         if not rows:
             raise ExperimentFailed("no slave has a distributed clock")
+        self._draw(setup, clocks)
         return rows
+
+    @staticmethod
+    def _draw(setup: Setup, clocks: dict[int, float]) -> None:
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(7.0, 4.5), layout="constrained")
+        axes = figure.subplots()
+        axes.bar(list(clocks), list(clocks.values()), width=0.5, label="here")
+        axes.plot(range(1, len(SOURCE_DELAYS_NS) + 1), SOURCE_DELAYS_NS, "o", color="tab:orange", label="source")
+        axes.set(xlabel="slave, in the order of the cable", ylabel="propagation delay, ns")
+        axes.grid(axis="y", alpha=0.3)
+        axes.legend()
+        setup.draw("delays", figure)
