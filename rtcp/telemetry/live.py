@@ -1,16 +1,20 @@
 """The live view: the channels of a recording over WebSocket, for Foxglove and Lichtblick (subprotocol foxglove.sdk.v1).
 
 A process of its own reads the blackboard as a recorder does. Clients only watch. Each has a queue of its own: one that
-reads too slowly loses its oldest messages, and nobody else waits for it.
+reads too slowly loses its oldest messages, one that does not read at all is dropped, and nobody else waits for it.
 """
 
 from __future__ import annotations
 
+import logging
+import os
+import socket
 import time
 from pathlib import Path
 from queue import SimpleQueue
 
 import foxglove
+import psutil
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from rtcp.ipc.errors import RtcpError
@@ -22,6 +26,8 @@ from rtcp.telemetry.feed import Feed
 _TURN_S = 0.025
 _QUEUE = 8192
 """Messages that wait for one client: 1 s of every signal at 500 us, some MB."""
+_HANGS_MS = 10_000
+"""A client that takes nothing for so long is dropped."""
 
 
 class _Subscriptions(ServerListener):
@@ -66,6 +72,7 @@ class LiveView:
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2]
             raise RtcpError("refused", f"{host} port {port} cannot be listened at: {reason}: choose another") from error
+        _drop_who_hangs(self._server.port)
         address = f"[{host}]" if ":" in host else host
         self.url = f"ws://{address}:{self._server.port}"
 
@@ -85,3 +92,13 @@ class LiveView:
         self._channels.publish(records, records[records["number"] % self._every == 0] if self._every > 1 else None)
         for instant, message, level in self._feed.messages():
             self._channels.log(self._channels.wall_ns(instant), message, level)
+
+
+def _drop_who_hangs(port: int) -> None:
+    """Let the kernel end connections whose client takes nothing: they inherit it from the socket that listens."""
+    # The SDK has a setting for neither.
+    logging.getLogger("foxglove").setLevel(logging.CRITICAL)
+    for one in psutil.Process().net_connections("tcp"):
+        if one.status == psutil.CONN_LISTEN and one.laddr.port == port:
+            with socket.socket(fileno=os.dup(one.fd)) as listening:
+                listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _HANGS_MS)
