@@ -23,9 +23,9 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LONGEST_S = 600.0
 """A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
-# ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: a little less jerk
-# is not on the border any more.
-_JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-3, 1.0 - 1e-2)
+# ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: with a little more
+# jerk it is not on the border any more. With less of it a joint at its speed limit would pass that.
+_JERK_SCALES = (1.0, 1.0 + 1e-4, 1.0 + 1e-3, 1.0 - 1e-2)
 _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
 
@@ -66,6 +66,19 @@ def stoppable_speed(distance: float, acceleration: float, jerk: float, kept_s: f
         return 0.0
     ramp = acceleration * (0.5 * acceleration / jerk + kept_s)
     return sqrt(ramp * ramp + 2.0 * acceleration * distance) - ramp
+
+
+def find_way(otg: Ruckig, way: InputParameter, jerk: Sequence[float], found: Trajectory) -> bool:
+    """Calculate a way with this jerk, shape (n,), rad/s^3, or nearly this; return whether there is one."""
+    for scale in _JERK_SCALES:
+        way.max_jerk = [scale * one for one in jerk]
+        try:
+            if otg.calculate(way, found) >= 0:
+                return True
+        except (RuckigError, ValueError):
+            # ruckig raises where its algorithm fails, and where its own result code is unknown to its binding.
+            continue
+    return False
 
 
 class JointMotion:
@@ -126,22 +139,11 @@ class JointMotion:
             max(min(speed, limit), abs(now))
             for limit, now in zip(self._velocity_limit, move.current_velocity, strict=True)
         ]  # fmt: skip
-        if not self._planned(move):
+        if not find_way(self._otg, move, self._jerk_limit, self._plan) or self._plan.duration > LONGEST_S:
             return False
         self._active = move
         self._begin(Phase.MOVE)
         return True
-
-    def _planned(self, move: InputParameter) -> bool:
-        for scale in _JERK_SCALES:
-            move.max_jerk = [scale * jerk for jerk in self._jerk_limit]
-            try:
-                if self._otg.calculate(move, self._plan) >= 0:
-                    return bool(self._plan.duration <= LONGEST_S)
-            except (RuckigError, ValueError):
-                # ruckig raises where its algorithm fails, and where its own result code is unknown to its binding.
-                continue
-        return False
 
     def stop(self, state: ArmState) -> None:
         """Come to rest under the acceleration and jerk limits; at rest, end a move that has not begun."""

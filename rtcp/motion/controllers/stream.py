@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import isfinite
 
-from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
+from ruckig import InputParameter, Ruckig, Trajectory
 
 from rtcp.ipc.commands import Command, StreamPosition
 from rtcp.ipc.events import ControllerFailed, StreamEnded
 from rtcp.ipc.refusals import Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_accelerations, stoppable_speed
+from rtcp.motion.joint_motion import allowed_accelerations, find_way, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 TIMEOUT_S = 0.2
@@ -47,7 +47,7 @@ class StreamController(Controller):
         self._relative, self._catch_up = InputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
-        self._last, self._last_velocity, self._acceleration = [0.0] * n, [0.0] * n, [0.0] * n
+        self._last, self._acceleration = [0.0] * n, [0.0] * n
         self._stamp_s = 0.0
         self._came_ns = 0
         self._interval_s = 0.0
@@ -130,24 +130,22 @@ class StreamController(Controller):
         self._elapsed_s += self._period_s
         # After its end the way goes on at the target's speed.
         target.position, target.velocity, self._acceleration = self._found.at_time(self._elapsed_s)
-        self._last, self._last_velocity = target.position, target.velocity
+        self._last = target.position
         self._tracks = self._elapsed_s < self._found.duration or any(self._way.target_velocity)
         return target
 
     def _begin(self, state: ArmState) -> None:
         """Let the next way begin in the state."""
         way, limits = self._way, self.limits
-        # Where nothing was cut the state is the way's own, which knows its acceleration better.
-        if self._tracks and state.commanded == self._last:
-            way.current_position, way.current_velocity = self._last, self._last_velocity
-            way.current_acceleration = self._acceleration
-        else:
-            way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
-            way.current_acceleration = allowed_accelerations(
-                state.commanded_acceleration, state, limits.velocity, limits.acceleration, limits.jerk
-            )
+        way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
+        # Where nothing was cut the way's own acceleration is known better.
+        own = self._tracks and state.commanded == self._last
+        way.current_acceleration = allowed_accelerations(
+            self._acceleration if own else state.commanded_acceleration,
+            state, limits.velocity, limits.acceleration, limits.jerk,
+        )  # fmt: skip
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
-        way.max_acceleration, way.max_jerk = limits.acceleration, limits.jerk
+        way.max_acceleration = limits.acceleration
 
     def _aim(self, state: ArmState) -> None:
         """Plan to where the newest target is met if it keeps its speed; where that cannot be, to rest at it."""
@@ -178,8 +176,9 @@ class StreamController(Controller):
         seen.current_acceleration = way.current_acceleration
         seen.max_velocity = [way.max_velocity[i] - speed[i] for i in n]
         seen.min_velocity = [-way.max_velocity[i] - speed[i] for i in n]
-        seen.max_acceleration, seen.max_jerk = way.max_acceleration, way.max_jerk
-        duration = self._catch_up.duration if self._calculated(seen, self._catch_up) else 0.0
+        seen.max_acceleration = way.max_acceleration
+        meets = find_way(self._otg, seen, self.limits.jerk, self._catch_up)
+        duration = self._catch_up.duration if meets else 0.0
         return min(TIMEOUT_S, _AT_LEAST_S + _LONGER * duration)
 
     def _plan(self, position: list[float], velocity: list[float], duration_s: float | None = None) -> bool:
@@ -187,13 +186,7 @@ class StreamController(Controller):
         way = self._way
         way.target_position, way.target_velocity, way.minimum_duration = position, velocity, duration_s
         self._elapsed_s = 0.0
-        return self._calculated(way, self._found)
-
-    def _calculated(self, way: InputParameter, found: Trajectory) -> bool:
-        try:
-            return bool(self._otg.calculate(way, found) >= 0)
-        except (RuckigError, ValueError):
-            return False
+        return find_way(self._otg, way, self.limits.jerk, self._found)
 
     def _stays_inside(self, state: ArmState) -> bool:
         """Whether the run-up to a target that moves lies inside the range."""

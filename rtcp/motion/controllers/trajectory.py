@@ -9,14 +9,14 @@ from collections.abc import Sequence
 from math import sqrt
 from typing import NamedTuple
 
-from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
+from ruckig import InputParameter, Ruckig, Trajectory
 
 from rtcp.ipc.commands import Command, RunTrajectory
 from rtcp.ipc.events import PlanDamaged
 from rtcp.ipc.layout import PLAN_ROWS
 from rtcp.ipc.refusals import ApproachImpossible, DamagedRow, PlanStartsElsewhere, PlanStartsMoving, Refusal
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_acceleration
+from rtcp.motion.joint_motion import allowed_acceleration, find_way
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import Coefficients, cubic, quintic
 from rtcp.motion.planning.plan import CUBIC, KIND, LONGEST_S, QUINTIC, first_not_finite, read_row
@@ -31,8 +31,6 @@ _EXACT = 1e-12
 _AT_ONCE_S = 1e-9
 _SLACK = 1e-6
 _INSIDE = 1.0 - 1e-9
-# ruckig finds no way where a distance is exactly a border between two profiles.
-_JERK_SCALES = (1.0, 1.0 - 1e-4, 1.0 - 1e-2)
 _MOST_RATE = 50.0
 _MOST_JERK = 2000.0
 """1/s and 1/s^2: bounds of how fast the path's time stops where no joint moves."""
@@ -91,7 +89,7 @@ class Approach:
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
         way.max_acceleration = list(bounds)
         way.minimum_duration = waypoint[0]
-        if not self._planned():
+        if not find_way(self._otg, way, limits.jerk, self._spare) or self._spare.duration > LONGEST_S:
             return NoApproach(-1, 0.0)
         extrema = self._spare.position_extrema
         for i in range(n):
@@ -104,16 +102,6 @@ class Approach:
         self._found, self._spare = self._spare, self._found
         self.duration_s = self._found.duration
         return None
-
-    def _planned(self) -> bool:
-        for scale in _JERK_SCALES:
-            self._way.max_jerk = [scale * jerk for jerk in self._limits.jerk]
-            try:
-                if self._otg.calculate(self._way, self._spare) >= 0:
-                    return bool(self._spare.duration <= LONGEST_S)
-            except (RuckigError, ValueError):
-                continue
-        return False
 
 
 class Slowdown:
