@@ -19,6 +19,7 @@ from ruckig import (
     Trajectory,
 )
 
+from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 LONGEST_S = 600.0
@@ -26,6 +27,8 @@ LONGEST_S = 600.0
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: with a little more
 # jerk it is not on the border any more. With less of it a joint at its speed limit would pass that.
 _JERK_SCALES = (1.0, 1.0 + 1e-4, 1.0 + 1e-3, 1.0 - 1e-2)
+_SLACK = 1e-6
+"""Beyond a range, rad, that is a rounding."""
 _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""
 
@@ -79,6 +82,30 @@ def find_way(otg: Ruckig, way: InputParameter, jerk: Sequence[float], found: Tra
             # ruckig raises where its algorithm fails, and where its own result code is unknown to its binding.
             continue
     return False
+
+
+def leaves_range(found: Trajectory, begin: Sequence[float], limits: Limits) -> tuple[int, float] | None:
+    """Return the first joint that leaves its range on a way, and how far it gets, rad; None: all stay inside.
+
+    What begins outside, as the guards let it for a rounding, has to be no further out.
+    """
+    extrema, low, high = found.position_extrema, limits.low, limits.high
+    for i, here in enumerate(begin):
+        least, largest = extrema[i].min, extrema[i].max
+        further = limits.velocity[i] * found.duration
+        if least - further < low[i] or largest + further > high[i]:
+            # ruckig leaves out where the speed passes 0 while the acceleration is constant.
+            profile = found.profiles[0][i]
+            p, v, a, j = profile.p, profile.v, profile.a, profile.j
+            for k in range(len(j)):
+                if j[k] == 0.0 and v[k] * v[k + 1] < 0.0:
+                    turns = p[k] - 0.5 * v[k] * v[k] / a[k]
+                    least, largest = min(least, turns), max(largest, turns)
+        if least < min(low[i], here) - _SLACK:
+            return i, least
+        if largest > max(high[i], here) + _SLACK:
+            return i, largest
+    return None
 
 
 class JointMotion:

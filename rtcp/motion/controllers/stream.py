@@ -11,17 +11,20 @@ from rtcp.ipc.commands import Command, StreamPosition
 from rtcp.ipc.events import ControllerFailed, StreamEnded
 from rtcp.ipc.refusals import Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_accelerations, find_way, stoppable_speed
+from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 TIMEOUT_S = 0.2
 """A stream that is silent for this long has ended."""
+_LOOK_AHEAD_S = 0.2
+"""A target is met no further ahead than this."""
 _LATE = 2.5
 """A target is missing this many intervals after the last one; until then the speed is kept."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """Weight of a new interval in the mean."""
-_SLACK = 1e-6
+_OVER_S = 0.01
+"""The speed of a target is estimated over this at least: steps of an encoder, or noise, are no speed."""
 _AT_LEAST_S = 0.01
 """The joints take this long at least to meet a target: in less, what is lost to rounding would take a detour."""
 _LONGER = 1.05
@@ -47,6 +50,9 @@ class StreamController(Controller):
         self._relative, self._catch_up = InputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
+        # Targets from which on the speed is estimated.
+        self._older, self._newer = [0.0] * n, [0.0] * n
+        self._older_s = self._newer_s = 0.0
         self._last, self._acceleration = [0.0] * n, [0.0] * n
         self._stamp_s = 0.0
         self._came_ns = 0
@@ -54,6 +60,7 @@ class StreamController(Controller):
         self._lag_s = 0.0
         self._late_s = 0.0
         self._elapsed_s = 0.0
+        self._bounds: tuple[float, ...] = ()
         self._first = True
         self._fresh = self._tracks = False
 
@@ -94,21 +101,28 @@ class StreamController(Controller):
         if self._first or step > TIMEOUT_S:
             self._speed = list(self._zero)
             self._interval_s = 0.0
+            self._older[:] = self._newer[:] = q
+            self._older_s = self._newer_s = stamp_s
         else:
-            self._learn(q, step)
+            self._learn(q, stamp_s, step)
         self._wanted[:] = q
         self._stamp_s, self._came_ns = stamp_s, now_ns
         self._first, self._fresh = False, True
         return None
 
-    def _learn(self, q: Sequence[float], step: float) -> None:
-        """Estimate the interval, and with which speed the target moves."""
+    def _learn(self, q: Sequence[float], stamp_s: float, step: float) -> None:
+        """Estimate the interval, and with which speed the target moves: over 10 to 20 ms, or the last interval."""
         interval = self._interval_s
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
-        wanted, speed, limits = self._wanted, self._speed, self.limits.velocity
+        if stamp_s - self._newer_s >= _OVER_S:
+            self._older, self._newer = self._newer, self._older
+            self._older_s, self._newer_s = self._newer_s, stamp_s
+            self._newer[:] = q
+        older, speed, limits = self._older, self._speed, self.limits.velocity
+        over = stamp_s - self._older_s
         for i in self._joints:
             bound = limits[i] * _INSIDE
-            v = (q[i] - wanted[i]) / step
+            v = (q[i] - older[i]) / over
             speed[i] = bound if v > bound else -bound if v < -bound else v
 
     def advance(self, state: ArmState) -> Setpoint:
@@ -134,14 +148,17 @@ class StreamController(Controller):
         self._tracks = self._elapsed_s < self._found.duration or any(self._way.target_velocity)
         return target
 
+    def _is_own(self, state: ArmState) -> bool:
+        """Whether the state is where the way under way has led."""
+        return self._tracks and state.commanded == self._last
+
     def _begin(self, state: ArmState) -> None:
         """Let the next way begin in the state."""
         way, limits = self._way, self.limits
         way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
         # Where nothing was cut the way's own acceleration is known better.
-        own = self._tracks and state.commanded == self._last
         way.current_acceleration = allowed_accelerations(
-            self._acceleration if own else state.commanded_acceleration,
+            self._acceleration if self._is_own(state) else state.commanded_acceleration,
             state, limits.velocity, limits.acceleration, limits.jerk,
         )  # fmt: skip
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, state.commanded_velocity, strict=True)]
@@ -149,9 +166,15 @@ class StreamController(Controller):
 
     def _aim(self, state: ArmState) -> None:
         """Plan to where the newest target is met if it keeps its speed; where that cannot be, to rest at it."""
-        self._begin(state)
         wanted, speed, limits = self._wanted, self._speed, self.limits
-        if any(speed):
+        bounds = (*limits.velocity, *limits.acceleration, *limits.jerk)
+        moves = any(speed)
+        # Planned anew, a way to the same rest could by rounding be another one, which passes it.
+        if not moves and self._is_own(state) and self._way.target_position == wanted and bounds == self._bounds:
+            return
+        self._bounds = bounds
+        self._begin(state)
+        if moves:
             duration = self._time_to_meet()
             ahead = duration + self._late_s
             for i in self._joints:
@@ -161,13 +184,13 @@ class StreamController(Controller):
                 stops = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i], ahead)
                 speed[i] = stops if v > stops else -stops if v < -stops else v
             meets = [q + v * ahead for q, v in zip(wanted, speed, strict=True)]
-            if self._plan(meets, speed, duration) and self._stays_inside(state):
+            if self._plan(meets, speed, duration) and leaves_range(self._found, state.commanded, limits) is None:
                 self._tracks = True
                 return
         self._tracks = self._plan(wanted, self._zero)
 
     def _time_to_meet(self) -> float:
-        """Return how long it takes at least to be where the moving target is then, s, up to the timeout."""
+        """Return how long it takes at least to be where the moving target is then, s, up to 0.2 s."""
         way, seen, speed = self._way, self._relative, self._speed
         n = self._joints
         late_s = self._late_s
@@ -177,9 +200,11 @@ class StreamController(Controller):
         seen.max_velocity = [way.max_velocity[i] - speed[i] for i in n]
         seen.min_velocity = [-way.max_velocity[i] - speed[i] for i in n]
         seen.max_acceleration = way.max_acceleration
-        meets = find_way(self._otg, seen, self.limits.jerk, self._catch_up)
-        duration = self._catch_up.duration if meets else 0.0
-        return min(TIMEOUT_S, _AT_LEAST_S + _LONGER * duration)
+        if not find_way(self._otg, seen, self.limits.jerk, self._catch_up):
+            # The target is as fast as the joint may be.
+            return _LOOK_AHEAD_S
+        duration: float = self._catch_up.duration
+        return min(_LOOK_AHEAD_S, _AT_LEAST_S + _LONGER * duration)
 
     def _plan(self, position: list[float], velocity: list[float], duration_s: float | None = None) -> bool:
         """Find the way to a position and velocity, which takes at least so long."""
@@ -187,15 +212,6 @@ class StreamController(Controller):
         way.target_position, way.target_velocity, way.minimum_duration = position, velocity, duration_s
         self._elapsed_s = 0.0
         return find_way(self._otg, way, self.limits.jerk, self._found)
-
-    def _stays_inside(self, state: ArmState) -> bool:
-        """Whether the run-up to a target that moves lies inside the range."""
-        low, high, extrema = self.limits.low, self.limits.high, self._found.position_extrema
-        for i in self._joints:
-            here = state.commanded[i]
-            if extrema[i].min < min(low[i], here) - _SLACK or extrema[i].max > max(high[i], here) + _SLACK:
-                return False
-        return True
 
     def _may_go_on(self, state: ArmState) -> bool:
         """Whether a target may just be late, and joints that have met it can still stop inside their range."""

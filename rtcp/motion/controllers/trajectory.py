@@ -16,7 +16,7 @@ from rtcp.ipc.events import PlanDamaged
 from rtcp.ipc.layout import PLAN_ROWS
 from rtcp.ipc.refusals import ApproachImpossible, DamagedRow, PlanStartsElsewhere, PlanStartsMoving, Refusal
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
-from rtcp.motion.joint_motion import allowed_acceleration, find_way
+from rtcp.motion.joint_motion import allowed_acceleration, find_way, leaves_range
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import Coefficients, cubic, quintic
 from rtcp.motion.planning.plan import CUBIC, KIND, LONGEST_S, QUINTIC, first_not_finite, read_row
@@ -91,14 +91,8 @@ class Approach:
         way.minimum_duration = waypoint[0]
         if not find_way(self._otg, way, limits.jerk, self._spare) or self._spare.duration > LONGEST_S:
             return NoApproach(-1, 0.0)
-        extrema = self._spare.position_extrema
-        for i in range(n):
-            least, largest = extrema[i].min, extrema[i].max
-            # What begins outside, as the guards let it for a rounding, has to be no further out.
-            if least < min(limits.low[i], position[i]) - _SLACK:
-                return NoApproach(i, least)
-            if largest > max(limits.high[i], position[i]) + _SLACK:
-                return NoApproach(i, largest)
+        if (left := leaves_range(self._spare, position, limits)) is not None:
+            return NoApproach(*left)
         self._found, self._spare = self._spare, self._found
         self.duration_s = self._found.duration
         return None
