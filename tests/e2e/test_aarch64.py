@@ -24,6 +24,11 @@ MAGIC = (
 PACKAGES = "python3,python3-venv,python3-dev,g++,make,git,ca-certificates,iproute2"
 TESTS = ("tests/config", "tests/devices", "tests/ipc", "tests/kinematics", "tests/realtime", "tests/virtual")
 """Those that decode bytes, compute, or depend on the machine."""
+NOT_EMULATED = (
+    "tests/realtime/test_doctor.py::test_the_kernel_of_this_machine_answers_for_its_interfaces",
+    "tests/virtual/faults/test_ground_truth.py::test_a_real_segment_tells_of_a_load_that_falls_without_any_master",
+)
+"""qemu passes neither the request of ethtool on nor those that create interfaces."""
 
 pytestmark = [
     pytest.mark.alone,
@@ -83,5 +88,6 @@ def test_an_arm64_debian_installs_it_and_passes_the_unit_tests(debian: Path) -> 
     assert run_in(debian, "uname -m").stdout == "aarch64\n"
     installed = run_in(debian, "make setup")
     assert installed.returncode == 0, installed.stdout + installed.stderr
-    tests = run_in(debian, f".venv/bin/python -m pytest -q -m 'not alone and not slow' {' '.join(TESTS)}")
+    left_out = " ".join(f"--deselect {name}" for name in NOT_EMULATED)
+    tests = run_in(debian, f".venv/bin/python -m pytest -q -m 'not alone and not slow' {left_out} {' '.join(TESTS)}")
     assert tests.returncode == 0, tests.stdout[-8000:] + tests.stderr[-2000:]
