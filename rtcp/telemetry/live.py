@@ -27,7 +27,7 @@ _TURN_S = 0.025
 _QUEUE = 8192
 """Messages that wait for one client: 1 s of every signal at 500 us, some MB."""
 _HANGS_MS = 10_000
-"""A client that takes nothing for so long is dropped."""
+"""Time without progress after which a client is disconnected, ms."""
 
 
 class _Subscriptions(ServerListener):
@@ -72,7 +72,7 @@ class LiveView:
         except RuntimeError as error:
             reason = str(error).rpartition("Failed to bind port: ")[2]
             raise RtcpError("refused", f"{host} port {port} cannot be listened at: {reason}: choose another") from error
-        _drop_who_hangs(self._server.port)
+        _drop_stalled_clients(self._server.port)
         address = f"[{host}]" if ":" in host else host
         self.url = f"ws://{address}:{self._server.port}"
 
@@ -94,9 +94,9 @@ class LiveView:
             self._channels.log(self._channels.wall_ns(instant), message, level)
 
 
-def _drop_who_hangs(port: int) -> None:
-    """Let the kernel end connections whose client takes nothing: they inherit it from the socket that listens."""
-    # The SDK has a setting for neither.
+def _drop_stalled_clients(port: int) -> None:
+    """Have the kernel close stalled connections: accepted sockets inherit the option of the listening one."""
+    # The SDK offers no setting for this, nor for the errors that it logs then.
     logging.getLogger("foxglove").setLevel(logging.CRITICAL)
     for one in psutil.Process().net_connections("tcp"):
         if one.status == psutil.CONN_LISTEN and one.laddr.port == port:

@@ -17,18 +17,18 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 TIMEOUT_S = 0.2
 """A stream that is silent for this long has ended."""
 _LOOK_AHEAD_S = 0.2
-"""A target is met no further ahead than this."""
+"""Longest time ahead at which a target is met, s."""
 _LATE = 2.5
 """A target is missing this many intervals after the last one; until then the speed is kept."""
 _INSIDE = 1.0 - 1e-6
 _SHARE = 0.2
 """Weight of a new interval in the mean."""
 _OVER_S = 0.01
-"""The speed of a target is estimated over this at least: steps of an encoder, or noise, are no speed."""
+"""Shortest time over which a target's speed is estimated, s: an encoder's steps and noise average out."""
 _AT_LEAST_S = 0.01
-"""The joints take this long at least to meet a target: in less, what is lost to rounding would take a detour."""
+"""Shortest time to meet a target, s: in less, a rounding error could only be corrected by a detour."""
 _LONGER = 1.05
-"""And this much longer than they need, since the shortest way is the only one in its time."""
+"""Factor on the shortest time: with no time to spare, rounding can leave no solution."""
 _DRIFT = 1e-4
 """The sender's clock may be slower than ours by this fraction."""
 _TIMEOUT_NS = round(TIMEOUT_S * 1e9)
@@ -50,7 +50,7 @@ class StreamController(Controller):
         self._relative, self._catch_up = InputParameter(n), Trajectory(n)
         self._wanted = [0.0] * n
         self._speed = [0.0] * n
-        # Targets from which on the speed is estimated.
+        # Earlier targets, from which the speed is estimated.
         self._older, self._newer = [0.0] * n, [0.0] * n
         self._older_s = self._newer_s = 0.0
         self._last, self._acceleration = [0.0] * n, [0.0] * n
@@ -63,6 +63,7 @@ class StreamController(Controller):
         self._bounds: tuple[float, ...] = ()
         self._first = True
         self._fresh = self._tracks = False
+        self._keeps_speed = False
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Follow the target from the next cycle on."""
@@ -111,7 +112,7 @@ class StreamController(Controller):
         return None
 
     def _learn(self, q: Sequence[float], stamp_s: float, step: float) -> None:
-        """Estimate the interval, and with which speed the target moves: over 10 to 20 ms, or the last interval."""
+        """Estimate the interval, and the target's speed over 10 to 20 ms, or over a longer last interval."""
         interval = self._interval_s
         self._interval_s = step if interval == 0.0 else interval + _SHARE * (step - interval)
         if stamp_s - self._newer_s >= _OVER_S:
@@ -136,7 +137,7 @@ class StreamController(Controller):
         elif not self._tracks:
             # It rests at the last target.
             return self.rest(state)
-        elif any(self._way.target_velocity) and not self._may_go_on(state):
+        elif self._keeps_speed and not self._may_go_on(state):
             self._begin(state)
             self._tracks = self._plan(self._wanted, self._zero)
         if not self._tracks:
@@ -145,15 +146,15 @@ class StreamController(Controller):
         # After its end the way goes on at the target's speed.
         target.position, target.velocity, self._acceleration = self._found.at_time(self._elapsed_s)
         self._last = target.position
-        self._tracks = self._elapsed_s < self._found.duration or any(self._way.target_velocity)
+        self._tracks = self._elapsed_s < self._found.duration or self._keeps_speed
         return target
 
     def _is_own(self, state: ArmState) -> bool:
-        """Whether the state is where the way under way has led."""
+        """Whether the state is the last setpoint of the current plan, unchanged by the guards."""
         return self._tracks and state.commanded == self._last
 
     def _begin(self, state: ArmState) -> None:
-        """Let the next way begin in the state."""
+        """Set the state, and the limits in force, as the start of the next plan."""
         way, limits = self._way, self.limits
         way.current_position, way.current_velocity = state.commanded, state.commanded_velocity
         # Where nothing was cut the way's own acceleration is known better.
@@ -169,37 +170,34 @@ class StreamController(Controller):
         wanted, speed, limits = self._wanted, self._speed, self.limits
         bounds = (*limits.velocity, *limits.acceleration, *limits.jerk)
         moves = any(speed)
-        # Planned anew, a way to the same rest could by rounding be another one, which passes it.
+        # Replanning to the same rest may, by rounding, choose another profile that overshoots.
         if not moves and self._is_own(state) and self._way.target_position == wanted and bounds == self._bounds:
             return
         self._bounds = bounds
         self._begin(state)
         if moves:
-            duration = self._time_to_meet()
+            duration = self._time_to_meet(state)
             ahead = duration + self._late_s
             for i in self._joints:
-                v = speed[i]
                 # Where the two meet, the joint must still be able to stop inside its range.
-                stopping_distance = limits.high[i] - wanted[i] if v > 0.0 else wanted[i] - limits.low[i]
-                stops = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i], ahead)
-                speed[i] = stops if v > stops else -stops if v < -stops else v
+                v, most = speed[i], self._stoppable(i, speed[i], wanted[i], ahead)
+                speed[i] = most if v > most else -most if v < -most else v
             meets = [q + v * ahead for q, v in zip(wanted, speed, strict=True)]
             if self._plan(meets, speed, duration) and leaves_range(self._found, state.commanded, limits) is None:
                 self._tracks = True
                 return
         self._tracks = self._plan(wanted, self._zero)
 
-    def _time_to_meet(self) -> float:
-        """Return how long it takes at least to be where the moving target is then, s, up to 0.2 s."""
-        way, seen, speed = self._way, self._relative, self._speed
-        n = self._joints
-        late_s = self._late_s
-        seen.current_position = [way.current_position[i] - self._wanted[i] - speed[i] * late_s for i in n]
-        seen.current_velocity = [way.current_velocity[i] - speed[i] for i in n]
-        seen.current_acceleration = way.current_acceleration
-        seen.max_velocity = [way.max_velocity[i] - speed[i] for i in n]
-        seen.min_velocity = [-way.max_velocity[i] - speed[i] for i in n]
-        seen.max_acceleration = way.max_acceleration
+    def _time_to_meet(self, state: ArmState) -> float:
+        """Return the shortest time in which the joints can meet the moving target, with a margin, s; at most 0.2 s."""
+        seen, wanted, speed, n = self._relative, self._wanted, self._speed, self._joints
+        q, v, late_s, most = state.commanded, state.commanded_velocity, self._late_s, self._way.max_velocity
+        seen.current_position = [q[i] - wanted[i] - speed[i] * late_s for i in n]
+        seen.current_velocity = [v[i] - speed[i] for i in n]
+        seen.current_acceleration = self._way.current_acceleration
+        seen.max_velocity = [most[i] - speed[i] for i in n]
+        seen.min_velocity = [-most[i] - speed[i] for i in n]
+        seen.max_acceleration = self.limits.acceleration
         if not find_way(self._otg, seen, self.limits.jerk, self._catch_up):
             # The target is as fast as the joint may be.
             return _LOOK_AHEAD_S
@@ -207,8 +205,9 @@ class StreamController(Controller):
         return min(_LOOK_AHEAD_S, _AT_LEAST_S + _LONGER * duration)
 
     def _plan(self, position: list[float], velocity: list[float], duration_s: float | None = None) -> bool:
-        """Find the way to a position and velocity, which takes at least so long."""
+        """Plan to a position, rad, and velocity, rad/s, with a minimum duration; return whether there is a plan."""
         way = self._way
+        self._keeps_speed = any(velocity)
         way.target_position, way.target_velocity, way.minimum_duration = position, velocity, duration_s
         self._elapsed_s = 0.0
         return find_way(self._otg, way, self.limits.jerk, self._found)
@@ -219,11 +218,14 @@ class StreamController(Controller):
             return False
         if self._elapsed_s < self._found.duration:
             return True
-        limits, speed, position = self.limits, self._speed, state.commanded
+        speed, position = self._speed, state.commanded
         for i in self._joints:
-            v = speed[i]
-            stopping_distance = limits.high[i] - position[i] if v > 0.0 else position[i] - limits.low[i]
-            most = stoppable_speed(0.9 * stopping_distance, limits.acceleration[i], limits.jerk[i])
-            if not -most <= v <= most:
+            if abs(speed[i]) > self._stoppable(i, speed[i], position[i]):
                 return False
         return True
+
+    def _stoppable(self, i: int, v: float, position: float, kept_s: float = 0.0) -> float:
+        """Return the highest speed towards v, rad/s, kept for `kept_s`, that still stops inside the range."""
+        limits = self.limits
+        distance = limits.high[i] - position if v > 0.0 else position - limits.low[i]
+        return stoppable_speed(0.9 * distance, limits.acceleration[i], limits.jerk[i], kept_s)
