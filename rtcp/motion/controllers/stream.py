@@ -219,7 +219,7 @@ class StreamController(Controller):
         if self._elapsed_s < self._found.duration:
             return True
         speed, position = self._speed, state.commanded
-        for i in self._joints:
+        for i in self._joints:  # noqa: SIM110  a generator allocates in the cycle
             if abs(speed[i]) > self._stoppable(i, speed[i], position[i]):
                 return False
         return True
