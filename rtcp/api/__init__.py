@@ -11,6 +11,7 @@ from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
+    from rtcp.api.feed import Feed
 
 __all__ = [
     "Arrival",
@@ -20,6 +21,7 @@ __all__ = [
     "DriveMode",
     "EventRecord",
     "Faulted",
+    "Feed",
     "GripperRest",
     "Invalid",
     "JogFrame",
@@ -40,9 +42,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # asyncio loads slowly, and a command has no use for it.
+    # asyncio and numpy load slowly, and a command has no use for it.
     if name in ("AsyncRobot", "connect_async"):
         from rtcp.api import async_robot
 
         return getattr(async_robot, name)
+    if name == "Feed":
+        from rtcp.api.feed import Feed
+
+        return Feed
     raise AttributeError(f"module 'rtcp.api' has no attribute {name!r}")

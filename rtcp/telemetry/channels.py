@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from kinematics.model import ArmModel
 from kinematics.urdf import to_urdf
+from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import STATE_BITS, state_of
 from rtcp.ipc import layout
@@ -41,7 +42,6 @@ from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.telemetry.cdr import CdrTemplate, stamps
 
-Records = npt.NDArray[np.void]
 TF_S = 0.01
 """Between two transforms."""
 _HEADER = "std_msgs/Header header\n"

@@ -17,11 +17,9 @@ import foxglove
 import psutil
 from foxglove.websocket import ChannelView, Client, ServerListener
 
+from rtcp.api.feed import Feed
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.observer import BlackboardError
-from rtcp.ipc.session import SessionError
 from rtcp.telemetry.channels import Channels
-from rtcp.telemetry.feed import Feed
 
 _TURN_S = 0.025
 _QUEUE = 8192
@@ -54,12 +52,7 @@ class LiveView:
     """
 
     def __init__(self, directory: Path, host: str, port: int, every: int = 1) -> None:
-        try:
-            self._feed = Feed(directory)
-        except (BlackboardError, SessionError) as error:
-            raise RtcpError(
-                "not running", f"no platform runs in {directory} ({error}): start one with `rtcp start`"
-            ) from error
+        self._feed = Feed(directory)
         self._every = every
         self._subscriptions = _Subscriptions()
         context = foxglove.Context()

@@ -28,15 +28,14 @@ from typing import IO, Any, Protocol, get_args
 import foxglove
 from foxglove.mcap import MCAPWriteOptions
 
+from rtcp.api.feed import Feed, Records
 from rtcp.config.model import ArmConfig, RecordingConfig, RecordingFormat
 from rtcp.config.serialization import from_json, to_json
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PER_JOINT
-from rtcp.ipc.observer import BlackboardError
 from rtcp.ipc.recording import FIELDS, versions
-from rtcp.ipc.session import SessionError, identify
-from rtcp.telemetry.channels import Channels, Records, UnknownSignal, fields_of, urdf_of
-from rtcp.telemetry.feed import Feed
+from rtcp.ipc.session import identify
+from rtcp.telemetry.channels import Channels, UnknownSignal, fields_of, urdf_of
 
 FORMATS = get_args(RecordingFormat)
 FLUSH_S = 0.5
@@ -257,7 +256,7 @@ class Recorder:
     Raises:
         RtcpError: it cannot be recorded; reasons and fields are those of `Robot.record_start`.
         UnknownSignal: a signal that no record has.
-        BlackboardError, SessionError: no platform runs there.
+        NotRunning: no platform runs there.
     """
 
     def __init__(self, directory: Path, options: RecordingConfig) -> None:
@@ -461,8 +460,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(RtcpError("invalid", str(error), "unknown_signal", fields))
     except RtcpError as error:
         return _refuse(error)
-    except (BlackboardError, SessionError) as error:
-        return _refuse(RtcpError("refused", str(error)))
     if wanted:
         recorder.end()
     _answer({"recording": dataclasses.asdict(recorder.status)})

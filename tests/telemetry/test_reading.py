@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
+from rtcp.api.feed import Records
 from rtcp.config import default_config, load
 from rtcp.ipc.layout import PER_JOINT
 from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_type, write
-from rtcp.telemetry.channels import Channels, Records
+from rtcp.telemetry.channels import Channels
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
 

@@ -1,4 +1,4 @@
-"""What a running loop publishes, each cycle record, event and sentence once: for the recorder and the live view."""
+"""What a running loop publishes: each cycle record, event and message once, read from shared memory."""
 
 from __future__ import annotations
 
@@ -7,14 +7,20 @@ import select
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TypeAlias
 
+import numpy as np
+import numpy.typing as npt
+
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.recording import ERROR, INFORMATION, WARNING
-from rtcp.ipc.runtime_directory import blackboard_file
-from rtcp.ipc.session import read_session
-from rtcp.telemetry.channels import Records
+from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
+from rtcp.ipc.session import SessionError, read_session
 
+Records: TypeAlias = npt.NDArray[np.void]
+"""Cycle records, oldest first: a structured array with a field a signal (`docs/recording.md`)."""
 LogLine = tuple[int, str, int]
 """Instant (CLOCK_MONOTONIC, ns), text and level of `foxglove.Log`."""
 
@@ -23,25 +29,42 @@ class Feed:
     """Reads a blackboard from now on.
 
     Args:
-        directory: the runtime directory.
+        directory: the runtime directory; None: that of this process' environment.
+
+    Attributes:
+        config: what was started.
+        period_ns: of a cycle.
 
     Raises:
-        BlackboardError, SessionError: no platform runs there.
+        NotRunning: no platform runs there.
     """
 
-    def __init__(self, directory: Path) -> None:
-        self.config = read_session(directory).config
-        self._observer = Observer(blackboard_file(directory))
+    def __init__(self, directory: Path | None = None) -> None:
+        directory = runtime_directory() if directory is None else directory
+        try:
+            self.config = read_session(directory).config
+            self._observer = Observer(blackboard_file(directory))
+        except (BlackboardError, SessionError) as error:
+            raise _not_running(directory, str(error)) from error
+        self.period_ns = self._observer.period_ns
         self._loop = select.poll()
         try:
-            self._loop.register(os.pidfd_open(self._observer.loop_pid), select.POLLIN)
+            self._process = os.pidfd_open(self._observer.loop_pid)
         except OSError as error:
-            raise BlackboardError(f"the loop (process {self._observer.loop_pid}) has ended") from error
+            self._observer.close()
+            message = f"the loop (process {self._observer.loop_pid}) has ended"
+            raise _not_running(directory, message) from error
+        self._loop.register(self._process, select.POLLIN)
         self._names = Names(self.config)
         self._at, self._event = self._observer.head, self._observer.last_event
         self._texts_read_ns = time.monotonic_ns()
         self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
         self._gaps: list[LogLine] = []
+
+    def close(self) -> None:
+        """Let go of the ring."""
+        os.close(self._process)
+        self._observer.close()
 
     def ended(self, wait_s: float) -> bool:
         """Wait, and return early and true when the loop's process has ended."""
@@ -76,6 +99,10 @@ class Feed:
             self._text = text.number
             yield instant, text.sentence, WARNING if text.is_problem else INFORMATION
         self._texts_read_ns = now_ns
+
+
+def _not_running(directory: Path, why: str) -> RtcpError:
+    return RtcpError("not running", f"no platform runs in {directory} ({why}): start one with `rtcp start`")
 
 
 def _gap(what: str, first: int, last: int, count: int, monotonic_ns: int) -> LogLine:
