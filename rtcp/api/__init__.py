@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from rtcp.api.results import Arrival, EventRecord, GripperRest, Progress, RecorderStatus, Status, Streamed, Zero
+from rtcp.api.results import (
+    Arrival,
+    EventRecord,
+    GripperRest,
+    Preview,
+    Progress,
+    RecorderStatus,
+    Status,
+    Streamed,
+    Zero,
+)
 from rtcp.api.robot import Robot, connect
 from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
@@ -26,6 +36,7 @@ __all__ = [
     "Invalid",
     "JogFrame",
     "NotRunning",
+    "Preview",
     "Progress",
     "RecorderStatus",
     "Refused",

@@ -104,6 +104,19 @@ class Arrival:
 
 
 @dataclass(frozen=True)
+class Preview:
+    """The way of a motion that has not begun."""
+
+    path: tuple[Positions, ...]
+    """Configurations along it, rad, from its begin to its end."""
+    duration_s: float
+    length_m: float | None = None
+    """Length of the path of the tool along lines."""
+    slowed: float | None = None
+    """Fraction of the wanted speed that the joints' limits allow."""
+
+
+@dataclass(frozen=True)
 class Streamed:
     """The arm when a streaming command was accepted."""
 

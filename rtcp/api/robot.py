@@ -19,6 +19,7 @@ from rtcp.api.results import (
     Arrival,
     EventRecord,
     GripperRest,
+    Preview,
     Progress,
     RecorderStatus,
     Status,
@@ -270,6 +271,34 @@ class Methods:
         """
         params = {"stops": [dict(stop) for stop in stops], "speed": speed, "approach": approach}
         return Call("run_path", params, _arrival, progress)
+
+    @Method
+    def preview(
+        self,
+        q: Sequence[float] | None = None,
+        pose: Sequence[float] | None = None,
+        file: str | None = None,
+        speed: float | None = None,
+        line: bool = False,
+        synchronized: bool = True,
+        approach: bool = False,
+    ) -> Call[Preview]:
+        """Plan what `move_joints(q)`, `move_pose(pose)` or `run(file)` would do now; nothing moves, no lease is needed.
+
+        Raises:
+            Refused: what the motion would be refused with, or that its way leads through a box.
+            Invalid: not exactly one of `q`, `pose` and `file`, or one with mistakes.
+        """
+        params = {
+            "q": None if q is None else list(q),
+            "pose": None if pose is None else list(pose),
+            "file": file,
+            "speed": speed,
+            "line": line,
+            "synchronized": synchronized,
+            "approach": approach,
+        }
+        return Call("preview", params, partial(result, Preview))
 
     # -- streaming commands -------------------------------------------------------------------------------------------
 

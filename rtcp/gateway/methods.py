@@ -304,6 +304,31 @@ class Methods:
         """
         return await self._motion.run_path(caller, [Stop(pose) for pose in poses], speed, False)
 
+    @method(at_once=True)
+    async def preview(
+        self,
+        caller: Caller,
+        q: Numbers | None = None,
+        pose: Numbers | None = None,
+        file: str | None = None,
+        speed: float | None = None,
+        line: bool = False,
+        synchronized: bool = True,
+        approach: bool = False,
+    ) -> Json:
+        """Plan a motion as `move_joints`, `move_pose` or `run` would, and move nothing.
+
+        Returns `path`, configurations along it, rad, `duration_s`, and of lines `length_m` and `slowed`; refused with
+        what would refuse it, or where its way leads through a box.
+        """
+        if (q is not None) + (pose is not None) + (file is not None) != 1:
+            raise RtcpError("invalid", "found none or several of q, pose and file, allowed is one of them")
+        if file is not None:
+            return await self._motion.preview_file(file, approach)
+        if pose is not None:
+            return await self._motion.preview_pose(pose, speed, line)
+        return await self._motion.preview(q, (), (), speed, synchronized)
+
     @method()
     async def run(self, caller: Caller, file: str, approach: bool = False) -> Json:
         """Run a motion file (`docs/motion.md`), an absolute path. `approach`: the joints first move to its start."""

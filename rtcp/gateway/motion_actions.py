@@ -19,9 +19,12 @@ from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PlanTooLong
+from rtcp.ipc.refusals import NoTrajectory, PositionOutOfRange, Refusal, SpeedOutOfRange
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.guards.zones import Zones
+from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
+from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Plan, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
@@ -99,6 +102,33 @@ class Planner:
             return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
+
+    def joint_move(
+        self, q: Sequence[float], q_now: Sequence[float], speed: float | None, synchronized: bool
+    ) -> tuple[preview.Path, float] | Refusal:
+        """Return the way of a joint move and its duration, s; or what the loop would refuse it with.
+
+        Raises:
+            RtcpError: `refused`: its way leads through a box, where a guard would stop it.
+        """
+        low, high, fastest = self.limits.low, self.limits.high, max(self.limits.velocity)
+        if speed is not None and not 0.0 < speed <= fastest:
+            return SpeedOutOfRange(speed, fastest)
+        for axis, wanted in enumerate(q):
+            if not low[axis] <= wanted <= high[axis]:
+                return PositionOutOfRange(axis, wanted, high[axis] if wanted > high[axis] else low[axis])
+        found = preview.joint_move(self.limits, q_now, q, fastest if speed is None else speed, synchronized)
+        if found is None:
+            return NoTrajectory(fastest if speed is None else speed, LONGEST_S)
+        for at, row in enumerate(found[0]):
+            if box := self._zone_at(row):
+                where = "at its end" if row == found[0][-1] else f"after {found[1] * at / len(found[0]):.1f} s"
+                raise RtcpError("refused", f"the move leads through {box} ({where}): choose another target or way")
+        return found
+
+    def way(self, plan: Plan, q_now: Sequence[float]) -> preview.Path:
+        """Return the joints along a plan."""
+        return preview.planned(plan, q_now, self._config.arm)
 
     @staticmethod
     def read(path: str) -> tuple[tuple[Point, ...], tuple[Stop, ...], float | None]:
@@ -178,6 +208,62 @@ class MotionActions:
                     return arrival
             plan = await asyncio.to_thread(self._planner.lines, stops, self._start(), speed)
             return await self._run_plan(lease, RunLines, plan, self._write(plan), "the path")
+
+    async def preview(
+        self,
+        q: Sequence[float] | None,
+        stops: Sequence[Stop],
+        points: Sequence[Point],
+        speed: float | None,
+        synchronized: bool,
+    ) -> Json:
+        """Return the way of a motion to `q`, along lines, or of a trajectory, that would begin now."""
+        here = self._start()
+        if q is not None:
+            if len(q) != self._count:
+                raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
+            found = await asyncio.to_thread(self._planner.joint_move, q, here, speed, synchronized)
+            if isinstance(found, Refusal):
+                raise self._channel.error("refused", found)
+            path, duration_s = found
+            return {"path": path, "duration_s": duration_s, "length_m": None, "slowed": None}
+
+        def plan() -> tuple[Plan, preview.Path]:
+            made = self._planner.lines(stops, here, speed) if stops else self._planner.trajectory(points, here)
+            return made, self._planner.way(made, here)
+
+        made, path = await asyncio.to_thread(plan)
+        return {"path": path, "duration_s": made.duration_s, "length_m": made.length_m, "slowed": made.slowed}
+
+    async def preview_pose(self, pose: Sequence[float], speed: float | None, line: bool) -> Json:
+        """Return the way of the tool to a pose: on a straight line, or by the joints."""
+        if line or self._channel.control_mode is ControlMode.CARTESIAN:
+            return await self.preview(None, [Stop(tuple(pose))], (), speed, True)
+        q = await asyncio.to_thread(self._planner.joints_at, pose, self._start())
+        return await self.preview(q, (), (), speed, True)
+
+    async def preview_file(self, file: str, approach: bool) -> Json:
+        """Return the way of a motion file; with `approach` it begins at its first point."""
+        points, stops, speed = await asyncio.to_thread(self._planner.read, file)
+        if not approach:
+            return await self.preview(None, stops, points, speed, True)
+        first = points[0].q if points else stops[0].q
+        if first is None:
+            first = tuple(await asyncio.to_thread(self._planner.joints_at, stops[0].pose or (), self._start()))
+        way = await self.preview(first, (), (), None, True)
+        rest = stops[1:]
+
+        def plan() -> tuple[Plan | None, preview.Path]:
+            if not (points or rest):
+                return None, []
+            made = self._planner.lines(rest, first, speed) if stops else self._planner.trajectory(points, first)
+            return made, self._planner.way(made, first)
+
+        made, path = await asyncio.to_thread(plan)
+        if made is None:
+            return way
+        duration_s = way["duration_s"] + made.duration_s
+        return {"path": way["path"] + path, "duration_s": duration_s, "length_m": made.length_m, "slowed": made.slowed}
 
     async def run_command(self, caller: Caller, command: MotionCommand) -> Json:
         """Send a motion command that needs no planning here; return when the arm holds again."""

@@ -172,6 +172,16 @@ class JointMotion:
         self._begin(Phase.MOVE)
         return True
 
+    @property
+    def planned_duration_s(self) -> float:
+        """Duration of the last move, s."""
+        return float(self._plan.duration)
+
+    def planned_position(self, time_s: float) -> tuple[float, ...]:
+        """Return where the last move has the joints at a time since its begin; outside the cycle."""
+        position, _, _ = self._plan.at_time(time_s)
+        return tuple(position)
+
     def stop(self, state: ArmState) -> None:
         """Come to rest under the acceleration and jerk limits; at rest, end a move that has not begun."""
         if self.phase is Phase.STOP:

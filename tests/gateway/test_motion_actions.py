@@ -220,3 +220,41 @@ def test_a_motion_that_another_command_ends_is_refused(arm: FakePlatform) -> Non
     arm.loop.ends_in = State.READY
     error = arm.error("move_joints", q=THERE)
     assert (error.kind, str(error)) == ("refused", "the move was ended by another command: the machine is ready")
+
+
+# -- previews -------------------------------------------------------------------------------------------------------
+
+
+def test_a_preview_of_a_joint_move_leads_from_here_to_there_and_sends_nothing(arm: FakePlatform) -> None:
+    found = arm.ask("preview", q=THERE, speed=0.1)
+    assert found["path"][0] == pytest.approx(BENT)
+    assert found["path"][-1] == pytest.approx(THERE)
+    assert found["duration_s"] > 2.0
+    assert arm.loop.commands == []
+
+
+def test_a_preview_of_a_line_keeps_the_tool_on_it(arm: FakePlatform) -> None:
+    found = arm.ask("preview", pose=beside(arm, 0.1), line=True)
+    x, _, z, *_ = tool(arm, BENT)
+    for q in found["path"]:
+        assert tool(arm, q)[0] == pytest.approx(x, abs=1e-6)
+        assert tool(arm, q)[2] == pytest.approx(z, abs=1e-6)
+    assert tool(arm, found["path"][-1]) == pytest.approx(beside(arm, 0.1), abs=1e-6)
+
+
+def test_a_preview_of_a_file_passes_its_points(arm: FakePlatform, tmp_path: Path) -> None:
+    middle = [0.1, *BENT[1:]]
+    file = tmp_path / "motion.yaml"
+    points = "".join(f"  - {{t: {t}, q: {q}}}\n" for t, q in enumerate((BENT, middle, THERE)))
+    file.write_text(f"trajectory:\n{points}")
+    for approach in (False, True):
+        found = arm.ask("preview", file=str(file), approach=approach)
+        assert min(max(map(abs, (a - b for a, b in zip(q, middle, strict=True)))) for q in found["path"]) < 1e-2
+        assert found["path"][-1] == pytest.approx(THERE)
+
+
+def test_a_preview_is_refused_with_what_would_refuse_the_move(arm: FakePlatform) -> None:
+    error = arm.error("preview", q=[9.0, *BENT[1:]])
+    assert (error.reason, error.fields["axis"]) == ("position_out_of_range", 0)
+    assert arm.error("preview", q=THERE, speed=9.0).reason == "speed_out_of_range"
+    assert "cannot be reached" in str(arm.error("preview", pose=[5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
