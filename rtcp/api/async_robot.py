@@ -71,6 +71,11 @@ class AsyncRobot(Methods):
             with contextlib.suppress(ConnectionError):
                 await self._writer.wait_closed()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection stands."""
+        return self._writer is not None and not self._writer.is_closing()
+
     async def state(self) -> State:
         """Return the state of the machine now."""
         return (await self.status()).state

@@ -22,6 +22,7 @@ from rtcp.cli import (
     jog,
     live,
     motion,
+    panel,
     platform,
     record,
     recorded,
@@ -64,7 +65,7 @@ def _root(
 
 _GROUPS = (
     platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults, record, recorded, live,
-    experiment,
+    experiment, panel,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)

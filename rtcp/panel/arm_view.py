@@ -1,0 +1,95 @@
+"""The arm in space, as an element of a page: what its URDF draws, and the boxes of its configuration."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import nicegui
+from nicegui.element import Element
+
+from kinematics.urdf import to_urdf
+from rtcp.config.model import ArmConfig
+
+_THREE = Path(nicegui.__file__).parent / "elements" / "scene" / "dist"
+Json = dict[str, Any]
+
+
+class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str(_THREE)}):
+    """The arm, live; `preview` shows a ghost.
+
+    Args:
+        config: the arm; its geometry must be known.
+    """
+
+    def __init__(self, config: ArmConfig) -> None:
+        super().__init__()
+        assert config.arm is not None
+        self._props["links"] = links(to_urdf(config.arm))
+        cartesian = config.cartesian
+        boxes = [] if cartesian.box is None else [_box(cartesian.box, False)]
+        self._props["boxes"] = boxes + [_box(box, True) for box in cartesian.keep_out]
+
+    def preview(self, path: list[list[float]], duration_s: float) -> None:
+        """Move a ghost along joint positions, rad; none: remove it."""
+        self.run_method("preview", path, duration_s)
+
+
+def _box(box: Any, keep_out: bool) -> Json:
+    return {"min": list(box.min), "max": list(box.max), "keep_out": keep_out}
+
+
+def links(urdf: str) -> list[Json]:
+    """Return the links of a URDF document, each after its parent: its place in that, its joint's number and solids."""
+    robot = ET.fromstring(urdf)
+    joints = {_attribute(joint.find("child"), "link"): joint for joint in robot.iter("joint")}
+    numbers = {
+        name: at for at, name in enumerate(one for one, joint in joints.items() if joint.get("type") == "revolute")
+    }
+    found = []
+    for link in robot.iter("link"):
+        name = link.get("name", "")
+        joint = joints.get(name)
+        axis = None if joint is None else joint.find("axis")
+        found.append(
+            {
+                "name": name,
+                "parent": "" if joint is None else _attribute(joint.find("parent"), "link"),
+                **_origin(joint),
+                "joint": numbers.get(name, -1),
+                "axis": [1.0, 0.0, 0.0] if axis is None else _numbers(axis.get("xyz", "1 0 0")),
+                "visuals": [_visual(one) for one in link.iter("visual")],
+            }
+        )
+    return found
+
+
+def _visual(visual: ET.Element) -> Json:
+    solid = next(iter(visual.find("geometry") or []))
+    size = {
+        "cylinder": lambda: [float(solid.get("radius", 0)), float(solid.get("length", 0))],
+        "sphere": lambda: [float(solid.get("radius", 0))],
+        "box": lambda: _numbers(solid.get("size", "0 0 0")),
+    }[solid.tag]()
+    return {
+        **_origin(visual),
+        "kind": solid.tag,
+        "size": size,
+        "drawn": _attribute(visual.find("material"), "name") == "grey",
+    }
+
+
+def _origin(parent: ET.Element | None) -> Json:
+    origin = None if parent is None else parent.find("origin")
+    if origin is None:
+        return {"xyz": [0.0] * 3, "rpy": [0.0] * 3}
+    return {"xyz": _numbers(origin.get("xyz", "0 0 0")), "rpy": _numbers(origin.get("rpy", "0 0 0"))}
+
+
+def _attribute(element: ET.Element | None, name: str) -> str:
+    return "" if element is None else element.get(name, "")
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(one) for one in text.split()]

@@ -1,0 +1,392 @@
+"""What goes to and fro all the time: the state to every page at 20 Hz, and what the operator's hand does.
+
+Each message to a page carries a token: the instant at which it left. The page answers with the token of the newest
+message that it has dealt with. What the operator does counts from that instant, on this machine's clock: however long
+the network, the browser or a queue has kept an answer, it is known how old it may be. That bounds three things:
+
+- a jog command holds until `JOG_S` after its token, and the next one of the same press comes before that or never;
+- a motion goes on while answers come from a visible page with a token not older than `PRESENCE_S`;
+- whoever closes the page has gone at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from kinematics.forward import forward
+from kinematics.jacobian import singularity_distances
+from rtcp.api import AsyncRobot, Feed, RtcpError, Status
+from rtcp.config.model import ArmConfig
+from rtcp.panel.access import Visitor
+
+T = TypeVar("T")
+Json = dict[str, Any]
+
+STATE_S = 0.05
+"""Between two messages to a page."""
+JOG_S = 0.25
+"""A jog ends so long after the last sign of the operator's hand."""
+LEAST_HOLD_S = 0.08
+"""A jog command that would hold for less is refused: the way to the browser and back takes too long."""
+PRESENCE_S = 1.0
+"""A motion ends so long after the last sign of its operator."""
+TAKE_OVER_S = 10.0
+"""An operator who does not answer loses the arm to the one who asks."""
+_RETRY_S = 0.5
+_JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
+log = logging.getLogger("rtcp.panel")
+
+
+class TookOver(Exception):
+    """Another page has the arm; `holder` names it."""
+
+    def __init__(self, holder: str) -> None:
+        super().__init__(f"{holder} operates the arm")
+        self.holder = holder
+
+
+@dataclass(eq=False)
+class Page:
+    """One open page: a tab of somebody's browser."""
+
+    key: str
+    visitor: Visitor
+    socket: WebSocket | None = None
+    sent_ns: int = 0
+    """Token of the last message to it."""
+    seen_ns: int = 0
+    """Newest token that it has answered with while it was visible."""
+    notes: list[str] = field(default_factory=list)
+    """For its next message."""
+    press: int = 0
+    """Number of the press that jogs."""
+    ended: int = 0
+    """Newest press that has ended: what still comes of it moves nothing."""
+    jogged_ns: int = 0
+    """When the jog of that press ends."""
+    sending: asyncio.Task[None] | None = None
+    notify: Callable[[str], None] = lambda message: None
+    asked: Callable[[str, asyncio.Future[bool]], None] = lambda who, answer: answer.set_result(True)
+    """Asks the person whether another may take over."""
+
+    def __str__(self) -> str:
+        return str(self.visitor)
+
+    def age_s(self, now_ns: int) -> float:
+        """Return for how long nothing is known of whoever looks at it, s."""
+        return (now_ns - self.seen_ns) * 1e-9 if self.socket is not None else math.inf
+
+
+class Operator:
+    """The one page that may move the arm, with a connection of its own: closing that stops what it moves."""
+
+    def __init__(self, page: Page) -> None:
+        self.page = page
+        self._robot: AsyncRobot | None = None
+        self._motions: set[asyncio.Task[Any]] = set()
+        self._wanted: tuple[Sequence[float], str, int] | None = None
+        self._jogging: asyncio.Task[None] | None = None
+
+    async def robot(self) -> AsyncRobot:
+        """Return the connection, made anew where it was lost."""
+        if self._robot is None or not self._robot.is_open:
+            made = AsyncRobot(f"panel: {self.page}")
+            await made.__aenter__()
+            self._robot = made
+        return self._robot
+
+    @property
+    def moves(self) -> bool:
+        """Whether something of this page's may move the arm."""
+        return bool(self._motions)
+
+    async def run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
+        """Carry out a command; leaving, or `end`, ends its motion."""
+        robot = await self.robot()
+        task = asyncio.ensure_future(command(robot))
+        self._motions.add(task)
+        try:
+            return await task
+        finally:
+            self._motions.discard(task)
+
+    def jog(self, velocity: Sequence[float], frame: str, token_ns: int) -> None:
+        """Move with a velocity until `JOG_S` after `token_ns`; only the newest command waits for its turn."""
+        self._wanted = (velocity, frame, token_ns)
+        if self._jogging is None or self._jogging.done():
+            self._jogging = asyncio.create_task(self._jog())
+
+    async def _jog(self) -> None:
+        while self._wanted is not None:
+            (velocity, frame, token_ns), self._wanted = self._wanted, None
+            hold_s = JOG_S - (time.monotonic_ns() - token_ns) * 1e-9
+            if hold_s <= 0.0:
+                continue
+            try:
+                robot = await self.robot()
+                await robot.jog(velocity, frame, hold_s, token_ns * 1e-9)
+            except RtcpError as error:
+                self.page.notes.append(error.message)
+                self.page.ended = self.page.press
+
+    async def end(self) -> None:
+        """Close the connection: what it moves comes to a controlled stop."""
+        self._wanted = None
+        robot, self._robot = self._robot, None
+        if robot is not None:
+            await robot.close()
+
+
+class Live:
+    """Follows the platform and serves the pages."""
+
+    def __init__(self) -> None:
+        self.status: Status | None = None
+        """Newest; None: no platform runs."""
+        self.problem = "no platform has been looked for yet"
+        """Why there is no status."""
+        self.config: ArmConfig | None = None
+        self.feed: Feed | None = None
+        self.pages: dict[str, Page] = {}
+        self.operator: Operator | None = None
+        self.sent_messages = 0
+        self._viewing: AsyncRobot | None = None
+        self._retry_at = 0.0
+        self._halting: asyncio.Task[None] | None = None
+
+    # -- pages --------------------------------------------------------------------------------------------------------
+
+    def open(self, key: str, visitor: Visitor) -> Page:
+        """Return a page that is being made."""
+        page = self.pages[key] = Page(key, visitor)
+        return page
+
+    def close(self, page: Page) -> None:
+        """A page has gone for good."""
+        self.pages.pop(page.key, None)
+
+    async def serve(self, socket: WebSocket, visitor: Visitor) -> None:
+        """Serve the socket of one page until it closes."""
+        page = self.pages.get(socket.query_params.get("page", ""))
+        if page is None or page.visitor is not visitor:
+            await socket.close(1008, "no such page")
+            return
+        await socket.accept()
+        page.socket = socket
+        try:
+            while True:
+                self._receive(page, await socket.receive_json())
+        except (WebSocketDisconnect, ValueError, KeyError, TypeError, RuntimeError):
+            with contextlib.suppress(RuntimeError):
+                await socket.close()
+        finally:
+            if page.socket is socket:
+                page.socket = None
+                await self.leave(page)
+
+    def _receive(self, page: Page, given: Json) -> None:
+        token_ns = given["seen"]
+        if type(token_ns) is not int or not 0 <= token_ns <= page.sent_ns:
+            raise ValueError("a token that was never sent")
+        if given.get("visible") is True:
+            page.seen_ns = max(page.seen_ns, token_ns)
+        if given.get("stop"):
+            self._halting = asyncio.create_task(self.halt())
+        elif "jog" in given:
+            self._jog(page, given, token_ns)
+
+    def _jog(self, page: Page, given: Json, token_ns: int) -> None:
+        if page.visitor.role != "operator":
+            return
+        press, velocity, frame = given["press"], given["jog"], given["frame"]
+        if type(press) is not int or frame not in ("base", "tool", "joints") or len(velocity) > 16:
+            raise ValueError("jog")
+        velocity = [float(one) for one in velocity]
+        if press <= page.ended:
+            return
+        now_ns = time.monotonic_ns()
+        age_s = (now_ns - token_ns) * 1e-9
+        if press == page.press and now_ns > page.jogged_ns:
+            # It has stopped already: going on would be a start that nobody expects.
+            self._end_press(page, press, "the jog has ended, nothing was heard for a while: release, then press again")
+        elif JOG_S - age_s < LEAST_HOLD_S:
+            allowed = f"allowed are {JOG_S - LEAST_HOLD_S:g} s"
+            self._end_press(page, press, f"no jog: to this browser and back it takes {age_s:.2f} s, {allowed}")
+        elif press == page.press or any(velocity):
+            try:
+                operator = self.claim(page)
+            except (TookOver, RtcpError) as error:
+                self._end_press(page, press, str(error))
+                return
+            page.press, page.jogged_ns = press, token_ns + int(JOG_S * 1e9)
+            operator.jog(velocity, frame, token_ns)
+
+    @staticmethod
+    def _end_press(page: Page, press: int, why: str) -> None:
+        page.ended = press
+        page.notes.append(why)
+
+    # -- who operates -------------------------------------------------------------------------------------------------
+
+    def claim(self, page: Page) -> Operator:
+        """Make a page the operator's, where nobody else is.
+
+        Raises:
+            TookOver: another page has the arm.
+            Refused: the visitor may only look.
+        """
+        if page.visitor.role != "operator":
+            raise RtcpError("refused", f"{page.visitor.name} may look, and not command: log in as an operator")
+        if self.operator is None:
+            self.operator = Operator(page)
+        elif self.operator.page is not page:
+            raise TookOver(str(self.operator.page))
+        return self.operator
+
+    async def take_over(self, page: Page) -> bool:
+        """Ask the operator for the arm; return whether `page` has it now. What moves is stopped first."""
+        held = self.operator
+        if held is not None and held.page is not page:
+            answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
+            held.page.asked(str(page), answer)
+            try:
+                if not await asyncio.wait_for(answer, TAKE_OVER_S):
+                    return False
+            except asyncio.TimeoutError:
+                pass
+            held.page.notify(f"{page} has taken over the arm")
+            if self.operator is held:
+                await self.leave(held.page)
+        self.claim(page)
+        return True
+
+    async def leave(self, page: Page) -> None:
+        """Take the arm from a page; what it moves stops."""
+        if self.operator is not None and self.operator.page is page:
+            operator, self.operator = self.operator, None
+            await operator.end()
+
+    async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
+        """Carry out a command of a page; raises RtcpError, TookOver."""
+        operator = self.claim(page)
+        return await operator.run(command)
+
+    async def halt(self) -> None:
+        """Stop every motion, whoever asks."""
+        with contextlib.suppress(RtcpError):
+            async with AsyncRobot("panel: stop") as robot:
+                await robot.halt()
+
+    async def view(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
+        """Ask something that commands nothing.
+
+        Raises:
+            NotRunning: no platform runs.
+        """
+        if self._viewing is None:
+            raise RtcpError("not running", self.problem)
+        return await query(self._viewing)
+
+    # -- the platform -------------------------------------------------------------------------------------------------
+
+    async def follow(self) -> None:
+        """Follow the platform for as long as the panel runs."""
+        due = time.monotonic()
+        while True:
+            await self._look()
+            await self._watch_operator()
+            self._send_all()
+            due = max(due + STATE_S, time.monotonic() - STATE_S)
+            await asyncio.sleep(max(0.0, due - time.monotonic()))
+
+    async def _look(self) -> None:
+        try:
+            if self._viewing is None or not self._viewing.is_open:
+                if time.monotonic() < self._retry_at:
+                    return
+                self._retry_at = time.monotonic() + _RETRY_S
+                made = AsyncRobot("panel: view")
+                await made.__aenter__()
+                self._viewing = made
+                self.feed = Feed()
+                self.config = self.feed.config
+            self.status = await asyncio.wait_for(self._viewing.status(), 2.0)
+        except (RtcpError, OSError, asyncio.TimeoutError) as error:
+            self.problem = str(error) or "the platform does not answer"
+            await self._lost()
+
+    async def _lost(self) -> None:
+        self.status = None
+        robot, self._viewing = self._viewing, None
+        feed, self.feed = self.feed, None
+        if feed is not None:
+            feed.close()
+        if robot is not None:
+            await robot.close()
+
+    async def _watch_operator(self) -> None:
+        operator = self.operator
+        if operator is None or not operator.moves:
+            return
+        age_s = operator.page.age_s(time.monotonic_ns())
+        if age_s > PRESENCE_S:
+            operator.page.notes.append(f"the motion was ended: nothing was heard of this page for {age_s:.1f} s")
+            log.warning("nothing heard of %s for %.1f s: its motion is ended", operator.page, age_s)
+            await operator.end()
+
+    # -- messages -----------------------------------------------------------------------------------------------------
+
+    def _send_all(self) -> None:
+        if not any(page.socket for page in self.pages.values()):
+            return
+        state = self.state()
+        for page in list(self.pages.values()):
+            # One that does not take its messages gets the newest when it does.
+            if page.socket is not None and (page.sending is None or page.sending.done()):
+                page.sending = asyncio.create_task(self._send(page, page.socket, state))
+
+    async def _send(self, page: Page, socket: WebSocket, state: Json) -> None:
+        page.sent_ns = time.monotonic_ns()
+        notes, page.notes = page.notes, []
+        operator = self.operator
+        mine = operator is not None and operator.page is page
+        who = "" if operator is None else str(operator.page)
+        with contextlib.suppress(Exception):  # it has gone: its receiver sees that too
+            await socket.send_json({"token": page.sent_ns, **state, "operator": who, "mine": mine, "notes": notes})
+            self.sent_messages += 1
+
+    def state(self) -> Json:
+        """Return what every page shows, SI units."""
+        if self.status is None:
+            return {"state": "off", "message": self.problem}
+        raw = self.status.raw
+        joints = raw["joints"]
+        shown: Json = {
+            "state": raw["state"],
+            "message": raw["message"],
+            "drive_mode": raw["drive_mode"],
+            "control_mode": raw["control_mode"],
+            "holder": raw["lease"]["holder"],
+            "bus": raw["bus"],
+            "joints": {name: [round(one, 5) for one in joints[name]] for name in _JOINTS if name in joints},
+            "statuswords": raw["statuswords"],
+            "wkc": raw["wkc"],
+            "missed": raw["missed"],
+            "cycles": raw["cycles"],
+        }
+        if self.config is not None and self.config.arm is not None:
+            q = joints["actual_position"]
+            pose = forward(self.config.arm, q)
+            distances = singularity_distances(self.config.arm, q)
+            shown["tool"] = [round(one, 5) for one in (*pose.position, *pose.rpy)]
+            shown["singular"] = [None if one is None else round(one, 4) for one in distances]
+        return shown

@@ -1,0 +1,239 @@
+"""What every page is built of: native HTML controls with labels, and commands whose refusals are shown."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from nicegui import Client, ui
+from nicegui.element import Element
+from nicegui.elements.mixins.text_element import TextElement
+
+from rtcp.api import AsyncRobot, RtcpError
+from rtcp.panel.arm_view import ArmView
+from rtcp.panel.live import TAKE_OVER_S, Live, Page, TookOver
+
+T = TypeVar("T")
+Handler = Callable[[], Awaitable[object] | object]
+ENABLED = "holding moving stopping"
+"""States with torque, as `data-when` of a control has them."""
+
+
+class Field:
+    """A control with a label; `value` is what it shows."""
+
+    def __init__(self, tag: str, label: str, value: str, **attributes: str) -> None:
+        with ui.element("div").classes("field"):
+            self._label = text("label", label)
+            self.control = ui.element(tag)
+        self._label.props["for"] = self.control.html_id
+        self.control.props.update(attributes)
+        self.control.props["value"] = value
+        self.control.on("input", self._changed, js_handler="(event) => emit(event.target.value)")
+        self._value = value
+        self._on_change: list[Handler] = []
+
+    def _changed(self, event: Any) -> None:
+        self._value = str(event.args)  # the browser shows it already
+        for one in self._on_change:
+            one()
+
+    def on_change(self, handler: Handler) -> None:
+        """Call `handler` when the person has changed it."""
+        self._on_change.append(handler)
+
+    @property
+    def value(self) -> str:
+        """What it shows."""
+        return self._value
+
+    @value.setter
+    def value(self, value: str) -> None:
+        self._value = value
+        # Not by its properties: those are only written where they change, and what was typed is none of them.
+        self.control.client.run_javascript(
+            f"document.getElementById('{self.control.html_id}').value = {json.dumps(value)}"
+        )
+
+    def number(self) -> float:
+        """Return its number.
+
+        Raises:
+            Invalid: it is none.
+        """
+        try:
+            return float(self._value)
+        except ValueError:
+            name = self._label.text
+            raise RtcpError("invalid", f'{name}: found the text "{self._value}", allowed is a number') from None
+
+
+def field(label: str, value: str = "", **attributes: str) -> Field:
+    """Return a line of text."""
+    return Field("input", label, value, type="text", autocomplete="off", spellcheck="false", **attributes)
+
+
+def number(label: str, value: str = "", **attributes: str) -> Field:
+    """Return a field for a number; `step` any."""
+    return Field("input", label, value, **{"type": "number", "step": "any", "inputmode": "decimal", **attributes})
+
+
+def choice(label: str, options: Iterable[str] | Mapping[str, str], value: str) -> Field:
+    """Return a field with options: values, or values and what is shown."""
+    made = Field("select", label, value)
+    shown = options if isinstance(options, Mapping) else {one: one for one in options}
+    with made.control:
+        for key, name in shown.items():
+            option = text("option", name)
+            option.props["value"] = key
+            option.props["selected"] = key == value
+    return made
+
+
+def text(tag: str, content: str, classes: str = "", **attributes: str) -> TextElement:
+    """Return an element with text, which is never read as HTML."""
+    made = TextElement(tag=tag, text=content)
+    made.props.update(attributes)
+    return made.classes(classes) if classes else made
+
+
+def shown(name: str, digits: int | None = None, tag: str = "td") -> Element:
+    """Return a place for a value of the live state (`Live.state`): `message`, `actual_position.2`."""
+    made = ui.element(tag)
+    made.props["data-live"] = name
+    if digits is not None:
+        made.props["data-digits"] = str(digits)
+    return made
+
+
+def button(label: str, handler: Handler | None = None, *, when: str = "", plain: bool = False) -> TextElement:
+    """Return a button; `when`: the states of the machine in which it can be used."""
+    made = text("button", label, "act plain" if plain else "act", type="button")
+    if when:
+        made.props["data-when"] = when
+    if handler is not None:
+        made.on("click", lambda: handler())  # noqa: PLW0108  without the event
+    return made
+
+
+def table(headings: Sequence[str], caption: str) -> Element:
+    """Return the body of a new table, which the caller fills with rows."""
+    with ui.element("div").classes("wide").props("tabindex=0 role=region").props(add="") as region:
+        region.props["aria-label"] = caption
+        with ui.element("table").classes("figures"):
+            text("caption", caption, "visually-hidden")
+            with ui.element("thead"), ui.element("tr"):
+                for heading in headings:
+                    text("th", heading, scope="col")
+            return ui.element("tbody")
+
+
+def row(body: Element, first: str, *cells: str) -> None:
+    """Add a row of text; its first cell is its heading."""
+    with body, ui.element("tr"):
+        text("th", first, scope="row")
+        for cell in cells:
+            text("td", cell, "text" if len(cell) > 24 else "")
+
+
+class View:
+    """One open page of the panel, to the functions that build it."""
+
+    def __init__(self, live: Live, page: Page, client: Client) -> None:
+        self.live = live
+        self.page = page
+        self.arm: ArmView | None = None
+        self._client = client
+        page.notify, page.asked = self.warn, self._ask
+
+    def say(self, message: str) -> None:
+        """Show that something went well."""
+        with self._client:
+            ui.notify(message, type="positive", timeout=3000)
+
+    def warn(self, message: str) -> None:
+        """Show that something did not."""
+        with self._client:
+            ui.notify(message, type="negative", timeout=10_000, close_button="Close", multi_line=True)
+
+    async def act(self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "") -> T | None:
+        """Carry out a command; show what becomes of it."""
+        try:
+            found = await self.live.command(self.page, command)
+        except TookOver as held:
+            self._offer_to_take_over(held.holder)
+            return None
+        except (RtcpError, OSError) as error:
+            self.warn(str(error))
+            return None
+        if done:
+            self.say(done)
+        return found
+
+    async def ask(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T | None:
+        """Ask the platform something that commands nothing."""
+        try:
+            return await self.live.view(query)
+        except RtcpError as error:
+            self.warn(error.message)
+            return None
+
+    async def operates(self) -> bool:
+        """Return whether this page has the arm now; else it says why not."""
+        try:
+            self.live.claim(self.page)
+        except TookOver as held:
+            self._offer_to_take_over(held.holder)
+            return False
+        except RtcpError as error:
+            self.warn(error.message)
+            return False
+        return True
+
+    async def rtcp(self, *arguments: str, show: Callable[[str], None] | None = None) -> tuple[int, str]:
+        """Run the command `rtcp`; return its exit code and output; `show` gets each line."""
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "rtcp.cli", *arguments,
+            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+        )  # fmt: skip
+        assert process.stdout is not None
+        lines = []
+        async for line in process.stdout:
+            lines.append(line.decode(errors="replace").rstrip())
+            if show is not None:
+                show(lines[-1])
+        return await process.wait(), "\n".join(lines)
+
+    def _offer_to_take_over(self, holder: str) -> None:
+        async def take() -> None:
+            dialog.close()
+            self.say(f"{holder} is asked; without an answer the arm is yours in {TAKE_OVER_S:g} s")
+            if await self.live.take_over(self.page):
+                self.say("You operate the arm")
+            else:
+                self.warn(f"{holder} keeps the arm")
+
+        with self._client, ui.dialog() as dialog, ui.card():
+            text("h2", f"{holder} operates the arm")
+            text("p", "Whoever takes over stops what moves.")
+            with ui.element("div").classes("buttons"):
+                button("Ask to take over", take)
+                button("Leave it", dialog.close, plain=True)
+        dialog.open()
+
+    def _ask(self, who: str, answer: asyncio.Future[bool]) -> None:
+        def give(value: bool) -> None:
+            dialog.close()
+            if not answer.done():
+                answer.set_result(value)
+
+        with self._client, ui.dialog() as dialog, ui.card():
+            text("h2", f"{who} asks for the arm")
+            text("p", f"Without an answer it changes hands in {TAKE_OVER_S:g} s. What moves is stopped first.")
+            with ui.element("div").classes("buttons"):
+                button("Give it", lambda: give(True))
+                button("Keep it", lambda: give(False), plain=True)
+        dialog.open()

@@ -1,0 +1,63 @@
+"""Arm: every joint's figures, with its limits as bars."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from rtcp.config.model import ArmConfig
+from rtcp.panel.page import View, shown, table, text
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Arm")
+    config = view.live.config
+    if config is None:
+        text("p", "No platform runs: start one on the page Start.")
+        return
+    with ui.element("p"):
+        text("span", "Mode ")
+        shown("control_mode", tag="b")
+        text("span", ", drives in ")
+        shown("drive_mode", tag="b")
+        text("span", ", bus ")
+        shown("bus", tag="b")
+    _joints(config)
+    text("h2", "Tool")
+    with table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool"), ui.element("tr"):
+        text("th", "pose", scope="row")
+        for at in range(6):
+            shown(f"tool.{at}", 4)
+    text("h2", "Distance from the singularities")
+    with (
+        table(
+            ("", "shoulder m", "elbow rad", "wrist rad", "smallest singular value"), "Distances from the singularities"
+        ),
+        ui.element("tr"),
+    ):
+        text("th", "distance", scope="row")
+        for at in range(4):
+            shown(f"singular.{at}", 3)
+
+
+def _joints(config: ArmConfig) -> None:
+    headings = ("Joint", "Drive", "rad", "Position", "rad/s", "Velocity", "Nm", "Torque", "Following error rad")
+    with table(headings, "Joints"):
+        for at, joint in enumerate(config.joints):
+            with ui.element("tr"):
+                text("th", joint.name, scope="row")
+                shown(f"drive.{at}").classes("text")
+                shown(f"actual_position.{at}", 4)
+                _bar(f"actual_position.{at}", joint.position.min, joint.position.max, "rad")
+                shown(f"actual_velocity.{at}", 3)
+                _bar(f"actual_velocity.{at}", -joint.velocity, joint.velocity, "rad/s")
+                shown(f"actual_torque.{at}", 2)
+                _bar(f"actual_torque.{at}", -joint.torque, joint.torque, "Nm")
+                shown(f"error.{at}", 5)
+
+
+def _bar(name: str, low: float, high: float, unit: str) -> None:
+    with ui.element("td"):
+        bar = ui.element("div").classes("bar")
+        bar.props["title"] = f"{low:g} to {high:g} {unit}"
+        bar.props.update({"data-bar": name, "data-low": str(low), "data-high": str(high)})

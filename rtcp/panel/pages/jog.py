@@ -1,0 +1,103 @@
+"""Jog: pads, keys and a gamepad, held to move."""
+
+from __future__ import annotations
+
+from nicegui import ui
+
+from rtcp.panel.page import ENABLED, View, button, choice, number, shown, table, text
+
+FRAMES = {"base": "Base frame", "tool": "Tool frame", "joints": "Joints"}
+_PADS = {
+    "X and Y": ("x+ Forward, +X", "y+ Left, +Y", "y- Right, -Y", "x- Back, -X"),
+    "Z and yaw": ("z+ Up, +Z", "rz+ Yaw +", "rz- Yaw -", "z- Down, -Z"),
+    "Roll and pitch": ("ry+ Pitch +", "rx+ Roll +", "rx- Roll -", "ry- Pitch -"),
+}
+"""Name -> part of the speed and label of the upper, left, right and lower button, as on the source's stick."""
+_PLACES = ("1 / 2", "2 / 1", "2 / 3", "3 / 2")
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Jog")
+    config = view.live.config
+    if config is None:
+        text("p", "No platform runs: start one on the page Start.")
+        return
+    text("p", "Hold to move. Letting go, leaving the page or losing the connection stops the arm.")
+    with ui.element("div").classes("page jog-area").props("tabindex=0") as area:
+        area.props["aria-label"] = (
+            "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch"
+        )
+        area.props["role"] = "group"
+
+        def settings() -> None:
+            # Numbers that are none, or beyond what is configured, move nothing: the platform refuses them.
+            area.props.update(
+                {
+                    "data-jog-frame": frame.value,
+                    "data-jog-speed": speed.value,
+                    "data-jog-turn": turn.value,
+                    "data-jog-joint": joint.value,
+                }
+            )
+            cartesian.set_visibility(frame.value != "joints")
+            single.set_visibility(frame.value == "joints")
+
+        with ui.element("div").classes("fields"):
+            frame = choice("Frame", FRAMES, config.jog.frame)
+            speed = number("Speed, m/s", str(config.jog.speed / 2), min="0", max=str(config.jog.speed), step="0.005")
+            turn = number(
+                "Turning, rad/s",
+                str(config.jog.angular_speed / 2),
+                min="0",
+                max=str(config.jog.angular_speed),
+                step="0.01",
+            )
+            joint = number("Joints, rad/s", "0.1", min="0", step="0.01")
+        cartesian = ui.element("div").classes("pads")
+        with cartesian:
+            for name, buttons in _PADS.items():
+                with ui.element("div"):
+                    text("h2", name)
+                    with ui.element("div").classes("pad"):
+                        for place, one in zip(_PLACES, buttons, strict=True):
+                            part, _, label = one.partition(" ")
+                            _hold(label, part).style(f"grid-area: {place}")
+        single = ui.element("div")
+        with single:
+            for at, motor in enumerate(config.joints):
+                with ui.element("div").classes("buttons"):
+                    text("span", motor.name).style("min-width: 5rem")
+                    _hold(f"{motor.name} -", f"{at}-")
+                    _hold(f"{motor.name} +", f"{at}+")
+        for one_field in (frame, speed, turn, joint):
+            one_field.on_change(settings)
+        settings()
+    with ui.element("div").classes("buttons"):
+        button(
+            "Open gripper",
+            lambda: view.act(lambda robot: robot.gripper(True), "The gripper is open"),
+            when=ENABLED,
+            plain=True,
+        )
+        button(
+            "Close gripper",
+            lambda: view.act(lambda robot: robot.gripper(False), "The gripper has closed"),
+            when=ENABLED,
+            plain=True,
+        )
+    text(
+        "p",
+        "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s. "
+        "Gamepad: hold the left shoulder button.",
+    )
+    with table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool"), ui.element("tr"):
+        text("th", "pose", scope="row")
+        for at in range(6):
+            shown(f"tool.{at}", 4)
+
+
+def _hold(label: str, part: str) -> ui.element:
+    made = button(label, when="holding moving")
+    made.props["data-jog"] = part
+    return made

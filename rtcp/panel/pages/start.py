@@ -1,0 +1,152 @@
+"""Start: bus, configuration, modes, cycle; start and stop; what stands in the way of real time."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+from nicegui import ui
+
+from rtcp.api import AsyncRobot
+from rtcp.config.find import default_config, find_config
+from rtcp.config.model import VIRTUAL, ConfigError
+from rtcp.panel.page import ENABLED, View, button, choice, field, number, row, table, text
+
+MODES = ("joint", "cartesian", "joystick", "velocity", "torque")
+DRIVE_MODES = ("csp", "csv", "cst")
+_CONFIGURED = "as configured"
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Start")
+    with ui.element("div").classes("fields"):
+        bus = choice("Bus", _interfaces(), VIRTUAL)
+        config = field("Configuration (file)", _default(), list="configurations")
+        mode = choice("Mode", (_CONFIGURED, *MODES, *DRIVE_MODES), _CONFIGURED)
+        cycle = number("Cycle, us (empty: as configured)", min="1")
+    with ui.element("datalist").props("id=configurations"):
+        for path in sorted(default_config().parent.glob("*.yaml")):
+            ui.element("option").props["value"] = str(path)
+    with ui.element("div").classes("buttons"):
+        begin = button("Start", when="off")
+        button(
+            "Stop the platform",
+            lambda: _end(view),
+            when=f"ready fault emergency_stop stopped_by_limit starting {ENABLED}",
+            plain=True,
+        )
+        check = button("Check this host", plain=True)
+        scan = button("Scan the bus", plain=True)
+    said = text("pre", "", "text", **{"aria-live": "polite"})
+    found = ui.element("div").classes("page")
+
+    def where() -> list[str]:
+        arguments = ["--bus", bus.value]
+        return [*arguments, "--config", config.value] if config.value.strip() else arguments
+
+    def show(line: str) -> None:
+        said.text = f"{said.text}\n{line}".strip()[-8000:]
+
+    async def start() -> None:
+        if not await view.operates():
+            return
+        said.text = ""
+        arguments = where()
+        if mode.value != _CONFIGURED:
+            arguments += ["--mode", mode.value]
+        if cycle.value.strip():
+            arguments += ["--cycle-us", cycle.value]
+        code, _ = await view.rtcp("start", "--detach", *arguments, show=show)
+        if code:
+            view.warn("The platform was not started: the reason stands below the buttons")
+        else:
+            view.say("The platform runs")
+
+    async def doctor() -> None:
+        said.text = "..."
+        _, said.text = await view.rtcp("doctor", *where())
+
+    async def look() -> None:
+        if not await view.operates():
+            return
+        said.text = "..."
+        code, out = await view.rtcp("scan", "--json", *(["--bus", bus.value] if view.live.status is None else []))
+        found.clear()
+        if code:
+            said.text = out
+            return
+        said.text = ""
+        slaves = json.loads(out)
+        with found:
+            body = table(("Slave", "Name", "State", "Vendor", "Product"), "Slaves in the order of the cable")
+            for slave in slaves["slaves"] if isinstance(slaves, dict) else slaves:
+                vendor, product = (f"0x{int(slave.get(key, 0)):08X}" for key in ("vendor", "product"))
+                row(
+                    body,
+                    str(slave.get("position", "")),
+                    str(slave.get("name", "")),
+                    str(slave.get("state", "")),
+                    vendor,
+                    product,
+                )
+
+    for control, handler in ((begin, start), (check, doctor), (scan, look)):
+        control.on("click", handler)
+
+    text("h2", "Machine")
+    with ui.element("div").classes("buttons"):
+        button("Enable", lambda: view.act(lambda robot: robot.enable(), "The drives hold the arm"), when="ready")
+        button(
+            "Disable",
+            lambda: view.act(_disable, "The drives are without torque"),
+            when=ENABLED + " stopped_by_limit",
+            plain=True,
+        )
+        button(
+            "Reset",
+            lambda: view.act(lambda robot: robot.reset(), "Reset"),
+            when="fault emergency_stop stopped_by_limit",
+            plain=True,
+        )
+        button("Halt", lambda: view.act(lambda robot: robot.halt(), "The arm holds"), when="moving homing", plain=True)
+    with ui.element("div").classes("fields"):
+        control_mode = choice("Control mode", MODES, "joint")
+        drive_mode = choice("Drive mode", DRIVE_MODES, "csp")
+    with ui.element("div").classes("buttons"):
+        button(
+            "Set control mode",
+            lambda: view.act(lambda robot: robot.mode(control_mode.value), f"Control mode {control_mode.value}"),
+            when="ready holding",
+            plain=True,
+        )
+        button(
+            "Set drive mode",
+            lambda: view.act(lambda robot: robot.mode(drive_mode.value), f"Drive mode {drive_mode.value}"),
+            when="ready holding",
+            plain=True,
+        )
+
+
+async def _disable(robot: AsyncRobot) -> None:
+    await robot.disable()
+
+
+async def _end(view: View) -> None:
+    problems = await view.act(lambda robot: robot.stop())
+    if problems:
+        view.warn("Stopped, but: " + "; ".join(problems))
+    elif problems is not None:
+        view.say("The platform has stopped")
+
+
+def _interfaces() -> list[str]:
+    return [VIRTUAL, *sorted(one for one in os.listdir("/sys/class/net") if one != "lo")]
+
+
+def _default() -> str:
+    try:
+        return str(find_config())
+    except ConfigError:
+        return str(Path())

@@ -1,0 +1,183 @@
+"""The panel's process: its pages, its sockets and files over HTTP, and the order in which they begin and end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import secrets
+import socket
+import webbrowser
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Request, Response, WebSocket
+from nicegui import Client, app, ui
+from starlette.staticfiles import StaticFiles
+
+from rtcp.api import RtcpError
+from rtcp.panel.access import Access, Sessions, Visitor, password_file, passwords_for
+from rtcp.panel.arm_view import ArmView
+from rtcp.panel.live import Live
+from rtcp.panel.page import View, shown, text
+from rtcp.panel.pages import arm, jog, start
+
+_STATIC = Path(__file__).parent / "static"
+PAGES: dict[str, tuple[str, Callable[[View], None], bool]] = {
+    "/": ("Start", start.build, False),
+    "/arm": ("Arm", arm.build, True),
+    "/jog": ("Jog", jog.build, True),
+}
+"""Path -> name, function that builds it, whether the arm in space stands beside it."""
+_COLOURS = {"primary": "#1864ab", "positive": "#2b8a3e", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
+
+
+@dataclass(frozen=True)
+class PanelOptions:
+    """Options of `rtcp panel`."""
+
+    host: str = "127.0.0.1"
+    port: int = 8080
+    open: bool = False
+    certificate: Path | None = None
+    key: Path | None = None
+
+
+class Panel:
+    """Serves the pages.
+
+    Args:
+        options: where and how.
+
+    Raises:
+        Invalid: other machines reach the address and there is no password.
+        Refused: nothing can listen there.
+    """
+
+    def __init__(self, options: PanelOptions) -> None:
+        self._sessions = Sessions(passwords_for(options.host, password_file()))
+        self._live = Live()
+        self._options = options
+        family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+        self._socket = socket.socket(family, socket.SOCK_STREAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._socket.bind((options.host, options.port))
+        except OSError as error:
+            self._socket.close()
+            message = (
+                f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}: choose another"
+            )
+            raise RtcpError("refused", message) from error
+        host = f"[{options.host}]" if ":" in options.host else options.host
+        scheme = "http" if options.certificate is None else "https"
+        self.url = f"{scheme}://{host}:{self._socket.getsockname()[1]}/"
+
+    def run(self) -> None:
+        """Serve until SIGINT or SIGTERM."""
+        server = FastAPI(lifespan=self._lifespan, docs_url=None, redoc_url=None, openapi_url=None)
+        server.add_middleware(
+            Access, sessions=self._sessions, host=self._options.host, secure=self._options.certificate is not None
+        )
+        self._add_routes(server)
+        for path in PAGES:
+            ui.page(path, title="rtcp panel")(self._page)
+        ui.run_with(server, title="rtcp panel", dark=None, language="en-US", tailwind=False, show_welcome_message=False,
+                    binding_refresh_interval=None, reconnect_timeout=3.0)  # fmt: skip
+        app.config.socket_io_js_transports = ["websocket"]
+        options = self._options
+        config = uvicorn.Config(
+            server, log_level="warning", ws_max_size=1 << 16, access_log=False, server_header=False,
+            ssl_certfile=options.certificate, ssl_keyfile=options.key, timeout_graceful_shutdown=1,
+            proxy_headers=False,
+        )  # fmt: skip
+        uvicorn.Server(config).run(sockets=[self._socket])
+
+    @contextlib.asynccontextmanager
+    async def _lifespan(self, server: FastAPI) -> AsyncIterator[None]:
+        following = asyncio.create_task(self._live.follow())
+        if self._options.open:
+            asyncio.get_running_loop().call_later(0.5, webbrowser.open, self.url)
+        try:
+            yield
+        finally:
+            following.cancel()
+            if self._live.operator is not None:
+                await self._live.operator.end()
+
+    def _add_routes(self, server: FastAPI) -> None:
+        server.mount("/static", StaticFiles(directory=_STATIC))
+
+        @server.websocket("/live")
+        async def live(socket: WebSocket) -> None:
+            await self._live.serve(socket, socket.scope["visitor"])
+
+        @server.post("/stop")
+        async def stop(request: Request) -> Response:
+            await self._live.halt()
+            return Response(status_code=204)
+
+    # -- what every page has ------------------------------------------------------------------------------------------
+
+    def _page(self, request: Request, client: Client) -> None:
+        visitor: Visitor = request.scope["visitor"]
+        page = self._live.open(secrets.token_urlsafe(16), visitor)
+        client.on_delete(lambda: self._live.close(page))
+        view = View(self._live, page, client)
+        ui.colors(**_COLOURS)
+        ui.add_head_html('<link rel="stylesheet" href="/static/panel.css"><script src="/static/panel.js"></script>')
+        with ui.element("header").props("id=head") as head:
+            head.props["data-page"] = page.key
+            shown("state", tag="span").props("role=status aria-live=polite")
+            shown("message", tag="span").classes("message")
+            text("span", "", id="operator")
+            with text("button", "STOP", "stop", type="button", **{"data-stop": ""}):
+                text("small", "not the emergency stop")
+        text(
+            "div",
+            "No connection to the panel: what this page moved has been stopped.",
+            id="lost",
+            role="alert",
+            hidden="",
+        )
+        with ui.element("nav").props("id=menu").props('aria-label="Pages"'):
+            for path, (name, _, _) in PAGES.items():
+                ui.link(name, path).props["data-path"] = path
+        with ui.element("main").props("id=main") as main:
+            space = ui.element("div").props("id=space")
+            place = ui.sub_pages({path: self._builder(view, main, path) for path in PAGES}, show_404=False)
+            place.classes("page")
+        with space:
+            self._draw(view)
+        text("div", "", id="notes", role="status", **{"aria-live": "polite"})
+
+    def _builder(self, view: View, main: Any, path: str) -> Callable[[], None]:
+        name, build, beside_arm = PAGES[path]
+
+        def made() -> None:
+            main.classes(remove="alone") if beside_arm else main.classes("alone")
+            ui.page_title(f"{name} - rtcp panel")
+            ui.run_javascript(
+                "document.querySelectorAll('#menu a').forEach((one) => one.toggleAttribute('aria-current', false));"
+                f"document.querySelector('#menu a[data-path=\"{path}\"]')?.setAttribute('aria-current', 'page')"
+            )
+            with ui.element("section").classes("page"):
+                build(view)
+
+        return made
+
+    def _draw(self, view: View) -> None:
+        config = self._live.config
+        if config is not None and config.arm is not None:
+            view.arm = ArmView(config)
+
+
+def serve(options: PanelOptions, announce: Callable[[str], None]) -> None:
+    """Serve the panel until it is ended; call `announce` with its address. Raises RtcpError."""
+    logging.getLogger("nicegui").setLevel(logging.WARNING)
+    panel = Panel(options)
+    announce(panel.url)
+    panel.run()

@@ -1,0 +1,169 @@
+// The arm in space: solid links of its URDF, live; a ghost along a planned path; the tool's path of the last seconds; boxes.
+import { THREE, OrbitControls } from "nicegui-scene";
+
+const TRACE = 600, SEEN = "rtcp-camera";
+const NORMAL = new THREE.Color("#4a6da7"), NEAR = new THREE.Color("#e8590c");
+
+function place(object, { xyz, rpy }) {
+  object.position.set(...xyz);
+  object.rotation.set(rpy[0], rpy[1], rpy[2], "ZYX"); // fixed axes roll, pitch, yaw
+}
+
+class Chain {
+  constructor(scene, links, ghost) {
+    this.joints = [];
+    this.links = new Map();
+    this.materials = [];
+    for (const link of links) {
+      const frame = new THREE.Group(), turning = new THREE.Group();
+      place(frame, link);
+      frame.add(turning);
+      (this.links.get(link.parent) ?? scene).add(frame);
+      this.links.set(link.name, turning);
+      if (link.joint >= 0) this.joints[link.joint] = [turning, new THREE.Vector3(...link.axis)];
+      for (const visual of link.visuals) {
+        const material = new THREE.MeshPhongMaterial({ color: ghost ? "#2f9e44" : visual.drawn ? "#868e96" : "#4a6da7",
+          transparent: ghost, opacity: ghost ? 0.35 : 1, depthWrite: !ghost });
+        const mesh = new THREE.Mesh(shape(visual), material);
+        const holder = new THREE.Group();
+        place(holder, visual);
+        if (visual.kind === "cylinder") mesh.rotateX(Math.PI / 2);
+        holder.add(mesh);
+        turning.add(holder);
+        if (!visual.drawn) this.materials.push(material);
+      }
+    }
+    this.root = this.links.get(links[0].name).parent;
+    this.tool = this.links.get(links[links.length - 1].name);
+  }
+  set(q) { this.joints.forEach(([turning, axis], at) => turning.setRotationFromAxisAngle(axis, q[at])); }
+  toolAt(q) {
+    this.set(q);
+    this.root.updateWorldMatrix(true, true);
+    return this.tool.getWorldPosition(new THREE.Vector3());
+  }
+}
+
+function shape({ kind, size }) {
+  if (kind === "cylinder") return new THREE.CylinderGeometry(size[0], size[0], size[1], 20);
+  if (kind === "sphere") return new THREE.SphereGeometry(size[0], 20, 14);
+  return new THREE.BoxGeometry(...size);
+}
+
+function line(color, count) {
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * count), 3));
+  geometry.setDrawRange(0, 0);
+  const made = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color }));
+  made.frustumCulled = false;
+  return made;
+}
+
+export default {
+  template: `<div class="arm-view" role="img" aria-label="The arm in space"><canvas></canvas>
+    <p v-if="problem" class="arm-problem">{{ problem }}</p></div>`,
+  props: { links: Array, boxes: Array },
+  data() { return { problem: "" }; },
+  mounted() {
+    const scene = (this.scene = new THREE.Scene());
+    this.camera = new THREE.PerspectiveCamera(45, 1, 0.01, 50);
+    this.camera.up.set(0, 0, 1);
+    try {
+      this.renderer = new THREE.WebGLRenderer({ antialias: true, alpha: true, canvas: this.$el.querySelector("canvas") });
+    } catch {
+      this.problem = "This browser offers no WebGL: the arm cannot be drawn. Everything else works.";
+      return;
+    }
+    scene.add(new THREE.AmbientLight(0xffffff, 2), Object.assign(new THREE.DirectionalLight(0xffffff, 2)));
+    scene.children[1].position.set(3, -4, 6);
+    const grid = new THREE.GridHelper(2, 20, "#868e96", "#adb5bd");
+    grid.rotateX(Math.PI / 2);
+    scene.add(grid, new THREE.AxesHelper(0.2));
+    this.arm = new Chain(scene, this.links, false);
+    this.ghost = new Chain(scene, this.links, true);
+    this.ghost.root.visible = false;
+    for (const box of this.boxes) {
+      const size = box.max.map((value, at) => value - box.min[at]);
+      const color = box.keep_out ? "#c92a2a" : "#2f9e44";
+      const geometry = new THREE.BoxGeometry(...size);
+      const solid = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color, transparent: true, opacity: box.keep_out ? 0.2 : 0.03, depthWrite: false }));
+      const edges = new THREE.LineSegments(new THREE.EdgesGeometry(geometry), new THREE.LineBasicMaterial({ color }));
+      for (const one of [solid, edges]) { one.position.set(...box.min.map((value, at) => value + size[at] / 2)); scene.add(one); }
+    }
+    this.trace = line("#1971c2", TRACE);
+    this.path = line("#2f9e44", 400);
+    scene.add(this.trace, this.path);
+    this.controls = new OrbitControls(this.camera, this.renderer.domElement);
+    const kept = JSON.parse(sessionStorage.getItem(SEEN) ?? "null") ?? { at: [-2.2, -2.4, 1.9], to: [0, 0, 0.5] };
+    this.camera.position.set(...kept.at);
+    this.controls.target.set(...kept.to);
+    this.controls.addEventListener("change", () => {
+      sessionStorage.setItem(SEEN, JSON.stringify({ at: this.camera.position.toArray(), to: this.controls.target.toArray() }));
+      this.draw();
+    });
+    this.controls.update();
+    this.stop = window.rtcp.listen((state) => this.show(state));
+    this.sizes = new ResizeObserver(() => this.resize());
+    this.sizes.observe(this.$el);
+    this.resize();
+  },
+  beforeUnmount() {
+    this.stop?.();
+    this.sizes?.disconnect();
+    this.renderer?.dispose();
+  },
+  methods: {
+    show(state) {
+      if (!state.joints || !this.$el.clientWidth) return;
+      this.arm.set(state.joints.actual_position);
+      if (state.tool) this.trail(state.tool);
+      if (state.singular) {
+        const [shoulder, elbow, wrist] = state.singular.map((one) => one ?? Infinity);
+        const near = 1 - Math.min(1, shoulder / 0.1, elbow / 0.2, wrist / 0.2);
+        for (const material of this.arm.materials) material.color.copy(NORMAL).lerp(NEAR, near);
+        this.$el.dataset.near = near.toFixed(2);
+      }
+      if (this.plan) this.follow();
+      this.draw();
+    },
+    trail(tool) {
+      const points = this.trace.geometry.attributes.position, last = this.last;
+      if (last && Math.hypot(tool[0] - last[0], tool[1] - last[1], tool[2] - last[2]) < 1e-3) return;
+      this.last = tool;
+      const count = Math.min(this.trace.geometry.drawRange.count, TRACE);
+      if (count === TRACE) points.array.copyWithin(0, 3);
+      const at = Math.min(count, TRACE - 1);
+      points.array.set(tool.slice(0, 3), 3 * at);
+      points.needsUpdate = true;
+      this.trace.geometry.setDrawRange(0, at + 1);
+    },
+    preview(path, duration_s) {
+      if (!this.ghost) return;
+      this.plan = path?.length ? { path, duration_s: Math.max(0.5, duration_s), began: performance.now() } : null;
+      this.ghost.root.visible = Boolean(this.plan);
+      const points = this.path.geometry.attributes.position;
+      const shown = (path ?? []).slice(0, 400);
+      shown.forEach((q, at) => points.array.set(this.ghost.toolAt(q).toArray(), 3 * at));
+      points.needsUpdate = true;
+      this.path.geometry.setDrawRange(0, shown.length);
+      if (this.plan) this.ghost.set(path[path.length - 1]);
+      this.$el.dataset.ghost = this.plan ? "shown" : "";
+      this.draw();
+    },
+    follow() {
+      const { path, duration_s, began } = this.plan;
+      const part = Math.min(1, ((performance.now() - began) / 1000 % (duration_s + 1)) / duration_s);
+      this.ghost.set(path[Math.round(part * (path.length - 1))]);
+    },
+    draw() { this.renderer?.render(this.scene, this.camera); },
+    resize() {
+      const { clientWidth, clientHeight } = this.$el;
+      if (!clientWidth || !clientHeight) return;
+      this.renderer.setPixelRatio(Math.min(2, window.devicePixelRatio));
+      this.renderer.setSize(clientWidth, clientHeight, false);
+      this.camera.aspect = clientWidth / clientHeight;
+      this.camera.updateProjectionMatrix();
+      this.draw();
+    },
+  },
+};

@@ -1,0 +1,203 @@
+// What a page does all the time without asking the server's pages: show the state, answer it, and pass on the hand of
+// the operator. The socket and its tokens: rtcp/panel/live.py.
+"use strict";
+window.rtcp = (() => {
+  const STALE_MS = 500; // without a message for so long the page says so
+  let socket = null, token = 0, heard = 0, state = {}, connected = false;
+  const listeners = new Set();
+
+  // -- the socket ------------------------------------------------------------------------------------------------------
+
+  function connect() {
+    const url = new URL("/live", location.href);
+    url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
+    url.searchParams.set("page", document.body.dataset.page || pageKey());
+    socket = new WebSocket(url);
+    socket.onmessage = (event) => receive(JSON.parse(event.data));
+    socket.onclose = () => { token = 0; release(); setTimeout(connect, 500); };
+  }
+  function pageKey() { return document.querySelector("[data-page]")?.dataset.page ?? ""; }
+  function send(message) {
+    if (socket?.readyState === WebSocket.OPEN && socket.bufferedAmount < 4096) {
+      socket.send(JSON.stringify({ seen: token, visible: !document.hidden, ...message }));
+    }
+  }
+  function receive(found) {
+    const now = performance.now();
+    // After a stall of this page what was pressed before counts no more.
+    if (heard && now - heard > 200) release();
+    heard = now;
+    token = found.token;
+    state = found;
+    gamepad();
+    send(pressed.size || pad ? jogMessage() : {});
+    for (const note of found.notes) say(note);
+    show();
+    for (const listener of listeners) listener(found);
+  }
+  function say(text) {
+    const box = document.getElementById("notes");
+    if (!box) return;
+    const line = document.createElement("div");
+    line.textContent = text;
+    box.append(line);
+    while (box.childElementCount > 3) box.firstChild.remove();
+    setTimeout(() => line.remove(), 6000);
+  }
+
+  // -- showing ---------------------------------------------------------------------------------------------------------
+
+  const STATES = { 0x00: "not ready", 0x40: "switch-on disabled", 0x21: "ready to switch on", 0x23: "switched on",
+    0x27: "operation enabled", 0x07: "quick stop", 0x0f: "fault reaction", 0x08: "fault" };
+  function drive(word) { return STATES[(word & 0x4f) in STATES && (word & 0x4f) !== 0x07 ? word & 0x4f : word & 0x6f] ?? "?"; }
+  function put(element, text) { if (element.textContent !== text) element.textContent = text; }
+  function show() {
+    const connectedNow = performance.now() - heard < STALE_MS;
+    if (connectedNow !== connected) {
+      connected = connectedNow;
+      document.body.classList.toggle("stale", !connected);
+    }
+    const joints = state.joints;
+    for (const element of document.querySelectorAll("[data-live]")) {
+      const [name, index] = element.dataset.live.split(".");
+      let value = connected ? state[name] : undefined;
+      if (joints && name in joints) value = joints[name][index];
+      else if (name === "error" && joints) value = joints.commanded_position[index] - joints.actual_position[index];
+      else if (name === "drive" && state.statuswords) value = drive(state.statuswords[index]);
+      else if (Array.isArray(value)) value = value[index];
+      if (!connected) value = name === "state" ? "no connection" : undefined;
+      const digits = element.dataset.digits;
+      put(element, value === undefined || value === null || value === "" ? "–" : digits ? value.toFixed(digits) : String(value));
+      if (name === "state") element.dataset.state = String(value);
+    }
+    for (const element of document.querySelectorAll("[data-bar]")) {
+      const [name, index] = element.dataset.bar.split(".");
+      const value = connected && joints ? joints[name][index] : NaN;
+      const low = +element.dataset.low, high = +element.dataset.high;
+      const part = Math.min(1, Math.max(0, (value - low) / (high - low)));
+      element.style.setProperty("--at", Number.isNaN(part) ? "50%" : `${100 * part}%`);
+      element.classList.toggle("near", part < 0.05 || part > 0.95);
+    }
+    for (const element of document.querySelectorAll("[data-when]")) {
+      const fits = connected && element.dataset.when.split(" ").includes(state.state);
+      if (element.disabled === fits) { element.disabled = !fits; element.ariaDisabled = String(!fits); }
+    }
+    const note = document.getElementById("operator");
+    if (note) put(note, state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
+    const now = document.getElementById("lost");
+    if (now) now.hidden = connected;
+  }
+  setInterval(() => { if (performance.now() - heard > STALE_MS) { release(); show(); } }, 250);
+
+  // -- the operator's hand -----------------------------------------------------------------------------------------------
+
+  const pressed = new Map(); // what holds -> the six parts of the speed that it asks for
+  let press = 0, pad = null;
+  const AXES = ["x", "y", "z", "rx", "ry", "rz"];
+  function begin(holder, axis, sign) {
+    if (!pressed.size && !pad) press += 1;
+    pressed.set(holder, [axis, sign]);
+    send(jogMessage());
+  }
+  function end(holder) {
+    if (!pressed.delete(holder)) return;
+    send(jogMessage());
+    mark();
+  }
+  function release() {
+    if (!pressed.size && !pad) return;
+    pressed.clear();
+    pad = null;
+    send(jogMessage());
+    press += 1;
+    mark();
+  }
+  function jogMessage() {
+    const root = document.querySelector("[data-jog-frame]");
+    const parts = root ? root.dataset : {};
+    const frame = parts.jogFrame ?? "base";
+    const count = frame === "joints" ? (state.joints?.actual_position.length ?? 6) : 6;
+    const jog = Array(count).fill(0);
+    for (const [axis, sign] of pressed.values()) if (axis < count) jog[axis] += sign;
+    if (pad) pad.forEach((value, axis) => { if (axis < count) jog[axis] += value; });
+    const speeds = frame === "joints" ? Array(count).fill(+parts.jogJoint || 0)
+      : [0, 1, 2].map(() => +parts.jogSpeed || 0).concat([0, 1, 2].map(() => +parts.jogTurn || 0));
+    mark();
+    return { jog: jog.map((part, axis) => Math.max(-1, Math.min(1, part)) * speeds[axis]), frame, press };
+  }
+  function mark() {
+    for (const button of document.querySelectorAll("[data-jog]")) {
+      button.classList.toggle("pressed", [...pressed.keys()].includes(button));
+    }
+  }
+  function jogOf(element) {
+    const button = element.closest?.("[data-jog]");
+    if (!button || button.disabled) return null;
+    const [axis, sign] = [button.dataset.jog.slice(0, -1), button.dataset.jog.endsWith("+") ? 1 : -1];
+    const at = AXES.indexOf(axis);
+    return [button, at >= 0 ? at : +axis, sign];
+  }
+  document.addEventListener("pointerdown", (event) => {
+    const found = jogOf(event.target);
+    if (!found || event.button > 0) return;
+    event.preventDefault();
+    found[0].focus();
+    found[0].setPointerCapture?.(event.pointerId);
+    begin(...found);
+  });
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
+    document.addEventListener(name, (event) => { const found = jogOf(event.target); if (found) end(found[0]); });
+  }
+  document.addEventListener("contextmenu", (event) => { if (jogOf(event.target)) event.preventDefault(); });
+
+  const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 1], ArrowRight: [1, -1], PageUp: [2, 1],
+    PageDown: [2, -1], q: [5, 1], e: [5, -1], a: [3, 1], d: [3, -1], w: [4, 1], s: [4, -1] };
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") { stop(); return; }
+    const button = jogOf(event.target);
+    if (button && (event.key === " " || event.key === "Enter")) {
+      event.preventDefault();
+      if (!event.repeat) begin(...button);
+      return;
+    }
+    const area = event.target.closest?.("[data-jog-frame]");
+    const found = area && KEYS[event.key];
+    if (!found || event.ctrlKey || event.altKey || event.metaKey) return;
+    event.preventDefault();
+    if (!event.repeat) begin(event.key, ...found);
+  });
+  document.addEventListener("keyup", (event) => {
+    const button = jogOf(event.target);
+    if (button && (event.key === " " || event.key === "Enter")) { event.preventDefault(); end(button[0]); }
+    end(event.key);
+  });
+  for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, release);
+  document.addEventListener("visibilitychange", () => { if (document.hidden) release(); });
+  document.addEventListener("focusout", (event) => { const found = jogOf(event.target); if (found) end(found[0]); });
+
+  // A gamepad jogs while its left shoulder button is held: left stick X-Y, right stick Z and yaw, cross roll and pitch.
+  function gamepad() {
+    const area = document.querySelector("[data-jog-frame]");
+    const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
+    const held = found && found.buttons[4]?.pressed;
+    if (!held) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
+    if (!pad && !pressed.size) press += 1;
+    const stick = (at) => (Math.abs(found.axes[at] ?? 0) > 0.15 ? found.axes[at] : 0);
+    const cross = (plus, minus) => (found.buttons[plus]?.pressed ? 1 : 0) - (found.buttons[minus]?.pressed ? 1 : 0);
+    pad = [-stick(1), -stick(0), -stick(3), cross(15, 14), cross(12, 13), -stick(2)];
+  }
+
+  function stop() {
+    release();
+    if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ seen: token, visible: true, stop: true }));
+    // By another way as well: the socket may hang.
+    fetch("/stop", { method: "POST", keepalive: true }).catch(() => {});
+  }
+  document.addEventListener("click", (event) => { if (event.target.closest?.("[data-stop]")) stop(); });
+
+  window.addEventListener("load", () => {
+    const wait = setInterval(() => { if (pageKey()) { clearInterval(wait); connect(); } }, 50);
+  });
+  return { listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); }, send, stop,
+    get state() { return state; } };
+})();
