@@ -27,6 +27,7 @@ from kinematics.jacobian import singularity_distances
 from rtcp.api import AsyncRobot, Feed, RtcpError, Status
 from rtcp.config.model import ArmConfig
 from rtcp.panel.access import Visitor
+from rtcp.panel.scope import Scope
 
 T = TypeVar("T")
 Json = dict[str, Any]
@@ -42,6 +43,8 @@ PRESENCE_S = 1.0
 TAKE_OVER_S = 10.0
 """An operator who does not answer loses the arm to the one who asks."""
 _RETRY_S = 0.5
+_SCOPE_TURNS = 2
+"""The scopes are read in every second turn."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
@@ -74,6 +77,10 @@ class Page:
     jogged_ns: int = 0
     """When the jog of that press ends."""
     sending: asyncio.Task[None] | None = None
+    scope: Scope | None = None
+    """The picture that it shows."""
+    blocks: list[Json] = field(default_factory=list)
+    """Of the scope, for its next message."""
     notify: Callable[[str], None] = lambda message: None
     asked: Callable[[str, asyncio.Future[bool]], None] = lambda who, answer: answer.set_result(True)
     """Asks the person whether another may take over."""
@@ -161,6 +168,8 @@ class Live:
         self.sent_messages = 0
         self._viewing: AsyncRobot | None = None
         self._retry_at = 0.0
+        self._turn = 0
+        self._scoped = False
         self._halting: asyncio.Task[None] | None = None
 
     # -- pages --------------------------------------------------------------------------------------------------------
@@ -349,10 +358,26 @@ class Live:
         if not any(page.socket for page in self.pages.values()):
             return
         state = self.state()
+        self._turn += 1
+        if self._turn % _SCOPE_TURNS == 0:
+            self._read_scopes()
         for page in list(self.pages.values()):
             # One that does not take its messages gets the newest when it does.
             if page.socket is not None and (page.sending is None or page.sending.done()):
                 page.sending = asyncio.create_task(self._send(page, page.socket, state))
+
+    def _read_scopes(self) -> None:
+        """Give the cycles since the last time to every scope that somebody looks at."""
+        watching = [page for page in self.pages.values() if page.scope is not None and page.socket is not None]
+        if self.feed is None:
+            return
+        records, _ = self.feed.records() if watching or self._scoped else (None, 0)
+        self._scoped = bool(watching)
+        for page in watching:
+            if records is not None and page.scope is not None:
+                page.scope.read(records)
+                if (block := page.scope.block()) is not None:
+                    page.blocks = [block]
 
     async def _send(self, page: Page, socket: WebSocket, state: Json) -> None:
         page.sent_ns = time.monotonic_ns()
@@ -360,7 +385,10 @@ class Live:
         operator = self.operator
         mine = operator is not None and operator.page is page
         who = "" if operator is None else str(operator.page)
+        blocks, page.blocks = page.blocks, []
         with contextlib.suppress(Exception):  # it has gone: its receiver sees that too
+            for block in blocks:
+                await socket.send_json({"scope": block})
             await socket.send_json({"token": page.sent_ns, **state, "operator": who, "mine": mine, "notes": notes})
             self.sent_messages += 1
 

@@ -54,9 +54,7 @@ class Field:
     def value(self, value: str) -> None:
         self._value = value
         # Not by its properties: those are only written where they change, and what was typed is none of them.
-        self.control.client.run_javascript(
-            f"document.getElementById('{self.control.html_id}').value = {json.dumps(value)}"
-        )
+        self.control.client.run_javascript(f"rtcp.fill('{self.control.html_id}', {json.dumps(value)})")
 
     def number(self) -> float:
         """Return its number.
@@ -119,11 +117,11 @@ def button(label: str, handler: Handler | None = None, *, when: str = "", plain:
     return made
 
 
-def table(headings: Sequence[str], caption: str) -> Element:
-    """Return the body of a new table, which the caller fills with rows."""
-    with ui.element("div").classes("wide").props("tabindex=0 role=region").props(add="") as region:
+def table(headings: Sequence[str], caption: str, numbers: bool = False) -> Element:
+    """Return the body of a new table, which the caller fills with rows; columns of numbers align to the right."""
+    with ui.element("div").classes("wide").props("tabindex=0 role=region") as region:
         region.props["aria-label"] = caption
-        with ui.element("table").classes("figures"):
+        with ui.element("table").classes("figures numbers" if numbers else "figures"):
             text("caption", caption, "visually-hidden")
             with ui.element("thead"), ui.element("tr"):
                 for heading in headings:
@@ -136,7 +134,7 @@ def row(body: Element, first: str, *cells: str) -> None:
     with body, ui.element("tr"):
         text("th", first, scope="row")
         for cell in cells:
-            text("td", cell, "text" if len(cell) > 24 else "")
+            text("td", cell)
 
 
 class View:

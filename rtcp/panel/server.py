@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import inspect
 import logging
 import secrets
 import socket
@@ -16,20 +17,29 @@ from typing import Any
 import uvicorn
 from fastapi import FastAPI, Request, Response, WebSocket
 from nicegui import Client, app, ui
+from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
 from rtcp.api import RtcpError
+from rtcp.config.zero import state_directory
 from rtcp.panel.access import Access, Sessions, Visitor, password_file, passwords_for
 from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import Live
+from rtcp.panel.metrics import exposition
 from rtcp.panel.page import View, shown, text
-from rtcp.panel.pages import arm, jog, start
+from rtcp.panel.pages import arm, health, jog, limits, recorder, scope, segment, start, targets
 
 _STATIC = Path(__file__).parent / "static"
-PAGES: dict[str, tuple[str, Callable[[View], None], bool]] = {
+PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
     "/": ("Start", start.build, False),
     "/arm": ("Arm", arm.build, True),
+    "/targets": ("Targets", targets.build, True),
     "/jog": ("Jog", jog.build, True),
+    "/limits": ("Limits", limits.build, False),
+    "/recorder": ("Recorder", recorder.build, True),
+    "/scope": ("Scope", scope.build, False),
+    "/segment": ("Segment", segment.build, False),
+    "/health": ("Health", health.build, False),
 }
 """Path -> name, function that builds it, whether the arm in space stands beside it."""
 _COLOURS = {"primary": "#1864ab", "positive": "#2b8a3e", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
@@ -120,6 +130,18 @@ class Panel:
             await self._live.halt()
             return Response(status_code=204)
 
+        @server.get("/metrics")
+        async def metrics() -> Response:
+            return Response(exposition(self._live), media_type="text/plain; version=0.0.4")
+
+        @server.get("/recordings/{path:path}")
+        async def recording(path: str) -> Response:
+            return _file(recorder.recordings_directory(), path, ("mcap", "csv", "png"))
+
+        @server.get("/faults/{path:path}")
+        async def fault(path: str) -> Response:
+            return _file(state_directory() / "faults", path, ("png",))
+
     # -- what every page has ------------------------------------------------------------------------------------------
 
     def _page(self, request: Request, client: Client) -> None:
@@ -154,10 +176,11 @@ class Panel:
             self._draw(view)
         text("div", "", id="notes", role="status", **{"aria-live": "polite"})
 
-    def _builder(self, view: View, main: Any, path: str) -> Callable[[], None]:
+    def _builder(self, view: View, main: Any, path: str) -> Callable[[], Any]:
         name, build, beside_arm = PAGES[path]
 
-        def made() -> None:
+        async def made() -> None:
+            view.page.scope = None
             main.classes(remove="alone") if beside_arm else main.classes("alone")
             ui.page_title(f"{name} - rtcp panel")
             ui.run_javascript(
@@ -165,7 +188,11 @@ class Panel:
                 f"document.querySelector('#menu a[data-path=\"{path}\"]')?.setAttribute('aria-current', 'page')"
             )
             with ui.element("section").classes("page"):
-                build(view)
+                try:
+                    if inspect.isawaitable(found := build(view)):
+                        await found
+                except RtcpError as error:
+                    text("p", error.message, "bad")
 
         return made
 
@@ -173,6 +200,14 @@ class Panel:
         config = self._live.config
         if config is not None and config.arm is not None:
             view.arm = ArmView(config)
+
+
+def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:
+    """Return a file of a directory; one outside of it, or of another kind, does not exist."""
+    found = (directory / path).resolve()
+    if not found.is_relative_to(directory.resolve()) or found.suffix[1:] not in endings or not found.is_file():
+        return Response("no such file", 404)
+    return FileResponse(found)
 
 
 def serve(options: PanelOptions, announce: Callable[[str], None]) -> None:

@@ -24,7 +24,10 @@ def build(view: View) -> None:
         shown("bus", tag="b")
     _joints(config)
     text("h2", "Tool")
-    with table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool"), ui.element("tr"):
+    with (
+        table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool", numbers=True),
+        ui.element("tr"),
+    ):
         text("th", "pose", scope="row")
         for at in range(6):
             shown(f"tool.{at}", 4)
@@ -42,7 +45,7 @@ def build(view: View) -> None:
 
 def _joints(config: ArmConfig) -> None:
     headings = ("Joint", "Drive", "rad", "Position", "rad/s", "Velocity", "Nm", "Torque", "Following error rad")
-    with table(headings, "Joints"):
+    with table(headings, "Joints", numbers=True):
         for at, joint in enumerate(config.joints):
             with ui.element("tr"):
                 text("th", joint.name, scope="row")

@@ -91,7 +91,10 @@ def build(view: View) -> None:
         "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s. "
         "Gamepad: hold the left shoulder button.",
     )
-    with table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool"), ui.element("tr"):
+    with (
+        table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool", numbers=True),
+        ui.element("tr"),
+    ):
         text("th", "pose", scope="row")
         for at in range(6):
             shown(f"tool.{at}", 4)

@@ -4,7 +4,7 @@
 window.rtcp = (() => {
   const STALE_MS = 500; // without a message for so long the page says so
   let socket = null, token = 0, heard = 0, state = {}, connected = false;
-  const listeners = new Set();
+  const listeners = new Set(), pictures = new Set();
 
   // -- the socket ------------------------------------------------------------------------------------------------------
 
@@ -23,6 +23,10 @@ window.rtcp = (() => {
     }
   }
   function receive(found) {
+    if (found.scope) {
+      for (const picture of pictures) picture(found.scope);
+      return;
+    }
     const now = performance.now();
     // After a stall of this page what was pressed before counts no more.
     if (heard && now - heard > 200) release();
@@ -195,9 +199,31 @@ window.rtcp = (() => {
   }
   document.addEventListener("click", (event) => { if (event.target.closest?.("[data-stop]")) stop(); });
 
+  // -- fields ------------------------------------------------------------------------------------------------------------
+
+  function sliderOf(field) { return document.querySelector(`[data-slider="${field.id}"]`); }
+  function fill(id, value) {
+    const field = document.getElementById(id);
+    if (!field) return;
+    field.value = value;
+    const slider = sliderOf(field);
+    if (slider) slider.value = value;
+  }
+  document.addEventListener("input", (event) => {
+    const field = document.getElementById(event.target.dataset?.slider);
+    if (field) {
+      field.value = event.target.value;
+      field.dispatchEvent(new Event("input"));
+    } else if (event.target.id) {
+      const slider = sliderOf(event.target);
+      if (slider) slider.value = event.target.value;
+    }
+  });
+
   window.addEventListener("load", () => {
     const wait = setInterval(() => { if (pageKey()) { clearInterval(wait); connect(); } }, 50);
   });
-  return { listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); }, send, stop,
-    get state() { return state; } };
+  return { fill, stop, get state() { return state; },
+    listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); },
+    scope: (picture) => { pictures.add(picture); return () => pictures.delete(picture); } };
 })();

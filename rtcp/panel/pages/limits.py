@@ -1,0 +1,89 @@
+"""Limits of joints and space: what is in force, what the file allows, narrowed while the platform runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from nicegui import ui
+
+from rtcp.api import RtcpError
+from rtcp.panel.page import Field, View, button, number, table, text
+
+_JOINT = {"min": "rad", "max": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³", "torque": "Nm"}
+
+
+async def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Limits")
+    if view.live.status is None:
+        text("p", "No platform runs: start one on the page Start.")
+        return
+    text(
+        "p",
+        "Narrower than the file allows, until the platform ends. A field says what is in force; below it stands what "
+        "the file allows.",
+    )
+    found = await view.live.view(lambda robot: robot.limits())
+    fields: dict[str, Field] = {}
+
+    async def apply() -> None:
+        try:
+            changes = {key: one.number() for key, one in fields.items() if one.value != kept[key]}
+        except RtcpError as error:
+            view.warn(error.message)
+            return
+        if changes and await view.act(lambda robot: robot.set_limits(changes), "The limits are in force") is not None:
+            kept.update({key: fields[key].value for key in changes})
+
+    def widest() -> None:
+        for key, _, allowed in _all(found):
+            fields[key].value = f"{allowed:g}"
+
+    headings = ("Joint", *(f"{name} {unit}" for name, unit in _JOINT.items()))
+    with table(headings, "Limits of the joints", numbers=True):
+        for at, name in enumerate(found["joint_names"]):
+            with ui.element("tr"):
+                text("th", name, scope="row")
+                for key in _JOINT:
+                    with ui.element("td"):
+                        fields[f"{name}.{key}"] = _field(
+                            f"{name} {key}", found["limits"][key][at], found["configured"][key][at]
+                        )
+    with table(("Space", "Corner", "x m", "y m", "z m"), "Limits of the space", numbers=True):
+        for box in _boxes(found["limits"]):
+            for side in ("min", "max"):
+                with ui.element("tr"):
+                    text("th", "box, the tool stays inside" if box == "box" else f"{box}, kept out", scope="row")
+                    text("td", "lower" if side == "min" else "upper", "text")
+                    for axis, letter in enumerate("xyz"):
+                        now, allowed = (_boxes(found[which])[box][side][axis] for which in ("limits", "configured"))
+                        with ui.element("td"):
+                            fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed)
+    kept = {key: one.value for key, one in fields.items()}
+    with ui.element("div").classes("buttons"):
+        button("Set the limits", apply)
+        button("As the file allows", widest, plain=True)
+
+
+def _field(name: str, now: float, allowed: float) -> Field:
+    made = number(name, f"{now:g}")
+    text("small", f"file: {allowed:g}")
+    return made
+
+
+def _boxes(limits: dict[str, Any]) -> dict[str, Any]:
+    inner = {} if limits.get("box") is None else {"box": limits["box"]}
+    return {**inner, **limits["keep_out"]}
+
+
+def _all(found: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
+    """Yield key, value in force and value of the file."""
+    now, allowed = found["limits"], found["configured"]
+    for at, name in enumerate(found["joint_names"]):
+        for key in _JOINT:
+            yield f"{name}.{key}", now[key][at], allowed[key][at]
+    for box, corners in _boxes(now).items():
+        for side in ("min", "max"):
+            for axis, letter in enumerate("xyz"):
+                yield f"{box}.{side}.{letter}", corners[side][axis], _boxes(allowed)[box][side][axis]

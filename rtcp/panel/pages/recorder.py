@@ -1,0 +1,162 @@
+"""Recorder: on and off, its files to download and plot. Programs: motion files, checked and run."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+
+from nicegui import ui
+
+from rtcp.api import Progress, RtcpError
+from rtcp.config.zero import state_directory
+from rtcp.panel.page import View, button, choice, field, row, table, text
+
+_FORMATS = ("mcap", "csv", "mcap,csv")
+_ENDINGS = (".mcap", ".csv")
+_MOST_SHOWN = 30
+
+
+def recordings_directory() -> Path:
+    """Return where the panel records, and offers files from."""
+    return state_directory() / "recordings"
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Recorder")
+    with ui.element("div").classes("fields"):
+        name = field("File name (empty: by the time)")
+        formats = choice("Format", _FORMATS, "mcap")
+        signals = field("Signals (empty: all)")
+    with ui.element("div").classes("buttons"):
+        begin = button("Record")
+        end = button("Stop recording", plain=True)
+        again = button("Show the files", plain=True)
+    said = text("p", "", role="status")
+    files = ui.element("div").classes("page")
+
+    async def start() -> None:
+        if not await view.operates():
+            return
+        directory = recordings_directory()
+        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        wanted = Path(name.value.strip() or f"{datetime.now():%Y-%m-%d_%H-%M-%S}").name
+        found = formats.value.split(",")
+        # One format: a file of that name; several: a folder.
+        out = directory / (f"{wanted}.{found[0]}" if len(found) == 1 else wanted)
+        chosen = signals.value.replace(",", " ").split()
+        if (
+            await view.act(lambda robot: robot.record_start(out, formats=found, signals=chosen), "Recording")
+            is not None
+        ):
+            await refresh()
+
+    async def stop() -> None:
+        ended = await view.act(lambda robot: robot.record_stop())
+        for one in ended or ():
+            view.say(f"{one.records} cycles, {one.missing} missing, {one.bytes / 1e6:.1f} MB")
+        await refresh()
+
+    async def refresh() -> None:
+        try:
+            running = [one for one in await view.live.view(lambda robot: robot.record_status()) if one.running]
+        except RtcpError as error:
+            running = []
+            said.text = error.message
+        else:
+            lines = []
+            for one in running:
+                names = ", ".join(Path(file).name for file in one.files)
+                lines.append(f"{names}: {one.records} samples, {one.missing} missing, {one.seconds:.0f} s")
+            said.text = "; ".join(lines) or "Nothing is recorded"
+
+    def show_files() -> None:
+        files.clear()
+        with files:
+            body = table(("File", "MB", "", ""), "Recordings")
+        found = sorted(_files(), key=lambda path: path.stat().st_mtime, reverse=True)[:_MOST_SHOWN]
+        for path in found:
+            where = str(path.relative_to(recordings_directory()))
+            row(body, where, f"{path.stat().st_size / 1e6:.1f}")
+            with body.default_slot.children[-1]:
+                with ui.element("td"):
+                    link = text("a", f"Download {where}", href=f"/recordings/{where}")
+                    link.props["download"] = path.name
+                with ui.element("td"):
+                    button(f"Plot {where}", partial(plot, path), plain=True)
+
+    async def plot(path: Path) -> None:
+        picture = path.with_suffix(".png")
+        code, out = await view.rtcp("plot", str(path), "--out", str(picture))
+        if code:
+            view.warn(out)
+            return
+        with files, ui.element("figure"):
+            where = picture.relative_to(recordings_directory())
+            image = ui.element("img").style("max-width: 100%; background: #fff")
+            image.props.update(
+                {"src": f"/recordings/{where}?{picture.stat().st_mtime_ns}", "alt": f"Plot of {path.name}"}
+            )
+
+    begin.on("click", start)
+    end.on("click", stop)
+    again.on("click", show_files)
+    ui.timer(1.0, refresh)
+    _programs(view)
+
+
+def _files() -> list[Path]:
+    directory = recordings_directory()
+    return (
+        [path for path in directory.rglob("*") if path.suffix in _ENDINGS and path.is_file()]
+        if directory.is_dir()
+        else []
+    )
+
+
+def _programs(view: View) -> None:
+    text("h2", "Programs")
+    with ui.element("div").classes("fields"):
+        file = field("Motion file", str(Path.home()) + "/", list="programs")
+        approach = choice("Start", {"approach": "move to its beginning first", "": "the arm stands there"}, "approach")
+    with ui.element("datalist").props("id=programs"):
+        for path in sorted(_motion_files()):
+            ui.element("option").props["value"] = str(path)
+    said = text("p", "", role="status", **{"aria-live": "polite"})
+    bar = ui.element("progress").props("max=1 value=0 aria-label=Progress")
+
+    async def check() -> bool:
+        path, first = file.value.strip(), bool(approach.value)
+        try:
+            found = await view.live.view(lambda robot: robot.preview(file=path, approach=first))
+        except RtcpError as error:
+            said.text = f"No: {error.message}"
+            return False
+        said.text = f"It can be run: {found.duration_s:.1f} s"
+        if view.arm is not None:
+            view.arm.preview([list(q) for q in found.path], found.duration_s)
+        return True
+
+    def progress(now: Progress) -> None:
+        bar.props["value"] = round(now.fraction, 3)
+        said.text = f"{now.fraction:.0%}, {now.remaining_s:.1f} s left"
+
+    async def run() -> None:
+        if await check():
+            path, first = file.value.strip(), bool(approach.value)
+            arrival = await view.act(lambda robot: robot.run(path, first, progress))
+            bar.props["value"] = 1 if arrival else 0
+            said.text = "Done" if arrival else "It has not reached its end"
+
+    with ui.element("div").classes("buttons"):
+        button("Check", check, plain=True)
+        button("Run", run, when="holding")
+        button(
+            "Stop the program", lambda: view.act(lambda robot: robot.halt(), "The arm holds"), when="moving", plain=True
+        )
+
+
+def _motion_files() -> list[Path]:
+    directory = state_directory() / "programs"
+    return [path for path in directory.glob("*") if path.suffix in (".yaml", ".yml", ".csv")]

@@ -1,0 +1,153 @@
+"""Segment: the slaves in the order of the cable, their counters, objects, and the faults of a virtual bus."""
+
+from __future__ import annotations
+
+import json
+
+from nicegui import ui
+
+from rtcp.api import RtcpError
+from rtcp.config.model import VIRTUAL
+from rtcp.panel.page import View, button, choice, field, number, row, table, text
+
+_COUNTERS = (
+    "Slave",
+    "Name",
+    "State",
+    "AL status code",
+    "Left OP",
+    "Came back",
+    "Damaged frames, own cables",
+    "forwarded",
+    "Lost links",
+)
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Segment")
+    slaves = ui.element("div").classes("page")
+    clock = text("p", "", role="status")
+    shown: list[object] = [None]
+
+    def refresh() -> None:
+        status = view.live.status
+        found = None if status is None else status.raw["slaves"]
+        if found != shown[0] or not slaves.default_slot.children:
+            shown[0] = found
+            slaves.clear()
+            with slaves:
+                body = table(_COUNTERS, "Slaves in the order of the cable")
+            for one in found or ():
+                errors = one["errors"]
+                counts = (one["lost"], one["recovered"], errors["rx"], errors["forwarded"], errors["links"])
+                row(
+                    body,
+                    str(one["position"]),
+                    one["name"],
+                    one["state"],
+                    f"0x{one['al_status_code']:04X}",
+                    *map(str, counts),
+                )
+        if status is not None:
+            dc, wkc = status.raw["dc"], status.raw["wkc"]
+            locked = "locked" if dc["locked"] else "not locked"
+            clock.text = (
+                f"Working counter {wkc['actual']} of {wkc['expected']}. Distributed clocks {locked}, offset "
+                f"{dc['offset_ns'] / 1e3:.1f} us, filtered {dc['filtered_ns'] / 1e3:.1f} us. "
+                f"Cycles skipped: {status.raw['missed']}."
+            )
+        else:
+            clock.text = view.live.problem
+
+    refresh()
+    ui.timer(0.5, refresh)
+    text("h2", "Messages")
+    messages = text("pre", "", "text")
+
+    def read_messages() -> None:
+        status = view.live.status
+        if status is not None:
+            lines = zip(status.raw["message_times"], status.raw["messages"], strict=True)
+            messages.text = "\n".join(f"{when[11:23]}  {what}" for when, what in lines)
+
+    read_messages()
+    ui.timer(0.5, read_messages)
+    _objects(view)
+    _faults(view)
+
+
+def _objects(view: View) -> None:
+    text("h2", "Objects (SDO)")
+    with ui.element("div").classes("fields"):
+        slave = number("Slave, from 1", "2", min="1", step="1")
+        index = field("Index, hex", "6041")
+        subindex = number("Subindex", "0", min="0", max="255", step="1")
+        data = field("Bytes, hex (to write)")
+    said = text("p", "", role="status", **{"aria-live": "polite"})
+
+    def place() -> tuple[int, int, int]:
+        try:
+            return int(slave.number()), int(index.value.removeprefix("0x"), 16), int(subindex.number())
+        except ValueError:
+            raise RtcpError("invalid", f'Index: found "{index.value}", allowed is a hexadecimal number') from None
+
+    async def read() -> None:
+        try:
+            where = place()
+            found = await view.live.view(lambda robot: robot.sdo_read(*where))
+        except RtcpError as error:
+            said.text = error.message
+            return
+        said.text = f"0x{where[1]:04X}:{where[2]} = {found.hex(' ')} ({int.from_bytes(found, 'little')})"
+
+    async def write() -> None:
+        try:
+            where, value = place(), bytes.fromhex(data.value)
+        except (RtcpError, ValueError) as error:
+            said.text = str(error)
+            return
+        said.text = ""
+        await view.act(lambda robot: robot.sdo_write(*where, value), "Written")
+
+    with ui.element("div").classes("buttons"):
+        button("Read", read, when="ready holding moving fault stopped_by_limit emergency_stop")
+        button("Write", write, when="ready", plain=True)
+
+
+def _faults(view: View) -> None:
+    status = view.live.status
+    if status is None or status.raw["bus"] != VIRTUAL:
+        return
+    text("h2", "Faults of the virtual bus")
+    with ui.element("div").classes("fields"):
+        kind = choice("Kind", ("cable", "power", "loss", "wkc", "drive", "sdo_abort", "al_fall", "delay"), "loss")
+        keys = field("Keys, as after=3 (`rtcp segment kinds`)", "rate=0.1")
+        lasts = number("Lasts, s (empty: until cleared)", "2", min="0")
+    active = ui.element("div").classes("page")
+
+    async def make() -> None:
+        if not await view.operates():
+            return
+        more = ["--lasts", lasts.value] if lasts.value.strip() else []
+        code, out = await view.rtcp("segment", "fault", kind.value, *keys.value.split(), *more)
+        view.warn(out) if code else view.say(out)
+        await show()
+
+    async def clear() -> None:
+        if await view.operates():
+            code, out = await view.rtcp("segment", "clear")
+            view.warn(out) if code else view.say(out)
+            await show()
+
+    async def show() -> None:
+        code, out = await view.rtcp("segment", "faults", "--json")
+        active.clear()
+        with active:
+            for one in json.loads(out) if code == 0 else ():
+                text("p", f"fault {one['id']}: {one['fault']['fault']}, for {one['since_s']:.1f} s")
+
+    with ui.element("div").classes("buttons"):
+        button("Make the fault", make)
+        button("Clear all", clear, plain=True)
+        button("Show what is active", show, plain=True)

@@ -1,0 +1,264 @@
+"""Targets: joint positions or a pose, planned and shown as a ghost before they are sent; named poses."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Awaitable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from io import StringIO
+from pathlib import Path
+
+from nicegui import ui
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from kinematics.inverse import InverseKinematics
+from kinematics.pose import Pose
+from rtcp.api import Arrival, AsyncRobot, Invalid, Preview, RtcpError
+from rtcp.config.model import ArmConfig
+from rtcp.config.zero import state_directory
+from rtcp.panel.page import Field, View, button, choice, field, number, row, table, text
+
+_WAYS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
+_POSE = ("x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
+_LONGEST_NAME = 40
+
+
+def build(view: View) -> None:
+    """Build the page."""
+    text("h1", "Targets")
+    config, status = view.live.config, view.live.status
+    if config is None or status is None or config.arm is None:
+        text("p", "No platform runs: start one on the page Start.")
+        return
+    Targets(view, config)
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the fields say."""
+
+    values: tuple[float, ...]
+    """Joint positions, rad; or a pose, m and rad."""
+    way: str
+    speed: float | None
+
+    def preview(self, robot: AsyncRobot) -> Awaitable[Preview]:
+        """Plan the way there."""
+        if self.way == "joints":
+            return robot.preview(q=self.values, speed=self.speed)
+        return robot.preview(pose=self.values, speed=self.speed, line=self.way == "line")
+
+    def move(self, robot: AsyncRobot) -> Awaitable[Arrival]:
+        """Move there."""
+        if self.way == "joints":
+            return robot.move_joints(self.values, self.speed)
+        return robot.move_pose(self.values, self.speed, self.way == "line")
+
+
+class Targets:
+    """The page of one arm: `Plan` shows a way, and only what was shown is sent."""
+
+    def __init__(self, view: View, config: ArmConfig) -> None:
+        self._view, self._config = view, config
+        self._planned: Target | None = None
+        with ui.element("div").classes("fields"):
+            self._way = choice("Target", _WAYS, "joints")
+            self._speed = number("Speed, rad/s or m/s (empty: the limit)", min="0")
+        self._joints_part = ui.element("div").classes("fields")
+        with self._joints_part:
+            self._joints = [
+                self._with_slider(joint.name, joint.position.min, joint.position.max) for joint in config.joints
+            ]
+        self._pose_part = ui.element("div").classes("fields")
+        with self._pose_part:
+            self._pose = [number(name) for name in _POSE]
+        with ui.element("div").classes("buttons"):
+            button("Here", self._here, plain=True)
+            button("Plan", self._plan, when="ready holding")
+            self._send_button = button("Send", self._send)
+            button("Solutions", self._solve, plain=True)
+        self._said = text("p", "", role="status", **{"aria-live": "polite"})
+        self._found = ui.element("div").classes("page")
+        text("h2", "Named poses")
+        with ui.element("div").classes("buttons"):
+            self._name = field("Name", maxlength=str(_LONGEST_NAME))
+            button("Keep these joint positions", self._keep, plain=True)
+        self._named = ui.element("div").classes("page")
+        self._show_named()
+        for one in (self._way, self._speed, *self._pose):
+            one.on_change(self._changed)
+        self._here()
+        self._changed()
+
+    def _with_slider(self, name: str, low: float, high: float) -> Field:
+        with ui.element("div"):
+            made = number(f"{name}, rad")
+            slider = ui.element("input")
+            slider.props.update(
+                {"type": "range", "min": f"{low:g}", "max": f"{high:g}", "step": "0.001", "aria-label": f"{name}, slider",
+                 "data-slider": made.control.html_id}
+            )  # fmt: skip
+        made.on_change(self._changed)
+        return made
+
+    def _changed(self) -> None:
+        """What was planned is not what the fields say any more."""
+        self._planned = None
+        self._send_button.props["disabled"] = True
+        self._joints_part.set_visibility(self._way.value == "joints")
+        self._pose_part.set_visibility(self._way.value != "joints")
+        if self._view.arm is not None:
+            self._view.arm.preview([], 0.0)
+
+    def _here(self) -> None:
+        state = self._view.live.state()
+        if "joints" in state:
+            self._fill(self._joints, state["joints"]["actual_position"])
+            self._fill(self._pose, state.get("tool", ()))
+            self._changed()
+
+    @staticmethod
+    def _fill(fields: Sequence[Field], values: Sequence[float]) -> None:
+        for one, value in zip(fields, values, strict=False):
+            one.value = f"{value:.5g}"
+
+    def _target(self) -> Target:
+        """Return what the fields say; raises Invalid."""
+        speed = self._speed.number() if self._speed.value.strip() else None
+        fields = self._joints if self._way.value == "joints" else self._pose
+        return Target(tuple(one.number() for one in fields), self._way.value, speed)
+
+    async def _plan(self) -> None:
+        self._changed()
+        try:
+            target = self._target()
+            found = await self._view.live.view(target.preview)
+        except RtcpError as error:
+            self._said.text = f"No: {error.message}"
+            return
+        if target != self._target():
+            return  # changed meanwhile
+        length = "" if found.length_m is None else f", {found.length_m:.3f} m"
+        self._said.text = f"{found.duration_s:.1f} s{length}: look at the ghost, then send it"
+        if self._view.arm is not None:
+            self._view.arm.preview([list(q) for q in found.path], found.duration_s)
+        self._planned = target
+        self._send_button.props["disabled"] = False
+
+    async def _send(self) -> None:
+        target = self._planned
+        if target is None:
+            return
+        self._said.text = "Moving"
+        arrival = await self._view.act(target.move)
+        self._changed()
+        self._said.text = "" if arrival is None else f"There; largest error of a joint {arrival.error:.5f} rad"
+
+    async def _solve(self) -> None:
+        """Show every configuration that reaches the pose, under the limits in force."""
+        self._found.clear()
+        try:
+            assert self._config.arm is not None
+            pose = Pose.from_xyzrpy(*(one.number() for one in self._pose))
+            found = InverseKinematics(self._config.arm).solve(
+                pose, self._view.live.state()["joints"]["actual_position"]
+            )
+            in_force = (await self._view.live.view(lambda robot: robot.limits()))["limits"]
+        except (Invalid, ValueError, LookupError) as error:
+            self._said.text = f"No: {error}"
+            return
+        if not found.solutions:
+            self._said.text = f"No: {found.reason}"
+            return
+        with self._found:
+            names = [joint.name for joint in self._config.joints]
+            body = table(("#", "Branch", *names, "Limits", ""), "Solutions of the pose")
+        for count, one in enumerate(found.solutions, 1):
+            outside = [
+                name for name, q, low, high in zip(names, one.q, in_force["min"], in_force["max"], strict=True)
+                if not low <= q <= high
+            ]  # fmt: skip
+            row(
+                body,
+                str(count),
+                str(one.branch or "-"),
+                *(f"{q:.4f}" for q in one.q),
+                f"outside: {', '.join(outside)}" if outside else "inside",
+            )
+            with body.default_slot.children[-1], ui.element("td"):
+                button(f"Use solution {count}", partial(self._use, one.q), plain=True)
+
+    def _use(self, q: Sequence[float]) -> None:
+        self._fill(self._joints, q)
+        self._way.value = "joints"
+        self._changed()
+
+    # -- named poses --------------------------------------------------------------------------------------------------
+
+    def _keep(self) -> None:
+        name = self._name.value.strip()[:_LONGEST_NAME]
+        if not name:
+            self._view.warn("Name: found nothing, allowed is a name of the pose")
+            return
+        try:
+            write_named({**read_named(), name: [one.number() for one in self._joints]})
+        except (RtcpError, OSError) as error:
+            self._view.warn(str(error))
+        self._show_named()
+
+    def _forget(self, name: str) -> None:
+        try:
+            write_named({key: q for key, q in read_named().items() if key != name})
+        except (RtcpError, OSError) as error:
+            self._view.warn(str(error))
+        self._show_named()
+
+    def _show_named(self) -> None:
+        self._named.clear()
+        try:
+            named = read_named()
+        except RtcpError as error:
+            with self._named:
+                text("p", error.message, "bad")
+            return
+        with self._named:
+            for name, q in named.items():
+                with ui.element("div").classes("buttons"):
+                    button(name, partial(self._use, q), plain=True)
+                    text("span", ", ".join(f"{one:.3f}" for one in q))
+                    button(f"Remove {name}", partial(self._forget, name), plain=True)
+
+
+def named_file() -> Path:
+    """Return the file of the named poses: `name: [q1, ..., q6]`, rad."""
+    return state_directory() / "poses.yaml"
+
+
+def read_named() -> dict[str, list[float]]:
+    """Return the named poses.
+
+    Raises:
+        Invalid: the file is damaged.
+    """
+    path = named_file()
+    if not path.exists():
+        return {}
+    try:
+        found = YAML(typ="safe").load(path.read_text()) or {}
+        return {str(name): [float(one) for one in q] for name, q in found.items()}
+    except (OSError, YAMLError, ValueError, TypeError, AttributeError) as error:
+        message = f"{path}: found no names with joint positions ({error}): mend or remove it"
+        raise RtcpError("invalid", message) from error
+
+
+def write_named(named: dict[str, list[float]]) -> None:
+    """Replace the file; raises OSError."""
+    path = named_file()
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    written = StringIO()
+    YAML(typ="safe").dump(named, written)
+    fresh = path.with_suffix(".new")
+    fresh.write_text(written.getvalue())
+    os.replace(fresh, path)

@@ -1,0 +1,68 @@
+// The picture of the scope: zoom by wheel or slider, two cursors by clicks, CSV of what is shown.
+import { echarts } from "nicegui-echart";
+
+export default {
+  template: `<div><div class="scope" role="img" aria-label="Signals over time"></div><p role="status">{{ cursors }}</p></div>`,
+  data() { return { cursors: "Click into the picture to set cursors A and B." }; },
+  mounted() {
+    this.chart = echarts.init(this.$el.firstChild, null, { renderer: "canvas" });
+    this.marks = [];
+    this.paused = false;
+    this.stop = window.rtcp.scope((block) => { if (!this.paused) this.show(block); });
+    this.sizes = new ResizeObserver(() => this.chart.resize());
+    this.sizes.observe(this.$el);
+    this.chart.getZr().on("click", (event) => {
+      const [t] = this.chart.convertFromPixel({ gridIndex: 0 }, [event.offsetX, event.offsetY]);
+      this.marks = [...this.marks, t].slice(-2);
+      this.draw();
+    });
+  },
+  beforeUnmount() { this.stop(); this.sizes.disconnect(); this.chart.dispose(); },
+  methods: {
+    show(block) {
+      this.block = block;
+      this.$el.dataset.shown = String(1 + Number(this.$el.dataset.shown ?? 0));
+      this.draw();
+    },
+    pause(value) { this.paused = value; },
+    draw() {
+      const block = this.block;
+      if (!block) return;
+      const dark = document.body.classList.contains("body--dark");
+      const lines = this.marks.map((t, at) => ({ xAxis: t, label: { formatter: "AB"[at] } }));
+      this.chart.setOption({
+        animation: false,
+        textStyle: { color: dark ? "#f1f3f5" : "#212529" },
+        legend: { type: "scroll", top: 0, textStyle: { color: dark ? "#f1f3f5" : "#212529" } },
+        grid: { left: 60, right: 15, top: 40, bottom: 70 },
+        xAxis: { type: "value", name: "s", min: "dataMin", max: "dataMax" },
+        yAxis: { type: "value", scale: true },
+        dataZoom: [{ type: "inside" }, { type: "slider", bottom: 10 }],
+        tooltip: { trigger: "axis" },
+        series: block.signals.map((name, at) => ({
+          name, type: "line", showSymbol: false, data: block.t.map((t, k) => [t, block.y[at][k]]),
+          markLine: at === 0 ? { symbol: "none", data: lines, animation: false } : undefined,
+        })),
+      }, { replaceMerge: ["series"] });
+      if (this.marks.length) this.cursors = this.read();
+    },
+    read() {
+      const { t, y, signals } = this.block;
+      const at = (mark) => t.reduce((best, one, k) => (Math.abs(one - mark) < Math.abs(t[best] - mark) ? k : best), 0);
+      const [a, b] = this.marks.map(at);
+      const one = (k) => signals.map((name, line) => `${name} ${y[line][k].toPrecision(5)}`).join(", ");
+      if (b === undefined) return `A ${t[a].toFixed(4)} s: ${one(a)}`;
+      const change = signals.map((name, line) => `${name} ${(y[line][b] - y[line][a]).toPrecision(4)}`).join(", ");
+      return `A ${t[a].toFixed(4)} s, B ${t[b].toFixed(4)} s, B - A ${(t[b] - t[a]).toFixed(4)} s: ${change}`;
+    },
+    csv() {
+      if (!this.block) return;
+      const { t, y, signals } = this.block;
+      const lines = [["Time", ...signals].join(","), ...t.map((one, k) => [one, ...y.map((line) => line[k])].join(","))];
+      const link = Object.assign(document.createElement("a"), { download: "scope.csv",
+        href: URL.createObjectURL(new Blob([lines.join("\n") + "\n"], { type: "text/csv" })) });
+      link.click();
+      URL.revokeObjectURL(link.href);
+    },
+  },
+};
