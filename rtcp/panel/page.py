@@ -31,7 +31,8 @@ class Field:
             self.control = ui.element(tag)
         self._label.props["for"] = self.control.html_id
         self.control.props.update(attributes)
-        self.control.props["value"] = value
+        # As an attribute: a property would be written again, over what was typed, whenever something near is drawn anew.
+        self.control.props["^value"] = value
         self.control.on("input", self._changed, js_handler="(event) => emit(event.target.value)")
         self._value = value
         self._on_change: list[Handler] = []
@@ -87,7 +88,8 @@ def choice(label: str, options: Iterable[str] | Mapping[str, str], value: str) -
         for key, name in shown.items():
             option = text("option", name)
             option.props["value"] = key
-            option.props["selected"] = key == value
+            if key == value:
+                option.props["^selected"] = ""
     return made
 
 

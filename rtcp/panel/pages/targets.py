@@ -97,9 +97,15 @@ class Targets:
             made = number(f"{name}, rad")
             slider = ui.element("input")
             slider.props.update(
-                {"type": "range", "min": f"{low:g}", "max": f"{high:g}", "step": "0.001", "aria-label": f"{name}, slider",
-                 "data-slider": made.control.html_id}
-            )  # fmt: skip
+                {
+                    "type": "range",
+                    "min": f"{low:g}",
+                    "max": f"{high:g}",
+                    "step": "0.001",
+                    "aria-label": f"{name}, slider",
+                    "data-slider": made.control.html_id,
+                }
+            )
         made.on_change(self._changed)
         return made
 
@@ -115,7 +121,9 @@ class Targets:
     def _here(self) -> None:
         state = self._view.live.state()
         if "joints" in state:
-            self._fill(self._joints, state["joints"]["actual_position"])
+            # Where it holds it is what it was told to hold: the same target again moves nothing.
+            which = "commanded_position" if state["state"] == "holding" else "actual_position"
+            self._fill(self._joints, state["joints"][which])
             self._fill(self._pose, state.get("tool", ()))
             self._changed()
 

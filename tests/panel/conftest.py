@@ -1,0 +1,115 @@
+"""A platform on its virtual segment, the panel beside it, and real Chromium in front of that."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from playwright.sync_api import Browser, Error, Page, sync_playwright
+
+from tests.e2e.conftest import Platform
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+
+
+@contextlib.contextmanager
+def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Run a panel on a free port; yield its process and address."""
+    # Not one of the platform's commands, which end with a test.
+    command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", "0", *arguments]
+    panel = subprocess.Popen(
+        command, env=platform.environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert panel.stdout is not None
+    try:
+        yield panel, panel.stdout.readline().partition(": ")[0].rstrip("/")
+    finally:
+        if panel.poll() is None:
+            panel.terminate()
+        _, complaints = panel.communicate(timeout=20)
+        assert "Traceback" not in complaints, complaints
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed (Debian: apt install chromium)")
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def platform() -> Iterator[Platform]:
+    """A platform that does not run yet."""
+    made = Platform()
+    made.be_patient(lost_ms=2000)
+    try:
+        yield made
+    finally:
+        made.end_commands()
+        made.rtcp("stop", check=None)
+        shutil.rmtree(made.directory, ignore_errors=True)
+
+
+@pytest.fixture(scope="module")
+def panel(platform: Platform) -> Iterator[str]:
+    """Its address."""
+    with begun(platform) as (_, url):
+        yield url
+
+
+@pytest.fixture
+def page(browser: Browser, panel: str) -> Iterator[Page]:
+    with visitor(browser, panel) as found:
+        yield found
+
+
+@contextlib.contextmanager
+def visitor(browser: Browser, url: str, **options: Any) -> Iterator[Page]:
+    """A browser window of its own; what the panel's scripts complain of fails the test."""
+    complaints: list[str] = []
+    context = browser.new_context(base_url=url, viewport={"width": 1600, "height": 900}, **options)
+    found = context.new_page()
+    found.on("pageerror", lambda error: complaints.append(str(error)))
+    found.set_default_timeout(15_000)
+    try:
+        yield found
+    finally:
+        with contextlib.suppress(Error):  # a browser that was killed
+            context.close()
+    assert complaints == []
+
+
+def show(page: Page, path: str) -> Page:
+    """Open a page of the panel and wait until its state is live."""
+    page.goto(path)
+    page.wait_for_selector("[data-live=state][data-state]:not([data-state='no connection'])")
+    return page
+
+
+def until(met: Callable[[], Any], what: str, patience_s: float = 20.0) -> Any:
+    """Wait until `met` returns something true; return that."""
+    end = time.monotonic() + patience_s
+    while time.monotonic() < end:
+        if found := met():
+            return found
+        time.sleep(0.05)
+    raise AssertionError(f"not within {patience_s:g} s: {what}")

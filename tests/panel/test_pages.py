@@ -1,0 +1,316 @@
+"""Every page of the panel, used as a person would; what came of it is judged by the API and the files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from mcap.reader import make_reader
+from playwright.sync_api import Browser, Page, expect
+from prometheus_client.parser import text_string_to_metric_families
+
+from rtcp.panel.server import PAGES
+from tests.e2e.conftest import Platform
+from tests.panel.conftest import show, until, visitor
+
+pytestmark = pytest.mark.alone
+BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
+
+
+@pytest.fixture
+def holding(platform: Platform, panel: str) -> Platform:
+    """The platform, enabled, bent and at rest."""
+    platform.rtcp("segment", "clear", check=None)
+    platform.restore()
+    platform.call("enable")
+    platform.call("move_joints", q=BENT)
+    return platform
+
+
+def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platform) -> None:
+    platform.rtcp("stop", check=None)
+    show(page, "/")
+    expect(page.locator("[data-live=state]")).to_have_text("off")
+    for name in ("Stop the platform", "Enable", "Disable", "Reset", "Halt"):
+        expect(page.get_by_role("button", name=name, exact=True)).to_be_disabled()
+    page.get_by_role("button", name="Check this host").click()
+    expect(page.locator("pre")).to_contain_text(re.compile("scheduler|kernel|CPU", re.I))
+    page.get_by_label("Bus").select_option("virtual")
+    page.get_by_role("button", name="Start", exact=True).click()
+    expect(page.locator("[data-live=state]")).to_have_text("ready", timeout=30_000)
+    assert platform.status()["bus"] == "virtual"
+    expect(page.get_by_role("button", name="Start", exact=True)).to_be_disabled()
+    page.get_by_role("button", name="Scan the bus").click()
+    expect(page.get_by_role("row")).to_have_count(8)
+    page.get_by_label("Drive mode").select_option("csv")
+    page.get_by_role("button", name="Set drive mode").click()
+    until(lambda: platform.status()["drive_mode"] == "csv", "csv")
+    page.get_by_label("Drive mode").select_option("csp")
+    page.get_by_role("button", name="Set drive mode").click()
+    until(lambda: platform.status()["drive_mode"] == "csp", "csp")
+    page.get_by_role("button", name="Enable").click()
+    until(lambda: platform.status()["state"] == "holding", "holding")
+    page.get_by_role("button", name="Disable").click()
+    until(lambda: platform.status()["state"] == "ready", "ready")
+    page.get_by_role("button", name="Stop the platform").click()
+    expect(page.locator("[data-live=state]")).to_have_text("off", timeout=30_000)
+
+
+def test_what_cannot_be_started_is_said(page: Page, platform: Platform) -> None:
+    platform.rtcp("stop", check=None)
+    show(page, "/")
+    page.get_by_label("Configuration").fill("/nowhere.yaml")
+    page.get_by_role("button", name="Start", exact=True).click()
+    expect(page.locator("pre")).to_contain_text("/nowhere.yaml")
+    expect(page.locator("[data-live=state]")).to_have_text("off")
+
+
+def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platform) -> None:
+    show(page, "/arm")
+    for at, value in enumerate(holding.status()["joints"]["actual_position"]):
+        expect(page.locator(f"[data-live='actual_position.{at}']")).to_have_text(f"{value:.4f}")
+    expect(page.locator("[data-live='drive.0']")).to_have_text("operation enabled")
+    bar = page.locator("[data-bar='actual_position.2']")
+    assert float(bar.evaluate("e => parseFloat(e.style.getPropertyValue('--at'))")) == pytest.approx(
+        100 * (1.57 + 2.4) / 4.8, abs=1
+    )
+    assert page.locator(".arm-view canvas").bounding_box()["height"] > 200  # type: ignore[index]
+    # Straight up it stands on two singularities, bent it does not.
+    expect(page.locator(".arm-view")).to_have_attribute("data-near", "0.00")
+    holding.call("move_joints", q=[0.0] * 6)
+    expect(page.locator(".arm-view")).to_have_attribute("data-near", "1.00")
+
+
+def test_a_target_is_planned_shown_and_sent(page: Page, holding: Platform) -> None:
+    show(page, "/targets")
+    send = page.get_by_role("button", name="Send", exact=True)
+    expect(page.get_by_label("joint2, rad")).to_have_value("0.3")
+    page.get_by_label("joint1, rad").fill("0.2")
+    expect(send).to_be_disabled()
+    page.get_by_role("button", name="Plan").click()
+    expect(page.locator(".arm-view")).to_have_attribute("data-ghost", "shown")
+    assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
+    send.click()
+    until(lambda: abs(holding.status()["joints"]["actual_position"][0] - 0.2) < 1e-3, "the arm is there")
+    expect(page.get_by_text("There; largest error")).to_be_visible()
+
+
+def test_a_target_out_of_range_or_reach_is_refused_with_the_limit(page: Page, holding: Platform) -> None:
+    show(page, "/targets")
+    page.get_by_label("joint1, rad").fill("9")
+    page.get_by_role("button", name="Plan").click()
+    expect(
+        page.get_by_text(re.compile("No: joint1: target 9 rad is outside its range, beyond 3.1 rad"))
+    ).to_be_visible()
+    page.get_by_label("Target").select_option("pose")
+    page.get_by_label("x m").fill("5")
+    page.get_by_role("button", name="Plan").click()
+    expect(page.get_by_text(re.compile("No: the pose cannot be reached.* m"))).to_be_visible()
+    expect(page.get_by_role("button", name="Send", exact=True)).to_be_disabled()
+
+
+def test_a_pose_on_a_line_and_its_solutions(page: Page, holding: Platform) -> None:
+    show(page, "/targets")
+    page.get_by_label("Target").select_option("line")
+    expect(page.get_by_label("y m")).not_to_have_value("")
+    y = float(page.get_by_label("y m").input_value())
+    page.get_by_label("y m").fill(f"{y + 0.05}")
+    page.get_by_role("button", name="Solutions").click()
+    expect(page.get_by_role("row", name=re.compile("inside"))).not_to_have_count(0)
+    page.get_by_role("button", name="Plan").click()
+    expect(page.get_by_text(re.compile(r"0\.050 m: look at the ghost"))).to_be_visible()
+    page.get_by_role("button", name="Send", exact=True).click()
+    expect(page.get_by_text("There; largest error")).to_be_visible()
+    expect(page.locator("[data-live=state]")).to_have_text("holding")
+    until(lambda: "arrived" in holding.events(), "it has arrived")
+    page.get_by_role("button", name="Use solution 1").click()
+    expect(page.get_by_label("Target")).to_have_value("joints")
+
+
+def test_named_poses_are_kept_in_a_file(page: Page, holding: Platform) -> None:
+    show(page, "/targets")
+    page.get_by_label("joint1, rad").fill("0.125")
+    page.get_by_label("Name", exact=True).fill("<b>beside</b> the cup")
+    page.get_by_role("button", name="Keep these joint positions").click()
+    use = page.get_by_role("button", name="<b>beside</b> the cup", exact=True)
+    expect(use).to_be_visible()
+    assert "beside" in Path(holding.environment["RTCP_STATE_DIR"], "poses.yaml").read_text()
+    page.get_by_role("button", name="Here").click()
+    expect(page.get_by_label("joint1, rad")).to_have_value("0")
+    use.click()
+    expect(page.get_by_label("joint1, rad")).to_have_value("0.125")
+    page.get_by_role("button", name="Remove <b>beside</b> the cup").click()
+    expect(use).to_have_count(0)
+
+
+def test_the_slider_of_a_joint_and_its_field_are_one(page: Page, holding: Platform) -> None:
+    show(page, "/targets")
+    slider = page.get_by_label("joint4, slider")
+    slider.focus()
+    for _ in range(10):
+        slider.press("ArrowRight")
+    expect(page.get_by_label("joint4, rad")).to_have_value("0.01")
+    page.get_by_role("button", name="Plan").click()
+    expect(page.get_by_role("button", name="Send", exact=True)).to_be_enabled()
+
+
+@pytest.fixture
+def limits_of_the_file(holding: Platform) -> Iterator[Platform]:
+    yield holding
+    holding.call("set_limits", changes={"joint2.max": 2.0, "box.max.z": 1.4})
+
+
+def test_limits_are_narrowed_and_never_widened(page: Page, limits_of_the_file: Platform) -> None:
+    platform = limits_of_the_file
+    show(page, "/limits")
+    page.get_by_label("joint2 max").fill("1.5")
+    page.get_by_label("box max z").fill("1.35")
+    page.get_by_role("button", name="Set the limits").click()
+    until(lambda: platform.call("limits")["limits"]["max"][1] == 1.5, "the limit of joint 2")
+    assert platform.call("limits")["limits"]["box"]["max"][2] == 1.35
+    page.get_by_label("joint2 max").fill("3")
+    page.get_by_role("button", name="Set the limits").click()
+    expect(page.locator(".q-notification", has_text="joint2")).to_be_visible()
+    assert platform.call("limits")["limits"]["max"][1] == 1.5
+    page.get_by_role("button", name="As the file allows").click()
+    page.get_by_role("button", name="Set the limits").click()
+    until(lambda: platform.call("limits")["limits"] == platform.call("limits")["configured"], "the limits of the file")
+
+
+def test_a_recording_is_made_downloaded_and_drawn(page: Page, holding: Platform, tmp_path: Path) -> None:
+    show(page, "/recorder")
+    page.get_by_label("File name").fill("cup")
+    page.get_by_role("button", name="Record", exact=True).click()
+    expect(page.get_by_text(re.compile(r"cup\.mcap: [1-9]\d* samples, 0 missing"))).to_be_visible()
+    page.get_by_role("button", name="Stop recording").click()
+    expect(page.get_by_text("Nothing is recorded")).to_be_visible()
+    page.get_by_role("button", name="Show the files").click()
+    with page.expect_download() as download:
+        page.get_by_role("link", name="Download cup.mcap").click()
+    download.value.save_as(tmp_path / "cup.mcap")
+    with open(tmp_path / "cup.mcap", "rb") as file:
+        assert sum(1 for _ in make_reader(file).iter_messages(topics=["/cycle"])) > 100
+    page.get_by_role("button", name="Plot cup.mcap").click()
+    picture = page.get_by_alt_text("Plot of cup.mcap")
+    expect(picture).to_be_visible(timeout=30_000)
+    assert picture.evaluate("image => image.naturalWidth") > 100
+
+
+def test_a_program_is_checked_run_and_stopped(page: Page, holding: Platform, tmp_path: Path) -> None:
+    there = [0.2, *BENT[1:]]
+    program = tmp_path / "program.yaml"
+    program.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 2, q: {there}}}\n")
+    show(page, "/recorder")
+    page.get_by_label("Motion file").fill(str(tmp_path / "none.yaml"))
+    page.get_by_role("button", name="Check", exact=True).click()
+    expect(page.get_by_text(re.compile(r"No: .*none\.yaml"))).to_be_visible()
+    page.get_by_label("Motion file").fill(str(program))
+    page.get_by_role("button", name="Check", exact=True).click()
+    expect(page.get_by_text(re.compile("It can be run"))).to_be_visible()
+    page.get_by_role("button", name="Run").click()
+    expect(page.get_by_text("Done")).to_be_visible()
+    assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.2, abs=1e-3)
+    page.get_by_role("button", name="Run").click()
+    holding.until(lambda found: found["state"] == "moving", "moving")
+    page.get_by_role("button", name="Stop the program").click()
+    holding.until(lambda found: found["state"] == "holding", "holding")
+    expect(page.get_by_text("It has not reached its end")).to_be_visible()
+
+
+def test_the_scope_shows_and_keeps_what_moves(page: Page, holding: Platform, tmp_path: Path) -> None:
+    show(page, "/scope")
+    page.get_by_label("Time base").fill("1")
+    page.get_by_label("Signal", exact=True).select_option("actual_velocity.0")
+    page.get_by_role("button", name="Add the signal").click()
+    page.get_by_label("Trigger", exact=True).select_option("commanded_position.0")
+    page.get_by_label("Level", exact=True).fill("0.05")
+    page.wait_for_timeout(1500)
+    before = page.locator("[data-shown]").get_attribute("data-shown") if page.locator("[data-shown]").count() else "0"
+    holding.call("move_joints", q=[0.2, *BENT[1:]])
+    until(
+        lambda: (
+            page.locator("[data-shown]").count() and page.locator("[data-shown]").get_attribute("data-shown") != before
+        ),
+        "the trigger",
+    )
+    page.get_by_role("button", name="Pause").click()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="CSV").click()
+    download.value.save_as(tmp_path / "scope.csv")
+    head, *lines = (tmp_path / "scope.csv").read_text().splitlines()
+    assert head == "Time,actual_position.0,commanded_position.0,actual_velocity.0"
+    rows = [[float(one) for one in line.split(",")] for line in lines]
+    at_trigger = min(rows, key=lambda one: abs(one[0]))
+    assert at_trigger[2] == pytest.approx(0.05, abs=2e-3)
+    assert rows[0][0] == pytest.approx(-0.2, abs=0.01)
+    assert max(one[3] for one in rows) > 0.1
+
+
+def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Platform) -> None:
+    show(page, "/segment")
+    expect(page.get_by_role("row")).to_have_count(8)
+    page.get_by_label("Index, hex").fill("1018")
+    page.get_by_label("Subindex").fill("1")
+    page.get_by_role("button", name="Read").click()
+    vendor = int.from_bytes(bytes.fromhex(holding.call("sdo_read", slave=2, index=0x1018, subindex=1)["hex"]), "little")
+    expect(page.get_by_text(f"({vendor})")).to_be_visible()
+    expect(page.get_by_role("button", name="Write")).to_be_disabled()
+    since = holding.last_event()
+    page.get_by_label("Kind", exact=True).select_option("power")
+    page.get_by_label("Keys").fill("slave=3")
+    page.get_by_label("Lasts").fill("")
+    page.get_by_role("button", name="Make the fault").click()
+    until(lambda: "slave_lost" in holding.events(since) or holding.status()["state"] == "fault", "the slave is lost")
+    expect(page.get_by_text(re.compile(r"^fault \d+: power, for"))).to_be_visible()
+    page.get_by_role("button", name="Clear all").click()
+    expect(page.locator("[data-live=state]")).to_have_text("fault")
+    holding.until(lambda found: all(one["state"] == "OP" for one in found["slaves"]), "OP again", 40.0)
+    expect(page.locator("td", has_text=re.compile("^OP$"))).to_have_count(7)
+
+
+def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding: Platform, panel: str) -> None:
+    show(page, "/health")
+    for name in ("Wake-up", "Exchange", "Compute"):
+        expect(page.get_by_label(f"Histogram: {name}, us").locator("canvas")).to_be_visible()
+    expect(page.get_by_role("row", name="wake-up")).to_contain_text(re.compile(r"\d+\.\d"))
+    expect(page.get_by_role("row", name="enabled").first).to_be_visible()
+    holding.rtcp("segment", "fault", "power", "slave=3", "--lasts", "0.5")
+    holding.until(lambda found: found["state"] == "fault", "fault")
+    recorded = Path(holding.environment["RTCP_STATE_DIR"], "faults")
+    until(lambda: list(recorded.glob("fault-*.mcap")), "the fault is recorded")
+    page.get_by_role("button", name="Show the recorded faults").click()
+    page.get_by_role("button", name="Picture of fault").first.click()
+    picture = page.get_by_alt_text(re.compile("What happened around fault"))
+    expect(picture).to_be_visible(timeout=30_000)
+    assert picture.evaluate("image => image.naturalWidth") > 100
+    text = page.request.get(f"{panel}/metrics").text()
+    found = {family.name: family for family in text_string_to_metric_families(text)}
+    assert {one.labels["state"] for one in found["rtcp_state"].samples if one.value} == {"fault"}
+    assert found["rtcp_cycles"].samples[0].value > 0
+    assert len(found["rtcp_joint_position_radians"].samples) == 6
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1600])
+def test_no_page_has_a_serious_barrier(
+    browser: Browser, panel: str, holding: Platform, width: int, scheme: str
+) -> None:
+    found: dict[str, object] = {}
+    with visitor(browser, panel, color_scheme=scheme) as page:
+        page.set_viewport_size({"width": width, "height": 800})
+        for path in PAGES:
+            show(page, path)
+            page.wait_for_timeout(1000)
+            for one in Axe().run(page).response["violations"]:
+                if one["impact"] in ("serious", "critical"):
+                    nodes = [
+                        f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in one["nodes"]
+                    ]
+                    found[f"{path} {one['id']}"] = nodes[:3]
+            if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+                found[f"{path} is wider than the screen"] = page.evaluate("document.documentElement.scrollWidth")
+            expect(page.get_by_role("button", name="STOP not the emergency stop")).to_be_in_viewport()
+    assert found == {}
