@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -50,12 +51,15 @@ def _password(
         ),
     ] = "operator",
 ) -> None:
-    """Set the password of a role; it is asked for, and kept as a hash."""
+    """Set the password of a role, asked for at the terminal, else the first line of standard input; kept as a hash."""
     from rtcp.panel.access import ROLES, password_file, set_password
 
     if role not in ROLES:
         raise CommandError(f"--role {role} is not known: {', '.join(ROLES)}")
-    password = typer.prompt(f"Password of the {role}s", hide_input=True, confirmation_prompt=True)
+    if sys.stdin.isatty():
+        password = typer.prompt(f"Password of the {role}s", hide_input=True, confirmation_prompt=True)
+    else:
+        password = sys.stdin.readline().rstrip("\n")
     set_password(password_file(), role, password)
     report(f"kept in {password_file()}; a panel that runs takes it at its next start")
 

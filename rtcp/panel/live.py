@@ -194,9 +194,12 @@ class Live:
         try:
             while True:
                 self._receive(page, await socket.receive_json())
-        except (WebSocketDisconnect, ValueError, KeyError, TypeError, RuntimeError):
-            with contextlib.suppress(RuntimeError):
-                await socket.close()
+        except (ValueError, LookupError, TypeError, OverflowError):
+            # Not one of ours: the page of this panel sends nothing else.
+            with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+                await socket.close(1003, "not a message of a page")
+        except (WebSocketDisconnect, RuntimeError):
+            pass  # it has closed, or was closed
         finally:
             if page.socket is socket:
                 page.socket = None

@@ -31,7 +31,7 @@ class Field:
             self.control = ui.element(tag)
         self._label.props["for"] = self.control.html_id
         self.control.props.update(attributes)
-        # As an attribute: a property would be written again, over what was typed, whenever something near is drawn anew.
+        # An attribute: a property would be written again, over what was typed, when something near is drawn anew.
         self.control.props["^value"] = value
         self.control.on("input", self._changed, js_handler="(event) => emit(event.target.value)")
         self._value = value

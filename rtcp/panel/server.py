@@ -204,8 +204,12 @@ class Panel:
 
 def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:
     """Return a file of a directory; one outside of it, or of another kind, does not exist."""
-    found = (directory / path).resolve()
-    if not found.is_relative_to(directory.resolve()) or found.suffix[1:] not in endings or not found.is_file():
+    try:
+        found = (directory / path).resolve()
+        is_ours = found.is_relative_to(directory.resolve()) and found.suffix[1:] in endings and found.is_file()
+    except (OSError, ValueError):
+        is_ours = False  # too long, or with a NUL
+    if not is_ours:
         return Response("no such file", 404)
     return FileResponse(found)
 

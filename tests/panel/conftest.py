@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Error, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Error, Page, sync_playwright
 
 from tests.e2e.conftest import Platform
 
@@ -47,13 +47,18 @@ def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Pope
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
+def chromium() -> Iterator[BrowserType]:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
     with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        yield found
-        found.close()
+        yield playwright.chromium
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: BrowserType) -> Iterator[Browser]:
+    found = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    yield found
+    found.close()
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +118,20 @@ def until(met: Callable[[], Any], what: str, patience_s: float = 20.0) -> Any:
             return found
         time.sleep(0.05)
     raise AssertionError(f"not within {patience_s:g} s: {what}")
+
+
+BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
+
+
+@pytest.fixture
+def holding(platform: Platform, panel: str) -> Platform:
+    """The platform, enabled, bent and at rest, as its file has it."""
+    ready(platform)
+    return platform
+
+
+def ready(platform: Platform) -> None:
+    platform.rtcp("segment", "clear", check=None)
+    platform.restore()
+    platform.call("enable")
+    platform.call("move_joints", q=BENT)

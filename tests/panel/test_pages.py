@@ -14,20 +14,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from rtcp.panel.server import PAGES
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import show, until, visitor
+from tests.panel.conftest import BENT, show, until, visitor
 
 pytestmark = pytest.mark.alone
-BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
-
-
-@pytest.fixture
-def holding(platform: Platform, panel: str) -> Platform:
-    """The platform, enabled, bent and at rest."""
-    platform.rtcp("segment", "clear", check=None)
-    platform.restore()
-    platform.call("enable")
-    platform.call("move_joints", q=BENT)
-    return platform
 
 
 def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platform) -> None:

@@ -1,0 +1,212 @@
+"""Who gets into the panel: over real HTTP and WebSockets, with requests that no browser would send."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import stat
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode, urlsplit
+
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from rtcp.api import Invalid
+from rtcp.panel import access
+from tests.e2e.conftest import Platform
+from tests.panel.conftest import begun
+
+PAGE = {"Accept": "text/html"}
+PASSWORDS = {"operator": "correct horse", "viewer": "battery staple"}
+
+
+@pytest.fixture(scope="module")
+def open_panel() -> Iterator[tuple[Platform, str]]:
+    """A panel that asks nobody, without a platform."""
+    platform = Platform()
+    try:
+        with begun(platform) as (_, url):
+            yield platform, url
+    finally:
+        platform.end()
+
+
+@pytest.fixture(scope="module")
+def closed_panel() -> Iterator[str]:
+    """One that asks for passwords."""
+    platform = Platform()
+    try:
+        for role, password in PASSWORDS.items():
+            platform_password(platform, role, password)
+        with begun(platform) as (_, url):
+            yield url
+    finally:
+        platform.end()
+
+
+def platform_password(platform: Platform, role: str, password: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "rtcp.cli", "panel", "password", "--role", role]
+    return subprocess.run(
+        command, input=f"{password}\n", env=platform.environment, text=True, capture_output=True, check=False
+    )
+
+
+def ask(url: str, method: str, path: str, headers: dict[str, str] | None = None, body: str | None = None) -> Any:
+    """Send one request; return the response, read."""
+    connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=20)
+    connection.request(method, path, body, headers or {})
+    response = connection.getresponse()
+    response.text = response.read().decode(errors="replace")  # type: ignore[attr-defined]
+    connection.close()
+    return response
+
+
+def cookie_of(response: Any) -> str:
+    return str(response.getheader("set-cookie") or "").partition(";")[0]
+
+
+def log_in(url: str, password: str, **headers: str) -> Any:
+    body = urlencode({"name": "Ada", "password": password})
+    given = {"Origin": url, "Content-Type": "application/x-www-form-urlencoded", **headers}
+    return ask(url, "POST", "/login", given, body)
+
+
+def status_of_socket(url: str, path: str, **headers: str) -> int:
+    try:
+        with connect(url.replace("http", "ws") + path, additional_headers=headers):
+            return 101
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
+def test_a_visitor_gets_a_cookie_that_no_script_and_no_other_site_can_use(open_panel: tuple[Platform, str]) -> None:
+    response = ask(open_panel[1], "GET", "/", PAGE)
+    assert response.status == 303
+    assert re.search("HttpOnly", response.getheader("set-cookie"))
+    assert re.search("SameSite=strict", response.getheader("set-cookie"))
+    page = ask(open_panel[1], "GET", "/", {**PAGE, "Cookie": cookie_of(response)})
+    assert page.status == 200
+    assert "frame-ancestors 'none'" in page.getheader("content-security-policy")
+    assert not re.search(r"""(src|href)=["']https?:""", page.text)
+
+
+@pytest.mark.parametrize(
+    "path", ["/", "/live", "/metrics", "/static/panel.js", "/recordings/x.mcap", "/_nicegui_ws/socket.io/"]
+)
+def test_nothing_is_served_without_a_session(open_panel: tuple[Platform, str], path: str) -> None:
+    for cookie in ("", "rtcp_panel=" + "A" * 43, "rtcp_panel=../../etc", "rtcp_panel=" + "x" * 9000):
+        assert ask(open_panel[1], "GET", path, {"Cookie": cookie}).status in (400, 401, 431)
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "10.0.0.1", "", "127.0.0.1.evil.example"])
+def test_a_foreign_host_is_refused(open_panel: tuple[Platform, str], host: str) -> None:
+    assert ask(open_panel[1], "GET", "/", {**PAGE, "Host": host}).status in (400, 403)
+
+
+@pytest.mark.parametrize("path", ["/live?page=x", "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"])
+def test_a_socket_of_another_site_is_refused(open_panel: tuple[Platform, str], path: str) -> None:
+    url = open_panel[1]
+    cookie = cookie_of(ask(url, "GET", "/", PAGE))
+    for origin in ("http://evil.example", "null", url.replace("http", "https"), url + ".evil.example"):
+        assert status_of_socket(url, path, Cookie=cookie, Origin=origin) == 403
+    assert status_of_socket(url, path, Cookie=cookie) == 403
+    assert status_of_socket(url, path, Origin=url) == 403
+
+
+def test_a_command_of_another_site_is_refused(open_panel: tuple[Platform, str]) -> None:
+    url = open_panel[1]
+    cookie = cookie_of(ask(url, "GET", "/", PAGE))
+    for headers in ({}, {"Origin": "http://evil.example"}, {"Origin": "null"}):
+        assert ask(url, "POST", "/stop", {"Cookie": cookie, **headers}).status == 403
+    assert ask(url, "POST", "/stop", {"Cookie": cookie, "Origin": url}).status == 204
+    assert ask(url, "POST", "/stop", {"Cookie": cookie, "Origin": url, "Content-Length": "99999999"}).status == 413
+    for method in ("PUT", "DELETE", "OPTIONS", "TRACE"):
+        assert ask(url, method, "/", {"Cookie": cookie, "Origin": url}).status == 405
+
+
+def test_no_file_outside_the_recordings_is_served(open_panel: tuple[Platform, str]) -> None:
+    platform, url = open_panel
+    cookie = {"Cookie": cookie_of(ask(url, "GET", "/", PAGE))}
+    state = Path(platform.environment["RTCP_STATE_DIR"])
+    (state / "recordings").mkdir(parents=True, exist_ok=True)
+    (state / "recordings" / "mine.csv").write_text("Time\n")
+    (state / "secret.csv").write_text("no")
+    (state / "recordings" / "link.csv").symlink_to(state / "secret.csv")
+    assert ask(url, "GET", "/recordings/mine.csv", cookie).text == "Time\n"
+    for path in (
+        "../secret.csv",
+        "..%2fsecret.csv",
+        "%2e%2e/secret.csv",
+        "link.csv",
+        "//etc/passwd",
+        "%00",
+        "a" * 5000,
+    ):
+        assert ask(url, "GET", f"/recordings/{path}", cookie).status in (400, 401, 404)
+
+
+def test_passwords_open_the_panel_and_are_kept_as_hashes(closed_panel: str) -> None:
+    assert ask(closed_panel, "GET", "/", PAGE).getheader("location") == "/login"
+    assert log_in(closed_panel, "wrong").status == 401
+    assert log_in(closed_panel, "correct horse", Origin="http://evil.example").status == 403
+    response = log_in(closed_panel, "correct horse")
+    assert (response.status, response.getheader("location")) == (303, "/")
+    assert ask(closed_panel, "GET", "/", {**PAGE, "Cookie": cookie_of(response)}).status == 200
+    ended = ask(closed_panel, "POST", "/logout", {"Cookie": cookie_of(response), "Origin": closed_panel})
+    assert ended.status == 303
+    assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie_of(response)}).status == 401
+
+
+def test_tries_are_limited(tmp_path: Path) -> None:
+    platform = Platform()
+    try:
+        platform_password(platform, "operator", "correct horse")
+        with begun(platform) as (_, url):
+            assert [log_in(url, "wrong").status for _ in range(6)] == [401] * 5 + [429]
+            assert log_in(url, "correct horse").status == 429
+    finally:
+        platform.end()
+
+
+def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str) -> None:
+    cookie = cookie_of(log_in(closed_panel, "battery staple"))
+    found = {ask(closed_panel, "GET", "/metrics").status for _ in range(600)}
+    assert 429 in found
+    assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie}).status == 200
+
+
+def test_another_address_wants_a_password() -> None:
+    platform = Platform()
+    try:
+        refused = platform.rtcp("panel", "--host", "0.0.0.0", "--port", "0", check=2)
+        assert "rtcp panel password" in refused.stderr
+    finally:
+        platform.end()
+
+
+def test_the_file_is_readable_by_its_owner_alone_and_a_damaged_one_is_said(tmp_path: Path) -> None:
+    file = tmp_path / "state" / "panel.json"
+    access.set_password(file, "viewer", "battery staple")
+    access.set_password(file, "operator", "correct horse")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert "horse" not in file.read_text()
+    kept = access.read_passwords(file)
+    assert [access.role_of(kept, one) for one in ("correct horse", "battery staple", "", "horse")] == [
+        "operator", "viewer", None, None,
+    ]  # fmt: skip
+    with pytest.raises(Invalid, match="found 5 characters, allowed are 8"):
+        access.set_password(file, "viewer", "short")
+    file.chmod(0o644)
+    with pytest.raises(Invalid, match="others may read it"):
+        access.read_passwords(file)
+    file.chmod(0o600)
+    for text in ("", "[]", '{"operator": {}}', '{"root": {"salt": "00", "scrypt": "00"}}', json.dumps({"viewer": 1})):
+        file.write_text(text)
+        with pytest.raises(Invalid, match="damaged"):
+            access.read_passwords(file)

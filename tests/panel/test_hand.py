@@ -1,0 +1,300 @@
+"""The operator's hand: what moves the arm, and that whatever becomes of the person, the browser or the network ends it.
+
+The network is a real one: Chromium in a namespace of its own, at the far end of a cable of `tests/panel/cable.py`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+from playwright.sync_api import Browser, BrowserType, Error, Page, expect
+
+from rtcp.api import Feed
+from rtcp.panel.live import JOG_S, PRESENCE_S
+from tests.e2e.conftest import Platform
+from tests.panel.cable import NEAR, Cable
+from tests.panel.conftest import CHROMIUM, FLAGS, begun, ready, show, until, visitor
+
+pytestmark = pytest.mark.alone
+NAMESPACE = f"rtcp-net-{os.getpid()}"
+SLACK_S = 0.35
+"""What braking, the screen's frame and a shared host may add: figures without it are those of benchmarks/panel.py."""
+
+
+def jogging(page: Page, platform: Platform) -> None:
+    """Hold a pad until the arm moves."""
+    show(page, "/jog")
+    page.get_by_label("Frame").select_option("joints")
+    page.get_by_role("button", name="joint1 +").hover()
+    page.mouse.down()
+    platform.until(lambda found: found["state"] == "moving", "the jog")
+    time.sleep(0.5)
+
+
+def moved_after(platform: Platform, feed: Feed, instant_ns: int) -> float:
+    """Wait for standstill; return for how long the arm has moved since an instant, s."""
+    until(lambda: platform.status()["state"] in ("holding", "ready"), "standstill")
+    time.sleep(0.2)
+    records, missing = feed.records()
+    assert missing == 0
+    commanded = records["commanded_position"]
+    moving = np.flatnonzero(np.abs(np.diff(commanded, axis=0)).max(axis=1) > 1e-9)
+    return max(0.0, (int(records["time_ns"][moving[-1] + 1]) - instant_ns) * 1e-9) if len(moving) else 0.0
+
+
+@pytest.fixture
+def feed(holding: Platform) -> Iterator[Feed]:
+    made = Feed(holding.directory)
+    yield made
+    made.close()
+
+
+def test_a_jog_lasts_as_long_as_it_is_held(page: Page, holding: Platform, feed: Feed) -> None:
+    jogging(page, holding)
+    assert holding.status()["lease"]["holder"] == "panel: local at this machine"
+    expect(page.locator("#operator")).to_have_text("You operate the arm")
+    now = time.monotonic_ns()
+    page.mouse.up()
+    assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+    assert holding.status()["joints"]["actual_position"][0] > 0.02
+
+
+def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, feed: Feed) -> None:
+    holding.call("mode", name="cartesian")
+    show(page, "/jog")
+    before = [float(page.locator(f"[data-live='tool.{at}']").inner_text()) for at in range(3)]
+    page.locator(".jog-area").focus()
+    page.keyboard.down("PageUp")
+    holding.until(lambda found: found["state"] == "moving", "the jog")
+    time.sleep(1.0)
+    page.keyboard.up("PageUp")
+    assert moved_after(holding, feed, time.monotonic_ns()) < JOG_S + SLACK_S
+    page.wait_for_timeout(300)
+    after = [float(page.locator(f"[data-live='tool.{at}']").inner_text()) for at in range(3)]
+    assert after[2] - before[2] > 0.02
+    assert after[:2] == pytest.approx(before[:2], abs=5e-3)
+
+
+def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
+    browser: Browser, panel: str, holding: Platform, feed: Feed
+) -> None:
+    holding.call("mode", name="cartesian")
+    with visitor(browser, panel) as page:
+        # A mock: no gamepad can be plugged in here.
+        page.add_init_script(
+            "window.pad = { connected: true, axes: [0, 0, 0, 0],"
+            " buttons: Array.from({length: 16}, () => ({ pressed: false })) };"
+            "navigator.getGamepads = () => [window.pad];"
+        )
+        show(page, "/jog")
+        page.evaluate("pad.axes[0] = -1")
+        time.sleep(0.4)
+        assert holding.status()["state"] == "holding"
+        page.evaluate("pad.buttons[4].pressed = true")
+        holding.until(lambda found: found["state"] == "moving", "the jog")
+        now = time.monotonic_ns()
+        page.evaluate("pad.buttons[4].pressed = false")
+        assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+
+
+@pytest.mark.parametrize("how", ["blur", "hidden", "overloaded", "left", "closed"])
+def test_a_jog_ends_with_the_attention_of_its_page(
+    browser: Browser, panel: str, holding: Platform, feed: Feed, how: str
+) -> None:
+    with visitor(browser, panel) as page:
+        jogging(page, holding)
+        now = time.monotonic_ns()
+        if how == "blur":
+            page.evaluate("window.dispatchEvent(new Event('blur'))")
+        elif how == "hidden":
+            # A mock: a headless browser hides no tab.
+            page.evaluate(
+                "Object.defineProperty(document, 'hidden', { value: true });"
+                "document.dispatchEvent(new Event('visibilitychange'))"
+            )
+        elif how == "overloaded":
+            page.evaluate("setTimeout(() => { const end = Date.now() + 3000; while (Date.now() < end) ; }, 0)")
+        elif how == "left":
+            page.goto("about:blank")
+        else:
+            page.close()
+        assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+        if how in ("blur", "hidden", "overloaded"):
+            # Still pressed: it does not begin again by itself.
+            time.sleep(3.5 if how == "overloaded" else 0.5)
+            assert holding.status()["state"] == "holding"
+            records, _ = feed.records()
+            assert np.ptp(records["commanded_position"][:, 0]) < 1e-9
+
+
+@pytest.mark.parametrize("motion", ["jog", "move"])
+@pytest.mark.parametrize("killed", ["browser", "panel"])
+def test_kill_stops_the_arm(chromium: BrowserType, platform: Platform, motion: str, killed: str) -> None:
+    before = set(psutil.Process().children(recursive=True))
+    own = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    browser = set(psutil.Process().children(recursive=True)) - before
+    with begun(platform) as (panel, url):
+        ready(platform)
+        with contextlib.suppress(Error), visitor(own, url) as page:
+            begin(page, platform, motion)
+            with contextlib.closing(Feed(platform.directory)) as feed:
+                now = time.monotonic_ns()
+                for process in browser if killed == "browser" else [psutil.Process(panel.pid)]:
+                    with contextlib.suppress(psutil.Error):
+                        process.kill()
+                took = moved_after(platform, feed, now)
+        with contextlib.suppress(Error):
+            own.close()
+    assert took < JOG_S + SLACK_S
+    assert platform.status()["state"] == "holding"
+
+
+def begin(page: Page, platform: Platform, motion: str) -> None:
+    """Jog, or send a long move."""
+    if motion == "jog":
+        jogging(page, platform)
+        return
+    show(page, "/targets")
+    expect(page.get_by_label("joint1, rad")).to_have_value("0")
+    page.get_by_label("joint1, rad").fill("1.5")
+    page.get_by_label("Speed").fill("0.1")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("button", name="Send", exact=True).click()
+    platform.until_moving()
+
+
+def test_the_stop_button_ends_a_move_of_anybody(browser: Browser, panel: str, holding: Platform, feed: Feed) -> None:
+    with visitor(browser, panel) as page:
+        begin(page, holding, "move")
+        with visitor(browser, panel) as other:
+            show(other, "/health")
+            now = time.monotonic_ns()
+            other.get_by_role("button", name="STOP not the emergency stop").click()
+            assert moved_after(holding, feed, now) < 1.5
+        assert abs(holding.status()["joints"]["actual_position"][0]) < 1.4
+
+
+def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, holding: Platform) -> None:
+    with visitor(browser, panel) as first, visitor(browser, panel) as second:
+        begin(first, holding, "move")
+        show(second, "/")
+        expect(second.locator("#operator")).to_have_text("local at this machine operates the arm")
+        second.get_by_role("button", name="Disable").click()
+        second.get_by_role("button", name="Ask to take over").click()
+        first.get_by_role("button", name="Keep it").click()
+        expect(second.get_by_text("keeps the arm")).to_be_visible()
+        assert holding.status()["state"] == "moving"
+        second.get_by_role("button", name="Disable").click()
+        second.get_by_role("button", name="Ask to take over").click()
+        first.get_by_role("button", name="Give it").click()
+        expect(second.locator("#operator")).to_have_text("You operate the arm")
+        expect(first.get_by_text("has taken over the arm")).to_be_visible()
+        holding.until(lambda found: found["state"] == "holding", "what moved has stopped")
+
+
+# -- over a network -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cable(platform: Platform) -> Iterator[Cable]:
+    """From the panel to a namespace for the browser."""
+    if os.geteuid() or not (shutil.which("ip") and CHROMIUM):
+        pytest.skip("needs root, iproute2 and Chromium")
+    made = Cable(NAMESPACE)
+    try:
+        yield made
+    finally:
+        made.close()
+        Path(platform.environment["RTCP_STATE_DIR"], "panel.json").unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def remote(chromium: BrowserType, directory: Path) -> Iterator[Browser]:
+    """Chromium in that namespace."""
+    wrapper = directory / "chromium"
+    wrapper.write_text(f'#!/bin/sh\nexec ip netns exec {NAMESPACE} {CHROMIUM} "$@"\n')
+    wrapper.chmod(0o700)
+    browser = chromium.launch(executable_path=wrapper, args=FLAGS)
+    yield browser
+    with contextlib.suppress(Error):
+        browser.close()
+
+
+def log_in(page: Page) -> None:
+    page.goto("/")
+    page.get_by_label("Your name").fill("Ada")
+    page.get_by_label("Password").fill("correct horse")
+    page.get_by_role("button", name="Log in").click()
+    page.wait_for_selector("[data-live=state][data-state]")
+
+
+@pytest.mark.parametrize("motion", ["jog", "move"])
+def test_a_cut_network_stops_the_arm(
+    chromium: BrowserType, platform: Platform, cable: Cable, motion: str, tmp_path: Path
+) -> None:
+    set_password(platform)
+    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
+        ready(platform)
+        with contextlib.suppress(Error), visitor(browser, url) as page:
+            log_in(page)
+            begin(page, platform, motion)
+            with contextlib.closing(Feed(platform.directory)) as feed:
+                now = time.monotonic_ns()
+                cable.cut()
+                took = moved_after(platform, feed, now)
+        assert took < (JOG_S if motion == "jog" else PRESENCE_S) + SLACK_S
+
+
+def test_a_slow_network_does_not_jog(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> None:
+    set_password(platform)
+    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
+        ready(platform)
+        with visitor(browser, url) as page:
+            log_in(page)
+            show(page, "/jog")
+            page.get_by_label("Frame").select_option("joints")
+            page.get_by_role("button", name="joint1 +").hover()
+            cable.delay_s = 0.15
+            page.wait_for_timeout(1500)
+            page.mouse.down()
+            expect(page.locator("#notes")).to_contain_text("no jog: to this browser and back it takes 0.3")
+            page.mouse.up()
+        assert platform.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_lossy_network_never_jogs_on(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> None:
+    set_password(platform)
+    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
+        ready(platform)
+        with visitor(browser, url) as page:
+            log_in(page)
+            show(page, "/jog")
+            page.get_by_label("Frame").select_option("joints")
+            pad = page.get_by_role("button", name="joint1 +")
+            cable.loss = 0.2
+            for _ in range(5):
+                with contextlib.closing(Feed(platform.directory)) as feed:
+                    pad.hover()
+                    page.mouse.down()
+                    time.sleep(0.7)
+                    now = time.monotonic_ns()
+                    page.mouse.up()
+                    assert moved_after(platform, feed, now) < JOG_S + SLACK_S
+
+
+def set_password(platform: Platform) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rtcp.cli", "panel", "password"],
+        input="correct horse\n", text=True, env=platform.environment, capture_output=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
