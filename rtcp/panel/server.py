@@ -76,6 +76,7 @@ class Panel:
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             self._socket.bind((options.host, options.port))
+            self._socket.listen()  # whoever is quicker than the start waits
         except OSError as error:
             self._socket.close()
             message = (
