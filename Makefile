@@ -6,7 +6,7 @@ BIN := .venv/bin
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup oracles run test test-all fast faults lint format clean
+.PHONY: help setup oracles run panel test test-all fast faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -20,6 +20,9 @@ oracles: setup ## add what the kinematics is compared with (Pinocchio, EAIK); wi
 
 run: setup ## run the demonstration: virtual segment, master, a move, the figures
 	@$(BIN)/rtcp demo --square xy
+
+panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a browser
+	@$(BIN)/rtcp start --panel
 
 test: setup ## run the tests
 	@status=0; \

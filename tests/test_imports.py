@@ -196,16 +196,27 @@ def test_kinematics_imports_only_the_standard_library_numpy_and_itself() -> None
     assert told([each for each in found if each.module.partition(".")[0] not in allowed]) == []
 
 
-def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
+def declared(key: str) -> set[str]:
     # Python 3.10 has no reader of TOML; a list of strings is written there as in Python.
-    listed = re.search(r"^dependencies = (\[.*?^\])", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
-    assert listed is not None
-    declared = {
-        re.split(r"[^\w.-]", requirement)[0].lower().replace("-", "_") for requirement in ast.literal_eval(listed[1])
-    }
-    names = {found.module.partition(".")[0] for found in IMPORTS if not is_ours(found)} - sys.stdlib_module_names
-    names -= {"typing_extensions"}  # imported for the type checker alone
-    assert {PACKAGES.get(name, name) for name in names} - declared == set()
+    listed = re.search(rf"^{key} = (\[.*?^\])", (ROOT / "pyproject.toml").read_text(), re.MULTILINE | re.DOTALL)
+    assert listed
+    return {re.split(r"[^\w.-]", name)[0].lower().replace("-", "_") for name in ast.literal_eval(listed[1])}
+
+
+def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
+    # typing_extensions is imported for the type checker alone.
+    ours = {"rtcp", "kinematics", "typing_extensions", *sys.stdlib_module_names}
+    outside = [(found.importer, found.module.partition(".")[0]) for found in IMPORTS]
+    names = {(importer == "panel", PACKAGES.get(name, name)) for importer, name in outside if name not in ours}
+    assert {name for of_panel, name in names if not of_panel} - declared("dependencies") == set()
+    assert {name for of_panel, name in names if of_panel} - declared("dependencies") - declared("panel") == set()
+
+
+def test_the_panel_is_a_client_of_the_api() -> None:
+    """What it reads besides are files: configuration and geometry."""
+    imported = {found.imported for found in IMPORTS if found.importer == "panel" and is_ours(found)}
+    assert imported == {"panel", "api", "config", "kinematics"}
+
 
 
 def test_modules_are_imported_by_a_name_made_at_run_time_in_one_place_only() -> None:

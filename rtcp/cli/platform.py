@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +26,7 @@ from rtcp.cli.output import (
     report,
     signals_raise,
 )
+from rtcp.cli.panel import require_panel
 from rtcp.ipc.runtime_directory import runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
@@ -51,12 +54,17 @@ def _start(
     cycle_us: Annotated[float | None, option("--cycle-us", "N", "Cycle, us. Default: the configured one.")] = None,
     poll: Poll = False,
     detach: Annotated[bool, option("--detach", "Return when it runs; `rtcp stop` ends it.")] = False,
+    panel: Annotated[bool, option("--panel", "Serve the panel too, and open it where there is a screen.")] = False,
 ) -> None:
     """Start the platform: bring the slaves to OP and wait for commands."""
     mode = None if mode is None else mode.lower()
     if mode is not None and mode not in MODES:
         raise CommandError(f"--mode {mode} is not known: {', '.join(MODES)}")
     positive("--cycle-us", cycle_us, "us")
+    if panel and detach:
+        raise CommandError("--panel ends with this command, --detach leaves it at once: start `rtcp panel` beside")
+    if panel:
+        require_panel()
     from rtcp.launch.launcher import StartOptions
 
     options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
@@ -67,9 +75,26 @@ def _start(
             raise CommandError(message, ExitCode.FAULT)
         report(message)
         return
-    code = serve(options, lambda: report(_wait_ready("`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`")[0]))
+
+    def announce() -> None:
+        report(_wait_ready("`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`")[0])
+
+    with _panel() if panel else nullcontext():
+        code = serve(options, announce)
     report("stopped" if code == 0 else "the platform has ended")
     raise typer.Exit(code)
+
+
+@contextmanager
+def _panel() -> Iterator[None]:
+    """Serve the panel in a process of its own meanwhile."""
+    screen = ["--open"] if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") else []
+    serving = subprocess.Popen([sys.executable, "-m", "rtcp.cli", "panel", *screen])
+    try:
+        yield
+    finally:
+        serving.terminate()
+        serving.wait()
 
 
 def _wait_ready(hint: str) -> tuple[str, bool]:

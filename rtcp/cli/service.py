@@ -22,6 +22,7 @@ from rtcp.cli.output import CommandError, ExitCode, emit
 UNIT = "rtcp@.service"
 PLACES = {
     UNIT: "etc/systemd/system/rtcp@.service",
+    "rtcp-panel@.service": "etc/systemd/system/rtcp-panel@.service",
     "rtcp.sysusers.conf": "etc/sysusers.d/rtcp.conf",
     "rtcp.tmpfiles.conf": "etc/tmpfiles.d/rtcp.conf",
     "rtcp.sysctl.conf": "etc/sysctl.d/80-rtcp.conf",
@@ -95,7 +96,7 @@ def service_files(root: Path, program: Path) -> list[ServiceFile]:
     made = []
     for name, place in PLACES.items():
         text = (folder / name).read_text()
-        if name == UNIT:
+        if name.endswith(".service"):
             text = text.replace(_PROGRAM, f"ExecStart={_quoted(program)} ")
         made.append(ServiceFile(root / place, f"{_mark(text)}\n{text}"))
     return made
@@ -107,7 +108,7 @@ def _install(
     program: Annotated[Path | None, option("--program", "FILE", "The rtcp to start. Default: the running one.")] = None,
     dry_run: DryRun = False,
 ) -> None:
-    """Write the unit rtcp@.service and its sysusers, tmpfiles and sysctl files; start and enable nothing."""
+    """Write the units of platform and panel, sysusers, tmpfiles and sysctl files; start and enable nothing."""
     files = service_files(root.absolute(), _checked(program))
     found = {file: file.found() for file in files}
     foreign = [str(file.path) for file in files if found[file] is Found.FOREIGN]

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 UNIT = "etc/systemd/system/rtcp@.service"
-PLACES = {UNIT, "etc/sysusers.d/rtcp.conf", "etc/tmpfiles.d/rtcp.conf", "etc/sysctl.d/80-rtcp.conf"}
+PANEL_UNIT = "etc/systemd/system/rtcp-panel@.service"
+PLACES = {UNIT, PANEL_UNIT, "etc/sysusers.d/rtcp.conf", "etc/tmpfiles.d/rtcp.conf", "etc/sysctl.d/80-rtcp.conf"}
 PROGRAM = "/usr/bin/env"
 """Stands for rtcp: systemd-analyze wants a program that exists."""
 EXPOSURE = 2.7
@@ -43,7 +44,7 @@ def uninstall(rtcp: Callable[..., Any], tmp_path: Path) -> Callable[..., Any]:
 # -- writing and removing -------------------------------------------------------------------------------------------
 
 
-def test_install_writes_its_four_files_and_nothing_that_enables_or_starts(
+def test_install_writes_its_files_and_nothing_that_enables_or_starts(
     install: Callable[..., Any], tmp_path: Path
 ) -> None:
     done = install()

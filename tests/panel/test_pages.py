@@ -282,8 +282,7 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
     assert len(found["rtcp_joint_position_radians"].samples) == 6
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [360, 1600])
+@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (1600, "dark")])
 def test_no_page_has_a_serious_barrier(
     browser: Browser, panel: str, holding: Platform, width: int, scheme: str
 ) -> None:

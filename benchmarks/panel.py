@@ -1,0 +1,304 @@
+"""What the panel costs and how soon the arm stops: `python benchmarks/panel.py [--rounds N] [--seconds N] [--json F]`.
+
+A platform on its virtual segment, the panel beside it, headless Chromium in front. In one run: the time to the first page;
+CPU and memory of the panel with one page; how old what it shows is; wake-up of the cycle without and with five pages,
+alternating; the same while somebody sends as many requests as one process can; and from losing the browser, the panel or
+the operator's attention to the arm's standstill, while it is jogged and while it moves.
+
+`--pictures DIR` writes a picture of every page at 400 and 1600 px instead. Needs Chromium, and what `pip install -e .[dev]`
+brings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import http.client
+import json
+import os
+import platform
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from datetime import date
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import psutil
+from playwright.sync_api import Browser, Error, Page, sync_playwright
+from rich.console import Console
+from rich.table import Table
+
+from rtcp.api import Feed, connect
+from rtcp.launch.launcher import StartOptions, start
+from rtcp.panel.server import PAGES
+
+FLAGS = ["--no-sandbox", "--disable-quic", "--disable-background-networking", "--disable-component-update",
+         "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # fmt: skip
+BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
+HOLDING = "[data-live=state][data-state=holding]"
+console = Console()
+
+
+@contextlib.contextmanager
+def panel() -> Iterator[tuple[psutil.Process, str]]:
+    command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield psutil.Process(process.pid), process.stdout.readline().partition(": ")[0].rstrip("/")
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def opened(browser: Browser, url: str, path: str, width: int = 1600) -> Page:
+    page = browser.new_context(base_url=url, viewport={"width": width, "height": 900}).new_page()
+    page.goto(path)
+    page.wait_for_selector("[data-live=state][data-state]")
+    return page
+
+
+def wakeup_p99(seconds: float) -> float:
+    with contextlib.closing(Feed()) as feed:
+        parts, until = [], time.monotonic() + seconds
+        while time.monotonic() < until:
+            feed.ended(0.2)
+            parts.append(feed.records()[0]["wakeup_ns"] / 1e3)
+    return float(np.percentile(np.concatenate(parts), 99))
+
+
+def alternating(
+    rounds: int, seconds: float, other: Callable[[], contextlib.AbstractContextManager[object]]
+) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {"without": [], "with": []}
+    for turn in range(rounds):
+        for kind in list(found)[:: -1 if turn % 2 else 1]:
+            with other() if kind == "with" else contextlib.nullcontext():
+                found[kind].append(wakeup_p99(seconds))
+    return found
+
+
+@contextlib.contextmanager
+def five(browser: Browser, url: str) -> Iterator[None]:
+    pages = [opened(browser, url, path) for path in ("/arm", "/jog", "/scope", "/segment", "/health")]
+    yield
+    for page in pages:
+        page.context.close()
+
+
+@contextlib.contextmanager
+def flood(url: str) -> Iterator[list[int]]:
+    """Send requests without a session, on kept connections, as fast as answers come."""
+    count, ended = [0], threading.Event()
+
+    def send() -> None:
+        while not ended.is_set():
+            connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=5)
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                while not ended.is_set():
+                    connection.request("GET", "/metrics")
+                    connection.getresponse().read()
+                    count[0] += 1
+            connection.close()
+
+    threads = [threading.Thread(target=send, daemon=True) for _ in range(4)]
+    for one in threads:
+        one.start()
+    yield count
+    ended.set()
+    for one in threads:
+        one.join()
+
+
+def age_ms(page: Page) -> list[float]:
+    """How old the newest message is when the page draws, by the clock of one machine."""
+    found = page.evaluate(
+        "() => new Promise((done) => { const ages = [];"
+        " const stop = rtcp.listen((state) => requestAnimationFrame(() => {"
+        "  ages.push([state.token, performance.timeOrigin + performance.now()]);"
+        "  if (ages.length === 100) { stop(); done(ages); } })); })"
+    )
+    ahead_ms = time.time() * 1e3 - time.monotonic() * 1e3
+    return [drawn - token * 1e-6 - ahead_ms for token, drawn in found]
+
+
+def jogging(page: Page) -> None:
+    page.goto("/jog")
+    page.wait_for_selector(HOLDING)
+    page.get_by_label("Frame").select_option("joints")
+    page.get_by_role("button", name="joint1 +").hover()
+    page.mouse.down()
+
+
+def moving(page: Page) -> None:
+    page.goto("/targets")
+    page.wait_for_selector(HOLDING)
+    page.get_by_label("joint1, rad").fill("1.5")
+    page.get_by_label("Speed").fill("0.15")
+    page.get_by_role("button", name="Plan").click()
+    page.get_by_role("button", name="Send", exact=True).click()
+
+
+LOSSES = ("button released", "focus lost", "page overloaded", "page closed", "browser killed", "panel killed")
+
+
+def to_standstill(playwright: object, loss: str, begin: Callable[[Page], None]) -> tuple[float, float]:
+    """Return the time from the loss until the arm begins to stop, and until it stands, ms."""
+    before = set(psutil.Process().children(recursive=True))
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)  # type: ignore[attr-defined]
+    own = set(psutil.Process().children(recursive=True)) - before
+    with panel() as (process, url), contextlib.closing(Feed()) as feed, connect("benchmark") as robot:
+        page = opened(browser, url, "/")
+        begin(page)
+        until = time.monotonic() + 10
+        while robot.state.name != "MOVING" and time.monotonic() < until:
+            time.sleep(0.01)
+        time.sleep(0.6)
+        at_ns = time.monotonic_ns()
+        if loss == "button released":
+            page.mouse.up() if begin is jogging else page.get_by_role(
+                "button", name="STOP not the emergency stop"
+            ).click()
+        elif loss == "focus lost":
+            page.evaluate("window.dispatchEvent(new Event('blur'))")
+        elif loss == "page overloaded":
+            page.evaluate("setTimeout(() => { const end = Date.now() + 3000; while (Date.now() < end) ; }, 0)")
+        elif loss == "page closed":
+            page.close()
+        else:
+            for one in own if loss == "browser killed" else {process}:
+                with contextlib.suppress(psutil.Error):
+                    one.kill()
+        time.sleep(2.5)
+        records, _ = feed.records()
+        with contextlib.suppress(Error):
+            browser.close()
+        robot.halt()
+        robot.move_joints(BENT)
+    speed = np.abs(np.diff(records["commanded_position"][:, 0])) / (np.diff(records["time_ns"]) * 1e-9)
+    times = (records["time_ns"][1:] - at_ns) * 1e-6
+    before_loss = float(np.median(speed[(times < 0) & (times > -200)]))
+    still = speed[times > 0] > 1e-6
+    if not len(still) or still[-1]:
+        return float("nan"), float("nan")
+    after = times[times > 0]
+    slower = np.flatnonzero(speed[times > 0] < 0.98 * before_loss)
+    return float(after[slower[0]]), float(after[np.flatnonzero(still)[-1]]) if still.any() else 0.0
+
+
+def pictures(playwright: object, directory: Path) -> None:
+    directory.mkdir(parents=True, exist_ok=True)
+    with panel() as (_, url):
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)  # type: ignore[attr-defined]
+        for width in (400, 1600):
+            for path, (name, _, _) in PAGES.items():
+                page = opened(browser, url, path, width)
+                time.sleep(2.5)
+                page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
+                page.context.close()
+        browser.close()
+
+
+def spread(values: list[float]) -> str:
+    return f"{statistics.median(values):.1f} ({min(values):.1f} to {max(values):.1f})"
+
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or sys.exit("no Chromium is installed")
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=6.0, help="length of one round")
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--losses", type=int, default=3, help="how often each loss is measured")
+    parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    console.print(
+        f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, {date.today().isoformat()}, load {os.getloadavg()[0]:.1f} before"
+    )
+    found: dict[str, object] = {}
+    with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as name, sync_playwright() as playwright:
+        os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = name
+        running = start(StartOptions(), lambda sentence: None)
+        try:
+            with connect("benchmark") as robot:
+                robot.enable()
+                robot.move_joints(BENT)
+            if given.pictures:
+                pictures(playwright, given.pictures)
+                return 0
+            with panel() as (process, url):
+                browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+                opened(browser, url, "/").context.close()
+                first = []
+                for _ in range(5):
+                    began = time.monotonic()
+                    page = opened(browser, url, "/")
+                    first.append(time.monotonic() - began)
+                    page.context.close()
+                page = opened(browser, url, "/arm")
+                time.sleep(2.0)
+                process.cpu_percent()
+                time.sleep(10.0)
+                found["cpu_percent"] = process.cpu_percent()
+                found["memory_mb"] = process.memory_info().rss / 1e6
+                found["first_page_s"] = first
+                ages = age_ms(page)
+                found["age_ms"] = [float(np.percentile(ages, part)) for part in (50, 99)]
+                page.context.close()
+                found["five"] = alternating(given.rounds, given.seconds, lambda: five(browser, url))
+                counts: list[tuple[int, float]] = []
+
+                @contextlib.contextmanager
+                def counted() -> Iterator[None]:
+                    began = time.monotonic()
+                    with flood(url) as count:
+                        yield
+                    counts.append((count[0], time.monotonic() - began))
+
+                found["flood"] = alternating(given.rounds, given.seconds, counted)
+                found["requests_per_s"] = sum(one for one, _ in counts) / sum(took for _, took in counts)
+                browser.close()
+            losses = {}
+            for loss in LOSSES:
+                for begin in (jogging, moving):
+                    if begin is moving and loss == "focus lost":
+                        continue
+                    measured = [to_standstill(playwright, loss, begin) for _ in range(given.losses)]
+                    losses[f"{loss}, {begin.__name__}"] = measured
+            found["losses_ms"] = losses
+        finally:
+            running.stop(lambda sentence: None)
+    _show(found)
+    if given.json:
+        given.json.write_text(json.dumps(found))
+    return 0
+
+
+def _show(found: dict[str, object]) -> None:
+    first, five_pages, flooded = found["first_page_s"], found["five"], found["flood"]
+    console.print(f"first page: {spread(first)} s (aim 2)")  # type: ignore[arg-type]
+    console.print(f"one page: {found['cpu_percent']:.0f} % of a core (aim 25), {found['memory_mb']:.0f} MB (aim 150)")
+    console.print(f"age of what is shown: p50 {found['age_ms'][0]:.0f}, p99 {found['age_ms'][1]:.0f} ms (aim 150)")  # type: ignore[index]
+    for name, one in (("five pages", five_pages), (f"{found['requests_per_s']:.0f} requests/s", flooded)):
+        without, with_it = one["without"], one["with"]  # type: ignore[index]
+        ratio = statistics.median(with_it) / max(0.1, statistics.median(without))
+        console.print(
+            f"{name}: wake-up p99 {spread(without)} without, {spread(with_it)} with, us: {ratio:.2f} (aim 1.1)"
+        )
+    rows = Table("lost", "begins to stop, ms", "stands, ms")
+    for name, values in found["losses_ms"].items():  # type: ignore[attr-defined]
+        rows.add_row(name, spread([one for one, _ in values]), spread([one for _, one in values]))
+    console.print(rows)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
