@@ -1,12 +1,12 @@
 """What the panel costs and how soon the arm stops: `python benchmarks/panel.py [--rounds N] [--seconds N] [--json F]`.
 
-A platform on its virtual segment, the panel beside it, headless Chromium in front. In one run: the time to the first page;
-CPU and memory of the panel with one page; how old what it shows is; wake-up of the cycle without and with five pages,
-alternating; the same while somebody sends as many requests as one process can; and from losing the browser, the panel or
-the operator's attention to the arm's standstill, while it is jogged and while it moves.
+A platform on its virtual segment, the panel beside it, headless Chromium in front. In one run: the time to the first
+page; CPU and memory of the panel with one page; how old what it shows is; wake-up of the cycle without and with five
+pages, alternating; the same while somebody sends as many requests as one process can; and from losing the browser, the
+panel or the operator's attention to the arm's standstill, while it is jogged and while it moves.
 
-`--pictures DIR` writes a picture of every page at 400 and 1600 px instead. Needs Chromium, and what `pip install -e .[dev]`
-brings.
+`--pictures DIR` writes a picture of every page at 400 and 1600 px instead. Needs Chromium, and what
+`pip install -e .[dev]` brings.
 """
 
 from __future__ import annotations
@@ -221,9 +221,8 @@ def main() -> int:
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    console.print(
-        f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}, {date.today().isoformat()}, load {os.getloadavg()[0]:.1f} before"
-    )
+    machine = f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}"
+    console.print(f"{machine}, {date.today().isoformat()}, load {os.getloadavg()[0]:.1f} before")
     found: dict[str, object] = {}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as name, sync_playwright() as playwright:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = name

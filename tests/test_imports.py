@@ -218,7 +218,6 @@ def test_the_panel_is_a_client_of_the_api() -> None:
     assert imported == {"panel", "api", "config", "kinematics"}
 
 
-
 def test_modules_are_imported_by_a_name_made_at_run_time_in_one_place_only() -> None:
     # What this file cannot see: there it is rtcp.config's own modules, on first use, so that the loop has no validator.
     by_name = {"import_module", "__import__"}

@@ -246,7 +246,7 @@ class Methods:
 
         `pressed`: of forward, backward, left, right, mode_up, mode_down, chair, emergency_stop, enabling_switch.
         """
-        _check_age(hold_s, sent_s)
+        _left(hold_s, sent_s)
         return await self.joystick_override.force(caller, pressed, byte, hold_s)
 
     # -- recordings ---------------------------------------------------------------------------------------------------
@@ -356,7 +356,7 @@ class Methods:
         sent_s: float | None = None,
     ) -> Json:
         """Move the tool, m/s and rad/s along and about the axes of `frame`, or the joints, rad/s, for `hold_s`."""
-        _check_age(hold_s, sent_s)
+        hold_s = _left(hold_s, sent_s)
         self._check_count("velocity", velocity, len(self._config.joints) if frame == "joints" else 6)
         command: Command = commands.Jog(velocity, JogFrame[frame.upper()], hold_s)
         if frame == "joints" and self.channel.control_mode is ControlMode.VELOCITY:
@@ -377,7 +377,7 @@ class Methods:
                 elif hint == Joints:
                     self._check_count(name, given[name], len(self._config.joints))
             if "hold_s" in hints:
-                _check_age(given["hold_s"], sent_s)
+                given["hold_s"] = _left(given["hold_s"], sent_s)
             command = kind(**given)
             if streams:
                 return await self._streaming.send(caller, command)
@@ -464,7 +464,15 @@ def _parameter(hint: Any) -> Any:
     return hint
 
 
-def _check_age(hold_s: float, sent_s: float | None) -> None:
-    """Raise RtcpError where `hold_s` has passed since `sent_s`, CLOCK_MONOTONIC, at which the command was wanted."""
-    if sent_s is not None and not (late_s := time.monotonic() - sent_s) <= hold_s:
+def _left(hold_s: float, sent_s: float | None) -> float:
+    """Return what is left of `hold_s` since `sent_s`, CLOCK_MONOTONIC, at which the command was wanted.
+
+    Raises:
+        TimedOut: nothing.
+    """
+    if sent_s is None:
+        return hold_s
+    late_s = time.monotonic() - sent_s
+    if not late_s <= hold_s:
         raise RtcpError("timeout", f"it came {late_s:.1f} s after it was sent, and lasts for {hold_s:g} s only")
+    return hold_s - max(0.0, late_s)

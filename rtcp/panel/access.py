@@ -139,15 +139,21 @@ class Visitor:
 
 
 @dataclass
-class _Bucket:
-    """Requests that one visitor may still send."""
+class Bucket:
+    """What one visitor may still send: so much at once, and so much each second."""
 
-    left: float = _BURST
+    most: float = _BURST
+    rate: float = _RATE
+    left: float = 0.0
     at: float = field(default_factory=time.monotonic)
 
+    def __post_init__(self) -> None:
+        self.left = self.most
+
     def take(self) -> bool:
+        """Count one; return whether it was still allowed."""
         now = time.monotonic()
-        self.left = min(_BURST, self.left + (now - self.at) * _RATE) - 1.0
+        self.left = min(self.most, self.left + (now - self.at) * self.rate) - 1.0
         self.at = now
         if self.left < 0.0:
             self.left = 0.0
@@ -192,7 +198,9 @@ class Sessions:
         self._numbers += 1
         shown = "".join(letter for letter in name.strip() if letter.isprintable())[:_LONGEST_NAME]
         while len(self._sessions) >= _MOST_SESSIONS:
-            del self._sessions[next(iter(self._sessions))]
+            # Of the same role first: viewers cannot throw an operator out.
+            same = (key for key, one in self._sessions.items() if one.role == role)
+            del self._sessions[next(same, next(iter(self._sessions)))]
         secret = secrets.token_urlsafe(32)
         self._sessions[secret] = Visitor(shown or f"visitor {self._numbers}", role, address, time.monotonic())
         return secret
@@ -243,7 +251,7 @@ class Access:
         if not self._only_loopback:
             self._names |= {host.lower(), socket.gethostname().lower(), f"{socket.gethostname().lower()}.local"}
         self._secure = secure
-        self._buckets: dict[str, _Bucket] = {}
+        self._buckets: dict[str, Bucket] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or pass it on."""
@@ -254,7 +262,8 @@ class Access:
         address = scope["client"][0] if scope.get("client") else "unknown"
         secret = _cookie(headers.get(b"cookie", ""))
         visitor = self._sessions.find(secret)
-        if not self._may_send(secret if visitor else address):
+        is_stop = visitor is not None and scope["path"] == "/stop"
+        if not is_stop and not self._may_send(secret if visitor else address):
             await self._refuse(scope, receive, send, 429, "too many requests: wait a second")
             return
         if why := self._foreign(scope, headers):
@@ -265,6 +274,7 @@ class Access:
             if response is not None:
                 await response(scope, receive, _with_headers(send))
                 return
+        visitor = visitor or scope.get("visitor")
         if visitor is None:
             await self._refuse(scope, receive, send, 401, "no session: open the panel's first page")
             return
@@ -274,7 +284,7 @@ class Access:
     def _may_send(self, key: str) -> bool:
         if len(self._buckets) > 4 * _MOST_SESSIONS:
             self._buckets.clear()
-        return self._buckets.setdefault(key, _Bucket()).take()
+        return self._buckets.setdefault(key, Bucket()).take()
 
     def _foreign(self, scope: Scope, headers: dict[bytes, str]) -> str:
         """Return why a request does not come from a page of this panel; empty: it does, or has no need to."""
@@ -317,12 +327,17 @@ class Access:
             return await self._log_in(receive, address) if method == "POST" else _login_page("")
         if visitor is not None:
             return None
+        if path == "/metrics" and method == "GET" and not self._sessions.asks:
+            # Prometheus keeps no cookies; whoever asks here could open the page as well.
+            scope["visitor"] = self._sessions.find(self._sessions.local)
+            return None
         if self._sessions.asks:
             wants_page = method == "GET" and "text/html" in headers.get(b"accept", "")
             return RedirectResponse("/login", 303) if wants_page else None
         if method != "GET" or "text/html" not in headers.get(b"accept", ""):
             return None
-        return self._welcome(RedirectResponse(path or "/", 303), self._sessions.local)
+        # Not to a path that begins with two slashes, which is another host's.
+        return self._welcome(RedirectResponse("/" + path.strip("/"), 303), self._sessions.local)
 
     async def _log_in(self, receive: Receive, address: str) -> Response:
         if self._sessions.too_many_tries(address):

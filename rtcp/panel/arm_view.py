@@ -26,6 +26,7 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
     def __init__(self, config: ArmConfig) -> None:
         super().__init__()
         assert config.arm is not None
+        self.config = config
         self._props["links"] = links(to_urdf(config.arm))
         cartesian = config.cartesian
         boxes = [] if cartesian.box is None else [_box(cartesian.box, False)]

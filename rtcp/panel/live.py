@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -26,7 +28,7 @@ from kinematics.forward import forward
 from kinematics.jacobian import singularity_distances
 from rtcp.api import AsyncRobot, Feed, RtcpError, Status
 from rtcp.config.model import ArmConfig
-from rtcp.panel.access import Visitor
+from rtcp.panel.access import Bucket, Visitor
 from rtcp.panel.scope import Scope
 
 T = TypeVar("T")
@@ -43,13 +45,30 @@ PRESENCE_S = 1.0
 TAKE_OVER_S = 10.0
 """An operator who does not answer loses the arm to the one who asks."""
 _RETRY_S = 0.5
+_MESSAGES = 200.0
+"""Messages of a page, at once and each second."""
+_MOST_UNSEEN = 32
+"""Pages that no browser has shown yet."""
 _SCOPE_TURNS = 2
 """The scopes are read in every second turn."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
 
-class TookOver(Exception):
+@dataclass(frozen=True)
+class Click:
+    """A click: the token that its page had then, and when it came."""
+
+    token_ns: int
+    came_ns: int
+
+
+_NO_CLICK = Click(0, 0)
+CLICK: ContextVar[Click] = ContextVar("click", default=_NO_CLICK)
+"""What the code that runs was called for."""
+
+
+class HeldByAnother(Exception):
     """Another page has the arm; `holder` names it."""
 
     def __init__(self, holder: str) -> None:
@@ -63,6 +82,10 @@ class Page:
 
     key: str
     visitor: Visitor
+    number: int = 0
+    """Counted from the panel's start: tells two tabs of one person apart."""
+    secret: str = ""
+    """Of its session."""
     socket: WebSocket | None = None
     sent_ns: int = 0
     """Token of the last message to it."""
@@ -79,14 +102,14 @@ class Page:
     sending: asyncio.Task[None] | None = None
     scope: Scope | None = None
     """The picture that it shows."""
-    blocks: list[Json] = field(default_factory=list)
+    block: Json | None = None
     """Of the scope, for its next message."""
     notify: Callable[[str], None] = lambda message: None
     asked: Callable[[str, asyncio.Future[bool]], None] = lambda who, answer: answer.set_result(True)
     """Asks the person whether another may take over."""
 
     def __str__(self) -> str:
-        return str(self.visitor)
+        return f"{self.visitor} (page {self.number})"
 
     def age_s(self, now_ns: int) -> float:
         """Return for how long nothing is known of whoever looks at it, s."""
@@ -102,13 +125,18 @@ class Operator:
         self._motions: set[asyncio.Task[Any]] = set()
         self._wanted: tuple[Sequence[float], str, int] | None = None
         self._jogging: asyncio.Task[None] | None = None
+        self._has_ended = False
 
     async def robot(self) -> AsyncRobot:
         """Return the connection, made anew where it was lost."""
         if self._robot is None or not self._robot.is_open:
             made = AsyncRobot(f"panel: {self.page}")
             await made.__aenter__()
+            if self._has_ended:
+                await made.close()
             self._robot = made
+        if self._has_ended:
+            raise RtcpError("refused", "this page does not operate the arm any more: nothing was sent")
         return self._robot
 
     @property
@@ -118,13 +146,21 @@ class Operator:
 
     async def run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Carry out a command; leaving, or `end`, ends its motion."""
-        robot = await self.robot()
-        task = asyncio.ensure_future(command(robot))
+        if self._motions:
+            raise RtcpError("refused", "the last command of this page is still carried out: wait, or STOP")
+        task = asyncio.ensure_future(self._run(command))
         self._motions.add(task)
         try:
             return await task
+        except asyncio.CancelledError:
+            if not self._has_ended:
+                raise
+            raise RtcpError("refused", "it was stopped") from None
         finally:
             self._motions.discard(task)
+
+    async def _run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
+        return await command(await self.robot())
 
     def jog(self, velocity: Sequence[float], frame: str, token_ns: int) -> None:
         """Move with a velocity until `JOG_S` after `token_ns`; only the newest command waits for its turn."""
@@ -135,28 +171,33 @@ class Operator:
     async def _jog(self) -> None:
         while self._wanted is not None:
             (velocity, frame, token_ns), self._wanted = self._wanted, None
-            hold_s = JOG_S - (time.monotonic_ns() - token_ns) * 1e-9
-            if hold_s <= 0.0:
-                continue
             try:
                 robot = await self.robot()
-                await robot.jog(velocity, frame, hold_s, token_ns * 1e-9)
+                await robot.jog(velocity, frame, JOG_S, token_ns * 1e-9)
             except RtcpError as error:
                 self.page.notes.append(error.message)
                 self.page.ended = self.page.press
 
     async def end(self) -> None:
-        """Close the connection: what it moves comes to a controlled stop."""
+        """Close the connection for good: what it moves comes to a controlled stop, what waits is not sent."""
+        self._has_ended = True
         self._wanted = None
+        for one in self._motions:
+            one.cancel()
         robot, self._robot = self._robot, None
         if robot is not None:
             await robot.close()
 
 
 class Live:
-    """Follows the platform and serves the pages."""
+    """Follows the platform and serves the pages.
 
-    def __init__(self) -> None:
+    Args:
+        is_session: whether the session with this secret still lasts.
+    """
+
+    def __init__(self, is_session: Callable[[str], bool]) -> None:
+        self._is_session = is_session
         self.status: Status | None = None
         """Newest; None: no platform runs."""
         self.problem = "no platform has been looked for yet"
@@ -165,23 +206,33 @@ class Live:
         self.feed: Feed | None = None
         self.pages: dict[str, Page] = {}
         self.operator: Operator | None = None
-        self.sent_messages = 0
         self._viewing: AsyncRobot | None = None
         self._retry_at = 0.0
         self._turn = 0
         self._scoped = False
-        self._halting: asyncio.Task[None] | None = None
+        self._halting: asyncio.Task[str] | None = None
+        self._halted_ns = 0
+        """When STOP was pressed last."""
+        self._asking = False
+        self._numbers = itertools.count(1)
 
     # -- pages --------------------------------------------------------------------------------------------------------
 
-    def open(self, key: str, visitor: Visitor) -> Page:
-        """Return a page that is being made."""
-        page = self.pages[key] = Page(key, visitor)
+    def open(self, key: str, visitor: Visitor, secret: str) -> Page:
+        """Return a page that is being made.
+
+        Raises:
+            Refused: too many have been asked for and not been shown.
+        """
+        if sum(page.sent_ns == 0 for page in self.pages.values()) >= _MOST_UNSEEN:
+            raise RtcpError("refused", f"{_MOST_UNSEEN} pages wait for a browser already")
+        page = self.pages[key] = Page(key, visitor, next(self._numbers), secret)
         return page
 
-    def close(self, page: Page) -> None:
+    async def close(self, page: Page) -> None:
         """A page has gone for good."""
         self.pages.pop(page.key, None)
+        await self.leave(page)
 
     async def serve(self, socket: WebSocket, visitor: Visitor) -> None:
         """Serve the socket of one page until it closes."""
@@ -191,8 +242,11 @@ class Live:
             return
         await socket.accept()
         page.socket = socket
+        bucket = Bucket(_MESSAGES, _MESSAGES)
         try:
             while True:
+                if not bucket.take():
+                    raise ValueError("too many messages")
                 self._receive(page, await socket.receive_json())
         except (ValueError, LookupError, TypeError, OverflowError):
             # Not one of ours: the page of this panel sends nothing else.
@@ -212,7 +266,8 @@ class Live:
         if given.get("visible") is True:
             page.seen_ns = max(page.seen_ns, token_ns)
         if given.get("stop"):
-            self._halting = asyncio.create_task(self.halt())
+            if self._halting is None or self._halting.done():
+                self._halting = asyncio.create_task(self.halt())
         elif "jog" in given:
             self._jog(page, given, token_ns)
 
@@ -236,7 +291,7 @@ class Live:
         elif press == page.press or any(velocity):
             try:
                 operator = self.claim(page)
-            except (TookOver, RtcpError) as error:
+            except (HeldByAnother, RtcpError) as error:
                 self._end_press(page, press, str(error))
                 return
             page.press, page.jogged_ns = press, token_ns + int(JOG_S * 1e9)
@@ -253,32 +308,44 @@ class Live:
         """Make a page the operator's, where nobody else is.
 
         Raises:
-            TookOver: another page has the arm.
+            HeldByAnother: another page has the arm.
             Refused: the visitor may only look.
         """
         if page.visitor.role != "operator":
             raise RtcpError("refused", f"{page.visitor.name} may look, and not command: log in as an operator")
+        if page.age_s(time.monotonic_ns()) > PRESENCE_S:
+            raise RtcpError("refused", f"nothing is heard of this page: {page}")
         if self.operator is None:
             self.operator = Operator(page)
         elif self.operator.page is not page:
-            raise TookOver(str(self.operator.page))
+            raise HeldByAnother(str(self.operator.page))
         return self.operator
 
     async def take_over(self, page: Page) -> bool:
         """Ask the operator for the arm; return whether `page` has it now. What moves is stopped first."""
         held = self.operator
-        if held is not None and held.page is not page:
+        if held is None or held.page is page:
+            self.claim(page)
+            return True
+        if self._asking:
+            raise RtcpError("refused", "somebody else asks for the arm already")
+        self._asking = True
+        try:
             answer: asyncio.Future[bool] = asyncio.get_running_loop().create_future()
             held.page.asked(str(page), answer)
-            try:
-                if not await asyncio.wait_for(answer, TAKE_OVER_S):
-                    return False
-            except asyncio.TimeoutError:
-                pass
-            held.page.notify(f"{page} has taken over the arm")
-            if self.operator is held:
-                await self.leave(held.page)
-        self.claim(page)
+            done, _ = await asyncio.wait([answer], timeout=TAKE_OVER_S)
+            if done and not answer.result():
+                return False
+            answer.cancel()
+        finally:
+            self._asking = False
+        if page.age_s(time.monotonic_ns()) > PRESENCE_S:
+            return False  # who asked has gone
+        # In one step: in between nobody else can claim it.
+        before, self.operator = self.operator, Operator(page)
+        if before is not None:
+            before.page.notify(f"{page} has taken over the arm")
+            await before.end()
         return True
 
     async def leave(self, page: Page) -> None:
@@ -287,16 +354,39 @@ class Live:
             operator, self.operator = self.operator, None
             await operator.end()
 
-    async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        """Carry out a command of a page; raises RtcpError, TookOver."""
+    def check_click(self, page: Page) -> None:
+        """Raise Refused for a click that came late, that no message of ours preceded, or that STOP has followed."""
+        click = CLICK.get()
+        late_s = (click.came_ns - click.token_ns) * 1e-9
+        if not 0 < click.token_ns <= page.sent_ns or late_s > PRESENCE_S:
+            raise RtcpError("refused", f"the click came {late_s:.1f} s late, allowed are {PRESENCE_S:g} s: click again")
+        if click.token_ns <= self._halted_ns:
+            raise RtcpError("refused", "STOP was pressed after this click: click again")
+
+    async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]], instead: bool = False) -> T:
+        """Carry out a command of a page; raises RtcpError, HeldByAnother. `instead`: what it moves stops first."""
+        self.check_click(page)
         operator = self.claim(page)
+        if instead and operator.moves:
+            await self.leave(page)
+            operator = self.claim(page)
         return await operator.run(command)
 
-    async def halt(self) -> None:
-        """Stop every motion, whoever asks."""
-        with contextlib.suppress(RtcpError):
+    async def halt(self) -> str:
+        """Stop every motion and what waits, whoever asks; return why it was not, or an empty text."""
+        self._halted_ns = time.monotonic_ns()
+        for page in self.pages.values():
+            page.ended = page.press
+        ending = None if self.operator is None else asyncio.create_task(self.leave(self.operator.page))
+        try:
             async with AsyncRobot("panel: stop") as robot:
                 await robot.halt()
+        except RtcpError as error:
+            return error.message
+        finally:
+            if ending is not None:
+                await ending
+        return ""
 
     async def view(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
         """Ask something that commands nothing.
@@ -314,13 +404,29 @@ class Live:
         """Follow the platform for as long as the panel runs."""
         due = time.monotonic()
         while True:
-            await self._look()
-            await self._watch_operator()
-            self._send_all()
+            try:
+                await self._read_status()
+                self._send_all()
+                await self._end_sessions()
+            except Exception:
+                # A defect met by one turn is logged; the pages are served on.
+                log.exception("a turn of the panel")
             due = max(due + STATE_S, time.monotonic() - STATE_S)
             await asyncio.sleep(max(0.0, due - time.monotonic()))
 
-    async def _look(self) -> None:
+    async def watch(self) -> None:
+        """Watch over the operator, whatever else waits."""
+        while True:
+            await asyncio.sleep(STATE_S)
+            await self._watch_operator()
+
+    async def _end_sessions(self) -> None:
+        for page in list(self.pages.values()):
+            if page.socket is not None and not self._is_session(page.secret):
+                await self.leave(page)
+                await page.socket.close(1008, "the session has ended")
+
+    async def _read_status(self) -> None:
         try:
             if self._viewing is None or not self._viewing.is_open:
                 if time.monotonic() < self._retry_at:
@@ -340,6 +446,9 @@ class Live:
         self.status = None
         robot, self._viewing = self._viewing, None
         feed, self.feed = self.feed, None
+        self.config = None
+        for page in self.pages.values():
+            page.scope = None
         if feed is not None:
             feed.close()
         if robot is not None:
@@ -353,7 +462,7 @@ class Live:
         if age_s > PRESENCE_S:
             operator.page.notes.append(f"the motion was ended: nothing was heard of this page for {age_s:.1f} s")
             log.warning("nothing heard of %s for %.1f s: its motion is ended", operator.page, age_s)
-            await operator.end()
+            await self.leave(operator.page)
 
     # -- messages -----------------------------------------------------------------------------------------------------
 
@@ -379,8 +488,7 @@ class Live:
         for page in watching:
             if records is not None and page.scope is not None:
                 page.scope.read(records)
-                if (block := page.scope.block()) is not None:
-                    page.blocks = [block]
+                page.block = page.scope.block() or page.block
 
     async def _send(self, page: Page, socket: WebSocket, state: Json) -> None:
         page.sent_ns = time.monotonic_ns()
@@ -388,12 +496,11 @@ class Live:
         operator = self.operator
         mine = operator is not None and operator.page is page
         who = "" if operator is None else str(operator.page)
-        blocks, page.blocks = page.blocks, []
+        block, page.block = page.block, None
         with contextlib.suppress(Exception):  # it has gone: its receiver sees that too
-            for block in blocks:
+            if block is not None:
                 await socket.send_json({"scope": block})
             await socket.send_json({"token": page.sent_ns, **state, "operator": who, "mine": mine, "notes": notes})
-            self.sent_messages += 1
 
     def state(self) -> Json:
         """Return what every page shows, SI units."""
@@ -408,16 +515,21 @@ class Live:
             "control_mode": raw["control_mode"],
             "holder": raw["lease"]["holder"],
             "bus": raw["bus"],
-            "joints": {name: [round(one, 5) for one in joints[name]] for name in _JOINTS if name in joints},
+            "joints": {name: [_number(one, 5) for one in joints[name]] for name in _JOINTS},
             "statuswords": raw["statuswords"],
             "wkc": raw["wkc"],
             "missed": raw["missed"],
             "cycles": raw["cycles"],
         }
-        if self.config is not None and self.config.arm is not None:
-            q = joints["actual_position"]
+        q = joints["actual_position"]
+        if self.config is not None and self.config.arm is not None and all(map(math.isfinite, q)):
             pose = forward(self.config.arm, q)
             distances = singularity_distances(self.config.arm, q)
             shown["tool"] = [round(one, 5) for one in (*pose.position, *pose.rpy)]
             shown["singular"] = [None if one is None else round(one, 4) for one in distances]
         return shown
+
+
+def _number(value: float, digits: int) -> float | None:
+    """Return a number as JSON has it, which knows none that is not finite."""
+    return round(value, digits) if math.isfinite(value) else None

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
 import sys
+import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
@@ -14,10 +16,15 @@ from nicegui.elements.mixins.text_element import TextElement
 
 from rtcp.api import AsyncRobot, RtcpError
 from rtcp.panel.arm_view import ArmView
-from rtcp.panel.live import TAKE_OVER_S, Live, Page, TookOver
+from rtcp.panel.live import CLICK, TAKE_OVER_S, Click, HeldByAnother, Live, Page
 
 T = TypeVar("T")
 Handler = Callable[[], Awaitable[object] | object]
+_BESIDE = "seamless position=bottom"
+"""A dialog that covers nothing: STOP stays in reach."""
+_COMMANDS = asyncio.Semaphore(2)
+"""Of `rtcp` at once."""
+_LONGEST_LINE = 1 << 22
 ENABLED = "holding moving stopping"
 """States with torque, as `data-when` of a control has them."""
 
@@ -115,8 +122,19 @@ def button(label: str, handler: Handler | None = None, *, when: str = "", plain:
     if when:
         made.props["data-when"] = when
     if handler is not None:
-        made.on("click", lambda: handler())  # noqa: PLW0108  without the event
+        on_click(made, handler)
     return made
+
+
+def on_click(element: Element, handler: Handler) -> None:
+    """Call `handler` for a click; what it commands is judged by when the person has clicked."""
+
+    async def clicked(event: Any) -> None:
+        CLICK.set(Click(event.args if type(event.args) is int else 0, time.monotonic_ns()))
+        if inspect.isawaitable(found := handler()):
+            await found
+
+    element.on("click", clicked, js_handler="() => emit(rtcp.token)")
 
 
 def table(headings: Sequence[str], caption: str, numbers: bool = False) -> Element:
@@ -146,6 +164,8 @@ class View:
         self.live = live
         self.page = page
         self.arm: ArmView | None = None
+        self.leaving: list[Callable[[], None]] = []
+        """Called when another page is shown or this one closes."""
         self._client = client
         page.notify, page.asked = self.warn, self._ask
 
@@ -159,11 +179,13 @@ class View:
         with self._client:
             ui.notify(message, type="negative", timeout=10_000, close_button="Close", multi_line=True)
 
-    async def act(self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "") -> T | None:
-        """Carry out a command; show what becomes of it."""
+    async def act(
+        self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False
+    ) -> T | None:
+        """Carry out a command; show what becomes of it. `instead`: what this page moves is stopped first."""
         try:
-            found = await self.live.command(self.page, command)
-        except TookOver as held:
+            found = await self.live.command(self.page, command, instead)
+        except HeldByAnother as held:
             self._offer_to_take_over(held.holder)
             return None
         except (RtcpError, OSError) as error:
@@ -181,11 +203,25 @@ class View:
             self.warn(error.message)
             return None
 
-    async def operates(self) -> bool:
-        """Return whether this page has the arm now; else it says why not."""
+    async def halt(self) -> None:
+        """Stop every motion."""
+        if problem := await self.live.halt():
+            self.warn(problem)
+        else:
+            self.say("The arm holds")
+
+    def may_command(self) -> bool:
+        """Return whether this person is an operator; else say that they are not."""
+        if self.page.visitor.role != "operator":
+            self.warn(f"{self.page.visitor.name} may look, and not command: log in as an operator")
+        return self.page.visitor.role == "operator"
+
+    def claim(self) -> bool:
+        """Make this page the operator's; return False where it says why not."""
         try:
+            self.live.check_click(self.page)
             self.live.claim(self.page)
-        except TookOver as held:
+        except HeldByAnother as held:
             self._offer_to_take_over(held.holder)
             return False
         except RtcpError as error:
@@ -194,29 +230,37 @@ class View:
         return True
 
     async def rtcp(self, *arguments: str, show: Callable[[str], None] | None = None) -> tuple[int, str]:
-        """Run the command `rtcp`; return its exit code and output; `show` gets each line."""
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "rtcp.cli", *arguments,
-            stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
-        )  # fmt: skip
-        assert process.stdout is not None
-        lines = []
-        async for line in process.stdout:
-            lines.append(line.decode(errors="replace").rstrip())
-            if show is not None:
-                show(lines[-1])
-        return await process.wait(), "\n".join(lines)
+        """Run the command `rtcp`; return its exit code and output; `show` gets each line. For operators alone."""
+        if not self.may_command():
+            return 3, "this is for operators"
+        async with _COMMANDS:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable, "-m", "rtcp.cli", *arguments, limit=_LONGEST_LINE,
+                stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+            )  # fmt: skip
+            assert process.stdout is not None
+            lines = []
+            async for line in process.stdout:
+                lines.append(line.decode(errors="replace").rstrip())
+                if show is not None:
+                    show(lines[-1])
+            return await process.wait(), "\n".join(lines)
 
     def _offer_to_take_over(self, holder: str) -> None:
         async def take() -> None:
             dialog.close()
             self.say(f"{holder} is asked; without an answer the arm is yours in {TAKE_OVER_S:g} s")
-            if await self.live.take_over(self.page):
+            try:
+                has_it = await self.live.take_over(self.page)
+            except (HeldByAnother, RtcpError) as error:
+                self.warn(str(error))
+                return
+            if has_it:
                 self.say("You operate the arm")
             else:
                 self.warn(f"{holder} keeps the arm")
 
-        with self._client, ui.dialog() as dialog, ui.card():
+        with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
             text("h2", f"{holder} operates the arm")
             text("p", "Whoever takes over stops what moves.")
             with ui.element("div").classes("buttons"):
@@ -230,10 +274,11 @@ class View:
             if not answer.done():
                 answer.set_result(value)
 
-        with self._client, ui.dialog() as dialog, ui.card():
+        with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
             text("h2", f"{who} asks for the arm")
             text("p", f"Without an answer it changes hands in {TAKE_OVER_S:g} s. What moves is stopped first.")
             with ui.element("div").classes("buttons"):
                 button("Give it", lambda: give(True))
                 button("Keep it", lambda: give(False), plain=True)
         dialog.open()
+        answer.add_done_callback(lambda _: dialog.close())

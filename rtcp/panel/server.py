@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import uvicorn
-from fastapi import FastAPI, Request, Response, WebSocket
+from fastapi import FastAPI, HTTPException, Request, Response, WebSocket
 from nicegui import Client, app, ui
+from nicegui.element import Element
 from starlette.responses import FileResponse
 from starlette.staticfiles import StaticFiles
 
@@ -69,7 +70,7 @@ class Panel:
 
     def __init__(self, options: PanelOptions) -> None:
         self._sessions = Sessions(passwords_for(options.host, password_file()))
-        self._live = Live()
+        self._live = Live(lambda secret: self._sessions.find(secret) is not None)
         self._options = options
         family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
         self._socket = socket.socket(family, socket.SOCK_STREAM)
@@ -109,13 +110,14 @@ class Panel:
 
     @contextlib.asynccontextmanager
     async def _lifespan(self, server: FastAPI) -> AsyncIterator[None]:
-        following = asyncio.create_task(self._live.follow())
+        tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._live.watch())]
         if self._options.open:
             asyncio.get_running_loop().call_later(0.5, webbrowser.open, self.url)
         try:
             yield
         finally:
-            following.cancel()
+            for task in tasks:
+                task.cancel()
             if self._live.operator is not None:
                 await self._live.operator.end()
 
@@ -128,8 +130,8 @@ class Panel:
 
         @server.post("/stop")
         async def stop(request: Request) -> Response:
-            await self._live.halt()
-            return Response(status_code=204)
+            problem = await self._live.halt()
+            return Response(problem, 503) if problem else Response(status_code=204)
 
         @server.get("/metrics")
         async def metrics() -> Response:
@@ -147,9 +149,12 @@ class Panel:
 
     def _page(self, request: Request, client: Client) -> None:
         visitor: Visitor = request.scope["visitor"]
-        page = self._live.open(secrets.token_urlsafe(16), visitor)
-        client.on_delete(lambda: self._live.close(page))
+        try:
+            page = self._live.open(secrets.token_urlsafe(16), visitor, request.scope["secret"])
+        except RtcpError as error:
+            raise HTTPException(429, error.message) from error
         view = View(self._live, page, client)
+        client.on_delete(lambda: self._close(view))
         ui.colors(**_COLOURS)
         ui.add_head_html('<link rel="stylesheet" href="/static/panel.css"><script src="/static/panel.js"></script>')
         with ui.element("header").props("id=head") as head:
@@ -159,6 +164,9 @@ class Panel:
             text("span", "", id="operator")
             with text("button", "STOP", "stop", type="button", **{"data-stop": ""}):
                 text("small", "not the emergency stop")
+            if self._sessions.asks:
+                with ui.element("form").props("method=post action=/logout"):
+                    text("button", "Log out", "act plain")
         text(
             "div",
             "No connection to the panel: what this page moved has been stopped.",
@@ -171,17 +179,24 @@ class Panel:
                 ui.link(name, path).props["data-path"] = path
         with ui.element("main").props("id=main") as main:
             space = ui.element("div").props("id=space")
-            place = ui.sub_pages({path: self._builder(view, main, path) for path in PAGES}, show_404=False)
+            place = ui.sub_pages({path: self._builder(view, main, space, path) for path in PAGES}, show_404=False)
             place.classes("page")
-        with space:
-            self._draw(view)
         text("div", "", id="notes", role="status", **{"aria-live": "polite"})
 
-    def _builder(self, view: View, main: Any, path: str) -> Callable[[], Any]:
+    async def _close(self, view: View) -> None:
+        for one in view.leaving:
+            one()
+        await self._live.close(view.page)
+
+    def _builder(self, view: View, main: Element, space: Element, path: str) -> Callable[[], Any]:
         name, build, beside_arm = PAGES[path]
 
         async def made() -> None:
             view.page.scope = None
+            while view.leaving:
+                view.leaving.pop()()
+            if beside_arm:
+                self._draw(view, space)
             main.classes(remove="alone") if beside_arm else main.classes("alone")
             ui.page_title(f"{name} - rtcp panel")
             ui.run_javascript(
@@ -197,10 +212,13 @@ class Panel:
 
         return made
 
-    def _draw(self, view: View) -> None:
+    def _draw(self, view: View, space: Element) -> None:
+        """Draw the arm that runs; it stays over all pages."""
         config = self._live.config
-        if config is not None and config.arm is not None:
-            view.arm = ArmView(config)
+        if config is not None and config.arm is not None and (view.arm is None or view.arm.config != config):
+            space.clear()
+            with space:
+                view.arm = ArmView(config)
 
 
 def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:

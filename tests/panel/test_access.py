@@ -99,9 +99,14 @@ def test_a_visitor_gets_a_cookie_that_no_script_and_no_other_site_can_use(open_p
 @pytest.mark.parametrize(
     "path", ["/", "/live", "/metrics", "/static/panel.js", "/recordings/x.mcap", "/_nicegui_ws/socket.io/"]
 )
-def test_nothing_is_served_without_a_session(open_panel: tuple[Platform, str], path: str) -> None:
+def test_nothing_is_served_without_a_session(closed_panel: str, path: str) -> None:
     for cookie in ("", "rtcp_panel=" + "A" * 43, "rtcp_panel=../../etc", "rtcp_panel=" + "x" * 9000):
-        assert ask(open_panel[1], "GET", path, {"Cookie": cookie}).status in (400, 401, 431)
+        assert ask(closed_panel, "GET", path, {"Cookie": cookie}).status in (400, 401, 431)
+
+
+def test_prometheus_needs_no_cookie_where_nobody_is_asked(open_panel: tuple[Platform, str]) -> None:
+    assert "rtcp_up 0.0" in ask(open_panel[1], "GET", "/metrics").text
+    assert ask(open_panel[1], "GET", "/static/panel.js").status == 401
 
 
 @pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "10.0.0.1", "", "127.0.0.1.evil.example"])
@@ -124,7 +129,7 @@ def test_a_command_of_another_site_is_refused(open_panel: tuple[Platform, str]) 
     cookie = cookie_of(ask(url, "GET", "/", PAGE))
     for headers in ({}, {"Origin": "http://evil.example"}, {"Origin": "null"}):
         assert ask(url, "POST", "/stop", {"Cookie": cookie, **headers}).status == 403
-    assert ask(url, "POST", "/stop", {"Cookie": cookie, "Origin": url}).status == 204
+    assert ask(url, "POST", "/stop", {"Cookie": cookie, "Origin": url}).status == 503  # no platform runs
     assert ask(url, "POST", "/stop", {"Cookie": cookie, "Origin": url, "Content-Length": "99999999"}).status == 413
     for method in ("PUT", "DELETE", "OPTIONS", "TRACE"):
         assert ask(url, method, "/", {"Cookie": cookie, "Origin": url}).status == 405

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -61,7 +62,7 @@ def feed(holding: Platform) -> Iterator[Feed]:
 
 def test_a_jog_lasts_as_long_as_it_is_held(page: Page, holding: Platform, feed: Feed) -> None:
     jogging(page, holding)
-    assert holding.status()["lease"]["holder"] == "panel: local at this machine"
+    assert holding.status()["lease"]["holder"].startswith("panel: local at this machine (page ")
     expect(page.locator("#operator")).to_have_text("You operate the arm")
     now = time.monotonic_ns()
     page.mouse.up()
@@ -85,6 +86,30 @@ def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, fe
     assert after[:2] == pytest.approx(before[:2], abs=5e-3)
 
 
+def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holding: Platform, feed: Feed) -> None:
+    holding.call("mode", name="cartesian")
+    show(page, "/jog")
+    page.locator(".jog-area").focus()
+    page.keyboard.down("w")
+    holding.until(lambda found: found["state"] == "moving", "the jog")
+    page.keyboard.down("Shift")
+    page.keyboard.up("W")
+    assert moved_after(holding, feed, time.monotonic_ns()) < JOG_S + SLACK_S
+    page.keyboard.up("Shift")
+
+
+def test_what_is_typed_into_a_field_jogs_nothing(page: Page, holding: Platform, feed: Feed) -> None:
+    holding.call("mode", name="cartesian")
+    show(page, "/jog")
+    feed.records()
+    for name in ("Speed, m/s", "Frame"):
+        page.get_by_label(name).focus()
+        page.keyboard.press("ArrowUp", delay=300)
+    page.get_by_label("Speed, m/s").press_sequentially("1e-2", delay=100)
+    records, _ = feed.records()
+    assert np.ptp(records["commanded_position"], axis=0).max() < 1e-9
+
+
 def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
     browser: Browser, panel: str, holding: Platform, feed: Feed
 ) -> None:
@@ -105,6 +130,16 @@ def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
         now = time.monotonic_ns()
         page.evaluate("pad.buttons[4].pressed = false")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+        page.evaluate("pad.buttons[4].pressed = true")
+        holding.until(lambda found: found["state"] == "moving", "the jog")
+        now = time.monotonic_ns()
+        page.keyboard.press("Escape")
+        assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+        time.sleep(0.5)
+        page.keyboard.press("Escape")  # a second time starts nothing
+        time.sleep(0.5)
+        records, _ = feed.records()
+        assert np.ptp(records["commanded_position"], axis=0).max() < 1e-9
 
 
 @pytest.mark.parametrize("how", ["blur", "hidden", "overloaded", "left", "closed"])
@@ -184,13 +219,37 @@ def test_the_stop_button_ends_a_move_of_anybody(browser: Browser, panel: str, ho
         assert abs(holding.status()["joints"]["actual_position"][0]) < 1.4
 
 
+def test_nothing_moves_after_stop_that_was_clicked_before(browser: Browser, panel: str, holding: Platform) -> None:
+    with visitor(browser, panel) as page:
+        begin(page, holding, "move")
+        since = holding.last_event()
+        # A click whose way to the panel takes longer than that of STOP: it has the token of before.
+        page.evaluate("Object.defineProperty(rtcp, 'token', { value: rtcp.token })")
+        page.keyboard.press("Escape")
+        holding.until(lambda found: found["state"] == "holding", "standstill")
+        page.get_by_role("button", name="Plan").click()
+        page.get_by_role("button", name="Send", exact=True).click()
+        expect(page.get_by_text("STOP was pressed after this click")).to_be_visible()
+        page.wait_for_timeout(1500)
+        page.get_by_role("button", name="Plan").click()
+        page.get_by_role("button", name="Send", exact=True).click()
+        expect(page.get_by_text(re.compile(r"the click came \d\.\d s late"))).to_be_visible()
+        assert "moving" not in holding.events(since)
+        assert holding.status()["state"] == "holding"
+
+
 def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, holding: Platform) -> None:
     with visitor(browser, panel) as first, visitor(browser, panel) as second:
         begin(first, holding, "move")
         show(second, "/")
-        expect(second.locator("#operator")).to_have_text("local at this machine operates the arm")
+        expect(second.locator("#operator")).to_have_text(
+            re.compile(r"local at this machine \(page \d+\) operates the arm")
+        )
         second.get_by_role("button", name="Disable").click()
         second.get_by_role("button", name="Ask to take over").click()
+        expect(first.get_by_role("button", name="Keep it")).to_be_visible()
+        # The question covers nothing.
+        first.get_by_role("button", name="STOP not the emergency stop").click(trial=True)
         first.get_by_role("button", name="Keep it").click()
         expect(second.get_by_text("keeps the arm")).to_be_visible()
         assert holding.status()["state"] == "moving"

@@ -72,7 +72,7 @@ def build(view: View) -> None:
     refresh()
     ui.timer(1.0, refresh)
     ui.timer(1.0, draw)
-    ui.context.client.on_delete(close)
+    view.leaving.append(close)
     _events(view)
     _faults(view)
 

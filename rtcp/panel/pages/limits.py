@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from rtcp.api import RtcpError
-from rtcp.panel.page import Field, View, button, number, table, text
+from rtcp.panel.page import ENABLED, Field, View, button, number, table, text
 
 _JOINT = {"min": "rad", "max": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³", "torque": "Nm"}
 
@@ -62,7 +62,7 @@ async def build(view: View) -> None:
                             fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed)
     kept = {key: one.value for key, one in fields.items()}
     with ui.element("div").classes("buttons"):
-        button("Set the limits", apply)
+        button("Set the limits", apply, when=f"ready {ENABLED} stopped_by_limit fault")
         button("As the file allows", widest, plain=True)
 
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from datetime import datetime
 from functools import partial
 from pathlib import Path
+from urllib.parse import quote
 
 from nicegui import ui
 
 from rtcp.api import Progress, RtcpError
 from rtcp.config.zero import state_directory
-from rtcp.panel.page import View, button, choice, field, row, table, text
+from rtcp.panel.page import View, button, choice, field, on_click, row, table, text
 
 _FORMATS = ("mcap", "csv", "mcap,csv")
 _ENDINGS = (".mcap", ".csv")
@@ -37,11 +38,11 @@ def build(view: View) -> None:
     files = ui.element("div").classes("page")
 
     async def start() -> None:
-        if not await view.operates():
+        if not view.claim():
             return
         directory = recordings_directory()
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        wanted = Path(name.value.strip() or f"{datetime.now():%Y-%m-%d_%H-%M-%S}").name
+        wanted = Path(name.value.strip()).name.lstrip(".") or f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
         found = formats.value.split(",")
         # One format: a file of that name; several: a folder.
         out = directory / (f"{wanted}.{found[0]}" if len(found) == 1 else wanted)
@@ -81,7 +82,7 @@ def build(view: View) -> None:
             row(body, where, f"{path.stat().st_size / 1e6:.1f}")
             with body.default_slot.children[-1]:
                 with ui.element("td"):
-                    link = text("a", f"Download {where}", href=f"/recordings/{where}")
+                    link = text("a", f"Download {where}", href=f"/recordings/{quote(where)}")
                     link.props["download"] = path.name
                 with ui.element("td"):
                     button(f"Plot {where}", partial(plot, path), plain=True)
@@ -96,12 +97,12 @@ def build(view: View) -> None:
             where = picture.relative_to(recordings_directory())
             image = ui.element("img").style("max-width: 100%; background: #fff")
             image.props.update(
-                {"src": f"/recordings/{where}?{picture.stat().st_mtime_ns}", "alt": f"Plot of {path.name}"}
+                {"src": f"/recordings/{quote(str(where))}?{picture.stat().st_mtime_ns}", "alt": f"Plot of {path.name}"}
             )
 
-    begin.on("click", start)
-    end.on("click", stop)
-    again.on("click", show_files)
+    on_click(begin, start)
+    on_click(end, stop)
+    on_click(again, show_files)
     ui.timer(1.0, refresh)
     _programs(view)
 
@@ -127,6 +128,8 @@ def _programs(view: View) -> None:
     bar = ui.element("progress").props("max=1 value=0 aria-label=Progress")
 
     async def check() -> bool:
+        if not view.may_command():
+            return False
         path, first = file.value.strip(), bool(approach.value)
         try:
             found = await view.live.view(lambda robot: robot.preview(file=path, approach=first))
@@ -152,9 +155,7 @@ def _programs(view: View) -> None:
     with ui.element("div").classes("buttons"):
         button("Check", check, plain=True)
         button("Run", run, when="holding")
-        button(
-            "Stop the program", lambda: view.act(lambda robot: robot.halt(), "The arm holds"), when="moving", plain=True
-        )
+        button("Stop the program", view.halt, when="moving", plain=True)
 
 
 def _motion_files() -> list[Path]:

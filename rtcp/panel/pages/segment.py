@@ -127,7 +127,7 @@ def _faults(view: View) -> None:
     active = ui.element("div").classes("page")
 
     async def make() -> None:
-        if not await view.operates():
+        if not view.claim():
             return
         more = ["--lasts", lasts.value] if lasts.value.strip() else []
         code, out = await view.rtcp("segment", "fault", kind.value, *keys.value.split(), *more)
@@ -135,7 +135,7 @@ def _faults(view: View) -> None:
         await show()
 
     async def clear() -> None:
-        if await view.operates():
+        if view.claim():
             code, out = await view.rtcp("segment", "clear")
             view.warn(out) if code else view.say(out)
             await show()

@@ -11,7 +11,7 @@ from nicegui import ui
 from rtcp.api import AsyncRobot
 from rtcp.config.find import default_config, find_config
 from rtcp.config.model import VIRTUAL, ConfigError
-from rtcp.panel.page import ENABLED, View, button, choice, field, number, row, table, text
+from rtcp.panel.page import ENABLED, View, button, choice, field, number, on_click, row, table, text
 
 MODES = ("joint", "cartesian", "joystick", "velocity", "torque")
 DRIVE_MODES = ("csp", "csv", "cst")
@@ -50,7 +50,7 @@ def build(view: View) -> None:
         said.text = f"{said.text}\n{line}".strip()[-8000:]
 
     async def start() -> None:
-        if not await view.operates():
+        if not view.claim():
             return
         said.text = ""
         arguments = where()
@@ -68,8 +68,8 @@ def build(view: View) -> None:
         said.text = "..."
         _, said.text = await view.rtcp("doctor", *where())
 
-    async def look() -> None:
-        if not await view.operates():
+    async def scan_bus() -> None:
+        if not view.claim():
             return
         said.text = "..."
         code, out = await view.rtcp("scan", "--json", *(["--bus", bus.value] if view.live.status is None else []))
@@ -92,15 +92,15 @@ def build(view: View) -> None:
                     product,
                 )
 
-    for control, handler in ((begin, start), (check, doctor), (scan, look)):
-        control.on("click", handler)
+    for control, handler in ((begin, start), (check, doctor), (scan, scan_bus)):
+        on_click(control, handler)
 
     text("h2", "Machine")
     with ui.element("div").classes("buttons"):
         button("Enable", lambda: view.act(lambda robot: robot.enable(), "The drives hold the arm"), when="ready")
         button(
             "Disable",
-            lambda: view.act(_disable, "The drives are without torque"),
+            lambda: view.act(_disable, "The drives are without torque", instead=True),
             when=ENABLED + " stopped_by_limit",
             plain=True,
         )
@@ -110,7 +110,7 @@ def build(view: View) -> None:
             when="fault emergency_stop stopped_by_limit",
             plain=True,
         )
-        button("Halt", lambda: view.act(lambda robot: robot.halt(), "The arm holds"), when="moving homing", plain=True)
+        button("Halt", view.halt, when="moving homing", plain=True)
     with ui.element("div").classes("fields"):
         control_mode = choice("Control mode", MODES, "joint")
         drive_mode = choice("Drive mode", DRIVE_MODES, "csp")
@@ -134,7 +134,7 @@ async def _disable(robot: AsyncRobot) -> None:
 
 
 async def _end(view: View) -> None:
-    problems = await view.act(lambda robot: robot.stop())
+    problems = await view.act(lambda robot: robot.stop(), instead=True)
     if problems:
         view.warn("Stopped, but: " + "; ".join(problems))
     elif problems is not None:

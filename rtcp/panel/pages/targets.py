@@ -23,6 +23,7 @@ from rtcp.panel.page import Field, View, button, choice, field, number, row, tab
 _WAYS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
 _POSE = ("x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
 _LONGEST_NAME = 40
+_SAME_RAD = 1e-3
 
 
 def build(view: View) -> None:
@@ -63,6 +64,8 @@ class Targets:
     def __init__(self, view: View, config: ArmConfig) -> None:
         self._view, self._config = view, config
         self._planned: Target | None = None
+        self._begin: Sequence[float] = ()
+        """Where what was shown begins, rad."""
         with ui.element("div").classes("fields"):
             self._way = choice("Target", _WAYS, "joints")
             self._speed = number("Speed, rad/s or m/s (empty: the limit)", min="0")
@@ -152,12 +155,16 @@ class Targets:
         self._said.text = f"{found.duration_s:.1f} s{length}: look at the ghost, then send it"
         if self._view.arm is not None:
             self._view.arm.preview([list(q) for q in found.path], found.duration_s)
-        self._planned = target
+        self._planned, self._begin = target, found.path[0]
         self._send_button.props["disabled"] = False
 
     async def _send(self) -> None:
-        target = self._planned
+        target, begin, self._planned = self._planned, self._begin, None
         if target is None:
+            return
+        now = self._view.live.state().get("joints", {}).get("commanded_position", ())
+        if len(now) != len(begin) or max(abs(a - b) for a, b in zip(now, begin, strict=True)) > _SAME_RAD:
+            self._said.text = "The arm has moved since: plan again"
             return
         self._said.text = "Moving"
         arrival = await self._view.act(target.move)
@@ -206,6 +213,8 @@ class Targets:
     # -- named poses --------------------------------------------------------------------------------------------------
 
     def _keep(self) -> None:
+        if not self._view.may_command():
+            return
         name = self._name.value.strip()[:_LONGEST_NAME]
         if not name:
             self._view.warn("Name: found nothing, allowed is a name of the pose")
@@ -217,6 +226,8 @@ class Targets:
         self._show_named()
 
     def _forget(self, name: str) -> None:
+        if not self._view.may_command():
+            return
         try:
             write_named({key: q for key, q in read_named().items() if key != name})
         except (RtcpError, OSError) as error:

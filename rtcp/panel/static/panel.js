@@ -11,7 +11,7 @@ window.rtcp = (() => {
   function connect() {
     const url = new URL("/live", location.href);
     url.protocol = location.protocol === "https:" ? "wss:" : "ws:";
-    url.searchParams.set("page", document.body.dataset.page || pageKey());
+    url.searchParams.set("page", pageKey());
     socket = new WebSocket(url);
     socket.onmessage = (event) => receive(JSON.parse(event.data));
     socket.onclose = () => { token = 0; release(); setTimeout(connect, 500); };
@@ -96,7 +96,7 @@ window.rtcp = (() => {
   // -- the operator's hand -----------------------------------------------------------------------------------------------
 
   const pressed = new Map(); // what holds -> the six parts of the speed that it asks for
-  let press = 0, pad = null;
+  let press = 0, pad = null, padEnded = false;
   const AXES = ["x", "y", "z", "rx", "ry", "rz"];
   function begin(holder, axis, sign) {
     if (!pressed.size && !pad) press += 1;
@@ -109,6 +109,7 @@ window.rtcp = (() => {
     mark();
   }
   function release() {
+    padEnded = true;
     if (!pressed.size && !pad) return;
     pressed.clear();
     pad = null;
@@ -122,6 +123,7 @@ window.rtcp = (() => {
     const frame = parts.jogFrame ?? "base";
     const count = frame === "joints" ? (state.joints?.actual_position.length ?? 6) : 6;
     const jog = Array(count).fill(0);
+    for (const one of pressed.keys()) if (one.isConnected === false || one.disabled) pressed.delete(one);
     for (const [axis, sign] of pressed.values()) if (axis < count) jog[axis] += sign;
     if (pad) pad.forEach((value, axis) => { if (axis < count) jog[axis] += value; });
     const speeds = frame === "joints" ? Array(count).fill(+parts.jogJoint || 0)
@@ -134,8 +136,9 @@ window.rtcp = (() => {
       button.classList.toggle("pressed", [...pressed.keys()].includes(button));
     }
   }
+  function padOf(element) { return element.closest?.("[data-jog]"); }
   function jogOf(element) {
-    const button = element.closest?.("[data-jog]");
+    const button = padOf(element);
     if (!button || button.disabled) return null;
     const [axis, sign] = [button.dataset.jog.slice(0, -1), button.dataset.jog.endsWith("+") ? 1 : -1];
     const at = AXES.indexOf(axis);
@@ -150,12 +153,13 @@ window.rtcp = (() => {
     begin(...found);
   });
   for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) {
-    document.addEventListener(name, (event) => { const found = jogOf(event.target); if (found) end(found[0]); });
+    document.addEventListener(name, (event) => end(padOf(event.target)));
   }
   document.addEventListener("contextmenu", (event) => { if (jogOf(event.target)) event.preventDefault(); });
 
+  // By the place of a key: its letter changes with Shift and Caps Lock between press and release.
   const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 1], ArrowRight: [1, -1], PageUp: [2, 1],
-    PageDown: [2, -1], q: [5, 1], e: [5, -1], a: [3, 1], d: [3, -1], w: [4, 1], s: [4, -1] };
+    PageDown: [2, -1], KeyQ: [5, 1], KeyE: [5, -1], KeyA: [3, 1], KeyD: [3, -1], KeyW: [4, 1], KeyS: [4, -1] };
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") { stop(); return; }
     const button = jogOf(event.target);
@@ -164,27 +168,28 @@ window.rtcp = (() => {
       if (!event.repeat) begin(...button);
       return;
     }
+    if (event.target.matches?.("input, select, textarea")) return;
     const area = event.target.closest?.("[data-jog-frame]");
-    const found = area && KEYS[event.key];
+    const found = area && KEYS[event.code];
     if (!found || event.ctrlKey || event.altKey || event.metaKey) return;
     event.preventDefault();
-    if (!event.repeat) begin(event.key, ...found);
+    if (!event.repeat) begin(event.code, ...found);
   });
   document.addEventListener("keyup", (event) => {
-    const button = jogOf(event.target);
-    if (button && (event.key === " " || event.key === "Enter")) { event.preventDefault(); end(button[0]); }
-    end(event.key);
+    if (event.key === " " || event.key === "Enter") end(padOf(event.target));
+    end(event.code);
   });
   for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, release);
   document.addEventListener("visibilitychange", () => { if (document.hidden) release(); });
-  document.addEventListener("focusout", (event) => { const found = jogOf(event.target); if (found) end(found[0]); });
+  document.addEventListener("focusout", (event) => end(padOf(event.target)));
 
   // A gamepad jogs while its left shoulder button is held: left stick X-Y, right stick Z and yaw, cross roll and pitch.
   function gamepad() {
     const area = document.querySelector("[data-jog-frame]");
     const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
     const held = found && found.buttons[4]?.pressed;
-    if (!held) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
+    if (!held) padEnded = false;
+    if (!held || padEnded) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
     if (!pad && !pressed.size) press += 1;
     const stick = (at) => (Math.abs(found.axes[at] ?? 0) > 0.15 ? found.axes[at] : 0);
     const cross = (plus, minus) => (found.buttons[plus]?.pressed ? 1 : 0) - (found.buttons[minus]?.pressed ? 1 : 0);
@@ -195,7 +200,9 @@ window.rtcp = (() => {
     release();
     if (socket?.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ seen: token, visible: true, stop: true }));
     // By another way as well: the socket may hang.
-    fetch("/stop", { method: "POST", keepalive: true }).catch(() => {});
+    fetch("/stop", { method: "POST", keepalive: true })
+      .then(async (answer) => { if (!answer.ok) say(`STOP was not carried out: ${await answer.text()}`); })
+      .catch(() => say("STOP did not reach the panel: use the emergency stop"));
   }
   document.addEventListener("click", (event) => { if (event.target.closest?.("[data-stop]")) stop(); });
 
@@ -223,7 +230,7 @@ window.rtcp = (() => {
   window.addEventListener("load", () => {
     const wait = setInterval(() => { if (pageKey()) { clearInterval(wait); connect(); } }, 50);
   });
-  return { fill, stop, get state() { return state; },
+  return { fill, stop, get token() { return token; }, get state() { return state; },
     listen: (listener) => { listeners.add(listener); return () => listeners.delete(listener); },
     scope: (picture) => { pictures.add(picture); return () => pictures.delete(picture); } };
 })();
