@@ -190,7 +190,9 @@ def to_standstill(playwright: object, loss: str, begin: Callable[[Page], None]) 
         return float("nan"), float("nan")
     after = times[times > 0]
     slower = np.flatnonzero(speed[times > 0] < 0.98 * before_loss)
-    return float(after[slower[0]]), float(after[np.flatnonzero(still)[-1]]) if still.any() else 0.0
+    if not len(slower) or not still.any():
+        return float("nan"), float("nan")
+    return float(after[slower[0]]), float(after[np.flatnonzero(still)[-1]])
 
 
 def pictures(playwright: object, directory: Path) -> None:
