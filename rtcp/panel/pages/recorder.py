@@ -38,7 +38,8 @@ def build(view: View) -> None:
     files = ui.element("div").classes("page")
 
     async def start() -> None:
-        if not view.claim():
+        # It moves nothing and needs no lease: also while something moves.
+        if not view.may_command():
             return
         directory = recordings_directory()
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -47,14 +48,13 @@ def build(view: View) -> None:
         # One format: a file of that name; several: a folder.
         out = directory / (f"{wanted}.{found[0]}" if len(found) == 1 else wanted)
         chosen = signals.value.replace(",", " ").split()
-        if (
-            await view.act(lambda robot: robot.record_start(out, formats=found, signals=chosen), "Recording")
-            is not None
-        ):
+        if await view.ask(lambda robot: robot.record_start(out, formats=found, signals=chosen)) is not None:
             await refresh()
 
     async def stop() -> None:
-        ended = await view.act(lambda robot: robot.record_stop())
+        if not view.may_command():
+            return
+        ended = await view.ask(lambda robot: robot.record_stop())
         for one in ended or ():
             view.say(f"{one.records} cycles, {one.missing} missing, {one.bytes / 1e6:.1f} MB")
         await refresh()
