@@ -122,6 +122,7 @@ class Operator:
     def __init__(self, page: Page) -> None:
         self.page = page
         self._robot: AsyncRobot | None = None
+        self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Any]] = set()
         self._wanted: tuple[Sequence[float], str, int] | None = None
         self._jogging: asyncio.Task[None] | None = None
@@ -129,15 +130,17 @@ class Operator:
 
     async def robot(self) -> AsyncRobot:
         """Return the connection, made anew where it was lost."""
-        if self._robot is None or not self._robot.is_open:
-            made = AsyncRobot(f"panel: {self.page}")
-            await made.__aenter__()
-            if self._has_ended:
-                await made.close()
-            self._robot = made
-        if self._has_ended:
-            raise RtcpError("refused", "this page does not operate the arm any more: nothing was sent")
-        return self._robot
+        async with self._connecting:
+            if not self._has_ended and (self._robot is None or not self._robot.is_open):
+                made = AsyncRobot(f"panel: {self.page}")
+                await made.__aenter__()
+                self._robot = made
+            robot = self._robot
+            if self._has_ended or robot is None:
+                if robot is not None:
+                    await robot.close()
+                raise RtcpError("refused", "this page does not operate the arm any more: nothing was sent")
+        return robot
 
     @property
     def moves(self) -> bool:
@@ -285,6 +288,8 @@ class Live:
         if press == page.press and now_ns > page.jogged_ns:
             # It has stopped already: going on would be a start that nobody expects.
             self._end_press(page, press, "the jog has ended, nothing was heard for a while: release, then press again")
+        elif token_ns <= self._halted_ns:
+            self._end_press(page, press, "no jog: STOP was pressed after this: release, then press again")
         elif JOG_S - age_s < LEAST_HOLD_S:
             allowed = f"allowed are {JOG_S - LEAST_HOLD_S:g} s"
             self._end_press(page, press, f"no jog: to this browser and back it takes {age_s:.2f} s, {allowed}")
