@@ -46,7 +46,7 @@ def begun(platform: Platform, *arguments: str) -> Iterator[tuple[subprocess.Pope
         assert "Traceback" not in complaints, complaints
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[BrowserType]:
     if CHROMIUM is None:
         pytest.skip("no Chromium is installed (Debian: apt install chromium)")
@@ -54,7 +54,7 @@ def chromium() -> Iterator[BrowserType]:
         yield playwright.chromium
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser(chromium: BrowserType) -> Iterator[Browser]:
     found = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
     yield found
