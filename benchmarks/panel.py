@@ -27,11 +27,12 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import date
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import psutil
-from playwright.sync_api import Browser, Error, Page, sync_playwright
+from playwright.sync_api import Browser, Error, Page, Playwright, sync_playwright
 from rich.console import Console
 from rich.table import Table
 
@@ -149,10 +150,10 @@ def moving(page: Page) -> None:
 LOSSES = ("button released", "focus lost", "page overloaded", "page closed", "browser killed", "panel killed")
 
 
-def to_standstill(playwright: object, loss: str, begin: Callable[[Page], None]) -> float:
+def to_standstill(playwright: Playwright, loss: str, begin: Callable[[Page], None]) -> float:
     """Return the time from the loss until the arm stands, ms; not a number where it had not moved."""
     before = set(psutil.Process().children(recursive=True))
-    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)  # type: ignore[attr-defined]
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
     own = set(psutil.Process().children(recursive=True)) - before
     with panel() as (process, url), contextlib.closing(Feed()) as feed, connect("benchmark") as robot:
         page = opened(browser, url, "/")
@@ -188,10 +189,10 @@ def to_standstill(playwright: object, loss: str, begin: Callable[[Page], None]) 
     return float(moving_at[-1]) if len(moving_at) else float("nan")
 
 
-def pictures(playwright: object, directory: Path) -> None:
+def pictures(playwright: Playwright, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     with panel() as (_, url):
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)  # type: ignore[attr-defined]
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for width in (400, 1600):
             for path, (name, _, _) in PAGES.items():
                 page = opened(browser, url, path, width)
@@ -218,7 +219,7 @@ def main() -> int:
     given = parser.parse_args()
     machine = f"{platform.machine()}, {os.cpu_count()} CPUs, Linux {platform.release()}"
     console.print(f"{machine}, {date.today().isoformat()}, load {os.getloadavg()[0]:.1f} before")
-    found: dict[str, object] = {}
+    found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as name, sync_playwright() as playwright:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = name
         running = start(StartOptions(), lambda sentence: None)
@@ -282,13 +283,13 @@ def main() -> int:
     return 0
 
 
-def _show_costs(found: dict[str, object]) -> None:
+def _show_costs(found: dict[str, Any]) -> None:
     first, five_pages, flooded = found["first_page_s"], found["five"], found["flood"]
-    console.print(f"first page: {spread(first)} s (aim 2)")  # type: ignore[arg-type]
+    console.print(f"first page: {spread(first)} s (aim 2)")
     console.print(f"one page: {found['cpu_percent']:.0f} % of a core (aim 25), {found['memory_mb']:.0f} MB (aim 150)")
-    console.print(f"age of what is shown: p50 {found['age_ms'][0]:.0f}, p99 {found['age_ms'][1]:.0f} ms (aim 150)")  # type: ignore[index]
+    console.print(f"age of what is shown: p50 {found['age_ms'][0]:.0f}, p99 {found['age_ms'][1]:.0f} ms (aim 150)")
     for name, one in (("five pages", five_pages), (f"{found['requests_per_s']:.0f} requests/s", flooded)):
-        without, with_it = one["without"], one["with"]  # type: ignore[index]
+        without, with_it = one["without"], one["with"]
         ratio = statistics.median(with_it) / max(0.1, statistics.median(without))
         console.print(
             f"{name}: wake-up p99 {spread(without)} without, {spread(with_it)} with, us: {ratio:.2f} (aim 1.1)"

@@ -105,7 +105,7 @@ class Planner:
 
     def joint_move(
         self, q: Sequence[float], q_now: Sequence[float], speed: float | None, synchronized: bool
-    ) -> tuple[preview.Path, float] | Refusal:
+    ) -> tuple[preview.JointPath, float] | Refusal:
         """Return the way of a joint move and its duration, s; or what the loop would refuse it with.
 
         Raises:
@@ -126,7 +126,7 @@ class Planner:
                 raise RtcpError("refused", f"the move leads through {box} ({where}): choose another target or way")
         return found
 
-    def way(self, plan: Plan, q_now: Sequence[float]) -> preview.Path:
+    def way(self, plan: Plan, q_now: Sequence[float]) -> preview.JointPath:
         """Return the joints along a plan."""
         return preview.planned(plan, q_now, self._config.arm)
 
@@ -228,7 +228,7 @@ class MotionActions:
             path, duration_s = found
             return {"path": path, "duration_s": duration_s, "length_m": None, "slowed": None}
 
-        def plan() -> tuple[Plan, preview.Path]:
+        def plan() -> tuple[Plan, preview.JointPath]:
             made = self._planner.lines(stops, here, speed) if stops else self._planner.trajectory(points, here)
             return made, self._planner.way(made, here)
 
@@ -253,7 +253,7 @@ class MotionActions:
         way = await self.preview(first, (), (), None, True)
         rest = stops[1:]
 
-        def plan() -> tuple[Plan | None, preview.Path]:
+        def plan() -> tuple[Plan | None, preview.JointPath]:
             if not (points or rest):
                 return None, []
             made = self._planner.lines(rest, first, speed) if stops else self._planner.trajectory(points, first)

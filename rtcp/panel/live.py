@@ -37,11 +37,11 @@ Json = dict[str, Any]
 STATE_S = 0.05
 """Between two messages to a page."""
 JOG_S = 0.25
-"""A jog ends so long after the last sign of the operator's hand."""
+"""Time from the operator's last input to the end of a jog, s."""
 LEAST_HOLD_S = 0.08
 """A jog command that would hold for less is refused: the way to the browser and back takes too long."""
 PRESENCE_S = 1.0
-"""A motion ends so long after the last sign of its operator."""
+"""Time from the last answer of the operator's page to the end of a motion, s."""
 TAKE_OVER_S = 10.0
 """An operator who does not answer loses the arm to the one who asks."""
 _RETRY_S = 0.5
@@ -252,7 +252,7 @@ class Live:
                     raise ValueError("too many messages")
                 self._receive(page, await socket.receive_json())
         except (ValueError, LookupError, TypeError, OverflowError):
-            # Not one of ours: the page of this panel sends nothing else.
+            # The panel's own pages never send this.
             with contextlib.suppress(WebSocketDisconnect, RuntimeError):
                 await socket.close(1003, "not a message of a page")
         except (WebSocketDisconnect, RuntimeError):
@@ -360,7 +360,7 @@ class Live:
             await operator.end()
 
     def check_click(self, page: Page) -> None:
-        """Raise Refused for a click that came late, that no message of ours preceded, or that STOP has followed."""
+        """Raise Refused for a click that arrived late, has no valid token, or was made before STOP."""
         click = CLICK.get()
         late_s = (click.came_ns - click.token_ns) * 1e-9
         if not 0 < click.token_ns <= page.sent_ns or late_s > PRESENCE_S:
@@ -502,7 +502,7 @@ class Live:
         mine = operator is not None and operator.page is page
         who = "" if operator is None else str(operator.page)
         block, page.block = page.block, None
-        with contextlib.suppress(Exception):  # it has gone: its receiver sees that too
+        with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # closed: `serve` handles that
             if block is not None:
                 await socket.send_json({"scope": block})
             await socket.send_json({"token": page.sent_ns, **state, "operator": who, "mine": mine, "notes": notes})

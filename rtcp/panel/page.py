@@ -42,14 +42,14 @@ class Field:
         self.control.props["^value"] = value
         self.control.on("input", self._changed, js_handler="(event) => emit(event.target.value)")
         self._value = value
-        self._on_change: list[Handler] = []
+        self._on_change: list[Callable[[], object]] = []
 
     def _changed(self, event: Any) -> None:
         self._value = str(event.args)  # the browser shows it already
         for one in self._on_change:
             one()
 
-    def on_change(self, handler: Handler) -> None:
+    def on_change(self, handler: Callable[[], object]) -> None:
         """Call `handler` when the person has changed it."""
         self._on_change.append(handler)
 
@@ -90,9 +90,9 @@ def number(label: str, value: str = "", **attributes: str) -> Field:
 def choice(label: str, options: Iterable[str] | Mapping[str, str], value: str) -> Field:
     """Return a field with options: values, or values and what is shown."""
     made = Field("select", label, value)
-    shown = options if isinstance(options, Mapping) else {one: one for one in options}
+    named = options if isinstance(options, Mapping) else {one: one for one in options}
     with made.control:
-        for key, name in shown.items():
+        for key, name in named.items():
             option = text("option", name)
             option.props["value"] = key
             if key == value:
@@ -149,12 +149,27 @@ def table(headings: Sequence[str], caption: str, numbers: bool = False) -> Eleme
             return ui.element("tbody")
 
 
-def row(body: Element, first: str, *cells: str) -> None:
-    """Add a row of text; its first cell is its heading."""
-    with body, ui.element("tr"):
+def row(body: Element, first: str, *cells: str) -> Element:
+    """Add a row of text and return it; its first cell is its heading."""
+    with body, ui.element("tr") as made:
         text("th", first, scope="row")
         for cell in cells:
             text("td", cell)
+    return made
+
+
+def tool_pose() -> None:
+    """Show the pose of the tool, live."""
+    headings = ("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
+    with table(headings, "Pose of the tool", numbers=True), ui.element("tr"):
+        text("th", "pose", scope="row")
+        for at in range(6):
+            shown(f"tool.{at}", 4)
+
+
+def no_platform() -> None:
+    """Say on a page that needs a platform that none runs."""
+    text("p", "No platform runs: start one on the page Start.")
 
 
 class View:

@@ -297,58 +297,52 @@ def log_in(page: Page) -> None:
     page.wait_for_selector("[data-live=state][data-state]")
 
 
-@pytest.mark.parametrize("motion", ["jog", "move"])
-def test_a_cut_network_stops_the_arm(
-    chromium: BrowserType, platform: Platform, cable: Cable, motion: str, tmp_path: Path
-) -> None:
+@pytest.fixture
+def far_page(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> Iterator[Page]:
+    """A page at the far end of the cable, logged in; the platform holds."""
     set_password(platform)
     with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
         ready(platform)
         with contextlib.suppress(Error), visitor(browser, url) as page:
             log_in(page)
-            begin(page, platform, motion)
-            with contextlib.closing(Feed(platform.directory)) as feed:
-                now = time.monotonic_ns()
-                cable.cut()
-                took = moved_after(platform, feed, now)
-        assert took < (JOG_S if motion == "jog" else PRESENCE_S) + SLACK_S
+            yield page
 
 
-def test_a_slow_network_does_not_jog(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> None:
-    set_password(platform)
-    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
-        ready(platform)
-        with visitor(browser, url) as page:
-            log_in(page)
-            show(page, "/jog")
-            page.get_by_label("Frame").select_option("joints")
-            page.get_by_role("button", name="joint1 +").hover()
-            cable.delay_s = 0.15
-            page.wait_for_timeout(1500)
-            page.mouse.down()
-            expect(page.locator("#notes")).to_contain_text("no jog: to this browser and back it takes 0.3")
-            page.mouse.up()
-        assert platform.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
+@pytest.mark.parametrize("motion", ["jog", "move"])
+def test_a_cut_network_stops_the_arm(platform: Platform, cable: Cable, far_page: Page, motion: str) -> None:
+    begin(far_page, platform, motion)
+    with contextlib.closing(Feed(platform.directory)) as feed:
+        now = time.monotonic_ns()
+        cable.cut()
+        took = moved_after(platform, feed, now)
+    assert took < (JOG_S if motion == "jog" else PRESENCE_S) + SLACK_S
 
 
-def test_a_lossy_network_never_jogs_on(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> None:
-    set_password(platform)
-    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
-        ready(platform)
-        with visitor(browser, url) as page:
-            log_in(page)
-            show(page, "/jog")
-            page.get_by_label("Frame").select_option("joints")
-            pad = page.get_by_role("button", name="joint1 +")
-            cable.loss = 0.2
-            for _ in range(5):
-                with contextlib.closing(Feed(platform.directory)) as feed:
-                    pad.hover()
-                    page.mouse.down()
-                    time.sleep(0.7)
-                    now = time.monotonic_ns()
-                    page.mouse.up()
-                    assert moved_after(platform, feed, now) < JOG_S + SLACK_S
+def test_a_slow_network_does_not_jog(platform: Platform, cable: Cable, far_page: Page) -> None:
+    show(far_page, "/jog")
+    far_page.get_by_label("Frame").select_option("joints")
+    far_page.get_by_role("button", name="joint1 +").hover()
+    cable.delay_s = 0.15
+    far_page.wait_for_timeout(1500)
+    far_page.mouse.down()
+    expect(far_page.locator("#notes")).to_contain_text("no jog: to this browser and back it takes 0.3")
+    far_page.mouse.up()
+    assert platform.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_a_lossy_network_never_jogs_on(platform: Platform, cable: Cable, far_page: Page) -> None:
+    show(far_page, "/jog")
+    far_page.get_by_label("Frame").select_option("joints")
+    pad = far_page.get_by_role("button", name="joint1 +")
+    cable.loss = 0.2
+    for _ in range(5):
+        with contextlib.closing(Feed(platform.directory)) as feed:
+            pad.hover()
+            far_page.mouse.down()
+            time.sleep(0.7)
+            now = time.monotonic_ns()
+            far_page.mouse.up()
+            assert moved_after(platform, feed, now) < JOG_S + SLACK_S
 
 
 def set_password(platform: Platform) -> None:

@@ -18,13 +18,13 @@ from rtcp.motion.state import ArmState
 SAMPLES = 60
 """Configurations of a preview at least, where the motion has an extent."""
 
-Path = list[tuple[float, ...]]
+JointPath = list[tuple[float, ...]]
 """Joint positions along the way, rad, begin and end included."""
 
 
 def joint_move(
     limits: Limits, q_now: Sequence[float], q: Sequence[float], speed: float, synchronized: bool
-) -> tuple[Path, float] | None:
+) -> tuple[JointPath, float] | None:
     """Return the way of a joint move from rest and its duration, s; None: no plan is found."""
     motion, state = JointMotion(1e-3, limits.velocity, limits.acceleration, limits.jerk), ArmState(len(q_now))
     state.commanded = list(q_now)
@@ -34,7 +34,7 @@ def joint_move(
     return [motion.planned_position(duration_s * k / SAMPLES) for k in range(SAMPLES + 1)], duration_s
 
 
-def planned(plan: Plan, q_now: Sequence[float], model: ArmModel | None) -> Path:
+def planned(plan: Plan, q_now: Sequence[float], model: ArmModel | None) -> JointPath:
     """Return the way of a plan, evenly in the time of a trajectory and in the length of a path."""
     if not plan.rows:
         return [tuple(q_now), plan.end]
@@ -44,7 +44,7 @@ def planned(plan: Plan, q_now: Sequence[float], model: ArmModel | None) -> Path:
     return _trajectory(plan, q_now)
 
 
-def _lines(plan: Plan, q_now: Sequence[float], model: ArmModel) -> Path:
+def _lines(plan: Plan, q_now: Sequence[float], model: ArmModel) -> JointPath:
     inverse, q = InverseKinematics(model), tuple(q_now)
     path = [q]
     each = max(2, SAMPLES // len(plan.rows))
@@ -59,7 +59,7 @@ def _lines(plan: Plan, q_now: Sequence[float], model: ArmModel) -> Path:
     return path
 
 
-def _trajectory(plan: Plan, q_now: Sequence[float]) -> Path:
+def _trajectory(plan: Plan, q_now: Sequence[float]) -> JointPath:
     joints, times = len(q_now), [row[0] for row in plan.rows]
     path = [tuple(q_now)]
     pieces = list(pairwise(plan.rows))

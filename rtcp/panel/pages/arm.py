@@ -5,7 +5,7 @@ from __future__ import annotations
 from nicegui import ui
 
 from rtcp.config.model import ArmConfig
-from rtcp.panel.page import View, shown, table, text
+from rtcp.panel.page import View, no_platform, shown, table, text, tool_pose
 
 
 def build(view: View) -> None:
@@ -13,7 +13,7 @@ def build(view: View) -> None:
     text("h1", "Arm")
     config = view.live.config
     if config is None:
-        text("p", "No platform runs: start one on the page Start.")
+        no_platform()
         return
     with ui.element("p"):
         text("span", "Mode ")
@@ -24,13 +24,7 @@ def build(view: View) -> None:
         shown("bus", tag="b")
     _joints(config)
     text("h2", "Tool")
-    with (
-        table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool", numbers=True),
-        ui.element("tr"),
-    ):
-        text("th", "pose", scope="row")
-        for at in range(6):
-            shown(f"tool.{at}", 4)
+    tool_pose()
     text("h2", "Distance from the singularities")
     with (
         table(

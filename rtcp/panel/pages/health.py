@@ -131,8 +131,8 @@ def _faults(view: View) -> None:
                 return
             body = table(("#", "Time", "What", ""), "Recorded faults")
         for one in reversed(found[-20:]):
-            row(body, str(one["number"]), str(one.get("time", "-"))[:19], str(one.get("what") or one.get("error")))
-            with body.default_slot.children[-1], ui.element("td"):
+            what = str(one.get("what") or one.get("error"))
+            with row(body, str(one["number"]), str(one.get("time", "-"))[:19], what), ui.element("td"):
                 button(f"Picture of fault {one['number']}", partial(draw, one["number"]), plain=True)
 
     async def draw(number: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nicegui import ui
 
-from rtcp.panel.page import ENABLED, View, button, choice, number, shown, table, text
+from rtcp.panel.page import ENABLED, View, button, choice, no_platform, number, text, tool_pose
 
 FRAMES = {"base": "Base frame", "tool": "Tool frame", "joints": "Joints"}
 _PADS = {
@@ -21,7 +21,7 @@ def build(view: View) -> None:
     text("h1", "Jog")
     config = view.live.config
     if config is None:
-        text("p", "No platform runs: start one on the page Start.")
+        no_platform()
         return
     text("p", "Hold to move. Letting go, leaving the page or losing the connection stops the arm.")
     with ui.element("div").classes("page jog-area").props("tabindex=0") as area:
@@ -91,13 +91,7 @@ def build(view: View) -> None:
         "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s. "
         "Gamepad: hold the left shoulder button.",
     )
-    with (
-        table(("", "x m", "y m", "z m", "rx rad", "ry rad", "rz rad"), "Pose of the tool", numbers=True),
-        ui.element("tr"),
-    ):
-        text("th", "pose", scope="row")
-        for at in range(6):
-            shown(f"tool.{at}", 4)
+    tool_pose()
 
 
 def _hold(label: str, part: str) -> ui.element:

@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from rtcp.api import RtcpError
-from rtcp.panel.page import ENABLED, Field, View, button, number, table, text
+from rtcp.panel.page import ENABLED, Field, View, button, no_platform, number, table, text
 
 _JOINT = {"min": "rad", "max": "rad", "velocity": "rad/s", "acceleration": "rad/s²", "jerk": "rad/s³", "torque": "Nm"}
 
@@ -17,7 +17,7 @@ async def build(view: View) -> None:
     """Build the page."""
     text("h1", "Limits")
     if view.live.status is None:
-        text("p", "No platform runs: start one on the page Start.")
+        no_platform()
         return
     text(
         "p",

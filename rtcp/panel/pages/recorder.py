@@ -79,8 +79,7 @@ def build(view: View) -> None:
         found = sorted(_files(), key=lambda path: path.stat().st_mtime, reverse=True)[:_MOST_SHOWN]
         for path in found:
             where = str(path.relative_to(recordings_directory()))
-            row(body, where, f"{path.stat().st_size / 1e6:.1f}")
-            with body.default_slot.children[-1]:
+            with row(body, where, f"{path.stat().st_size / 1e6:.1f}"):
                 with ui.element("td"):
                     link = text("a", f"Download {where}", href=f"/recordings/{quote(where)}")
                     link.props["download"] = path.name

@@ -9,7 +9,7 @@ from nicegui import ui
 from nicegui.element import Element
 
 from rtcp.api import RtcpError
-from rtcp.panel.page import View, button, choice, number, text
+from rtcp.panel.page import View, button, choice, no_platform, number, text
 from rtcp.panel.scope import EVENTS, LONGEST_S, MOST_SIGNALS, SHORTEST_S, Scope, signals_of
 
 _ECHARTS = Path(nicegui.__file__).parent / "elements" / "echart" / "dist"
@@ -24,7 +24,7 @@ def build(view: View) -> None:
     text("h1", "Scope")
     config, feed = view.live.config, view.live.feed
     if config is None or feed is None:
-        text("p", "No platform runs: start one on the page Start.")
+        no_platform()
         return
     allowed = signals_of(config)
     chosen = ["actual_position.0", "commanded_position.0"]

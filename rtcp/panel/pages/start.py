@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import get_args
 
 from nicegui import ui
 
 from rtcp.api import AsyncRobot
 from rtcp.config.find import default_config, find_config
-from rtcp.config.model import VIRTUAL, ConfigError
+from rtcp.config.model import VIRTUAL, ConfigError, ControlModeName, DriveModeName
 from rtcp.panel.page import ENABLED, View, button, choice, field, number, on_click, row, table, text
 
-MODES = ("joint", "cartesian", "joystick", "velocity", "torque")
-DRIVE_MODES = ("csp", "csv", "cst")
+MODES, DRIVE_MODES = get_args(ControlModeName), get_args(DriveModeName)
 _CONFIGURED = "as configured"
 
 
@@ -78,19 +78,11 @@ def build(view: View) -> None:
             said.text = out
             return
         said.text = ""
-        slaves = json.loads(out)
         with found:
             body = table(("Slave", "Name", "State", "Vendor", "Product"), "Slaves in the order of the cable")
-            for slave in slaves["slaves"] if isinstance(slaves, dict) else slaves:
-                vendor, product = (f"0x{int(slave.get(key, 0)):08X}" for key in ("vendor", "product"))
-                row(
-                    body,
-                    str(slave.get("position", "")),
-                    str(slave.get("name", "")),
-                    str(slave.get("state", "")),
-                    vendor,
-                    product,
-                )
+            for slave in json.loads(out):
+                identity = (f"0x{slave[key]:08X}" for key in ("vendor_id", "product_code"))
+                row(body, str(slave["position"]), slave["name"], slave["state"], *identity)
 
     for control, handler in ((begin, start), (check, doctor), (scan, scan_bus)):
         on_click(control, handler)

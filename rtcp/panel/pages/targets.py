@@ -18,7 +18,7 @@ from kinematics.pose import Pose
 from rtcp.api import Arrival, AsyncRobot, Invalid, Preview, RtcpError
 from rtcp.config.model import ArmConfig
 from rtcp.config.zero import state_directory
-from rtcp.panel.page import Field, View, button, choice, field, number, row, table, text
+from rtcp.panel.page import Field, View, button, choice, field, no_platform, number, row, table, text
 
 _WAYS = {"joints": "Joint positions", "pose": "Pose, by the joints", "line": "Pose, on a straight line"}
 _POSE = ("x m", "y m", "z m", "rx rad", "ry rad", "rz rad")
@@ -31,7 +31,7 @@ def build(view: View) -> None:
     text("h1", "Targets")
     config, status = view.live.config, view.live.status
     if config is None or status is None or config.arm is None:
-        text("p", "No platform runs: start one on the page Start.")
+        no_platform()
         return
     Targets(view, config)
 
@@ -195,14 +195,9 @@ class Targets:
                 name for name, q, low, high in zip(names, one.q, in_force["min"], in_force["max"], strict=True)
                 if not low <= q <= high
             ]  # fmt: skip
-            row(
-                body,
-                str(count),
-                str(one.branch or "-"),
-                *(f"{q:.4f}" for q in one.q),
-                f"outside: {', '.join(outside)}" if outside else "inside",
-            )
-            with body.default_slot.children[-1], ui.element("td"):
+            limits = f"outside: {', '.join(outside)}" if outside else "inside"
+            cells = (str(one.branch or "-"), *(f"{q:.4f}" for q in one.q), limits)
+            with row(body, str(count), *cells), ui.element("td"):
                 button(f"Use solution {count}", partial(self._use, one.q), plain=True)
 
     def _use(self, q: Sequence[float]) -> None:
