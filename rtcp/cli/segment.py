@@ -7,7 +7,7 @@ import signal
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass
+from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -166,8 +166,11 @@ def _faults(as_json: AsJson = False, segment: ControlPath = None) -> None:
 
 
 @commands.command("kinds")
-def _kinds() -> None:
+def _kinds(as_json: AsJson = False) -> None:
     """List the kinds of faults, their keys and the allowed values."""
+    if as_json:
+        emit_json([asdict(kind) for kind in kinds()])
+        return
     for kind in kinds():
         emit(f"{kind.name}: {kind.says}")
         for key, allowed in kind.keys.items():

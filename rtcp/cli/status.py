@@ -182,7 +182,7 @@ def _slaves(status: Json) -> Table:
 
 def _error_counts(slave: Json) -> str:
     """Return how often the slave left OP, damaged frames at its ports and lost links; empty where all are 0."""
-    counts = [slave["lost"], slave["errors"]["rx"], slave["errors"]["links"]]
+    counts = [slave["lost"], sum(slave["errors"]["rx"]), sum(slave["errors"]["links"])]
     return "/".join(map(str, counts)) if any(counts) else ""
 
 

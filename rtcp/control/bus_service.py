@@ -5,6 +5,7 @@ It shares a few plain attributes with the cycle (one writer each) and never hold
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -89,6 +90,8 @@ class BusService(threading.Thread):
         """Why OP was not reached at the start; the cycle then ends."""
         self.clock_followed: Callable[[], bool] = _always
         """Whether the cycle follows the reference clock; slaves that were lost wait in SAFE-OP for it."""
+        self.temperature: Callable[[int], float] = lambda position: math.nan
+        """Temperature of the drive at a position, C."""
         self.on_op: Callable[[], None] = _nothing
         """Called once, from this thread, when all slaves are in OP for the first time."""
         self.on_refused: Callable[[], None] = _nothing
@@ -234,9 +237,9 @@ class BusService(threading.Thread):
     def _publish_health(self, watcher: SlaveWatcher) -> None:
         self._publish_states(watcher.slaves)
         for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
-            self._blackboard.health(
-                slave.position, slave.lost, slave.recovered, errors.rx, errors.forwarded, errors.links
-            )
+            ports = zip(errors.rx, errors.forwarded, errors.links, strict=True)
+            temperature = self.temperature(slave.position)
+            self._blackboard.health(slave.position, slave.lost, slave.recovered, temperature, ports)
 
 
 REPORT_INTERVAL_S = 10.0

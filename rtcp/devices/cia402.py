@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import Enum
 
@@ -121,8 +122,8 @@ class Cia402Drive(Driver):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
     Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm; 0 where it is not mapped),
-    `statusword`, `mode_display`, `state`, and `error_code` where 0x603F is mapped as `error_code`. A velocity that is
-    not mapped is the mean one over 20 ms.
+    `statusword`, `mode_display`, `state`, and `temperature` (C; not a number where no channel of that name is mapped).
+    A velocity that is not mapped is the mean one over 20 ms.
     Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
     `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
     `zero` (rad) is what the drive itself shows where the joint is at 0; `position` and `target_position` count from it.
@@ -149,11 +150,12 @@ class Cia402Drive(Driver):
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
-        (self._error_slot,) = _slots(self.tpdo, ("error_code",))
+        (self._temperature_slot,) = _slots(self.tpdo, ("temperature",))
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
         self._fields: list[int] = [0] * len(self.rpdo.channels)
         self.position = self.velocity = self.torque = 0.0
-        self.statusword = self.mode_display = self.error_code = 0
+        self.temperature = math.nan
+        self.statusword = self.mode_display = 0
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.controlword = DISABLE_VOLTAGE
         self.mode = CSP
@@ -195,8 +197,8 @@ class Cia402Drive(Driver):
             self.torque = values[torque] * by_torque
         self.mode_display = int(values[mode])
         self.state = _STATE_OF[word & STATE_BITS]
-        if self._error_slot >= 0:
-            self.error_code = int(values[self._error_slot])
+        if self._temperature_slot >= 0:
+            self.temperature = values[self._temperature_slot] * self.tpdo.channels[self._temperature_slot].factor
         if self.controlword not in _TARGET_STANDS:
             self.target_position = self.position
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from rtcp.fieldbus.bus import slave_label, station_of
 from rtcp.fieldbus.registers import DatagramCommand, Register, RegisterPort
@@ -27,13 +27,13 @@ _CALM_S = 60.0
 
 @dataclass
 class PortErrors:
-    """What a slave's ports have counted since the start."""
+    """What each of a slave's ports has counted since the start."""
 
-    rx: int = 0
-    """Damaged frames that came in over a cable of its own."""
-    forwarded: int = 0
+    rx: list[int] = field(default_factory=lambda: [0] * _PORTS)
+    """Damaged frames that came in over the cable of that port."""
+    forwarded: list[int] = field(default_factory=lambda: [0] * _PORTS)
     """Damaged frames that somebody before it has already counted."""
-    links: int = 0
+    links: list[int] = field(default_factory=lambda: [0] * _PORTS)
     """Lost links."""
 
 
@@ -87,12 +87,12 @@ class ErrorCounters:
         # A counter that shows less than before was set to 0 meanwhile.
         new = [now - then if now >= then else now for then, now in zip(before, found, strict=True)]
         errors = self.of[index]
-        errors.forwarded += sum(new[_FORWARDED : _FORWARDED + _PORTS])
         for port in range(_PORTS):
             # A damaged frame may count as a receive error of the port, too.
             damaged, links = max(new[2 * port], new[2 * port + 1]), new[_LINKS + port]
-            errors.rx += damaged
-            errors.links += links
+            errors.rx[port] += damaged
+            errors.forwarded[port] += new[_FORWARDED + port]
+            errors.links[port] += links
             # Port 0 looks towards the master, any other away from it.
             cable = index if port == 0 else index + 1
             if damaged:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from datetime import datetime
@@ -201,6 +202,7 @@ class StatusSnapshot:
                 "al_status_code": code,
                 "lost": health.lost,
                 "recovered": health.recovered,
+                "temperature": None if math.isnan(health.temperature) else round(health.temperature, 1),
                 "errors": {"rx": health.rx, "forwarded": health.forwarded, "links": health.links},
             }
             for position, (slave, (al, code), health) in enumerate(found, 1)

@@ -11,7 +11,7 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rtcp.fieldbus.al_state import AlState
@@ -46,6 +46,7 @@ from rtcp.ipc.layout import (
     RECORDS_HEAD_AT,
     SLAVES_AT,
     SLAVES_MAX,
+    TEMPERATURE,
     TEXT,
     TEXTS,
     TEXTS_AT,
@@ -58,7 +59,7 @@ from rtcp.ipc.layout import (
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import Malformed, Refusal
 
-_U16, _U32, _I63 = 0xFFFF, 0xFFFF_FFFF, (1 << 63) - 1
+_U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
 
 
@@ -148,12 +149,19 @@ class Blackboard:
         at = SLAVES_AT + (position - 1) * 8
         return position > SLAVES_MAX or self._words[at] & _AL_STATE == AlState.OP
 
-    def health(self, position: int, lost: int, recovered: int, rx: int, forwarded: int, links: int) -> None:
-        """Note how often the slave at `position` left OP and came back, and what its ports have counted."""
+    def health(
+        self, position: int, lost: int, recovered: int, temperature: float, ports: Iterable[tuple[int, int, int]]
+    ) -> None:
+        """Note how often the slave at `position` left OP and came back, its temperature (C), what its ports counted.
+
+        A port counts damaged frames that came in there, damaged frames forwarded, and lost links.
+        """
         if 1 <= position <= SLAVES_MAX:
             at = HEALTH_AT + (position - 1) * HEALTH_SIZE
-            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | min(links, _U32) << 32
-            self._words[at + 8] = min(rx, _U32) | min(forwarded, _U32) << 32
+            hot = int.from_bytes(TEMPERATURE.pack(temperature), "little")
+            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | hot << 32
+            for number, (rx, forwarded, links) in enumerate(ports, 1):
+                self._words[at + 8 * number] = min(rx, _U24) | min(forwarded, _U24) << 24 | min(links, _U16) << 48
 
     def lease(self) -> tuple[int, int, int]:
         """Return the lease's id (0: free), the instant it was renewed (ns) and its duration (ns)."""

@@ -10,7 +10,7 @@
 | 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
 | 3072 | slave health: lost, recovered, error counters | service thread |
-| 8192 | service text, texts, events, commands, plans, cycle records | loop and commanders |
+| 16384 | service text, texts, events, commands, plans, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
 """
@@ -27,7 +27,7 @@ from dataclasses import dataclass
 
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_0006
+MAGIC = 0x5254_4350_0000_0007
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -58,7 +58,7 @@ PLAN_IN_USE_AT = 408
 SERVICE_STATE_AT = 512
 """0 idle, 1 asked, 2 answered"""
 SERVICE_LENGTH_AT = 520
-SERVICE_TEXT_AT = 8192
+SERVICE_TEXT_AT = 16384
 SERVICE_TEXT_SIZE = 8192
 
 SLAVES_AT = 1024
@@ -66,9 +66,12 @@ SLAVES_AT = 1024
 SLAVES_MAX = 256
 
 HEALTH_AT = SLAVES_AT + SLAVES_MAX * 8
-"""Two words a slave: how often it left OP | how often it came back << 16 | lost links << 32; damaged frames that came
-in over its cables | damaged frames forwarded << 32."""
-HEALTH_SIZE = 16
+PORTS = 4
+HEALTH_SIZE = 8 * (1 + PORTS)
+"""A word of a slave: how often it left OP | how often it came back << 16 | its temperature << 32 (C, a float; not a
+number: none is known); then one for each of its ports: damaged frames that came in there | damaged frames forwarded
+<< 24 | lost links << 48."""
+TEMPERATURE = struct.Struct("<f")
 
 TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
 TEXT = struct.Struct("<QqHH500s")

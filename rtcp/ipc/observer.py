@@ -45,6 +45,7 @@ from rtcp.ipc.layout import (
     LEASE_RENEWED_AT,
     MAGIC,
     PER_JOINT,
+    PORTS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
     SCALARS,
@@ -53,6 +54,7 @@ from rtcp.ipc.layout import (
     SERVICE_TEXT_AT,
     SERVICE_TEXT_SIZE,
     SLAVES_AT,
+    TEMPERATURE,
     TEXT,
     TEXTS,
     TEXTS_AT,
@@ -121,12 +123,14 @@ class Health:
 
     lost: int
     recovered: int
-    rx: int
-    """Damaged frames that came in over its own cables."""
-    forwarded: int
-    """Damaged frames that slaves before it had counted."""
-    links: int
-    """Lost links."""
+    temperature: float
+    """C; not a number: none is known."""
+    rx: tuple[int, ...]
+    """Damaged frames that came in at each port."""
+    forwarded: tuple[int, ...]
+    """Damaged frames at each port that slaves before it had counted."""
+    links: tuple[int, ...]
+    """Lost links of each port."""
 
 
 @dataclass(frozen=True)
@@ -259,10 +263,10 @@ class Observer:
         """Return what the first `count` slaves have been through."""
         found = []
         for at in range(HEALTH_AT, HEALTH_AT + count * HEALTH_SIZE, HEALTH_SIZE):
-            life, errors = self._words[at], self._words[at + 8]
-            found.append(
-                Health(life & 0xFFFF, life >> 16 & 0xFFFF, errors & 0xFFFF_FFFF, errors >> 32, life >> 32)
-            )  # fmt: skip
+            life, *ports = [self._words[at + 8 * word] for word in range(1 + PORTS)]
+            counts = zip(*((word & 0xFF_FFFF, word >> 24 & 0xFF_FFFF, word >> 48) for word in ports), strict=True)
+            (temperature,) = TEMPERATURE.unpack((life >> 32).to_bytes(4, "little"))
+            found.append(Health(life & 0xFFFF, life >> 16 & 0xFFFF, temperature, *counts))
         return found
 
     # -- the lease ----------------------------------------------------------------------------------------------

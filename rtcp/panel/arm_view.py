@@ -1,4 +1,4 @@
-"""The arm in space, as an element of a page: what its URDF draws, and the boxes of its configuration."""
+"""The arm in space, as an element of a page: what its URDF draws, and the boxes of the limits in force."""
 
 from __future__ import annotations
 
@@ -28,17 +28,10 @@ class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str
         assert config.arm is not None
         self.config = config
         self._props["links"] = links(to_urdf(config.arm))
-        cartesian = config.cartesian
-        boxes = [] if cartesian.box is None else [_box(cartesian.box, False)]
-        self._props["boxes"] = boxes + [_box(box, True) for box in cartesian.keep_out]
 
     def preview(self, path: list[list[float]], duration_s: float) -> None:
         """Move a ghost along joint positions, rad; none: remove it."""
         self.run_method("preview", path, duration_s)
-
-
-def _box(box: Any, keep_out: bool) -> Json:
-    return {"min": list(box.min), "max": list(box.max), "keep_out": keep_out}
 
 
 def links(urdf: str) -> list[Json]:

@@ -51,6 +51,8 @@ _MOST_UNSEEN = 32
 """Pages that no browser has shown yet."""
 _SCOPE_TURNS = 2
 """The scopes are read in every second turn."""
+_LIMIT_TURNS = 10
+"""The limits in every tenth."""
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
@@ -206,6 +208,8 @@ class Live:
         self.problem = "no platform has been looked for yet"
         """Why there is no status."""
         self.config: ArmConfig | None = None
+        self.limits: Json | None = None
+        """In force, as `Robot.limits` has them."""
         self.feed: Feed | None = None
         self.pages: dict[str, Page] = {}
         self.operator: Operator | None = None
@@ -407,15 +411,18 @@ class Live:
 
     async def follow(self) -> None:
         """Follow the platform for as long as the panel runs."""
-        due = time.monotonic()
+        due, defect = time.monotonic(), ""
         while True:
+            self._turn += 1
             try:
                 await self._read_status()
                 self._send_all()
                 await self._end_sessions()
-            except Exception:
-                # A defect met by one turn is logged; the pages are served on.
-                log.exception("a turn of the panel")
+            except Exception as error:
+                # The pages are served on; what every turn meets is logged once.
+                if repr(error) != defect:
+                    defect = repr(error)
+                    log.exception("a turn of the panel")
             due = max(due + STATE_S, time.monotonic() - STATE_S)
             await asyncio.sleep(max(0.0, due - time.monotonic()))
 
@@ -443,12 +450,14 @@ class Live:
                 self.feed = Feed()
                 self.config = self.feed.config
             self.status = await asyncio.wait_for(self._viewing.status(), 2.0)
+            if self.limits is None or self._turn % _LIMIT_TURNS == 0:
+                self.limits = (await asyncio.wait_for(self._viewing.limits(), 2.0))["limits"]
         except (RtcpError, OSError, asyncio.TimeoutError) as error:
             self.problem = str(error) or "the platform does not answer"
             await self._lost()
 
     async def _lost(self) -> None:
-        self.status = None
+        self.status = self.limits = None
         robot, self._viewing = self._viewing, None
         feed, self.feed = self.feed, None
         self.config = None
@@ -475,7 +484,6 @@ class Live:
         if not any(page.socket for page in self.pages.values()):
             return
         state = self.state()
-        self._turn += 1
         if self._turn % _SCOPE_TURNS == 0:
             self._read_scopes()
         for page in list(self.pages.values()):
@@ -525,7 +533,11 @@ class Live:
             "wkc": raw["wkc"],
             "missed": raw["missed"],
             "cycles": raw["cycles"],
+            "limits": self.limits,
         }
+        if self.config is not None:
+            temperatures = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
+            shown["temperature"] = [temperatures.get(joint.slave) for joint in self.config.joints]
         q = joints["actual_position"]
         if self.config is not None and self.config.arm is not None and all(map(math.isfinite, q)):
             pose = forward(self.config.arm, q)
@@ -537,4 +549,4 @@ class Live:
 
 def _number(value: float, digits: int) -> float | None:
     """Return a number as JSON has it, which knows none that is not finite."""
-    return round(value, digits) if math.isfinite(value) else None
+    return round(value, digits) + 0.0 if math.isfinite(value) else None  # never -0.0

@@ -54,14 +54,18 @@ class PlatformCollector(Collector):
         )
         in_op = GaugeMetricFamily("rtcp_slave_in_op", "Whether a slave is in OP.", labels=["position", "name"])
         errors = CounterMetricFamily(
-            "rtcp_slave_errors", "What a slave has counted.", labels=["position", "name", "kind"]
+            "rtcp_slave_errors", "What the ports of a slave have counted.", labels=["position", "name", "kind", "port"]
         )
+        lost = CounterMetricFamily("rtcp_slave_lost", "How often a slave has left OP.", labels=["position", "name"])
         for slave in raw["slaves"]:
             place = [str(slave["position"]), slave["name"]]
             in_op.add_metric(place, float(slave["state"] == "OP"))
-            for kind, count in (*slave["errors"].items(), ("lost", slave["lost"])):
-                errors.add_metric([*place, kind], count)
+            lost.add_metric(place, slave["lost"])
+            for kind, counts in slave["errors"].items():
+                for port, count in enumerate(counts):
+                    errors.add_metric([*place, kind, str(port)], count)
         yield in_op
+        yield lost
         yield errors
         for name, unit in (
             ("actual_position", "radians"),

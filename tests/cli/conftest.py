@@ -82,7 +82,13 @@ def status() -> dict[str, Any]:
         "lost_s": 0.0,
         "wkc": {"expected": 21, "actual": 21},
         "slaves": [
-            {"position": at, "name": name, "state": "OP", "lost": 0, "errors": {"rx": 0, "forwarded": 0, "links": 0}}
+            {
+                "position": at,
+                "name": name,
+                "state": "OP",
+                "lost": 0,
+                "errors": {kind: [0] * 4 for kind in ("rx", "forwarded", "links")},
+            }
             for at, name in enumerate(["io", *(f"drive{n}" for n in range(1, JOINTS + 1))], 1)
         ],
         "joint_names": [f"joint{n}" for n in range(1, JOINTS + 1)],

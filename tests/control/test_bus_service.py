@@ -260,9 +260,10 @@ def test_what_slaves_have_been_through_is_read_as_it_was_written(
     bus: Bus, service: BusService, observer: Observer
 ) -> None:
     bus.watching.slaves[1].lost, bus.watching.slaves[1].recovered = 3, 2
-    bus.watching.errors.of[1] = PortErrors(rx=70_000, forwarded=1 << 40, links=5)
-    until(lambda: observer.health(2)[1] == Health(3, 2, 70_000, 0xFFFF_FFFF, 5))
-    assert observer.health(2)[0] == Health(0, 0, 0, 0, 0)
+    service.temperature = {1: 40.5, 2: -3.25}.__getitem__
+    bus.watching.errors.of[1] = PortErrors([0, 70_000, 0, 0], [0, 0, 0, 1 << 40], [5, 0, 0, 0])
+    until(lambda: observer.health(2)[1] == Health(3, 2, -3.25, (0, 70_000, 0, 0), (0, 0, 0, 0xFF_FFFF), (5, 0, 0, 0)))
+    assert observer.health(2)[0] == Health(0, 0, 40.5, *[(0, 0, 0, 0)] * 3)
 
 
 def test_an_interface_that_is_gone_is_reported_once_and_not_in_every_turn(

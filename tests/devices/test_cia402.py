@@ -211,11 +211,11 @@ def test_values_are_in_si_units(drive, wire):
 
 
 def test_widths_and_order_are_those_of_the_description():
-    tpdo = (("torque", 0x6077, "int16", 0.1), TPDO[0], ("error_code", 0x603F, "uint16", 1.0), *TPDO[1:3], TPDO[4])
+    tpdo = (("torque", 0x6077, "int16", 0.1), TPDO[0], ("temperature", 0x2000, "int16", 0.1), *TPDO[1:3], TPDO[4])
     rpdo = (RPDO[4], ("target_torque", 0x6071, "int16", 0.1), *RPDO[:3], ("offset", 0x60B1, "int32", 1.0))
     drive = Cia402Drive(slave(rpdo, tpdo), 0.001)
-    drive.decode(struct.pack("<hHHiib", -5, ENABLED, 0x8611, 20000, 1, 10))
-    assert (drive.torque, drive.error_code, drive.position) == pytest.approx((-0.5, 0x8611, 2.0))
+    drive.decode(struct.pack("<hHhiib", -5, ENABLED, -125, 20000, 1, 10))
+    assert (drive.torque, drive.temperature, drive.position) == pytest.approx((-0.5, -12.5, 2.0))
     drive.mode, drive.target_torque, drive.target_position, drive.controlword = 10, 3.0, 2.0, 0x0F
     assert drive.encode() == struct.pack("<bhHiii", 10, 30, 0x0F, 20000, 0, 0)
 

@@ -51,7 +51,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 def test_what_was_counted_before_the_start_is_nobodys_fault(bench: Bench) -> None:
     assert bench.round() == []
-    assert [one.rx for one in bench.counters.of] == [0, 0, 0]
+    assert [sum(one.rx) for one in bench.counters.of] == [0, 0, 0]
 
 
 def test_counters_are_cleared_before_they_stop_and_the_sum_goes_on(bench: Bench) -> None:
@@ -59,14 +59,14 @@ def test_counters_are_cleared_before_they_stop_and_the_sum_goes_on(bench: Bench)
         bench.set(2, 0, shown)
         bench.round()
         assert bench.get(2, 0) < 128
-    assert bench.counters.of[1].rx == 100 + 43 + 60 + 140 + 255
+    assert sum(bench.counters.of[1].rx) == 100 + 43 + 60 + 140 + 255
 
 
 def test_a_frame_that_counts_as_damaged_and_as_received_wrongly_is_one(bench: Bench) -> None:
     bench.set(2, 0, 12)
     bench.set(2, 1, 4)
     bench.round()
-    assert bench.counters.of[1].rx == 5
+    assert sum(bench.counters.of[1].rx) == 5
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_errors_of_a_port_name_the_cable_that_is_plugged_in_there(
 def test_forwarded_errors_name_no_cable(bench: Bench) -> None:
     bench.set(3, 0x08, 9)
     assert bench.round() == []
-    assert bench.counters.of[2].forwarded == 9
+    assert sum(bench.counters.of[2].forwarded) == 9
 
 
 def test_a_bad_cable_is_told_at_its_beginning_then_every_ten_seconds_with_the_number(bench: Bench) -> None:
@@ -107,7 +107,7 @@ def test_a_link_that_both_its_ends_lost_was_lost_once(bench: Bench) -> None:
     bench.set(3, 0x10, 1)
     (sentence,) = bench.round()
     assert sentence.startswith("the link between slave 2 (drive1) and slave 3 (drive2) was lost once since ")
-    assert [one.links for one in bench.counters.of] == [0, 1, 1]
+    assert [sum(one.links) for one in bench.counters.of] == [0, 1, 1]
 
 
 def test_a_slave_that_was_without_supply_counts_from_zero(bench: Bench) -> None:
@@ -115,7 +115,7 @@ def test_a_slave_that_was_without_supply_counts_from_zero(bench: Bench) -> None:
     bench.round()
     bench.set(2, 0, 3)
     bench.round()
-    assert bench.counters.of[1].rx == 93 + 3
+    assert sum(bench.counters.of[1].rx) == 93 + 3
 
 
 def test_errors_that_are_no_cables_are_not_cleared_for_ever(bench: Bench) -> None:
@@ -123,7 +123,7 @@ def test_errors_that_are_no_cables_are_not_cleared_for_ever(bench: Bench) -> Non
     bench.set(2, 0x00, 9)
     bench.round()
     assert (bench.get(2, 0x0D), bench.get(2, 0x00)) == (200, 9)
-    assert bench.counters.of[1].rx == 2
+    assert sum(bench.counters.of[1].rx) == 2
 
 
 def test_links_whose_clearing_got_lost_are_not_counted_twice(bench: Bench) -> None:
@@ -133,12 +133,12 @@ def test_links_whose_clearing_got_lost_are_not_counted_twice(bench: Bench) -> No
         # Not all slave controllers clear the links with the first write.
         bench.set(2, 0x11, 200)
         bench.round()
-    assert (bench.counters.of[1].rx, bench.counters.of[1].links) == (123, 200)
+    assert (sum(bench.counters.of[1].rx), sum(bench.counters.of[1].links)) == (123, 200)
     bench.port.lost.clear()
     bench.round()
     bench.set(2, 0x11, 3)
     bench.round()
-    assert bench.counters.of[1].links == 203
+    assert sum(bench.counters.of[1].links) == 203
 
 
 def test_a_cable_that_damages_frames_on_their_way_back_is_the_one_that_is_named(bench: Bench) -> None:
@@ -148,4 +148,4 @@ def test_a_cable_that_damages_frames_on_their_way_back_is_the_one_that_is_named(
     bench.set(1, 0x09, 4)
     (sentence,) = bench.round()
     assert sentence.startswith("errors enter between slave 2 (drive1) and slave 3 (drive2): 4 damaged frames since ")
-    assert [(one.rx, one.forwarded) for one in bench.counters.of] == [(0, 4), (4, 0), (0, 0)]
+    assert [(sum(one.rx), sum(one.forwarded)) for one in bench.counters.of] == [(0, 4), (4, 0), (0, 0)]

@@ -148,7 +148,7 @@ class Watched:
                 "states": [slave.words() for slave in watcher.slaves], "seen": watching.seen, "acted": acted,
                 "lost": [slave.lost for slave in watcher.slaves],
                 "recovered": [slave.recovered for slave in watcher.slaves],
-                "errors": [[one.rx, one.forwarded, one.links] for one in watcher.errors.of],
+                "errors": [[sum(one.rx), sum(one.forwarded), sum(one.links)] for one in watcher.errors.of],
                 "before": self.before, "after": self.registers(), "clocks": clocks(self.bus, self.count),
             }  # fmt: skip
 
@@ -198,7 +198,7 @@ class Watched:
         for number in range(1, BURSTS + 1):
             self.client.fault({"fault": "corrupt", "after": 1, "burst": BURST})
             least = number * (BURST - MISSED)
-            watching.until(lambda least=least: errors[1].rx >= least and errors[2].forwarded >= least)
+            watching.until(lambda least=least: sum(errors[1].rx) >= least and sum(errors[2].forwarded) >= least)
 
     def count_links(self, watching: Watching) -> None:
         watching.until(lambda: all(one.links for one in watching.watcher.errors.of[1:]))

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserType, Error, Page, sync_playwright
 
+from rtcp.api import RtcpError
 from tests.e2e.conftest import Platform
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -91,7 +92,7 @@ def page(browser: Browser, panel: str) -> Iterator[Page]:
 def visitor(browser: Browser, url: str, **options: Any) -> Iterator[Page]:
     """A browser window of its own; what the panel's scripts complain of fails the test."""
     complaints: list[str] = []
-    context = browser.new_context(base_url=url, viewport={"width": 1600, "height": 900}, **options)
+    context = browser.new_context(base_url=url, viewport={"width": 1200, "height": 700}, **options)
     found = context.new_page()
     found.on("pageerror", lambda error: complaints.append(str(error)))
     found.set_default_timeout(15_000)
@@ -131,6 +132,14 @@ def holding(platform: Platform, panel: str) -> Platform:
 
 
 def ready(platform: Platform) -> None:
+    """Bring the arm to `BENT`, holding, in mode joint and csp; all the way only where it has to be."""
+    with contextlib.suppress(RtcpError):
+        platform.call("halt")
+        found = platform.status()
+        if found["state"] == "holding" and found["drive_mode"] == "csp":
+            platform.call("mode", name="joint")
+            platform.call("move_joints", q=BENT)
+            return
     platform.rtcp("segment", "clear", check=None)
     platform.restore()
     platform.call("enable")

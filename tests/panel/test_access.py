@@ -5,6 +5,8 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import shutil
+import ssl
 import stat
 import subprocess
 import sys
@@ -57,9 +59,21 @@ def platform_password(platform: Platform, role: str, password: str) -> subproces
     )
 
 
-def ask(url: str, method: str, path: str, headers: dict[str, str] | None = None, body: str | None = None) -> Any:
+def ask(
+    url: str,
+    method: str,
+    path: str,
+    headers: dict[str, str] | None = None,
+    body: str | None = None,
+    context: ssl.SSLContext | None = None,
+) -> Any:
     """Send one request; return the response, read."""
-    connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=20)
+    place = urlsplit(url).netloc
+    connection = (
+        http.client.HTTPConnection(place, timeout=20)
+        if context is None
+        else http.client.HTTPSConnection(place, timeout=20, context=context)
+    )
     connection.request(method, path, body, headers or {})
     response = connection.getresponse()
     response.text = response.read().decode(errors="replace")  # type: ignore[attr-defined]
@@ -166,6 +180,36 @@ def test_passwords_open_the_panel_and_are_kept_as_hashes(closed_panel: str) -> N
     ended = ask(closed_panel, "POST", "/logout", {"Cookie": cookie_of(response), "Origin": closed_panel})
     assert ended.status == 303
     assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie_of(response)}).status == 401
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
+def test_with_a_certificate_everything_is_encrypted(tmp_path: Path) -> None:
+    certificate = tmp_path / "panel.pem"
+    subprocess.run(
+        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256", "-nodes", "-days", "1",
+         "-subj", "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1",
+         "-keyout", certificate, "-out", tmp_path / "public.pem"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    certificate.write_text(certificate.read_text() + (tmp_path / "public.pem").read_text())
+    trusted = ssl.create_default_context(cafile=tmp_path / "public.pem")
+    platform = Platform()
+    try:
+        with begun(platform, "--certificate", str(certificate)) as (_, url):
+            assert url.startswith("https://127.0.0.1:")
+            response = ask(url, "GET", "/", PAGE, context=trusted)
+            assert re.search("Secure", response.getheader("set-cookie"))
+            cookie = {"Cookie": cookie_of(response)}
+            assert ask(url, "POST", "/stop", {**cookie, "Origin": url}, context=trusted).status == 503
+            plain = url.replace("https", "http")
+            assert ask(url, "POST", "/stop", {**cookie, "Origin": plain}, context=trusted).status == 403
+            socket = url.replace("http", "ws") + "/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+            with connect(socket, additional_headers={**cookie, "Origin": url}, ssl=trusted):
+                pass
+            with pytest.raises((http.client.HTTPException, OSError)):
+                ask(plain, "GET", "/", PAGE)
+    finally:
+        platform.end()
 
 
 def test_tries_are_limited(tmp_path: Path) -> None:

@@ -86,6 +86,17 @@ def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, fe
     assert after[:2] == pytest.approx(before[:2], abs=5e-3)
 
 
+def test_the_gripper_is_opened_and_closed_by_its_buttons_and_keys(page: Page, holding: Platform) -> None:
+    show(page, "/jog")
+    closed = 1 << 3
+    page.get_by_role("button", name="Close", exact=True).click()
+    holding.until(lambda found: found["outputs"] & closed, "closed")
+    page.locator(".jog-area").focus()
+    page.wait_for_timeout(500)
+    page.keyboard.press("o")
+    holding.until(lambda found: not found["outputs"] & closed, "open")
+
+
 def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holding: Platform, feed: Feed) -> None:
     holding.call("mode", name="cartesian")
     show(page, "/jog")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,10 +14,12 @@ from playwright.sync_api import Browser, Page, expect
 from prometheus_client.parser import text_string_to_metric_families
 
 from rtcp.panel.server import PAGES
+from rtcp.virtual.faults.registry import installed
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import BENT, show, until, visitor
+from tests.panel.conftest import BENT, begun, show, until, visitor
 
 pytestmark = pytest.mark.alone
+DRIVE_IDENTITY = re.compile(r"vendor_id: (\w+)[\s\S]*product_id: (\w+)")
 
 
 def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platform) -> None:
@@ -34,6 +37,10 @@ def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platfor
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_disabled()
     page.get_by_role("button", name="Scan the bus").click()
     expect(page.get_by_role("row")).to_have_count(8)
+    drive = DRIVE_IDENTITY.search((platform.directory / "config/devices/cubemars-orh.yaml").read_text())
+    assert drive is not None
+    for figure in drive.groups():
+        expect(page.get_by_role("cell", name=f"0x{int(figure, 0):08X}")).not_to_have_count(0)
     page.get_by_label("Drive mode").select_option("csv")
     page.get_by_role("button", name="Set drive mode").click()
     until(lambda: platform.status()["drive_mode"] == "csv", "csv")
@@ -160,6 +167,10 @@ def test_limits_are_narrowed_and_never_widened(page: Page, limits_of_the_file: P
     page.get_by_role("button", name="Set the limits").click()
     until(lambda: platform.call("limits")["limits"]["max"][1] == 1.5, "the limit of joint 2")
     assert platform.call("limits")["limits"]["box"]["max"][2] == 1.35
+    with page.context.new_page() as other:
+        show(other, "/arm")
+        expect(other.locator("[data-bar='actual_position.1']")).to_have_attribute("title", re.compile(" to 1.5 rad$"))
+        expect(other.locator(".arm-view")).to_have_attribute("data-boxes", re.compile(r"1\.35\]"))
     page.get_by_label("joint2 max").fill("3")
     page.get_by_role("button", name="Set the limits").click()
     expect(page.locator(".q-notification", has_text="joint2")).to_be_visible()
@@ -247,9 +258,18 @@ def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Pl
     vendor = int.from_bytes(bytes.fromhex(holding.call("sdo_read", slave=2, index=0x1018, subindex=1)["hex"]), "little")
     expect(page.get_by_text(f"({vendor})")).to_be_visible()
     expect(page.get_by_role("button", name="Write")).to_be_disabled()
+    assert page.get_by_label("Kind", exact=True).locator("option").count() == len(installed())
+    page.get_by_label("Kind", exact=True).select_option("corrupt")
+    expect(page.get_by_text("Frames are damaged on the cable behind slave")).to_be_visible()
+    page.get_by_label("after:").fill("4")
+    page.get_by_label("burst:").fill("40")
+    page.get_by_role("button", name="Make the fault").click()
+    # On the way out: they come in at the port of the next slave that looks towards the master.
+    damaged = page.get_by_role("row", name=re.compile("^5 ")).get_by_role("cell").nth(5)
+    expect(damaged).to_have_text(re.compile(r"^[1-9]\d* / 0 / 0 / 0$"))
     since = holding.last_event()
     page.get_by_label("Kind", exact=True).select_option("power")
-    page.get_by_label("Keys").fill("slave=3")
+    page.get_by_label("slave:").fill("3")
     page.get_by_label("Lasts").fill("")
     page.get_by_role("button", name="Make the fault").click()
     until(lambda: "slave_lost" in holding.events(since) or holding.status()["state"] == "fault", "the slave is lost")
@@ -282,7 +302,46 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
     assert len(found["rtcp_joint_position_radians"].samples) == 6
 
 
-@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (1600, "dark")])
+HOSTILE = "<img src=x onerror=alert(1)>"
+
+
+@pytest.fixture
+def hostile() -> Iterator[Platform]:
+    """A platform whose names are scripts, and whose drives have their temperature in the process data."""
+    made = Platform()
+    made.be_patient(lost_ms=2000)
+    arm, drive = made.directory / "config/assistive_arm.yaml", made.directory / "config/devices/cubemars-orh.yaml"
+    names = arm.read_text()
+    for name in ("drive2", "joint2"):
+        names = re.sub(rf"\b{name}\b", f'"{name} {HOSTILE}"', names)
+    arm.write_text(names)
+    temperature = "- {index: 0x2000, sub_index: 1, type: int16, name: temperature, factor: 0.1}"
+    drive.write_text(re.sub(r"( *)- \{index: 0x6061.*", rf"\g<0>\n\1{temperature}", drive.read_text()))
+    made.rtcp("start", "--detach")
+    try:
+        yield made
+    finally:
+        made.rtcp("stop", check=None)
+        shutil.rmtree(made.directory, ignore_errors=True)
+
+
+def test_names_are_text_and_temperatures_are_shown_where_they_are_mapped(browser: Browser, hostile: Platform) -> None:
+    with begun(hostile) as (_, url), visitor(browser, url) as page:
+        dialogs: list[str] = []
+        page.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+        for path in ("/targets", "/jog", "/limits", "/health", "/segment"):
+            show(page, path)
+            expect(page.get_by_role("heading", level=1)).to_be_visible()
+            page.wait_for_timeout(300)
+            assert page.locator("img[src=x]").count() == 0
+        expect(page.get_by_role("cell", name=f"drive2 {HOSTILE}")).to_be_visible()
+        show(page, "/arm")
+        expect(page.get_by_role("rowheader", name=f"joint2 {HOSTILE}")).to_be_visible()
+        expect(page.locator("[data-live='temperature.1']")).to_have_text(re.compile(r"^[23]\d\.\d$"))
+        assert dialogs == []
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(360, "light"), (3840, "dark")])
 def test_no_page_has_a_serious_barrier(
     browser: Browser, panel: str, holding: Platform, width: int, scheme: str
 ) -> None:
@@ -291,7 +350,7 @@ def test_no_page_has_a_serious_barrier(
         page.set_viewport_size({"width": width, "height": 800})
         for path in PAGES:
             show(page, path)
-            page.wait_for_timeout(1000)
+            page.wait_for_timeout(500)
             for one in Axe().run(page).response["violations"]:
                 if one["impact"] in ("serious", "critical"):
                     nodes = [

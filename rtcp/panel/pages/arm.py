@@ -38,23 +38,24 @@ def build(view: View) -> None:
 
 
 def _joints(config: ArmConfig) -> None:
-    headings = ("Joint", "Drive", "rad", "Position", "rad/s", "Velocity", "Nm", "Torque", "Following error rad")
+    headings = ("Joint", "Drive", "rad", "Position", "rad/s", "Velocity", "Nm", "Torque", "Following error rad", "°C")
     with table(headings, "Joints", numbers=True):
         for at, joint in enumerate(config.joints):
             with ui.element("tr"):
                 text("th", joint.name, scope="row")
                 shown(f"drive.{at}").classes("text")
                 shown(f"actual_position.{at}", 4)
-                _bar(f"actual_position.{at}", joint.position.min, joint.position.max, "rad")
+                _bar(f"actual_position.{at}", "min max", "rad")
                 shown(f"actual_velocity.{at}", 3)
-                _bar(f"actual_velocity.{at}", -joint.velocity, joint.velocity, "rad/s")
+                _bar(f"actual_velocity.{at}", "velocity", "rad/s")
                 shown(f"actual_torque.{at}", 2)
-                _bar(f"actual_torque.{at}", -joint.torque, joint.torque, "Nm")
+                _bar(f"actual_torque.{at}", "torque", "Nm")
                 shown(f"error.{at}", 5)
+                shown(f"temperature.{at}", 1)
 
 
-def _bar(name: str, low: float, high: float, unit: str) -> None:
+def _bar(name: str, limits: str, unit: str) -> None:
+    """Show a value between the limits in force: two by their names, or one for both ways."""
     with ui.element("td"):
         bar = ui.element("div").classes("bar")
-        bar.props["title"] = f"{low:g} to {high:g} {unit}"
-        bar.props.update({"data-bar": name, "data-low": str(low), "data-high": str(high)})
+        bar.props.update({"data-bar": name, "data-limits": limits, "data-unit": unit})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
+
 from nicegui import ui
 
 from rtcp.panel.page import ENABLED, View, button, choice, no_platform, number, text, tool_pose
@@ -14,6 +16,15 @@ _PADS = {
 }
 """Name -> part of the speed and label of the upper, left, right and lower button, as on the source's stick."""
 _PLACES = ("1 / 2", "2 / 1", "2 / 3", "3 / 2")
+_KEYS = (
+    "up and down, left stick",
+    "left and right, left stick",
+    "page up and down, right stick",
+    "a and d, cross left and right",
+    "w and s, cross up and down",
+    "q and e, right stick",
+)
+"""What moves each joint, in the frame of the joints."""
 
 
 def build(view: View) -> None:
@@ -26,7 +37,7 @@ def build(view: View) -> None:
     text("p", "Hold to move. Letting go, leaving the page or losing the connection stops the arm.")
     with ui.element("div").classes("page jog-area").props("tabindex=0") as area:
         area.props["aria-label"] = (
-            "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch"
+            "Jog by keys: arrows X and Y, page up and down Z, q and e yaw, a and d roll, w and s pitch, o and c gripper"
         )
         area.props["role"] = "group"
 
@@ -54,7 +65,10 @@ def build(view: View) -> None:
                 step="0.01",
             )
             joint = number("Joints, rad/s", "0.1", min="0", step="0.01")
-        cartesian = ui.element("div").classes("pads")
+        with ui.element("div").classes("pads"):
+            cartesian = ui.element("div").classes("pads")
+            single = ui.element("div")
+            _gripper(view)
         with cartesian:
             for name, buttons in _PADS.items():
                 with ui.element("div"):
@@ -63,35 +77,39 @@ def build(view: View) -> None:
                         for place, one in zip(_PLACES, buttons, strict=True):
                             part, _, label = one.partition(" ")
                             _hold(label, part).style(f"grid-area: {place}")
-        single = ui.element("div")
         with single:
             for at, motor in enumerate(config.joints):
                 with ui.element("div").classes("buttons"):
                     text("span", motor.name).style("min-width: 5rem")
                     _hold(f"{motor.name} -", f"{at}-")
                     _hold(f"{motor.name} +", f"{at}+")
+                    text("small", _KEYS[at] if at < len(_KEYS) else "")
         for one_field in (frame, speed, turn, joint):
             one_field.on_change(settings)
         settings()
-    with ui.element("div").classes("buttons"):
-        button(
-            "Open gripper",
-            lambda: view.act(lambda robot: robot.gripper(True), "The gripper is open"),
-            when=ENABLED,
-            plain=True,
-        )
-        button(
-            "Close gripper",
-            lambda: view.act(lambda robot: robot.gripper(False), "The gripper has closed"),
-            when=ENABLED,
-            plain=True,
-        )
     text(
         "p",
-        "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s. "
-        "Gamepad: hold the left shoulder button.",
+        "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s; o opens and c closes the "
+        "gripper. Gamepad: hold the left shoulder button; A closes and B opens.",
     )
     tool_pose()
+
+
+def _gripper(view: View) -> None:
+    """Show the gripper as on the source's stick: forward opens, backward closes."""
+
+    def move(opens: bool, done: str) -> Callable[[], Awaitable[object]]:
+        return lambda: view.act(lambda robot: robot.gripper(opens), done)
+
+    with ui.element("div"):
+        text("h2", "Gripper")
+        with ui.element("div").classes("pad"):
+            for label, place, opens, done in (
+                ("Open", _PLACES[0], True, "The gripper is open"),
+                ("Close", _PLACES[3], False, "The gripper has closed"),
+            ):
+                made = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
+                made.props["data-gripper"] = label.lower()
 
 
 def _hold(label: str, part: str) -> ui.element:

@@ -8,7 +8,7 @@ from nicegui import ui
 
 from rtcp.api import RtcpError
 from rtcp.config.model import VIRTUAL
-from rtcp.panel.page import View, button, choice, field, number, row, table, text
+from rtcp.panel.page import Field, View, button, choice, field, number, row, table, text
 
 _COUNTERS = (
     "Slave",
@@ -17,13 +17,13 @@ _COUNTERS = (
     "AL status code",
     "Left OP",
     "Came back",
-    "Damaged frames, own cables",
-    "forwarded",
+    "Damaged frames at its ports 0 / 1 / 2 / 3",
+    "Forwarded ones",
     "Lost links",
 )
 
 
-def build(view: View) -> None:
+async def build(view: View) -> None:
     """Build the page."""
     text("h1", "Segment")
     slaves = ui.element("div").classes("page")
@@ -40,14 +40,16 @@ def build(view: View) -> None:
                 body = table(_COUNTERS, "Slaves in the order of the cable")
             for one in found or ():
                 errors = one["errors"]
-                counts = (one["lost"], one["recovered"], errors["rx"], errors["forwarded"], errors["links"])
+                ports = (" / ".join(map(str, errors[kind])) for kind in ("rx", "forwarded", "links"))
                 row(
                     body,
                     str(one["position"]),
                     one["name"],
                     one["state"],
                     f"0x{one['al_status_code']:04X}",
-                    *map(str, counts),
+                    str(one["lost"]),
+                    str(one["recovered"]),
+                    *ports,
                 )
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
@@ -74,7 +76,7 @@ def build(view: View) -> None:
     read_messages()
     ui.timer(0.5, read_messages)
     _objects(view)
-    _faults(view)
+    await _faults(view)
 
 
 def _objects(view: View) -> None:
@@ -115,22 +117,42 @@ def _objects(view: View) -> None:
         button("Write", write, when="ready", plain=True)
 
 
-def _faults(view: View) -> None:
+async def _faults(view: View) -> None:
     status = view.live.status
-    if status is None or status.raw["bus"] != VIRTUAL:
+    if status is None or status.raw["bus"] != VIRTUAL or view.page.visitor.role != "operator":
         return
     text("h2", "Faults of the virtual bus")
-    with ui.element("div").classes("fields"):
-        kind = choice("Kind", ("cable", "power", "loss", "wkc", "drive", "sdo_abort", "al_fall", "delay"), "loss")
-        keys = field("Keys, as after=3 (`rtcp segment kinds`)", "rate=0.1")
-        lasts = number("Lasts, s (empty: until cleared)", "2", min="0")
-    active = ui.element("div").classes("page")
+    place = ui.element("div").classes("page")
+    code, out = await view.rtcp("segment", "kinds", "--json")
+    if code:
+        view.warn(out)
+        return
+    kinds = {one["name"]: one for one in json.loads(out)}
+    keys: dict[str, Field] = {}
+    with place:
+        with ui.element("div").classes("fields"):
+            kind = choice("Kind", kinds, "loss")
+            lasts = number("Lasts, s (empty: until cleared)", "2", min="0")
+        says = text("p", "")
+        keys_part = ui.element("div").classes("fields")
+
+    def show_keys() -> None:
+        says.text = kinds[kind.value]["says"]
+        keys_part.clear()
+        keys.clear()
+        with keys_part:
+            for name, allowed in kinds[kind.value]["keys"].items():
+                keys[name] = field(f"{name}: {allowed}")
+
+    kind.on_change(show_keys)
+    show_keys()
 
     async def make() -> None:
         if not view.claim():
             return
+        given = [f"{name}={one.value.strip()}" for name, one in keys.items() if one.value.strip()]
         more = ["--lasts", lasts.value] if lasts.value.strip() else []
-        code, out = await view.rtcp("segment", "fault", kind.value, *keys.value.split(), *more)
+        code, out = await view.rtcp("segment", "fault", kind.value, *given, *more)
         view.warn(out) if code else view.say(out)
         await show()
 
@@ -147,7 +169,10 @@ def _faults(view: View) -> None:
             for one in json.loads(out) if code == 0 else ():
                 text("p", f"fault {one['id']}: {one['fault']['fault']}, for {one['since_s']:.1f} s")
 
-    with ui.element("div").classes("buttons"):
+    with place:
+        buttons = ui.element("div").classes("buttons")
+        active = ui.element("div").classes("page")
+    with buttons:
         button("Make the fault", make)
         button("Clear all", clear, plain=True)
         button("Show what is active", show, plain=True)

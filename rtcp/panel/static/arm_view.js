@@ -1,7 +1,7 @@
 // The arm in space: solid links of its URDF, live; a ghost along a planned path; the tool's path of the last seconds; boxes.
 import { THREE, OrbitControls } from "nicegui-scene";
 
-const TRACE = 600, SEEN = "rtcp-camera";
+const TRACE = 600, TRACE_S = 10, SEEN = "rtcp-camera";
 const NORMAL = new THREE.Color("#4a6da7"), NEAR = new THREE.Color("#e8590c");
 
 function place(object, { xyz, rpy }) {
@@ -62,7 +62,7 @@ function line(color, count) {
 export default {
   template: `<div class="arm-view" role="img" aria-label="The arm in space"><canvas></canvas>
     <p v-if="problem" class="arm-problem">{{ problem }}</p></div>`,
-  props: { links: Array, boxes: Array },
+  props: { links: Array },
   data() { return { problem: "" }; },
   mounted() {
     const scene = (this.scene = new THREE.Scene());
@@ -82,14 +82,7 @@ export default {
     this.arm = new Chain(scene, this.links, false);
     this.ghost = new Chain(scene, this.links, true);
     this.ghost.root.visible = false;
-    for (const box of this.boxes) {
-      const size = box.max.map((value, at) => value - box.min[at]);
-      const color = box.keep_out ? "#c92a2a" : "#2f9e44";
-      const geometry = new THREE.BoxGeometry(...size);
-      const solid = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color, transparent: true, opacity: box.keep_out ? 0.2 : 0.03, depthWrite: false }));
-      const edges = new THREE.LineSegments(new THREE.EdgesGeometry(geometry), new THREE.LineBasicMaterial({ color }));
-      for (const one of [solid, edges]) { one.position.set(...box.min.map((value, at) => value + size[at] / 2)); scene.add(one); }
-    }
+    scene.add((this.boxes = new THREE.Group()));
     this.trace = line("#1971c2", TRACE);
     this.path = line("#2f9e44", 400);
     scene.add(this.trace, this.path);
@@ -116,6 +109,7 @@ export default {
     show(state) {
       if (!state.joints || !this.$el.clientWidth) return;
       this.arm.set(state.joints.actual_position);
+      const before = this.drawn;
       if (state.tool) this.trail(state.tool);
       if (state.singular) {
         const [shoulder, elbow, wrist] = state.singular.map((one) => one ?? Infinity);
@@ -123,19 +117,37 @@ export default {
         for (const material of this.arm.materials) material.color.copy(NORMAL).lerp(NEAR, near);
         this.$el.dataset.near = near.toFixed(2);
       }
+      if (state.limits) this.fence(state.limits);
       if (this.plan) this.follow();
-      this.draw();
+      // Drawn only where something has changed: an arm at rest costs its viewers nothing.
+      this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4))].join();
+      if (this.plan || this.drawn !== before) this.draw();
     },
     trail(tool) {
-      const points = this.trace.geometry.attributes.position, last = this.last;
-      if (last && Math.hypot(tool[0] - last[0], tool[1] - last[1], tool[2] - last[2]) < 1e-3) return;
-      this.last = tool;
-      const count = Math.min(this.trace.geometry.drawRange.count, TRACE);
-      if (count === TRACE) points.array.copyWithin(0, 3);
-      const at = Math.min(count, TRACE - 1);
-      points.array.set(tool.slice(0, 3), 3 * at);
+      const now = performance.now() / 1000, points = this.trace.geometry.attributes.position;
+      this.points = (this.points ?? []).filter(([at]) => now - at < TRACE_S).slice(1 - TRACE);
+      const last = this.points.at(-1)?.[1];
+      if (!last || Math.hypot(tool[0] - last[0], tool[1] - last[1], tool[2] - last[2]) > 1e-3) this.points.push([now, tool]);
+      this.points.forEach(([, [x, y, z]], at) => points.setXYZ(at, x, y, z));
       points.needsUpdate = true;
-      this.trace.geometry.setDrawRange(0, at + 1);
+      this.trace.geometry.setDrawRange(0, this.points.length);
+      this.$el.dataset.trail = this.points.length;
+    },
+    fence({ box, keep_out }) {
+      const found = [...(box ? [[box, false]] : []), ...Object.values(keep_out).map((one) => [one, true])];
+      const drawn = JSON.stringify(found);
+      if (drawn === this.$el.dataset.boxes) return;
+      this.$el.dataset.boxes = drawn;
+      for (const one of this.boxes.children) { one.geometry.dispose(); one.material.dispose(); }
+      this.boxes.clear();
+      for (const [{ min, max }, isKeptOut] of found) {
+        const size = max.map((value, at) => value - min[at]), color = isKeptOut ? "#c92a2a" : "#2f9e44";
+        const geometry = new THREE.BoxGeometry(...size);
+        const solid = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color, transparent: true,
+          opacity: isKeptOut ? 0.2 : 0.03, depthWrite: false }));
+        const edges = new THREE.LineSegments(new THREE.EdgesGeometry(geometry), new THREE.LineBasicMaterial({ color }));
+        for (const one of [solid, edges]) { one.position.set(...min.map((value, at) => value + size[at] / 2)); this.boxes.add(one); }
+      }
     },
     preview(path, duration_s) {
       if (!this.ghost) return;

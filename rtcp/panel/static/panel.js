@@ -77,7 +77,9 @@ window.rtcp = (() => {
     for (const element of document.querySelectorAll("[data-bar]")) {
       const [name, index] = element.dataset.bar.split(".");
       const value = connected && joints ? joints[name][index] : NaN;
-      const low = +element.dataset.low, high = +element.dataset.high;
+      const ends = element.dataset.limits.split(" ").map((limit) => state.limits?.[limit]?.[index] ?? NaN);
+      const [low, high] = ends.length > 1 ? ends : [-ends[0], ends[0]];
+      element.title = `${low} to ${high} ${element.dataset.unit}`;
       const part = Math.min(1, Math.max(0, (value - low) / (high - low)));
       element.style.setProperty("--at", Number.isNaN(part) ? "50%" : `${100 * part}%`);
       element.classList.toggle("near", part < 0.05 || part > 0.95);
@@ -160,6 +162,8 @@ window.rtcp = (() => {
   // By the place of a key: its letter changes with Shift and Caps Lock between press and release.
   const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 1], ArrowRight: [1, -1], PageUp: [2, 1],
     PageDown: [2, -1], KeyQ: [5, 1], KeyE: [5, -1], KeyA: [3, 1], KeyD: [3, -1], KeyW: [4, 1], KeyS: [4, -1] };
+  const GRIPPER = { KeyO: "open", KeyC: "close" };
+  function gripper(which) { document.querySelector(`[data-gripper="${which}"]`)?.click(); }
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") { stop(); return; }
     const button = jogOf(event.target);
@@ -170,8 +174,10 @@ window.rtcp = (() => {
     }
     if (event.target.matches?.("input, select, textarea")) return;
     const area = event.target.closest?.("[data-jog-frame]");
-    const found = area && KEYS[event.code];
-    if (!found || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (!area || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (GRIPPER[event.code] && !event.repeat) gripper(GRIPPER[event.code]);
+    const found = KEYS[event.code];
+    if (!found) return;
     event.preventDefault();
     if (!event.repeat) begin(event.code, ...found);
   });
@@ -183,7 +189,9 @@ window.rtcp = (() => {
   document.addEventListener("visibilitychange", () => { if (document.hidden) release(); });
   document.addEventListener("focusout", (event) => end(padOf(event.target)));
 
-  // A gamepad jogs while its left shoulder button is held: left stick X-Y, right stick Z and yaw, cross roll and pitch.
+  // A gamepad jogs while its left shoulder button is held: left stick X-Y, right stick Z and yaw, cross roll and pitch;
+  // A closes and B opens the gripper.
+  let wished = "";
   function gamepad() {
     const area = document.querySelector("[data-jog-frame]");
     const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
@@ -193,6 +201,9 @@ window.rtcp = (() => {
     if (!pad && !pressed.size) press += 1;
     const stick = (at) => (Math.abs(found.axes[at] ?? 0) > 0.15 ? found.axes[at] : 0);
     const cross = (plus, minus) => (found.buttons[plus]?.pressed ? 1 : 0) - (found.buttons[minus]?.pressed ? 1 : 0);
+    const wish = found.buttons[0]?.pressed ? "close" : found.buttons[1]?.pressed ? "open" : "";
+    if (wish && wish !== wished) gripper(wish);
+    wished = wish;
     pad = [-stick(1), -stick(0), -stick(3), cross(15, 14), cross(12, 13), -stick(2)];
   }
 
