@@ -44,7 +44,7 @@ _BURST, _RATE = 400.0, 100.0
 _MOST_BYTES = 64 << 10
 """Of a request's body."""
 _TRIES, _TRIES_S = 5, 60.0
-"""Wrong passwords of one address in a minute; of all addresses ten times as many."""
+"""Wrong passwords of one address in a minute; of all that have never given a right one, ten times as many."""
 _LONGEST_NAME = 32
 _HEADERS = [
     (b"x-content-type-options", b"nosniff"),
@@ -172,6 +172,8 @@ class Sessions:
         self._passwords = passwords
         self._sessions: dict[str, Visitor] = {}
         self._failures: list[tuple[float, str]] = []
+        self._trusted: set[str] = set()
+        """Addresses that a right password came from: wrong ones of others keep nobody there out."""
         self._numbers = 0
         self._local = self.begin("local", "operator", "this machine") if passwords is None else ""
 
@@ -213,7 +215,9 @@ class Sessions:
         """Return whether an address has to wait before its next try."""
         since = time.monotonic() - _TRIES_S
         self._failures = [one for one in self._failures if one[0] > since]
-        return len(self._failures) >= 10 * _TRIES or sum(one == address for _, one in self._failures) >= _TRIES
+        if sum(one == address for _, one in self._failures) >= _TRIES:
+            return True
+        return address not in self._trusted and len(self._failures) >= 10 * _TRIES
 
     async def log_in(self, name: str, password: str, address: str) -> str | None:
         """Return the secret of a new session; None: the password is wrong."""
@@ -227,6 +231,7 @@ class Sessions:
             return None
         with contextlib.suppress(ValueError):
             self._failures.remove(failure)
+        self._trusted.add(address)
         return self.begin(name, role, address)
 
 

@@ -201,7 +201,7 @@ class Watched:
             watching.until(lambda least=least: sum(errors[1].rx) >= least and sum(errors[2].forwarded) >= least)
 
     def count_links(self, watching: Watching) -> None:
-        watching.until(lambda: all(one.links for one in watching.watcher.errors.of[1:]))
+        watching.until(lambda: all(any(one.links) for one in watching.watcher.errors.of[1:]))
 
 
 def episodes(bus: SoemBus, count: int, control: str) -> Any:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import http.client
 import json
 import re
 import shutil
+import signal
+import socket
 import ssl
 import stat
 import subprocess
@@ -22,7 +26,7 @@ from websockets.sync.client import connect
 from rtcp.api import Invalid
 from rtcp.panel import access
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import begun
+from tests.panel.conftest import begun, until
 
 PAGE = {"Accept": "text/html"}
 PASSWORDS = {"operator": "correct horse", "viewer": "battery staple"}
@@ -223,11 +227,51 @@ def test_tries_are_limited(tmp_path: Path) -> None:
         platform.end()
 
 
+def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(tmp_path: Path) -> None:
+    file = tmp_path / "panel.json"
+    access.set_password(file, "operator", "correct horse")
+    sessions = access.Sessions(file)
+    assert asyncio.run(sessions.log_in("Ada", "correct horse", "10.0.0.1"))
+    for host in range(50):
+        assert asyncio.run(sessions.log_in("", "wrong", f"10.0.1.{host}")) is None
+    assert sessions.too_many_tries("10.0.2.1")
+    assert not sessions.too_many_tries("10.0.0.1")
+
+
 def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str) -> None:
     cookie = cookie_of(log_in(closed_panel, "battery staple"))
     found = {ask(closed_panel, "GET", "/metrics").status for _ in range(600)}
     assert 429 in found
     assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie}).status == 200
+
+
+def test_a_platform_is_started_with_its_panel_and_both_end_together() -> None:
+    platform = Platform()
+    platform.be_patient(lost_ms=2000)
+    with contextlib.closing(socket.socket()) as probe:
+        if probe.connect_ex(("127.0.0.1", 8080)) == 0:
+            pytest.skip("something else listens at port 8080")
+    command = [sys.executable, "-m", "rtcp.cli", "start", "--panel"]
+    environment = {**platform.environment, "DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    running = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    url = "http://127.0.0.1:8080"
+
+    def answers() -> bool:
+        with contextlib.suppress(OSError):
+            return bool(ask(url, "GET", "/", PAGE).status == 303)
+        return False
+
+    try:
+        until(answers, "the panel")
+        until(lambda: "rtcp_up 1.0" in ask(url, "GET", "/metrics").text, "the platform")
+        running.send_signal(signal.SIGINT)
+        out, complaints = running.communicate(timeout=30)
+        assert (running.returncode, "Traceback" in complaints) == (0, False), complaints
+        assert f"{url}/: Ctrl-C" in out
+        assert not answers()
+    finally:
+        running.kill()
+        platform.end()
 
 
 def test_another_address_wants_a_password() -> None:

@@ -302,6 +302,51 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
     assert len(found["rtcp_joint_position_radians"].samples) == 6
 
 
+FOCUS = """() => {
+    const found = document.activeElement, style = getComputedStyle(found);
+    wanted.delete(found);
+    for (const one of wanted) if (!one.isConnected || one.disabled) wanted.delete(one);
+    const seen = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2;
+    return [seen || found === document.body ? "" : found.outerHTML.slice(0, 150), wanted.size];
+}"""
+
+
+def test_every_control_is_reached_by_keyboard_and_shows_its_focus(page: Page, holding: Platform) -> None:
+    found: dict[str, list[str]] = {}
+    for path in PAGES:
+        show(page, path)
+        expect(page.get_by_role("heading", level=1)).to_be_visible()
+        page.wait_for_timeout(300)
+        page.evaluate(
+            "window.wanted = new Set([...document.querySelectorAll('button:not([disabled]), a[href], input, select, "
+            '[tabindex="0"]\')].filter((one) => one.checkVisibility() && one.tabIndex >= 0))'
+        )
+        for _ in range(150):
+            page.keyboard.press("Tab")
+            without, left = page.evaluate(FOCUS)
+            if without:
+                found.setdefault(f"{path} shows no focus", []).append(without)
+            if not left:
+                break
+        else:
+            found[f"{path} is not reached"] = page.evaluate("[...wanted].map((one) => one.outerHTML.slice(0, 150))")
+    assert found == {}
+
+
+def test_a_target_is_sent_by_keyboard_alone(page: Page, holding: Platform) -> None:
+    show(page, "/arm")
+    page.get_by_role("link", name="Targets").press("Enter")
+    joint = page.get_by_label("joint1, rad")
+    expect(joint).to_have_value(re.compile("."))
+    joint.press("Control+a")
+    page.keyboard.type("0.1")
+    page.get_by_role("button", name="Plan").press("Enter")
+    send = page.get_by_role("button", name="Send", exact=True)
+    expect(send).to_be_enabled()
+    send.press("Enter")
+    until(lambda: abs(holding.status()["joints"]["actual_position"][0] - 0.1) < 1e-3, "the arm is there")
+
+
 HOSTILE = "<img src=x onerror=alert(1)>"
 
 
