@@ -150,7 +150,7 @@ class Bucket:
     def __post_init__(self) -> None:
         self.left = self.most
 
-    def take(self) -> bool:
+    def allows(self) -> bool:
         """Count one; return whether it was still allowed."""
         now = time.monotonic()
         self.left = min(self.most, self.left + (now - self.at) * self.rate) - 1.0
@@ -275,7 +275,7 @@ class Access:
             await self._refuse(scope, receive, send, 403, why)
             return
         if scope["type"] == "http":
-            response = await self._entrance(scope, receive, headers, address, visitor, secret)
+            response = await self._respond(scope, receive, headers, address, visitor, secret)
             if response is not None:
                 await response(scope, receive, _with_headers(send))
                 return
@@ -289,7 +289,7 @@ class Access:
     def _may_send(self, key: str) -> bool:
         if len(self._buckets) > 4 * _MOST_SESSIONS:
             self._buckets.clear()
-        return self._buckets.setdefault(key, Bucket()).take()
+        return self._buckets.setdefault(key, Bucket()).allows()
 
     def _foreign(self, scope: Scope, headers: dict[bytes, str]) -> str:
         """Return why a request does not come from a page of this panel; empty: it does, or has no need to."""
@@ -310,7 +310,7 @@ class Access:
         wanted = f"{'https' if self._secure else 'http'}://{host}"
         return "" if origin.lower() == wanted else "the request comes from another site"
 
-    async def _entrance(
+    async def _respond(
         self,
         scope: Scope,
         receive: Receive,
@@ -319,6 +319,7 @@ class Access:
         visitor: Visitor | None,
         secret: str,
     ) -> Response | None:
+        """Return the answer of what needs no page; None: a page answers, for a visitor."""
         path, method = scope["path"], scope["method"]
         if method not in ("GET", "HEAD", "POST"):
             return PlainTextResponse("method not allowed", 405)
@@ -375,7 +376,9 @@ class Access:
             await receive()
             await send({"type": "websocket.close", "code": 1008, "reason": why})
         else:
-            await PlainTextResponse(why, status)(scope, receive, _with_headers(send))
+            # Whoever sends too much has to connect again; what else came over that connection is not even read.
+            headers = {"connection": "close"} if status == 429 else None
+            await PlainTextResponse(why, status, headers)(scope, receive, _with_headers(send))
 
 
 def is_loopback(host: str) -> bool:

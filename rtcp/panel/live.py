@@ -252,7 +252,7 @@ class Live:
         bucket = Bucket(_MESSAGES, _MESSAGES)
         try:
             while True:
-                if not bucket.take():
+                if not bucket.allows():
                     raise ValueError("too many messages")
                 self._receive(page, await socket.receive_json())
         except (ValueError, LookupError, TypeError, OverflowError):
