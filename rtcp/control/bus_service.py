@@ -238,7 +238,7 @@ class BusService(threading.Thread):
         self._publish_states(watcher.slaves)
         for slave, errors in zip(watcher.slaves, watcher.errors.of, strict=True):
             ports = zip(errors.rx, errors.forwarded, errors.links, strict=True)
-            temperature = self.temperature(slave.position)
+            temperature = self.temperature(slave.position) if slave.state == AlState.OP else math.nan
             self._blackboard.health(slave.position, slave.lost, slave.recovered, temperature, ports)
 
 

@@ -153,7 +153,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         report.close()
 
     service.on_op = started
-    drives = {position_of(config, joint): drive for joint, drive in zip(config.joints, cycle.arm.drives, strict=True)}
+    drives = {position_of(config, joint): drive for joint, drive in zip(config.axes, cycle.arm.all_drives, strict=True)}
     service.temperature = lambda position: drives[position].temperature if position in drives else math.nan
     service.clock_followed = lambda: discipline is None or discipline.locked
     service.on_refused = cycle.shut_down

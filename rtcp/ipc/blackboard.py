@@ -6,6 +6,7 @@ finds two different numbers, or another than it wanted, knows that the record is
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import struct
@@ -42,6 +43,7 @@ from rtcp.ipc.layout import (
     MAGIC,
     PLAN_IN_USE_AT,
     PLANS,
+    PORTS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
     SLAVES_AT,
@@ -59,6 +61,7 @@ from rtcp.ipc.layout import (
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import Malformed, Refusal
 
+_HOTTEST = 1e6
 _U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
 
@@ -101,6 +104,8 @@ class Blackboard:
         self._texts = 0
         self._taken = 0
         self._text_lock = threading.Lock()
+        for position in range(1, SLAVES_MAX + 1):
+            self.health(position, 0, 0, math.nan, [(0, 0, 0)] * PORTS)
         # Every page is touched now, so that none is faulted in by the cycle.
         for page in range(0, size, mmap.PAGESIZE):
             self._map[page] = self._map[page]
@@ -158,9 +163,11 @@ class Blackboard:
         """
         if 1 <= position <= SLAVES_MAX:
             at = HEALTH_AT + (position - 1) * HEALTH_SIZE
-            hot = int.from_bytes(TEMPERATURE.pack(temperature), "little")
-            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | hot << 32
-            for number, (rx, forwarded, links) in enumerate(ports, 1):
+            # What a drive sends may be anything, also what no float of this width and no JSON can hold.
+            known = temperature if abs(temperature) < _HOTTEST else math.nan
+            temperature_bits = int.from_bytes(TEMPERATURE.pack(known), "little")
+            self._words[at] = min(lost, _U16) | min(recovered, _U16) << 16 | temperature_bits << 32
+            for number, (rx, forwarded, links) in zip(range(1, 1 + PORTS), ports, strict=True):
                 self._words[at + 8 * number] = min(rx, _U24) | min(forwarded, _U24) << 24 | min(links, _U16) << 48
 
     def lease(self) -> tuple[int, int, int]:

@@ -9,7 +9,7 @@
 | 512 | request and answer of the service thread | commander; service thread |
 | 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
-| 3072 | slave health: lost, recovered, error counters | service thread |
+| 3072 | slave health: lost, recovered, temperature, error counters | service thread |
 | 16384 | service text, texts, events, commands, plans, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.

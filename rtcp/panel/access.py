@@ -172,8 +172,8 @@ class Sessions:
         self._passwords = passwords
         self._sessions: dict[str, Visitor] = {}
         self._failures: list[tuple[float, str]] = []
-        self._trusted: set[str] = set()
-        """Addresses that a right password came from: wrong ones of others keep nobody there out."""
+        self._trusted = {"127.0.0.1", "::1"}
+        """Addresses that a right password came from, and this machine: wrong ones of others lock nobody out there."""
         self._numbers = 0
         self._local = self.begin("local", "operator", "this machine") if passwords is None else ""
 

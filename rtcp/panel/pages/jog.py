@@ -99,7 +99,7 @@ def _gripper(view: View) -> None:
     """Show the gripper as on the source's stick: forward opens, backward closes."""
 
     def move(opens: bool, done: str) -> Callable[[], Awaitable[object]]:
-        return lambda: view.act(lambda robot: robot.gripper(opens), done)
+        return lambda: view.act(lambda robot: robot.gripper(opens), done, instead=True)
 
     with ui.element("div"):
         text("h2", "Gripper")
@@ -109,7 +109,7 @@ def _gripper(view: View) -> None:
                 ("Close", _PLACES[3], False, "The gripper has closed"),
             ):
                 made = button(label, move(opens, done), when=ENABLED).style(f"grid-area: {place}")
-                made.props["data-gripper"] = label.lower()
+                made.props.update({"data-gripper": label.lower(), "aria-label": f"{label} gripper"})
 
 
 def _hold(label: str, part: str) -> ui.element:

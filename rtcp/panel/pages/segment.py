@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 from nicegui import ui
 
@@ -18,9 +19,12 @@ _COUNTERS = (
     "Left OP",
     "Came back",
     "Damaged frames at its ports 0 / 1 / 2 / 3",
-    "Forwarded ones",
-    "Lost links",
+    "Forwarded at ports 0 / 1 / 2 / 3",
+    "Lost links at ports 0 / 1 / 2 / 3",
 )
+
+_KINDS: dict[str, Any] = {}
+"""Kinds of faults, as `rtcp segment kinds --json` has them; asked for once."""
 
 
 async def build(view: View) -> None:
@@ -32,25 +36,14 @@ async def build(view: View) -> None:
 
     def refresh() -> None:
         status = view.live.status
-        found = None if status is None else status.raw["slaves"]
+        found = [_cells(one) for one in (status.raw["slaves"] if status is not None else ())]
         if found != shown[0] or not slaves.default_slot.children:
             shown[0] = found
             slaves.clear()
             with slaves:
                 body = table(_COUNTERS, "Slaves in the order of the cable")
-            for one in found or ():
-                errors = one["errors"]
-                ports = (" / ".join(map(str, errors[kind])) for kind in ("rx", "forwarded", "links"))
-                row(
-                    body,
-                    str(one["position"]),
-                    one["name"],
-                    one["state"],
-                    f"0x{one['al_status_code']:04X}",
-                    str(one["lost"]),
-                    str(one["recovered"]),
-                    *ports,
-                )
+            for cells in found:
+                row(body, *cells)
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
             locked = "locked" if dc["locked"] else "not locked"
@@ -77,6 +70,13 @@ async def build(view: View) -> None:
     ui.timer(0.5, read_messages)
     _objects(view)
     await _faults(view)
+
+
+def _cells(slave: dict[str, Any]) -> list[str]:
+    """Return the row of a slave, under `_COUNTERS`."""
+    figures = (slave["state"], f"0x{slave['al_status_code']:04X}", slave["lost"], slave["recovered"])
+    ports = (" / ".join(map(str, slave["errors"][kind])) for kind in ("rx", "forwarded", "links"))
+    return [*map(str, (slave["position"], slave["name"], *figures)), *ports]
 
 
 def _objects(view: View) -> None:
@@ -123,15 +123,17 @@ async def _faults(view: View) -> None:
         return
     text("h2", "Faults of the virtual bus")
     place = ui.element("div").classes("page")
-    code, out = await view.rtcp("segment", "kinds", "--json")
-    if code:
-        view.warn(out)
-        return
-    kinds = {one["name"]: one for one in json.loads(out)}
+    if not _KINDS:
+        code, out = await view.rtcp("segment", "kinds", "--json")
+        if code:
+            view.warn(out)
+            return
+        _KINDS.update({one["name"]: one for one in json.loads(out)})
+    kinds = _KINDS
     keys: dict[str, Field] = {}
     with place:
         with ui.element("div").classes("fields"):
-            kind = choice("Kind", kinds, "loss")
+            kind = choice("Kind", list(kinds), "loss")
             lasts = number("Lasts, s (empty: until cleared)", "2", min="0")
         says = text("p", "")
         keys_part = ui.element("div").classes("fields")

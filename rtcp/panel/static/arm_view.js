@@ -95,6 +95,7 @@ export default {
       this.draw();
     });
     this.controls.update();
+    this.renderer.domElement.addEventListener("webglcontextrestored", () => this.draw());
     this.stop = window.rtcp.listen((state) => this.show(state));
     this.sizes = new ResizeObserver(() => this.resize());
     this.sizes.observe(this.$el);
@@ -107,6 +108,7 @@ export default {
   },
   methods: {
     show(state) {
+      if (!state.joints && this.points?.length) { this.points = []; this.trace.geometry.setDrawRange(0, 0); this.drawBoxes({ box: null, keep_out: {} }); this.draw(); }
       if (!state.joints || !this.$el.clientWidth) return;
       this.arm.set(state.joints.actual_position);
       const before = this.drawn;
@@ -117,7 +119,7 @@ export default {
         for (const material of this.arm.materials) material.color.copy(NORMAL).lerp(NEAR, near);
         this.$el.dataset.near = near.toFixed(2);
       }
-      if (state.limits) this.fence(state.limits);
+      if (state.limits) this.drawBoxes(state.limits);
       if (this.plan) this.follow();
       // Drawn only where something has changed: an arm at rest costs its viewers nothing.
       this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4))].join();
@@ -133,7 +135,7 @@ export default {
       this.trace.geometry.setDrawRange(0, this.points.length);
       this.$el.dataset.trail = this.points.length;
     },
-    fence({ box, keep_out }) {
+    drawBoxes({ box, keep_out }) {
       const found = [...(box ? [[box, false]] : []), ...Object.values(keep_out).map((one) => [one, true])];
       const drawn = JSON.stringify(found);
       if (drawn === this.$el.dataset.boxes) return;

@@ -79,7 +79,8 @@ window.rtcp = (() => {
       const value = connected && joints ? joints[name][index] : NaN;
       const ends = element.dataset.limits.split(" ").map((limit) => state.limits?.[limit]?.[index] ?? NaN);
       const [low, high] = ends.length > 1 ? ends : [-ends[0], ends[0]];
-      element.title = `${low} to ${high} ${element.dataset.unit}`;
+      const title = Number.isFinite(low + high) ? `${+low.toPrecision(4)} to ${+high.toPrecision(4)} ${element.dataset.unit}` : "";
+      if (element.title !== title) element.title = title;
       const part = Math.min(1, Math.max(0, (value - low) / (high - low)));
       element.style.setProperty("--at", Number.isNaN(part) ? "50%" : `${100 * part}%`);
       element.classList.toggle("near", part < 0.05 || part > 0.95);
@@ -163,7 +164,11 @@ window.rtcp = (() => {
   const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [1, 1], ArrowRight: [1, -1], PageUp: [2, 1],
     PageDown: [2, -1], KeyQ: [5, 1], KeyE: [5, -1], KeyA: [3, 1], KeyD: [3, -1], KeyW: [4, 1], KeyS: [4, -1] };
   const GRIPPER = { KeyO: "open", KeyC: "close" };
-  function gripper(which) { document.querySelector(`[data-gripper="${which}"]`)?.click(); }
+  // It ends the jog, as every other command does: release, then press again.
+  function gripper(which) {
+    release();
+    document.querySelector(`[data-gripper="${which}"]`)?.click();
+  }
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") { stop(); return; }
     const button = jogOf(event.target);
@@ -191,19 +196,20 @@ window.rtcp = (() => {
 
   // A gamepad jogs while its left shoulder button is held: left stick X-Y, right stick Z and yaw, cross roll and pitch;
   // A closes and B opens the gripper.
-  let wished = "";
+  let lastGripper = "";
   function gamepad() {
     const area = document.querySelector("[data-jog-frame]");
     const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
     const held = found && found.buttons[4]?.pressed;
+    const wanted = found?.buttons[0]?.pressed ? "close" : found?.buttons[1]?.pressed ? "open" : "";
+    const begins = wanted && wanted !== lastGripper;
+    lastGripper = wanted;
+    if (held && begins) { gripper(wanted); return; }
     if (!held) padEnded = false;
     if (!held || padEnded) { if (pad) { pad = null; if (!pressed.size) { send(jogMessage()); press += 1; } } return; }
     if (!pad && !pressed.size) press += 1;
     const stick = (at) => (Math.abs(found.axes[at] ?? 0) > 0.15 ? found.axes[at] : 0);
     const cross = (plus, minus) => (found.buttons[plus]?.pressed ? 1 : 0) - (found.buttons[minus]?.pressed ? 1 : 0);
-    const wish = found.buttons[0]?.pressed ? "close" : found.buttons[1]?.pressed ? "open" : "";
-    if (wish && wish !== wished) gripper(wish);
-    wished = wish;
     pad = [-stick(1), -stick(0), -stick(3), cross(15, 14), cross(12, 13), -stick(2)];
   }
 

@@ -8,7 +8,7 @@ export default {
     this.chart = echarts.init(this.$el.firstChild, null, { renderer: "canvas" });
     this.marks = [];
     this.paused = false;
-    this.rest_ms = 0;
+    this.free_at = 0;
     this.stop = window.rtcp.scope((block) => { if (!this.paused) this.show(block); });
     this.sizes = new ResizeObserver(() => this.chart.resize());
     this.sizes.observe(this.$el);
@@ -29,9 +29,9 @@ export default {
         const began = performance.now();
         this.draw();
         this.chart.getZr().flush();
-        this.rest_ms = 3 * (performance.now() - began);
+        this.free_at = performance.now() + 3 * (performance.now() - began);
         this.$el.dataset.shown = String(1 + Number(this.$el.dataset.shown ?? 0));
-      }, this.rest_ms);
+      }, Math.max(0, this.free_at - performance.now()));
     },
     pause(value) { this.paused = value; },
     draw() {
