@@ -24,13 +24,13 @@ run: setup ## run the demonstration: virtual segment, master, a move, the figure
 panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a browser
 	@$(BIN)/rtcp start --panel
 
-test: setup ## run the tests
+test: setup ## run the tests, but those in a browser
 	@status=0; \
 	$(BIN)/python -m pytest -m 'not alone and not slow' --numprocesses auto || status=1; \
-	$(BIN)/python -m pytest -m 'alone and not slow' || status=1; \
+	$(BIN)/python -m pytest -m 'alone and not slow and not browser' --numprocesses 2 --dist loadfile || status=1; \
 	exit $$status
 
-test-all: oracles ## run the tests that take long too: every sample, systemd as PID 1
+test-all: oracles ## run all tests: every sample, systemd as PID 1, in a browser
 	@status=0; \
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m alone || status=1; \

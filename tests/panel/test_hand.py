@@ -26,7 +26,7 @@ from tests.e2e.conftest import Platform
 from tests.panel.cable import NEAR, Cable
 from tests.panel.conftest import CHROMIUM, FLAGS, begun, ready, show, until, visitor
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.browser]
 NAMESPACE = f"rtcp-net-{os.getpid()}"
 GRIPPER = 1 << 3
 """Its output, number 4."""

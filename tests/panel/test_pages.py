@@ -18,7 +18,7 @@ from rtcp.virtual.faults.registry import installed
 from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, begun, show, until, visitor
 
-pytestmark = pytest.mark.alone
+pytestmark = [pytest.mark.alone, pytest.mark.browser]
 DRIVE_IDENTITY = re.compile(r"vendor_id: (\w+)[\s\S]*product_id: (\w+)")
 
 
@@ -67,7 +67,8 @@ def test_what_cannot_be_started_is_said(page: Page, platform: Platform) -> None:
 def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platform) -> None:
     show(page, "/arm")
     for at, value in enumerate(holding.status()["joints"]["actual_position"]):
-        expect(page.locator(f"[data-live='actual_position.{at}']")).to_have_text(f"{value:.4f}")
+        shown = float(page.locator(f"[data-live='actual_position.{at}']").inner_text())
+        assert shown == pytest.approx(value, abs=1e-3)
     expect(page.locator("[data-live='drive.0']")).to_have_text("operation enabled")
     bar = page.locator("[data-bar='actual_position.2']")
     assert float(bar.evaluate("e => parseFloat(e.style.getPropertyValue('--at'))")) == pytest.approx(
@@ -266,7 +267,7 @@ def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Pl
     page.get_by_role("button", name="Make the fault").click()
     # On the way out: they come in at the port of the next slave that looks towards the master.
     damaged = page.get_by_role("row", name=re.compile("^5 ")).get_by_role("cell").nth(5)
-    expect(damaged).to_have_text(re.compile(r"^[1-9]\d* / 0 / 0 / 0$"))
+    expect(damaged).to_have_text(re.compile(r"^[1-9]\d* / 0 / 0 / 0$"), timeout=20_000)
     since = holding.last_event()
     page.get_by_label("Kind", exact=True).select_option("power")
     page.get_by_label("slave:").fill("3")

@@ -201,7 +201,7 @@ window.rtcp = (() => {
     const area = document.querySelector("[data-jog-frame]");
     const found = area && !document.hidden && document.hasFocus() && [...navigator.getGamepads()].find((one) => one?.connected);
     const held = found && found.buttons[4]?.pressed;
-    const wanted = found?.buttons[0]?.pressed ? "close" : found?.buttons[1]?.pressed ? "open" : "";
+    const wanted = !found ? "" : found.buttons[0]?.pressed ? "close" : found.buttons[1]?.pressed ? "open" : "";
     const begins = wanted && wanted !== lastGripper;
     lastGripper = wanted;
     if (held && begins) { gripper(wanted); return; }
