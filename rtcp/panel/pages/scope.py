@@ -16,7 +16,11 @@ _ECHARTS = Path(nicegui.__file__).parent / "elements" / "echart" / "dist"
 
 
 class ScopeView(Element, component="../static/scope_view.js", esm={"nicegui-echart": str(_ECHARTS)}):
-    """The picture."""
+    """The picture; `names`: what a person reads for each signal."""
+
+    def __init__(self, names: dict[str, str]) -> None:
+        super().__init__()
+        self.props["names"] = names
 
 
 def build(view: View) -> None:
@@ -42,7 +46,7 @@ def build(view: View) -> None:
         )
         level = number("Level", "0")
     listed = text("p", "", role="status")
-    picture = ScopeView()
+    picture = ScopeView(allowed)
 
     def apply() -> None:
         names = ", ".join(allowed[one] for one in chosen)

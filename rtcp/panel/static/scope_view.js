@@ -3,6 +3,7 @@ import { echarts } from "nicegui-echart";
 
 export default {
   template: `<div><div class="scope" role="img" aria-label="Signals over time"></div><p role="status">{{ cursors }}</p></div>`,
+  props: { names: Object },
   data() { return { cursors: "Click into the picture to set cursors A and B." }; },
   mounted() {
     this.chart = echarts.init(this.$el.firstChild, null, { renderer: "canvas" });
@@ -44,12 +45,12 @@ export default {
         textStyle: { color: dark ? "#f1f3f5" : "#212529" },
         legend: { type: "scroll", top: 0, textStyle: { color: dark ? "#f1f3f5" : "#212529" } },
         grid: { left: 60, right: 15, top: 40, bottom: 70 },
-        xAxis: { type: "value", name: "s", min: "dataMin", max: "dataMax" },
+        xAxis: { type: "value", name: "s", min: "dataMin", max: "dataMax", axisLabel: { formatter: (t) => String(Number(t.toFixed(4))) } },
         yAxis: { type: "value", scale: true },
         dataZoom: [{ type: "inside" }, { type: "slider", bottom: 10 }],
         tooltip: { trigger: "axis" },
         series: block.signals.map((name, at) => ({
-          name, type: "line", showSymbol: false, lineStyle: { width: 1 }, data: block.t.map((t, k) => [t, block.y[at][k]]),
+          name: this.names[name], type: "line", showSymbol: false, lineStyle: { width: 1 }, data: block.t.map((t, k) => [t, block.y[at][k]]),
           markLine: at === 0 ? { symbol: "none", data: lines, animation: false } : undefined,
         })),
       }, { replaceMerge: ["series"] });
@@ -59,9 +60,9 @@ export default {
       const { t, y, signals } = this.block;
       const at = (mark) => t.reduce((best, one, k) => (Math.abs(one - mark) < Math.abs(t[best] - mark) ? k : best), 0);
       const [a, b] = this.marks.map(at);
-      const one = (k) => signals.map((name, line) => `${name} ${y[line][k].toPrecision(5)}`).join(", ");
+      const one = (k) => signals.map((name, line) => `${this.names[name]} ${y[line][k].toPrecision(5)}`).join(", ");
       if (b === undefined) return `A ${t[a].toFixed(4)} s: ${one(a)}`;
-      const change = signals.map((name, line) => `${name} ${(y[line][b] - y[line][a]).toPrecision(4)}`).join(", ");
+      const change = signals.map((name, line) => `${this.names[name]} ${(y[line][b] - y[line][a]).toPrecision(4)}`).join(", ");
       return `A ${t[a].toFixed(4)} s, B ${t[b].toFixed(4)} s, B - A ${(t[b] - t[a]).toFixed(4)} s: ${change}`;
     },
     csv() {
