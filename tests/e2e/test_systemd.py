@@ -239,3 +239,15 @@ def test_a_killed_main_process_takes_the_others_along_and_the_next_start_records
     service.run("systemctl", "start", UNIT, check=False)  # it records before it opens the bus
     assert "black box: this fault is number" in service.journal()
     assert "the loop" in service.run("rtcp", "faults")
+
+
+def test_the_panel_of_an_instance_serves_its_platform_and_outlives_it(service: Machine) -> None:
+    ask = ["/opt/rtcp/python/bin/python3", "-c", "import urllib.request as net, sys\n"
+           "print(net.urlopen('http://127.0.0.1:8080/metrics', timeout=5).read().decode())"]  # fmt: skip
+    service.run("ip", "link", "set", "lo", "up")
+    service.run("systemctl", "start", "rtcp-panel@virtual")
+    service.until(lambda: 'rtcp_state{state="ready"} 1.0' in service.run(*ask, check=False), "no panel answers")
+    service.run("systemctl", "stop", UNIT)
+    service.until(lambda: "rtcp_up 0.0" in service.run(*ask, check=False), "the panel does not notice the end")
+    assert service.run("systemctl", "is-active", "rtcp-panel@virtual").strip() == "active"
+    service.run("systemctl", "stop", "rtcp-panel@virtual")
