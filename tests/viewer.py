@@ -26,7 +26,10 @@ class Viewer:
 
     def __init__(self, url: str, topics: Sequence[str] = ()) -> None:
         # No pings: a viewer that hangs does not notice.
-        opened: Any = connect(url, subprotocols=[SUBPROTOCOL], max_size=None, compression=None, ping_interval=None)
+        # A short close: what was sent and not read would hold it up.
+        opened: Any = connect(
+            url, subprotocols=[SUBPROTOCOL], max_size=None, compression=None, ping_interval=None, close_timeout=0.1
+        )
         self._socket = opened.__enter__()
         self._decoders = DecoderFactory()
         self.info = json.loads(self._socket.recv())

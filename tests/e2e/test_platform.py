@@ -188,7 +188,7 @@ def test_a_move_without_enabling_is_refused(shared: Platform) -> None:
 
 
 def test_a_second_commander_is_refused_with_the_holders_name(enabled: Platform) -> None:
-    moving = enabled.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.3")
+    moving = enabled.background("move", "0.4", "0", "0", "0", "0", "0", "--speed", "0.2")
     enabled.until(lambda found: found["state"] == "moving", "motion")
     with pytest.raises(Refused) as refused:
         enabled.call("move_joints", q=Q)

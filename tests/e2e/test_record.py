@@ -117,20 +117,6 @@ def test_a_refused_recording_has_its_reason_and_fields(shared: Platform) -> None
     assert "actual_position" in refused.value.fields["allowed"]
 
 
-def test_the_end_of_the_platform_completes_the_file() -> None:
-    platform = Platform()
-    try:
-        platform.be_patient(2000)
-        platform.rtcp("start", "--detach")
-        out = platform.directory / "whole.mcap"
-        platform.rtcp("record", "start", "--out", str(out))
-        platform.rtcp("stop")
-        assert out.read_bytes()[-8:] == b"\x89MCAP0\r\n"
-        assert not list(platform.directory.glob("recorder-*.json"))
-    finally:
-        platform.end()
-
-
 def test_the_recording_of_the_arms_file_runs_once_whatever_becomes_of_the_gateway() -> None:
     platform = Platform()
     try:
@@ -150,13 +136,18 @@ def test_the_recording_of_the_arms_file_runs_once_whatever_becomes_of_the_gatewa
         platform.end()
 
 
-def test_a_recording_of_the_arms_file_that_cannot_start_is_reported_and_the_platform_runs() -> None:
+def test_a_recording_that_cannot_start_with_the_platform_is_reported_and_the_end_completes_another() -> None:
     platform = Platform()
     try:
         start_with(platform, "{out: /proc/nowhere}")
         wanted = "the recording of the arm's file (recording) does not run: /proc/nowhere cannot be written"
         platform.until(lambda found: any(one.startswith(wanted) for one in found["messages"]), "the message")
         platform.call("enable")
+        out = platform.directory / "whole.mcap"
+        platform.rtcp("record", "start", "--out", str(out))
+        platform.rtcp("stop")
+        assert out.read_bytes()[-8:] == b"\x89MCAP0\r\n"
+        assert not list(platform.directory.glob("recorder-*.json"))
     finally:
         platform.end()
 

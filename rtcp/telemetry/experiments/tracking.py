@@ -9,6 +9,7 @@ from math import cos, pi, sin, tau
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import least_squares
 
 from rtcp.api import Robot
 from rtcp.config.loader import segment_path
@@ -32,6 +33,7 @@ _WINDOW_S = 0.01
 _SETTLING_S = 0.01
 """Time after a gap between two samples during which the torque still shows what happened in the gap, s."""
 _MOVING_RAD_S = 0.02
+_EXACT_NM = 1e-6
 _TOLERANCE = 0.05
 
 
@@ -76,7 +78,7 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
     torque = J a + c sign(v) + b v - g1 sin(q) - g2 cos(q), each side integrated over short windows: the acceleration
     need not be had from the noise of the velocity. Windows in which the joint hardly moves or turns round tell nothing
     of dry friction, and those with a gap between two samples, or just after one, nothing of what was in it: they are
-    left out.
+    left out. What a stall of the host disturbs further weighs little (loss "soft_l1").
 
     Raises:
         ExperimentFailed: it hardly moved.
@@ -104,7 +106,11 @@ def identify(seconds: Array, torque: Array, velocity: Array, position: Array) ->
         np.diff(velocity[ends]) / np.diff(seconds[ends]), mean(np.sign(velocity)), mean(velocity),
         -mean(np.sin(position)), -mean(np.cos(position)),
     ))  # fmt: skip
-    (inertia, coulomb, viscous, g1, g2), *_ = np.linalg.lstsq(columns[useful], mean(torque)[useful], rcond=None)
+    matrix, wanted = columns[useful], mean(torque)[useful]
+    plain = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
+    scale = max(float(np.median(np.abs(wanted - matrix @ plain))), _EXACT_NM)
+    robust = least_squares(lambda values: wanted - matrix @ values, plain, loss="soft_l1", f_scale=scale)
+    inertia, coulomb, viscous, g1, g2 = robust.x
     return Friction(float(inertia), float(coulomb), float(viscous), (float(g1), float(g2)))
 
 

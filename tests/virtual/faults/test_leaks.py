@@ -104,11 +104,13 @@ def _bench() -> Bench:
 def bench(_bench: Bench) -> Iterator[Bench]:
     """The one of this file, its collector off as in the segment's process."""
     gc.collect()
+    gc.freeze()  # what other tests keep need not be looked through each time
     gc.disable()
     try:
         yield _bench
     finally:
         gc.enable()
+        gc.unfreeze()
 
 
 def left_by(play: Callable[[], object]) -> int:
