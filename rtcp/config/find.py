@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from importlib.metadata import EntryPoint, entry_points
+from functools import cache
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import TypeVar
 
@@ -87,6 +88,12 @@ def _there(path: Path, asked_by: str) -> Path:
     return path
 
 
+@cache
+def installed(group: str) -> EntryPoints:
+    """Return the entry points of a group, found once: each time the metadata of every installed package are read."""
+    return entry_points(group=group)
+
+
 def registered(group: str) -> dict[str, EntryPoint]:
     """Return what installed packages registered in a group of entry points, by name.
 
@@ -95,7 +102,7 @@ def registered(group: str) -> dict[str, EntryPoint]:
         ConfigError: there is none, not even of this package.
     """
     found: dict[str, EntryPoint] = {}
-    for entry in sorted(entry_points(group=group)):
+    for entry in sorted(installed(group)):
         other = found.setdefault(entry.name, entry)
         if other.value != entry.value:
             raise PluginError(entry, f"has the name of {other.value}: rename one, or uninstall its package")

@@ -33,14 +33,14 @@ def test_an_entry_point_that_cannot_serve_is_named_with_the_reason(value, proble
 
 def test_two_packages_with_the_same_name_are_refused(monkeypatch):
     points = EntryPoints([EntryPoint("scale", value, GROUP) for value in ("one:Scale", "two:Scale")])
-    monkeypatch.setattr(find, "entry_points", lambda group: points.select(group=group))
+    monkeypatch.setattr(find, "installed", lambda group: points.select(group=group))
     with pytest.raises(PluginError, match="has the name of one:Scale"):
         registered(GROUP)
 
 
 def test_a_package_that_is_found_twice_counts_once(monkeypatch):
     points = EntryPoints([EntryPoint("scale", "one:Scale", GROUP)] * 2)
-    monkeypatch.setattr(find, "entry_points", lambda group: points.select(group=group))
+    monkeypatch.setattr(find, "installed", lambda group: points.select(group=group))
     assert list(registered(GROUP)) == ["scale"]
 
 

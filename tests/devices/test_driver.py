@@ -30,7 +30,7 @@ def test_our_own_drivers_are_found_by_the_kind_of_their_device():
 
 def test_a_driver_of_another_package_is_found_and_offers_its_channels_in_si_units(monkeypatch):
     points = EntryPoints([EntryPoint("force", "tests.devices.test_driver:ForceSensor", "rtcp.devices")])
-    monkeypatch.setattr(find, "entry_points", lambda group: points.select(group=group))
+    monkeypatch.setattr(find, "installed", lambda group: points.select(group=group))
     sensor = make_driver(SENSOR, 0.001)
     sensor.decode(b"\xfb\xff\x00\x00\xc0\x3f")
     assert sensor.values == pytest.approx({"x": -0.5, "y": 3.0})
