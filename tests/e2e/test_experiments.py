@@ -19,9 +19,7 @@ from rtcp.telemetry.experiments import (
     LatencyExperiment,
     PicksExperiment,
     ResourcesExperiment,
-    SquareExperiment,
     TrackingExperiment,
-    motions,
 )
 from rtcp.telemetry.experiments.experiment import Row, Setup, carry_out, read_result
 
@@ -68,14 +66,13 @@ def test_a_step_of_1_35_rad_settles_at_0_2_rad_s_without_overshoot(platform: Pla
     assert "Step of 1.35 rad" in (tmp_path / "step" / "report.html").read_text()
 
 
-@pytest.mark.parametrize("plane", [pytest.param("xy", marks=pytest.mark.slow), "yz"])
-def test_the_square_is_driven_within_1_mm_commanded_and_3_mm_actual(
-    setup: Setup, monkeypatch: pytest.MonkeyPatch, plane: str
+@pytest.mark.slow
+def test_the_square_is_driven_in_both_planes_within_1_mm_commanded_and_3_mm_actual(
+    platform: Platform, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(motions, "SPEED_RAD_S", 0.5)  # on the way there and back
-    rows = carried_out(SquareExperiment((plane,)), setup)
-    assert [row.met for row in rows.values()] == [True] * 2
-    assert (setup.folder / f"recording-{plane}.mcap").stat().st_size > 0
+    rows, _ = ran(platform, "square", tmp_path)
+    assert [row["met"] for row in rows.values()] == [True] * 4
+    assert (tmp_path / "square" / "recording-yz.mcap").stat().st_size > 0
 
 
 def test_the_delays_are_those_of_the_source(platform: Platform, tmp_path: Path) -> None:
@@ -108,6 +105,7 @@ def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup:
     assert any("other limits" in note for note in read_result(setup.folder).notes)
 
 
+@pytest.mark.slow
 def test_inertia_and_friction_of_a_joint_come_back_within_5_percent(setup: Setup) -> None:
     rows = carried_out(TrackingExperiment((0,), (0.5, 1.0)), setup)
     assert [rows[f"joint1: {key}"].met for key in ("inertia", "coulomb", "viscous")] == [True] * 3

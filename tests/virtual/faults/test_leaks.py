@@ -96,21 +96,22 @@ class Bench:
 
 
 @pytest.fixture(scope="module")
-def _bench() -> Bench:
-    return Bench()
+def _bench() -> Iterator[Bench]:
+    made = Bench()
+    gc.collect()
+    gc.freeze()  # what other tests keep need not be looked through each time
+    yield made
+    gc.unfreeze()
 
 
 @pytest.fixture
 def bench(_bench: Bench) -> Iterator[Bench]:
     """The one of this file, its collector off as in the segment's process."""
-    gc.collect()
-    gc.freeze()  # what other tests keep need not be looked through each time
     gc.disable()
     try:
         yield _bench
     finally:
         gc.enable()
-        gc.unfreeze()
 
 
 def left_by(play: Callable[[], object]) -> int:
