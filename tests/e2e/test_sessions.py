@@ -13,7 +13,7 @@ from tests.sessions.wire_session import check, run_on_the_wire
 pytestmark = pytest.mark.alone
 
 PERIOD_US = 2000
-SECONDS = 8.0
+SECONDS = 6.0
 SEED = 5
 OUTPUTS_AT = 26
 ENABLE_OPERATION = 0x0F
