@@ -164,10 +164,13 @@ def datagrams(frame: bytes) -> Iterator[tuple[int, int, bytes, int]]:
         at += 12 + length
 
 
-def outputs(path: Path) -> Iterator[tuple[int, list[Targets]]]:
-    """Yield time (ns) and the targets of all drives of every process data frame that reached the segment."""
+def outputs(path: Path, answered: bool = False) -> Iterator[tuple[int, list[Targets]]]:
+    """Yield time (ns) and the targets of all drives of every process data frame that reached the segment.
+
+    `answered`: of those only that the segment answered, as they stand beside the inputs in the answers.
+    """
     for when, leaves, got in frames(path):
-        if not leaves:
+        if leaves is answered:
             for command, _, image, _ in datagrams(got):
                 if command == LRW:
                     yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
