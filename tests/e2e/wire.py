@@ -164,16 +164,22 @@ def datagrams(frame: bytes) -> Iterator[tuple[int, int, bytes, int]]:
         at += 12 + length
 
 
+def images(path: Path, leave: bool) -> Iterator[tuple[int, bytes]]:
+    """Yield time (ns) and process image of every frame that leaves the segment, or that reaches it."""
+    for when, leaves, got in frames(path):
+        if leaves is leave:
+            for command, _, image, _ in datagrams(got):
+                if command == LRW:
+                    yield when, image
+
+
 def outputs(path: Path, answered: bool = False) -> Iterator[tuple[int, list[Targets]]]:
     """Yield time (ns) and the targets of all drives of every process data frame that reached the segment.
 
     `answered`: of those only that the segment answered, as they stand beside the inputs in the answers.
     """
-    for when, leaves, got in frames(path):
-        if leaves is answered:
-            for command, _, image, _ in datagrams(got):
-                if command == LRW:
-                    yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
+    for when, image in images(path, leave=answered):
+        yield when, [Targets(*DRIVE.unpack_from(image, BOX_OUT + i * DRIVE.size)) for i in range(DRIVES)]
 
 
 @dataclass(frozen=True)
@@ -190,11 +196,8 @@ class Actual:
 def inputs(path: Path) -> Iterator[tuple[int, list[Actual]]]:
     """Yield time (ns) and what the drives show in every process data frame that leaves the segment."""
     first = BOX_OUT + DRIVES * DRIVE.size + BOX_IN
-    for when, leaves, got in frames(path):
-        if leaves:
-            for command, _, image, _ in datagrams(got):
-                if command == LRW:
-                    yield when, [Actual(*DRIVE.unpack_from(image, first + i * DRIVE.size)) for i in range(DRIVES)]
+    for when, image in images(path, leave=True):
+        yield when, [Actual(*DRIVE.unpack_from(image, first + i * DRIVE.size)) for i in range(DRIVES)]
 
 
 def main() -> None:
