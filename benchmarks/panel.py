@@ -44,14 +44,16 @@ from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_socket
 from websockets.typing import Origin
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from rtcp.api import Feed, connect
 from rtcp.launch.launcher import StartOptions, start
+from rtcp.panel.access import set_password
 from rtcp.panel.server import PAGES
+from tests.panel.cable import NEAR, Cable
+from tests.panel.conftest import BENT, FLAGS, PASSWORD, log_in
 
-FLAGS = ["--no-sandbox", "--disable-quic", "--disable-background-networking", "--disable-component-update",
-         "--disable-sync", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]  # fmt: skip
 WATCHED = ("/arm", "/jog", "/scope", "/segment", "/health")
-BENT = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
 REQUESTS_PER_S = 12_000
 _BATCH, _SENDERS = 100, 4
 HOLDING = "[data-live=state][data-state=holding]"
@@ -59,8 +61,8 @@ console = Console()
 
 
 @contextlib.contextmanager
-def panel() -> Iterator[tuple[psutil.Process, str]]:
-    command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", "0"]
+def panel(*arguments: str) -> Iterator[tuple[psutil.Process, str]]:
+    command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", "0", *arguments]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
@@ -71,8 +73,12 @@ def panel() -> Iterator[tuple[psutil.Process, str]]:
         process.wait()
 
 
+def visit(browser: Browser, url: str, width: int = 1600) -> Page:
+    return browser.new_context(base_url=url, viewport={"width": width, "height": 900}).new_page()
+
+
 def opened(browser: Browser, url: str, path: str, width: int = 1600) -> Page:
-    page = browser.new_context(base_url=url, viewport={"width": width, "height": 900}).new_page()
+    page = visit(browser, url, width)
     page.goto(path)
     page.wait_for_selector("[data-live=state][data-state]")
     return page
@@ -185,37 +191,57 @@ def moving(page: Page) -> None:
     page.get_by_role("button", name="Send", exact=True).click()
 
 
+def let_go(page: Page, begin: Callable[[Page], None]) -> None:
+    """Release the pad of a jog; press STOP in a move."""
+    if begin is jogging:
+        page.mouse.up()
+    else:
+        page.get_by_role("button", name="STOP not the emergency stop").click()
+
+
 LOSSES = ("button released", "focus lost", "page overloaded", "page closed", "browser killed", "panel killed")
+NETWORKS = {"network cut": (0.0, 1.0), "network 0.3 s slow": (0.15, 0.0), "network loses a fifth": (0.0, 0.2)}
+"""Delay, s, and loss of each way. The last two let a move go on: STOP is pressed as they begin, and the pad of a jog
+released where a fifth is lost."""
 
 
-def to_standstill(playwright: Playwright, loss: str, begin: Callable[[Page], None]) -> float:
+def to_standstill(
+    playwright: Playwright, loss: str, begin: Callable[[Page], None], cable: Cable | None = None
+) -> float:
     """Return the time from the loss until the arm stands, ms; not a number where it had not moved."""
     before = set(psutil.Process().children(recursive=True))
-    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+    chromium = cable.far(CHROMIUM, Path(os.environ["RTCP_STATE_DIR"])) if cable else CHROMIUM
+    browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
     own = set(psutil.Process().children(recursive=True)) - before
-    with panel() as (process, url), contextlib.closing(Feed()) as feed, connect("benchmark") as robot:
-        page = opened(browser, url, "/")
+    where = ("--host", NEAR) if cable else ()
+    with panel(*where) as (process, url), contextlib.closing(Feed()) as feed, connect("benchmark") as robot:
+        if cable:
+            cable.delay_s, cable.loss = 0.0, 0.0
+            page = visit(browser, url)
+            log_in(page)
+        else:
+            page = opened(browser, url, "/")
         begin(page)
         until = time.monotonic() + 10
         while robot.state.name != "MOVING" and time.monotonic() < until:
             time.sleep(0.01)
         time.sleep(0.6)
         at_ns = time.monotonic_ns()
-        if loss == "button released":
-            page.mouse.up() if begin is jogging else page.get_by_role(
-                "button", name="STOP not the emergency stop"
-            ).click()
+        if cable:
+            cable.delay_s, cable.loss = NETWORKS[loss]
+        if loss in ("button released", "network loses a fifth") or (loss == "network 0.3 s slow" and begin is moving):
+            let_go(page, begin)
         elif loss == "focus lost":
             page.evaluate("window.dispatchEvent(new Event('blur'))")
         elif loss == "page overloaded":
             page.evaluate("setTimeout(() => { const end = Date.now() + 3000; while (Date.now() < end) ; }, 0)")
         elif loss == "page closed":
             page.close()
-        else:
+        elif not cable:
             for one in own if loss == "browser killed" else {process}:
                 with contextlib.suppress(psutil.Error):
                     one.kill()
-        time.sleep(2.5)
+        time.sleep(3.5)  # longer than the lease of a jog on a shared host
         records, _ = feed.records()
         with contextlib.suppress(Error):
             browser.close()
@@ -260,10 +286,73 @@ def spread(values: list[float]) -> str:
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or sys.exit("no Chromium is installed")
 
 
+def losses_ms(playwright: Playwright, times: int) -> dict[str, list[float]]:
+    """Measure each loss that many times, jogging and moving."""
+    found: dict[str, list[float]] = {}
+
+    def measure(loss: str, begin: Callable[[Page], None], cable: Cable | None = None) -> None:
+        name = f"{loss}, {begin.__name__}"
+        found[name] = [to_standstill(playwright, loss, begin, cable) for _ in range(times)]
+        console.print(f"{name}: {found[name]}")
+
+    for loss in LOSSES:
+        measure(loss, jogging)
+        if loss != "focus lost":
+            measure(loss, moving)
+    if os.geteuid():
+        console.print("the network's rows want root: left out")
+        return found
+    set_password(Path(os.environ["RTCP_STATE_DIR"], "panel.json"), "operator", PASSWORD)
+    with contextlib.closing(Cable("rtcp-bench")) as cable:
+        for loss in NETWORKS:
+            measure(loss, jogging, cable)
+            measure(loss, moving, cable)
+    return found
+
+
+def costs(playwright: Playwright, rounds: int, seconds: float) -> dict[str, Any]:
+    """Measure the first page, one page, and what five viewers and a flood cost the cycle."""
+    found: dict[str, Any] = {}
+    with panel() as (process, url):
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        opened(browser, url, "/").context.close()
+        first = []
+        for _ in range(5):
+            began = time.monotonic()
+            page = opened(browser, url, "/")
+            first.append(time.monotonic() - began)
+            page.context.close()
+        page = opened(browser, url, "/arm")
+        time.sleep(2.0)
+        process.cpu_percent()
+        time.sleep(10.0)
+        found["cpu_percent"] = process.cpu_percent()
+        found["memory_mb"] = process.memory_info().rss / 1e6
+        found["first_page_s"] = first
+        ages = age_ms(page)
+        found["age_ms"] = [float(np.percentile(ages, part)) for part in (50, 99)]
+        page.context.close()
+        found["five pages"] = alternating(rounds, seconds, lambda: five_pages(browser, url))
+        found["five clients"] = alternating(rounds, seconds, lambda: five_clients(url))
+        counts: list[tuple[int, float]] = []
+
+        @contextlib.contextmanager
+        def counted() -> Iterator[None]:
+            began = time.monotonic()
+            with flood(url) as count:
+                yield
+            counts.append((count[0], time.monotonic() - began))
+
+        found["flood"] = alternating(rounds, seconds, counted)
+        found["requests_per_s"] = sum(one for one, _ in counts) / sum(took for _, took in counts)
+        browser.close()
+    return found
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=6.0, help="length of one round")
-    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=4, help="0: no costs")
     parser.add_argument("--losses", type=int, default=3, help="how often each loss is measured")
     parser.add_argument("--pictures", type=Path)
     parser.add_argument("--json", type=Path)
@@ -283,53 +372,14 @@ def main() -> int:
                 return 0
             # Viewers are other machines: what stands for them keeps off the CPU of the loop.
             os.sched_setaffinity(0, set(range(os.cpu_count() or 1)) - {running_cpu()} or {0})
-            with panel() as (process, url):
-                browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-                opened(browser, url, "/").context.close()
-                first = []
-                for _ in range(5):
-                    began = time.monotonic()
-                    page = opened(browser, url, "/")
-                    first.append(time.monotonic() - began)
-                    page.context.close()
-                page = opened(browser, url, "/arm")
-                time.sleep(2.0)
-                process.cpu_percent()
-                time.sleep(10.0)
-                found["cpu_percent"] = process.cpu_percent()
-                found["memory_mb"] = process.memory_info().rss / 1e6
-                found["first_page_s"] = first
-                ages = age_ms(page)
-                found["age_ms"] = [float(np.percentile(ages, part)) for part in (50, 99)]
-                page.context.close()
-                found["five pages"] = alternating(given.rounds, given.seconds, lambda: five_pages(browser, url))
-                found["five clients"] = alternating(given.rounds, given.seconds, lambda: five_clients(url))
-                counts: list[tuple[int, float]] = []
-
-                @contextlib.contextmanager
-                def counted() -> Iterator[None]:
-                    began = time.monotonic()
-                    with flood(url) as count:
-                        yield
-                    counts.append((count[0], time.monotonic() - began))
-
-                found["flood"] = alternating(given.rounds, given.seconds, counted)
-                found["requests_per_s"] = sum(one for one, _ in counts) / sum(took for _, took in counts)
-                browser.close()
-            _show_costs(found)
-            losses = {}
-            for loss in LOSSES if given.losses else ():
-                for begin in (jogging, moving):
-                    if begin is moving and loss == "focus lost":
-                        continue
-                    measured = [to_standstill(playwright, loss, begin) for _ in range(given.losses)]
-                    losses[f"{loss}, {begin.__name__}"] = measured
-                    console.print(f"{loss}, {begin.__name__}: {measured}")
-            found["losses_ms"] = losses
+            if given.rounds:
+                found |= costs(playwright, given.rounds, given.seconds)
+                _show_costs(found)
+            found["losses_ms"] = losses_ms(playwright, given.losses) if given.losses else {}
         finally:
             running.stop(lambda sentence: None)
     rows = Table("lost", "stands, ms")
-    for name, values in losses.items():
+    for name, values in found["losses_ms"].items():
         rows.add_row(name, spread(values))
     console.print(rows)
     if given.json:

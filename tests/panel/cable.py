@@ -15,6 +15,7 @@ import struct
 import subprocess
 import threading
 import time
+from pathlib import Path
 
 NEAR, FAR = "10.137.0.1", "10.137.0.2"
 _NEAR_END, _FAR_END = "rtcp-near", "rtcp-far"
@@ -46,6 +47,13 @@ class Cable:
             one.setblocking(False)
         self._thread = threading.Thread(target=self._carry, daemon=True)
         self._thread.start()
+
+    def far(self, program: str, directory: Path) -> Path:
+        """Write a script that runs a program at the far end; return its path."""
+        script = directory / "far"
+        script.write_text(f'#!/bin/sh\nexec ip netns exec {self._namespace} {program} "$@"\n')
+        script.chmod(0o700)
+        return script
 
     def cut(self) -> None:
         """Let nothing through any more."""

@@ -27,6 +27,7 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
+PASSWORD = "correct horse"
 
 
 @contextlib.contextmanager
@@ -109,6 +110,15 @@ def show(page: Page, path: str) -> Page:
     page.goto(path)
     page.wait_for_selector("[data-live=state][data-state]:not([data-state='no connection'])")
     return page
+
+
+def log_in(page: Page) -> None:
+    """Get past the panel's door."""
+    page.goto("/")
+    page.get_by_label("Your name").fill("Ada")
+    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_role("button", name="Log in").click()
+    page.wait_for_selector("[data-live=state][data-state]")
 
 
 def until(met: Callable[[], Any], what: str, patience_s: float = 20.0) -> Any:

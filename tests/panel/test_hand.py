@@ -9,8 +9,6 @@ import contextlib
 import os
 import re
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,10 +19,11 @@ import pytest
 from playwright.sync_api import Browser, BrowserType, Error, Page, expect
 
 from rtcp.api import Feed
+from rtcp.panel import access
 from rtcp.panel.live import JOG_S, PRESENCE_S
 from tests.e2e.conftest import Platform
 from tests.panel.cable import NEAR, Cable
-from tests.panel.conftest import CHROMIUM, FLAGS, begun, ready, show, until, visitor
+from tests.panel.conftest import CHROMIUM, FLAGS, PASSWORD, begun, log_in, ready, show, until, visitor
 
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
 NAMESPACE = f"rtcp-net-{os.getpid()}"
@@ -298,45 +297,48 @@ def cable(platform: Platform) -> Iterator[Cable]:
         Path(platform.environment["RTCP_STATE_DIR"], "panel.json").unlink(missing_ok=True)
 
 
-@contextlib.contextmanager
-def remote(chromium: BrowserType, directory: Path) -> Iterator[Browser]:
-    """Chromium in that namespace."""
-    wrapper = directory / "chromium"
-    wrapper.write_text(f'#!/bin/sh\nexec ip netns exec {NAMESPACE} {CHROMIUM} "$@"\n')
-    wrapper.chmod(0o700)
-    browser = chromium.launch(executable_path=wrapper, args=FLAGS)
-    yield browser
-    with contextlib.suppress(Error):
-        browser.close()
-
-
-def log_in(page: Page) -> None:
-    page.goto("/")
-    page.get_by_label("Your name").fill("Ada")
-    page.get_by_label("Password").fill("correct horse")
-    page.get_by_role("button", name="Log in").click()
-    page.wait_for_selector("[data-live=state][data-state]")
-
-
 @pytest.fixture
 def far_page(chromium: BrowserType, platform: Platform, cable: Cable, tmp_path: Path) -> Iterator[Page]:
     """A page at the far end of the cable, logged in; the platform holds."""
-    set_password(platform)
-    with begun(platform, "--host", NEAR) as (_, url), remote(chromium, tmp_path) as browser:
+    access.set_password(Path(platform.environment["RTCP_STATE_DIR"], "panel.json"), "operator", PASSWORD)
+    with begun(platform, "--host", NEAR) as (_, url):
+        browser = chromium.launch(executable_path=cable.far(CHROMIUM, tmp_path), args=FLAGS)
         ready(platform)
         with contextlib.suppress(Error), visitor(browser, url) as page:
             log_in(page)
             yield page
+        with contextlib.suppress(Error):
+            browser.close()
 
 
-@pytest.mark.parametrize("motion", ["jog", "move"])
-def test_a_cut_network_stops_the_arm(platform: Platform, cable: Cable, far_page: Page, motion: str) -> None:
+@pytest.mark.parametrize(("motion", "how"), [("jog", "cut"), ("move", "cut"), ("jog", "slow")])
+def test_a_network_that_fails_stops_the_arm(
+    platform: Platform, cable: Cable, far_page: Page, motion: str, how: str
+) -> None:
     begin(far_page, platform, motion)
     with contextlib.closing(Feed(platform.directory)) as feed:
         now = time.monotonic_ns()
-        cable.cut()
+        if how == "cut":
+            cable.cut()
+        else:
+            cable.delay_s = 0.15
         took = moved_after(platform, feed, now)
     assert took < (JOG_S if motion == "jog" else PRESENCE_S) + SLACK_S
+
+
+@pytest.mark.parametrize(("delay_s", "loss"), [(0.15, 0.0), (0.0, 0.2)])
+def test_stop_ends_a_move_over_a_bad_network(
+    platform: Platform, cable: Cable, far_page: Page, delay_s: float, loss: float
+) -> None:
+    begin(far_page, platform, "move")
+    cable.delay_s, cable.loss = delay_s, loss
+    time.sleep(1.5)
+    assert loss or platform.status()["state"] == "moving"
+    with contextlib.closing(Feed(platform.directory)) as feed:
+        now = time.monotonic_ns()
+        far_page.get_by_role("button", name="STOP not the emergency stop").click()
+        # Where STOP itself is lost, all that the page sends after it waits for it: the arm stops unheard.
+        assert moved_after(platform, feed, now) < PRESENCE_S + SLACK_S
 
 
 def test_a_slow_network_does_not_jog(platform: Platform, cable: Cable, far_page: Page) -> None:
@@ -364,11 +366,3 @@ def test_a_lossy_network_never_jogs_on(platform: Platform, cable: Cable, far_pag
             now = time.monotonic_ns()
             far_page.mouse.up()
             assert moved_after(platform, feed, now) < JOG_S + SLACK_S
-
-
-def set_password(platform: Platform) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "rtcp.cli", "panel", "password"],
-        input="correct horse\n", text=True, env=platform.environment, capture_output=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
