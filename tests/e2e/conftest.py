@@ -20,8 +20,9 @@ import pytest
 from rtcp.config.find import default_config
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.runtime_directory import control_socket
+from rtcp.ipc.runtime_directory import control_socket, segment_control
 from rtcp.ipc.session import read_processes
+from rtcp.virtual.faults.control import SegmentClient
 
 HERE = Path(__file__).parent
 WIRE = HERE / "wire.py"
@@ -118,11 +119,13 @@ class Platform:
         return max((int(event["number"]) for event in self.call("events")["events"]), default=0)
 
     def restore(self) -> None:
-        """Start what a test has ended, leave a fault, and bring the arm to 0 in mode joint, csp, disabled."""
+        """Start what a test has ended, undo its faults, and bring the arm to 0 in mode joint, csp, disabled."""
         self.end_commands()
         if not all(lives(pid) for pid in self.pids().values()):
             self.rtcp("stop", check=None)
             self.rtcp("start", "--detach")
+        with SegmentClient(segment_control(self.directory)) as segment:
+            segment.clear()
         if self.status()["state"] == "emergency_stop":
             # After an emergency stop the slaves return to OP only after a reset.
             self.call("reset")

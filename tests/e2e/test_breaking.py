@@ -161,9 +161,9 @@ def test_one_slave_that_is_lost_stops_the_joints_of_the_others(running: Platform
         assert len(sent) > 100
         assert {drive.controlword for targets in sent for drive in targets} == {0x0000}
         assert {(drive.velocity, drive.torque) for targets in sent for drive in targets} == {(0, 0)}
-        assert "working counter" in running.rtcp("disable", check=5).stderr
+        while "working counter" not in (said := running.rtcp("disable", check=5).stderr):
+            assert "no frame returns" in said  # the newest cycle is one of those
         assert running.rtcp("reset", check=5).stderr
-        segment.clear()
 
 
 def test_an_object_is_not_written_while_drives_have_torque(running: Platform) -> None:

@@ -150,7 +150,6 @@ def ready(platform: Platform) -> None:
             platform.call("mode", name="joint")
             platform.call("move_joints", q=BENT)
             return
-    platform.rtcp("segment", "clear", check=None)
     platform.restore()
     platform.call("enable")
     platform.call("move_joints", q=BENT)
