@@ -27,7 +27,7 @@ FLAGS = [
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 ]
-PASSWORD = "correct horse"
+PASSWORD, VIEWERS_PASSWORD = "correct horse", "battery staple"
 
 
 @contextlib.contextmanager
@@ -112,11 +112,11 @@ def show(page: Page, path: str) -> Page:
     return page
 
 
-def log_in(page: Page) -> None:
+def log_in(page: Page, password: str = PASSWORD) -> None:
     """Get past the panel's door."""
     page.goto("/")
     page.get_by_label("Your name").fill("Ada")
-    page.get_by_label("Password").fill(PASSWORD)
+    page.get_by_label("Password").fill(password)
     page.get_by_role("button", name="Log in").click()
     page.wait_for_selector("[data-live=state][data-state]")
 

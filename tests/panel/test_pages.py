@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 import re
 import shutil
 from collections.abc import Iterator
@@ -19,6 +21,7 @@ from tests.e2e.conftest import Platform
 from tests.panel.conftest import BENT, begun, show, until, visitor
 
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
+REPOSITORY = Path(__file__).parents[2]
 DRIVE_IDENTITY = re.compile(r"vendor_id: (\w+)[\s\S]*product_id: (\w+)")
 
 
@@ -31,9 +34,15 @@ def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platfor
     page.get_by_role("button", name="Check this host").click()
     expect(page.locator("pre")).to_contain_text(re.compile("scheduler|kernel|CPU", re.I))
     page.get_by_label("Bus").select_option("virtual")
+    page.get_by_label("Mode", exact=True).select_option("cartesian")
+    page.get_by_label("Cycle, us").fill("4000")
     page.get_by_role("button", name="Start", exact=True).click()
     expect(page.locator("[data-live=state]")).to_have_text("ready", timeout=30_000)
-    assert platform.status()["bus"] == "virtual"
+    found = platform.status()
+    assert (found["bus"], found["control_mode"], found["cycle_ns"]) == ("virtual", "cartesian", 4_000_000)
+    page.get_by_label("Control mode").select_option("joint")
+    page.get_by_role("button", name="Set control mode").click()
+    until(lambda: platform.status()["control_mode"] == "joint", "mode joint")
     expect(page.get_by_role("button", name="Start", exact=True)).to_be_disabled()
     page.get_by_role("button", name="Scan the bus").click()
     expect(page.get_by_role("row")).to_have_count(8)
@@ -49,6 +58,11 @@ def test_a_platform_is_started_enabled_and_stopped(page: Page, platform: Platfor
     until(lambda: platform.status()["drive_mode"] == "csp", "csp")
     page.get_by_role("button", name="Enable").click()
     until(lambda: platform.status()["state"] == "holding", "holding")
+    platform.background("move", "1.5", "0", "0", "0", "0", "0", "--speed", "0.1")
+    platform.until_moving()
+    page.get_by_role("button", name="Halt").click()
+    until(lambda: platform.status()["state"] == "holding", "halted")
+    platform.end_commands()
     page.get_by_role("button", name="Disable").click()
     until(lambda: platform.status()["state"] == "ready", "ready")
     page.get_by_role("button", name="Stop the platform").click()
@@ -79,6 +93,33 @@ def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platf
     expect(page.locator(".arm-view")).to_have_attribute("data-near", "0.00")
     holding.call("move_joints", q=[0.0] * 6)
     expect(page.locator(".arm-view")).to_have_attribute("data-near", "1.00")
+    expect(page.locator(".arm-view")).to_have_attribute("data-trail", re.compile(r"^\d{2}"))
+    limits = holding.call("limits")["limits"]
+    boxes = [limits["box"], *limits["keep_out"].values()]
+    shown_boxes = json.loads(page.locator(".arm-view").get_attribute("data-boxes") or "")
+    assert [(one["min"], one["max"]) for one, _ in shown_boxes] == [(one["min"], one["max"]) for one in boxes]
+    assert [is_kept_out for _, is_kept_out in shown_boxes] == [False, True, True]
+
+
+def test_the_view_of_the_arm_is_turned_by_keys_and_kept(page: Page, holding: Platform) -> None:
+    def camera() -> list[float]:
+        place: list[float] = page.evaluate("JSON.parse(sessionStorage.getItem('rtcp-camera'))?.at ?? []")
+        return place
+
+    show(page, "/arm")
+    canvas = page.locator(".arm-view canvas")
+    canvas.press("ArrowUp")
+    above = camera()
+    canvas.press("ArrowLeft")
+    turned = camera()
+    assert turned[2] == pytest.approx(above[2])
+    assert math.hypot(*turned[:2]) == pytest.approx(math.hypot(*above[:2]))
+    assert turned[0] != pytest.approx(above[0], abs=0.05)
+    show(page, "/arm")
+    canvas.press("ArrowRight")
+    assert camera() == pytest.approx(above)
+    canvas.press("+")
+    assert math.dist(camera(), [0, 0, 0.5]) < math.dist(above, [0, 0, 0.5])
 
 
 def test_a_target_is_planned_shown_and_sent(page: Page, holding: Platform) -> None:
@@ -106,6 +147,11 @@ def test_a_target_out_of_range_or_reach_is_refused_with_the_limit(page: Page, ho
     page.get_by_label("x m").fill("5")
     page.get_by_role("button", name="Plan").click()
     expect(page.get_by_text(re.compile("No: the pose cannot be reached.* m"))).to_be_visible()
+    page.get_by_label("Target").select_option("joints")
+    page.get_by_label("joint1, rad").fill("3")
+    page.get_by_label("joint2, rad").fill("0.1")
+    page.get_by_role("button", name="Plan").click()
+    expect(page.get_by_text(re.compile("No: .*keep-out box user"))).to_be_visible()
     expect(page.get_by_role("button", name="Send", exact=True)).to_be_disabled()
 
 
@@ -208,11 +254,18 @@ def test_a_program_is_checked_run_and_stopped(page: Page, holding: Platform, tmp
     page.get_by_label("Motion file").fill(str(tmp_path / "none.yaml"))
     page.get_by_role("button", name="Check", exact=True).click()
     expect(page.get_by_text(re.compile(r"No: .*none\.yaml"))).to_be_visible()
+    beyond = tmp_path / "beyond.yaml"
+    beyond.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 9, q: {[3.3, *BENT[1:]]}}}\n")
+    page.get_by_label("Motion file").fill(str(beyond))
+    page.get_by_role("button", name="Run").click()
+    expect(page.get_by_text(re.compile("No: .*joint1.*3.1 rad"))).to_be_visible()
     page.get_by_label("Motion file").fill(str(program))
     page.get_by_role("button", name="Check", exact=True).click()
     expect(page.get_by_text(re.compile("It can be run"))).to_be_visible()
     page.get_by_role("button", name="Run").click()
+    expect(page.get_by_label("Progress")).to_have_attribute("value", re.compile(r"^0\.[1-9]"))
     expect(page.get_by_text("Done")).to_be_visible()
+    expect(page.get_by_label("Progress")).to_have_attribute("value", "1")
     assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.2, abs=1e-3)
     page.get_by_role("button", name="Run").click()
     holding.until(lambda found: found["state"] == "moving", "moving")
@@ -248,6 +301,20 @@ def test_the_scope_shows_and_keeps_what_moves(page: Page, holding: Platform, tmp
     assert at_trigger[2] == pytest.approx(0.05, abs=2e-3)
     assert rows[0][0] == pytest.approx(-0.2, abs=0.01)
     assert max(one[3] for one in rows) > 0.1
+    picture = page.get_by_role("group", name="Signals over time")
+    picture.press("Enter")
+    picture.press("Shift+ArrowRight")
+    expect(page.get_by_text(re.compile(r"^A 0\.35"))).to_be_visible()
+    picture.click(position={"x": 300, "y": 100})
+    expect(page.get_by_text(re.compile(r"^A 0\.35.*, B .* s, B - A .* rad|^A 0\.35.*B - A"))).to_be_visible()
+    for _ in range(2):
+        picture.press("+")
+    with page.expect_download() as download:
+        page.get_by_role("button", name="CSV").click()
+    download.value.save_as(tmp_path / "zoomed.csv")
+    zoomed = (tmp_path / "zoomed.csv").read_text().splitlines()
+    assert len(lines) / 6 < len(zoomed) < len(lines) / 2
+    assert set(zoomed) < {head, *lines}
 
 
 def test_faults_of_the_segment_are_made_and_objects_read(page: Page, holding: Platform) -> None:
@@ -287,7 +354,8 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
         expect(page.get_by_label(f"Histogram: {name}, us").locator("canvas")).to_be_visible()
     expect(page.get_by_role("row", name="wake-up")).to_contain_text(re.compile(r"\d+\.\d"))
     expect(page.get_by_role("row", name="enabled").first).to_be_visible()
-    holding.rtcp("segment", "fault", "power", "slave=3", "--lasts", "0.5")
+    expect(page.get_by_text(re.compile(r"^\d+ of \d+ cycles skipped"))).to_be_visible()
+    holding.rtcp("segment", "fault", "drive", "slave=3", "error=over-current")
     holding.until(lambda found: found["state"] == "fault", "fault")
     recorded = Path(holding.environment["RTCP_STATE_DIR"], "faults")
     until(lambda: list(recorded.glob("fault-*.mcap")), "the fault is recorded")
@@ -301,6 +369,24 @@ def test_health_draws_the_cycle_and_serves_it_to_prometheus(page: Page, holding:
     assert {one.labels["state"] for one in found["rtcp_state"].samples if one.value} == {"fault"}
     assert found["rtcp_cycles"].samples[0].value > 0
     assert len(found["rtcp_joint_position_radians"].samples) == 6
+    drawn = set(re.findall(r"\brtcp_\w+", (REPOSITORY / "config/grafana/rtcp.json").read_text()))
+    assert drawn
+    assert drawn <= {sample.name for family in found.values() for sample in family.samples}
+    show(page, "/segment")
+    expect(page.get_by_text(re.compile("slave 3 .*sent emergency 0x2310: continuous over-current"))).to_be_visible()
+    expect(page.get_by_text(re.compile("Distributed clocks locked, offset -?\\d"))).to_be_visible()
+    show(page, "/")
+    page.get_by_role("button", name="Reset").click()
+    holding.until(lambda now: now["state"] == "ready", "reset")
+    show(page, "/segment")
+    page.get_by_label("Index, hex").fill("6065")
+    page.get_by_label("Bytes, hex").fill("d1070000")
+    page.get_by_role("button", name="Write").click()
+    expect(page.get_by_text("Written")).to_be_visible()
+    assert holding.call("sdo_read", slave=2, index=0x6065, subindex=0)["hex"] == "d1070000"
+    page.get_by_label("Bytes, hex").fill("d0070000")
+    page.get_by_role("button", name="Write").click()
+    until(lambda: holding.call("sdo_read", slave=2, index=0x6065, subindex=0)["hex"] == "d0070000", "as it was")
 
 
 FOCUS = """() => {
@@ -375,11 +461,12 @@ def test_names_are_text_and_temperatures_are_shown_where_they_are_mapped(browser
     with begun(hostile) as (_, url), visitor(browser, url) as page:
         dialogs: list[str] = []
         page.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
-        for path in ("/targets", "/jog", "/limits", "/health", "/segment"):
+        for path in PAGES:
             show(page, path)
             expect(page.get_by_role("heading", level=1)).to_be_visible()
             page.wait_for_timeout(300)
             assert page.locator("img[src=x]").count() == 0
+        show(page, "/segment")
         expect(page.get_by_role("cell", name=f"drive2 {HOSTILE}")).to_be_visible()
         show(page, "/arm")
         expect(page.get_by_role("rowheader", name=f"joint2 {HOSTILE}")).to_be_visible()

@@ -60,7 +60,7 @@ function line(color, count) {
 }
 
 export default {
-  template: `<div class="arm-view" role="img" aria-label="The arm in space"><canvas></canvas>
+  template: `<div class="arm-view" role="group" aria-label="The arm in space"><canvas tabindex="0" aria-label="Arrows turn the view, + and - zoom" @keydown="keys"></canvas>
     <p v-if="problem" class="arm-problem">{{ problem }}</p></div>`,
   props: { links: Array },
   data() { return { problem: "" }; },
@@ -168,6 +168,22 @@ export default {
       const { path, duration_s, began } = this.plan;
       const part = Math.min(1, ((performance.now() - began) / 1000 % (duration_s + 1)) / duration_s);
       this.ghost.set(path[Math.round(part * (path.length - 1))]);
+    },
+    keys(event) {
+      const turn = { ArrowLeft: [0.1, 0], ArrowRight: [-0.1, 0], ArrowUp: [0, 0.1], ArrowDown: [0, -0.1] }[event.key];
+      const zoom = { "+": 0.8, "-": 1.25 }[event.key];
+      if ((!turn && !zoom) || event.ctrlKey || event.altKey || event.metaKey || !this.controls) return;
+      event.preventDefault();
+      const seen = this.camera.position.clone().sub(this.controls.target), up = this.camera.up;
+      if (zoom) seen.multiplyScalar(zoom);
+      else {
+        seen.applyAxisAngle(up, turn[0]);
+        // Not over the top: what is above stays above.
+        const polar = seen.angleTo(up), wanted = Math.min(Math.PI - 0.05, Math.max(0.05, polar - turn[1]));
+        seen.applyAxisAngle(up.clone().cross(seen).normalize(), wanted - polar);
+      }
+      this.camera.position.copy(this.controls.target).add(seen);
+      this.controls.update();
     },
     draw() { this.renderer?.render(this.scene, this.camera); },
     resize() {

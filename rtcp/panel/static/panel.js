@@ -190,7 +190,8 @@ window.rtcp = (() => {
     if (event.key === " " || event.key === "Enter") end(padOf(event.target));
     end(event.code);
   });
-  for (const name of ["blur", "pagehide", "freeze"]) window.addEventListener(name, release);
+  for (const name of ["blur", "pagehide"]) window.addEventListener(name, release);
+  document.addEventListener("freeze", release);
   document.addEventListener("visibilitychange", () => { if (document.hidden) release(); });
   document.addEventListener("focusout", (event) => end(padOf(event.target)));
 

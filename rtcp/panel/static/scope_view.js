@@ -1,10 +1,10 @@
-// The picture of the scope: zoom by wheel or slider, two cursors by clicks, CSV of what is shown.
+// The picture of the scope: zoom by wheel, slider or keys, two cursors by clicks or keys, CSV of what is shown.
 import { echarts } from "nicegui-echart";
 
 export default {
-  template: `<div><div class="scope" role="img" aria-label="Signals over time"></div><p role="status">{{ cursors }}</p></div>`,
+  template: `<div><div class="scope" role="group" tabindex="0" aria-label="Signals over time" @keydown="keys"></div><p role="status">{{ cursors }}</p></div>`,
   props: { names: Object },
-  data() { return { cursors: "Click into the picture to set cursors A and B." }; },
+  data() { return { cursors: "Click into the picture to set cursors A and B. Keys: Enter sets one, arrows move it, + and - zoom." }; },
   mounted() {
     this.chart = echarts.init(this.$el.firstChild, null, { renderer: "canvas" });
     this.marks = [];
@@ -35,6 +35,24 @@ export default {
       }, Math.max(0, this.free_at - performance.now()));
     },
     pause(value) { this.paused = value; },
+    shown() {
+      const { t } = this.block, { start = 0, end = 100 } = this.chart.getOption().dataZoom[0];
+      return [start, end].map((percent) => t[0] + (percent / 100) * (t.at(-1) - t[0]));
+    },
+    keys(event) {
+      if (!this.block || event.ctrlKey || event.altKey || event.metaKey) return;
+      const [from, to] = this.shown(), middle = (from + to) / 2, last = this.marks.length - 1;
+      const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key], wider = { "+": 0.5, "-": 2 }[event.key];
+      if (event.key === "Enter") this.marks = [...this.marks, middle].slice(-2);
+      else if (step && this.marks.length) this.marks[last] = Math.min(to, Math.max(from, this.marks[last] + (step * (to - from)) / (event.shiftKey ? 20 : 200)));
+      else if (wider) {
+        const half = (wider * (to - from)) / 2, [first, end] = [this.block.t[0], this.block.t.at(-1)];
+        const about = Math.min(to, Math.max(from, this.marks[last] ?? middle));
+        this.chart.dispatchAction({ type: "dataZoom", startValue: Math.max(first, about - half), endValue: Math.min(end, about + half) });
+      } else return;
+      event.preventDefault();
+      this.draw();
+    },
     draw() {
       const block = this.block;
       if (!block) return;
@@ -68,7 +86,9 @@ export default {
     csv() {
       if (!this.block) return;
       const { t, y, signals } = this.block;
-      const lines = [["Time", ...signals].join(","), ...t.map((one, k) => [one, ...y.map((line) => line[k])].join(","))];
+      const [from, to] = this.shown();
+      const rows = t.map((one, k) => [one, ...y.map((line) => line[k])]).filter(([one]) => from <= one && one <= to);
+      const lines = [["Time", ...signals], ...rows].map((row) => row.join(","));
       const link = Object.assign(document.createElement("a"), { download: "scope.csv",
         href: URL.createObjectURL(new Blob([lines.join("\n") + "\n"], { type: "text/csv" })) });
       link.click();
