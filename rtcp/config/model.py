@@ -461,7 +461,7 @@ class RecordingConfig:
     formats: tuple[RecordingFormat, ...] = ()
     """Formats; none: the ending of `out`, or mcap."""
     signals: tuple[str, ...] = ()
-    """Fields of a cycle record or patterns (`*_position`); none: all, or for CSV those of its usual columns."""
+    """Fields of a cycle record or patterns (`*_position`); none: all. CSV has its own columns, then these."""
     every: Annotated[int, Ge(1), Le(1_000_000)] = 1
     """Every Nth cycle."""
     seconds: Positive | None = None

@@ -187,17 +187,17 @@ class McapWriter:
 
 
 class CsvWriter:
-    """A recording as CSV, in the source's columns, or those that were chosen.
+    """A recording as CSV.
 
     Args:
         joints: how many.
-        signals: of the records; none: the source's.
+        names: of the records' fields, in the order of the columns; none: those of the source.
     """
 
-    def __init__(self, joints: int, signals: Sequence[str]) -> None:
+    def __init__(self, joints: int, names: Sequence[str] = ()) -> None:
         self.path: Path | None = None
         self._joints = joints
-        self._names = fields_of(signals) if signals else list(CSV_NAMES)
+        self._names = list(names or CSV_NAMES)
         self._began_ns: int | None = None
 
     def open(self, path: Path) -> None:
@@ -270,10 +270,11 @@ class Recorder:
             message = f"keep: found {options.keep} without max_file_mb or max_file_seconds, which begin new files"
             raise RtcpError("invalid", message, "keep_without_limit", {"keep": options.keep})
         self._stem, formats = _place(options)
+        more = [one for one in fields_of(options.signals) if one not in CSV_NAMES] if options.signals else []
         self._writers: dict[str, Writer] = {
             name: McapWriter(self._channels, config)
             if name == "mcap"
-            else CsvWriter(len(config.joints), options.signals)
+            else CsvWriter(len(config.joints), [*CSV_NAMES, *more])
             for name in formats
         }
         me = identify(os.getpid())

@@ -1,4 +1,4 @@
-"""`rtcp live` on a whole platform, watched by a real client of its protocol."""
+"""`rtcp live` on a whole platform, watched by a client of its protocol, of our own (tests/viewer.py)."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from rtcp.api.feed import Records
 from rtcp.config import default_config, load
 from rtcp.ipc.layout import PER_JOINT
 from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_type, write
-from rtcp.telemetry.channels import Channels
+from rtcp.telemetry.channels import Channels, fields_of
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
 
@@ -50,7 +50,7 @@ def mcap(path: Path, records: Records | None = None, signals: tuple[str, ...] = 
 
 
 def csv(path: Path, records: Records | None = None, signals: tuple[str, ...] = ()) -> Path:
-    writer = CsvWriter(6, signals)
+    writer = CsvWriter(6, fields_of(signals) if signals else ())
     writer.open(path)
     given = cycles() if records is None else records
     writer.write(given, given)

@@ -221,10 +221,13 @@ def test_a_full_disk_ends_the_recording_with_a_message(loop: Loop) -> None:
     assert len(whole_cycles(path)) > 50
 
 
-def test_a_file_that_is_removed_ends_the_recording(loop: Loop) -> None:
-    recorder = record(loop)
+@pytest.mark.parametrize("what", ["file", "directory"])
+def test_a_file_or_directory_that_is_removed_ends_the_recording(loop: Loop, what: str) -> None:
+    directory = loop.directory / "gone"
+    directory.mkdir()
+    recorder = record(loop, out=str(directory))
     (path,) = map(Path, begun(recorder)["recording"]["files"])
-    path.unlink()
+    path.unlink() if what == "file" else shutil.rmtree(directory)
     while recorder.poll() is None:
         loop.publish(10)
         time.sleep(0.02)
@@ -273,7 +276,8 @@ def test_chosen_signals_of_each_tenth_cycle(loop: Loop) -> None:
     assert not hasattr(first, "actual_torque")
     rows = list(csv.reader(csv_file.open()))
     assert len(rows) == 11
-    assert "J6_pos" in rows[0]
+    source = [f"J{axis}_{name}" for name in ("pos", "vel", "tor", "tpos") for axis in range(1, 7)]
+    assert rows[0][:28] == ["Time", *source, "number", "time_ns", "J1_commanded_position"]
     assert int(rows[1][rows[0].index("time_ns")]) == first.time_ns
 
 
