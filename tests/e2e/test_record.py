@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.session import read_processes
+from rtcp.telemetry.reading import read
 
 from .conftest import Platform
 from .wire import COUNTS_PER_RAD, inputs, outputs
@@ -99,6 +101,29 @@ def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -
     (killed,) = (one for one in recordings(enabled) if one["pid"] == running["pid"])
     assert "ended from outside" in killed["problem"]
     assert enabled.rtcp("record", "stop").stdout == "nothing is being recorded\n"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounting wants root")
+def test_a_full_disk_ends_the_recording_and_not_the_move(enabled: Platform, tmp_path: Path) -> None:
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", tmp_path], check=True)
+    try:
+        moving = enabled.background("move", "1.2", "0", "0", "0", "0", "0", "--speed", "0.15")
+        enabled.until_moving()
+        enabled.call("record_start", out=str(tmp_path), formats=["mcap", "csv"], reserve_mb=0)
+
+        def ended() -> dict[str, Any]:
+            return next(one for one in enabled.call("record_status")["recordings"] if str(tmp_path) in one["files"][0])
+
+        enabled.until(lambda _: not ended()["running"], "the end of the recording")
+        assert ended()["problem"].endswith("cannot be written: No space left on device")
+        assert enabled.status()["state"] == "moving"
+        moving.communicate()
+        assert moving.returncode == 0
+        assert enabled.status()["joints"]["actual_position"][0] == pytest.approx(1.2, abs=1e-3)
+        written = next(tmp_path.glob("*.mcap"))
+        assert len(read(written, ["wkc"]).seconds) > 50
+    finally:
+        subprocess.run(["umount", "--lazy", tmp_path], check=True)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserType, Error, Page, expect
 
 from kinematics.forward import forward
@@ -312,9 +313,13 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
     kept = Path(holding.environment["RTCP_STATE_DIR"], "panel.json")
     access.set_password(kept, "operator", PASSWORD)
     access.set_password(kept, "viewer", VIEWERS_PASSWORD)
+    holding.call("move_gripper", open=True)
     since, limits = holding.last_event(), holding.call("limits")
     try:
         with begun(holding) as (_, url), visitor(browser, url) as page:
+            page.goto("/")
+            found_by_axe = Axe().run(page).response["violations"]
+            assert [one["id"] for one in found_by_axe if one["impact"] in ("serious", "critical")] == []
             log_in(page, VIEWERS_PASSWORD)
             refused = page.get_by_text("Ada may look, and not command: log in as an operator")
             for path, name in (
@@ -400,6 +405,13 @@ def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, ho
         expect(second.locator("#operator")).to_have_text("You operate the arm")
         expect(first.get_by_text("has taken over the arm")).to_be_visible()
         holding.until(lambda found: found["state"] == "holding", "what moved has stopped")
+        # Without an answer it changes hands after 10 s.
+        show(first, "/")
+        asked = time.monotonic()
+        first.get_by_role("button", name="Disable").click()
+        first.get_by_role("button", name="Ask to take over").click()
+        expect(first.locator("#operator")).to_have_text("You operate the arm", timeout=20_000)
+        assert time.monotonic() - asked > 9.0
 
 
 # -- over a network -------------------------------------------------------------------------------------------------
