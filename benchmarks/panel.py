@@ -390,8 +390,9 @@ def judge(found: dict[str, Any]) -> int:
 
     def row(name: str, shown: str, value: float, aim: float) -> None:
         nonlocal missed
-        missed += not value <= aim  # nor a number that is none
-        rows.add_row(name, shown, f"{aim:g}", "met" if value <= aim else "missed")
+        is_met = value <= aim  # False for NaN, too
+        missed += not is_met
+        rows.add_row(name, shown, f"{aim:g}", "met" if is_met else "missed")
 
     if "first_page_s" in found:
         row("first page, s", spread(found["first_page_s"]), statistics.median(found["first_page_s"]), 2.0)

@@ -103,7 +103,7 @@ def test_a_killed_recorder_is_reported_and_the_arm_moves_on(enabled: Platform) -
     assert enabled.rtcp("record", "stop").stdout == "nothing is being recorded\n"
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="mounting wants root")
+@pytest.mark.skipif(os.geteuid() != 0, reason="a mount needs root")
 def test_a_full_disk_ends_the_recording_and_not_the_move(enabled: Platform, tmp_path: Path) -> None:
     subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", tmp_path], check=True)
     try:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserType, Error, Page, sync_playwright
 
 from rtcp.api import RtcpError
@@ -119,6 +120,15 @@ def log_in(page: Page, password: str = PASSWORD) -> None:
     page.get_by_label("Password").fill(password)
     page.get_by_role("button", name="Log in").click()
     page.wait_for_selector("[data-live=state][data-state]")
+
+
+def barriers(page: Page) -> dict[str, list[str]]:
+    """Return what axe-core calls serious or critical, by its rule."""
+    return {
+        one["id"]: [f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in one["nodes"][:3]]
+        for one in Axe().run(page).response["violations"]
+        if one["impact"] in ("serious", "critical")
+    }
 
 
 def until(met: Callable[[], Any], what: str, patience_s: float = 20.0) -> Any:

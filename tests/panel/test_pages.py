@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from mcap.reader import make_reader
 from playwright.sync_api import Browser, Page, expect
 from prometheus_client.parser import text_string_to_metric_families
@@ -18,7 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from rtcp.panel.server import PAGES
 from rtcp.virtual.faults.registry import installed
 from tests.e2e.conftest import Platform
-from tests.panel.conftest import BENT, begun, show, until, visitor
+from tests.panel.conftest import BENT, barriers, begun, show, until, visitor
 
 pytestmark = [pytest.mark.alone, pytest.mark.browser]
 REPOSITORY = Path(__file__).parents[2]
@@ -306,7 +305,7 @@ def test_the_scope_shows_and_keeps_what_moves(page: Page, holding: Platform, tmp
     picture.press("Shift+ArrowRight")
     expect(page.get_by_text(re.compile(r"^A 0\.35"))).to_be_visible()
     picture.click(position={"x": 300, "y": 100})
-    expect(page.get_by_text(re.compile(r"^A 0\.35.*, B .* s, B - A .* rad|^A 0\.35.*B - A"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^A 0\.35.*B - A"))).to_be_visible()
     for _ in range(2):
         picture.press("+")
     with page.expect_download() as download:
@@ -484,12 +483,7 @@ def test_no_page_has_a_serious_barrier(
         for path in PAGES:
             show(page, path)
             page.wait_for_timeout(500)
-            for one in Axe().run(page).response["violations"]:
-                if one["impact"] in ("serious", "critical"):
-                    nodes = [
-                        f"{node['html'][:150]}: {node['any'] and node['any'][0]['message']}" for node in one["nodes"]
-                    ]
-                    found[f"{path} {one['id']}"] = nodes[:3]
+            found |= {f"{path} {rule}": nodes for rule, nodes in barriers(page).items()}
             if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
                 found[f"{path} is wider than the screen"] = page.evaluate("document.documentElement.scrollWidth")
             expect(page.get_by_role("button", name="STOP not the emergency stop")).to_be_in_viewport()
