@@ -260,6 +260,22 @@ _WITHOUT_PATHS = """([project, home]) => {
 }"""
 
 
+@contextlib.contextmanager
+def moved_by_another() -> Iterator[None]:
+    """Move the first joint meanwhile, as somebody else does, and then back."""
+    command = [sys.executable, "-m", "rtcp.cli", "move", "-1.2", *map(str, BENT[1:]), "--speed", "0.1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        time.sleep(3.0)
+        yield
+    finally:
+        process.terminate()
+        process.wait()
+        with connect("pictures") as robot:
+            robot.halt()
+            robot.move_joints(BENT)
+
+
 def pictures(playwright: Playwright, directory: Path) -> None:
     directory.mkdir(parents=True, exist_ok=True)
     with panel() as (_, url):
@@ -267,9 +283,10 @@ def pictures(playwright: Playwright, directory: Path) -> None:
         for width in (400, 1600):
             for path, (name, _, _) in PAGES.items():
                 page = opened(browser, url, path, width)
-                time.sleep(2.5)
-                page.evaluate(_WITHOUT_PATHS, [str(Path(__file__).parents[1]), str(Path.home())])
-                page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
+                with moved_by_another() if path == "/arm" else contextlib.nullcontext():
+                    time.sleep(2.5)
+                    page.evaluate(_WITHOUT_PATHS, [str(Path(__file__).parents[1]), str(Path.home())])
+                    page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
                 page.context.close()
         browser.close()
 

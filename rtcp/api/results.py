@@ -47,6 +47,8 @@ class Status:
     """Setpoints of the controller, rad."""
     sent_positions: Positions
     """Target positions in the frame, rad: what left on the wire."""
+    goal: Positions | None
+    """Joint positions at the end of the motion under way, rad; None: no motion, or one without an end (jog, stream)."""
     holder: str
     """Who commands the arm; empty: nobody."""
     raw: Mapping[str, Any]
@@ -67,6 +69,7 @@ class Status:
             torques=tuple(joints["actual_torque"]),
             commanded_positions=tuple(joints["commanded_position"]),
             sent_positions=tuple(joints["sent_position"]),
+            goal=None if found["goal"] is None else tuple(found["goal"]),
             holder=found["lease"]["holder"],
             raw=found,
         )

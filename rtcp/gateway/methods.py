@@ -145,7 +145,7 @@ class Methods:
     async def status(self, caller: Caller) -> Json:
         """Return the state of machine, joints, bus and slaves: the object that `rtcp status --json` prints."""
         self._snapshot.follow()
-        return self._snapshot.status(read_processes(self._directory))
+        return self._snapshot.status(read_processes(self._directory), self._motion.goal)
 
     @method(at_once=True)
     async def events(self, caller: Caller, since: Annotated[int, Ge(0)] = 0) -> Json:

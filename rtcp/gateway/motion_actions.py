@@ -156,6 +156,8 @@ class MotionActions:
         self._channel = channel
         self._planner = planner
         self._count = len(channel.config.joints)
+        self.goal: Sequence[float] | None = None
+        """Joint positions at the end of the motion under way, rad; None: no motion, or a package's own."""
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
@@ -293,7 +295,7 @@ class MotionActions:
         command = MoveJoints(tuple(q), max(velocities) if speed is None else speed, synchronized)
         # Twice round at that speed and some more: only a machine that hangs takes longer.
         timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
-        return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"))
+        return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"), q)
 
     def _write(self, plan: Plan) -> int:
         try:
@@ -306,11 +308,17 @@ class MotionActions:
     ) -> Json:
         arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
-        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival)
+        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival, plan.end)
         return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
 
     async def _run(
-        self, lease: int, command: Command, timeout_s: float, what: str, arrived: Callable[[], T | None]
+        self,
+        lease: int,
+        command: Command,
+        timeout_s: float,
+        what: str,
+        arrived: Callable[[], T | None],
+        goal: Sequence[float] | None = None,
     ) -> T:
         """Send a command and return what `arrived` finds when the arm holds again."""
         channel = self._channel
@@ -320,6 +328,7 @@ class MotionActions:
 
         def outcome() -> T | None:
             nonlocal rested
+            self.goal = goal  # accepted: it moves there
             if not rested:
                 if at_rest() is None:
                     return None
@@ -328,7 +337,10 @@ class MotionActions:
                 rested = True
             return arrived()
 
-        return await channel.run(lease, command, outcome, timeout_s, what)
+        try:
+            return await channel.run(lease, command, outcome, timeout_s, what)
+        finally:
+            self.goal = None
 
     def _arrival(self, q: Sequence[float], same_rad: float, what: str) -> Callable[[], Json | None]:
         """Return an outcome: where the arm is, once the following error has died away."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Sequence
 from datetime import datetime
 from typing import Any
 
@@ -216,8 +217,8 @@ class StatusSnapshot:
             return None
         return {"share": found.share, "part": found.part.value, "message": found.message, "remedy": found.remedy}
 
-    def status(self, processes: Processes) -> dict[str, Any]:
-        """Return everything, as `rtcp status --json` prints it."""
+    def status(self, processes: Processes, goal: Sequence[float] | None) -> dict[str, Any]:
+        """Return everything, as `rtcp status --json` prints it; `goal`: where the motion under way ends, rad."""
         latest = self._observer.latest()
         if latest is None:
             raise RuntimeError("the loop has published no cycle yet")
@@ -256,6 +257,8 @@ class StatusSnapshot:
             "joints": {
                 name: [round(float(value), 7) for value in record[name]] for name, code in PER_JOINT if code == "d"
             },
+            # Not while it stops: it goes there no more.
+            "goal": [round(value, 7) for value in goal] if goal is not None and state is State.MOVING else None,
             "statuswords": [int(word) for word in record["statusword"]],
             "inputs": int(record["inputs"]),
             "outputs": int(record["outputs"]),

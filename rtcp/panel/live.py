@@ -531,6 +531,7 @@ class Live:
             "holder": raw["lease"]["holder"],
             "bus": raw["bus"],
             "joints": {name: [_number(one, 5) for one in joints[name]] for name in _JOINTS},
+            "goal": raw["goal"],
             "statuswords": raw["statuswords"],
             "wkc": raw["wkc"],
             "missed": raw["missed"],

@@ -111,6 +111,7 @@ def status() -> dict[str, Any]:
         },
         "start_to_op_s": 1.5,
         "pids": {"loop": 11, "gateway": 12, "segment": 13},
+        "goal": None,
         "lease": {"holder": ""},
         "messages": [],
         "message_times": [],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,44 @@ def test_a_move_reports_its_progress(arm: FakePlatform) -> None:
     reports: list[dict[str, Any]] = []
     arm.run(lambda: arm.methods.call("move_joints", Caller("one", 1, reports.append), {"q": THERE}))
     assert {"state", "fraction", "remaining_s", "positions"} == set(reports[0])
+
+
+@pytest.mark.parametrize("motion", ["move_joints", "run_trajectory", "move_line"])
+def test_the_status_has_the_goal_while_the_arm_moves_there(arm: FakePlatform, motion: str) -> None:
+    pose = beside(arm, 0.1)
+    goal, params = {
+        "move_joints": (THERE, {"q": THERE}),
+        "run_trajectory": (THERE, {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]}),
+        "move_line": (end_of_line(arm, pose), {"poses": [pose]}),
+    }[motion]
+    arm.loop.ends[RunLines] = arm.loop.ends[RunTrajectory] = goal
+
+    async def shown() -> list[Any]:
+        found = []
+        moving = asyncio.create_task(arm.call(motion, params))
+        while not moving.done():
+            found.append((await arm.call("status", {}))["goal"])
+            await asyncio.sleep(0.002)
+        await moving
+        return [*found, (await arm.call("status", {}))["goal"]]
+
+    found = arm.run(shown)
+    assert found[0] is found[-1] is None
+    assert next(filter(None, found)) == pytest.approx(list(goal), abs=1e-7)
+
+
+def test_an_arm_that_stops_has_no_goal(arm: FakePlatform) -> None:
+    async def stop() -> Any:
+        moving = asyncio.create_task(arm.call("move_joints", {"q": THERE}))
+        while (await arm.call("status", {}))["goal"] is None:
+            await asyncio.sleep(0.002)
+        arm.loop.state = State.STOPPING
+        while (status := await arm.call("status", {}))["state"] == "moving":
+            await asyncio.sleep(0.002)
+        await moving
+        return status
+
+    assert arm.run(stop)["goal"] is None
 
 
 def test_a_line_is_planned_from_the_commanded_position_and_ends_at_the_pose(arm: FakePlatform) -> None:

@@ -50,7 +50,7 @@ class Written:
     @property
     def status(self) -> dict[str, Any]:
         self.snapshot.follow()
-        return self.snapshot.status(Processes())
+        return self.snapshot.status(Processes(), None)
 
     @property
     def headline(self) -> str:

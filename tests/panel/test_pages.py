@@ -100,6 +100,18 @@ def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platf
     assert [is_kept_out for _, is_kept_out in shown_boxes] == [False, True, True]
 
 
+def test_a_ghost_stands_where_a_move_from_elsewhere_ends(page: Page, holding: Platform) -> None:
+    show(page, "/arm")
+    view = page.locator(".arm-view")
+    expect(view).to_have_attribute("data-ghost", "")
+    holding.background("move", "1.2", *(str(q) for q in BENT[1:]), "--speed", "0.1")
+    expect(view).to_have_attribute("data-ghost", "goal")
+    assert page.evaluate("rtcp.state.goal") == pytest.approx([1.2, *BENT[1:]])
+    page.get_by_role("button", name="STOP").click()
+    holding.end_commands()
+    expect(view).to_have_attribute("data-ghost", "")
+
+
 def test_the_view_of_the_arm_is_turned_by_keys_and_kept(page: Page, holding: Platform) -> None:
     def camera() -> list[float]:
         place: list[float] = page.evaluate("JSON.parse(sessionStorage.getItem('rtcp-camera'))?.at ?? []")
@@ -128,7 +140,7 @@ def test_a_target_is_planned_shown_and_sent(page: Page, holding: Platform) -> No
     page.get_by_label("joint1, rad").fill("0.2")
     expect(send).to_be_disabled()
     page.get_by_role("button", name="Plan").click()
-    expect(page.locator(".arm-view")).to_have_attribute("data-ghost", "shown")
+    expect(page.locator(".arm-view")).to_have_attribute("data-ghost", "plan")
     assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.0, abs=1e-3)
     send.click()
     until(lambda: abs(holding.status()["joints"]["actual_position"][0] - 0.2) < 1e-3, "the arm is there")

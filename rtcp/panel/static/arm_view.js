@@ -1,4 +1,5 @@
-// The arm in space: solid links of its URDF, live; a ghost along a planned path; the tool's path of the last seconds; boxes.
+// The arm in space: solid links of its URDF, live; a ghost along a planned path, else where the motion under way ends; the
+// tool's path of the last seconds; boxes.
 import { THREE, OrbitControls } from "nicegui-scene";
 
 const TRACE = 600, TRACE_S = 10, SEEN = "rtcp-camera";
@@ -54,7 +55,8 @@ function line(color, count) {
   const geometry = new THREE.BufferGeometry();
   geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(3 * count), 3));
   geometry.setDrawRange(0, 0);
-  const made = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color }));
+  const made = new THREE.Line(geometry, new THREE.LineBasicMaterial({ color, depthTest: false }));
+  made.renderOrder = 1; // seen through the arm
   made.frustumCulled = false;
   return made;
 }
@@ -83,7 +85,7 @@ export default {
     this.ghost = new Chain(scene, this.links, true);
     this.ghost.root.visible = false;
     scene.add((this.boxes = new THREE.Group()));
-    this.trace = line("#1971c2", TRACE);
+    this.trace = line("#d6336c", TRACE);
     this.path = line("#2f9e44", 400);
     scene.add(this.trace, this.path);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
@@ -108,6 +110,7 @@ export default {
   },
   methods: {
     show(state) {
+      if (!this.plan) this.aim(state.goal);
       if (!state.joints && this.points?.length) { this.points = []; this.trace.geometry.setDrawRange(0, 0); this.drawBoxes({ box: null, keep_out: {} }); this.draw(); }
       if (!state.joints || !this.$el.clientWidth) return;
       this.arm.set(state.joints.actual_position);
@@ -122,7 +125,7 @@ export default {
       if (state.limits) this.drawBoxes(state.limits);
       if (this.plan) this.follow();
       // Drawn only where something has changed: an arm at rest costs its viewers nothing.
-      this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4))].join();
+      this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4)), state.goal].join();
       if (this.plan || this.drawn !== before) this.draw();
     },
     trail(tool) {
@@ -154,15 +157,18 @@ export default {
     preview(path, duration_s) {
       if (!this.ghost) return;
       this.plan = path?.length ? { path, duration_s: Math.max(0.5, duration_s), began: performance.now() } : null;
-      this.ghost.root.visible = Boolean(this.plan);
       const points = this.path.geometry.attributes.position;
       const shown = (path ?? []).slice(0, 400);
       shown.forEach((q, at) => points.array.set(this.ghost.toolAt(q).toArray(), 3 * at));
       points.needsUpdate = true;
       this.path.geometry.setDrawRange(0, shown.length);
-      if (this.plan) this.ghost.set(path[path.length - 1]);
-      this.$el.dataset.ghost = this.plan ? "shown" : "";
+      this.aim(path?.at(-1));
       this.draw();
+    },
+    aim(q) {
+      this.ghost.root.visible = Boolean(q);
+      this.$el.dataset.ghost = !q ? "" : this.plan ? "plan" : "goal";
+      if (q) this.ghost.set(q);
     },
     follow() {
       const { path, duration_s, began } = this.plan;
