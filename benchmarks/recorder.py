@@ -1,10 +1,11 @@
 """What a recorder costs: `python benchmarks/recorder.py [--seconds N] [--rounds N] [--minutes N] [--hold] [--json F]`.
 
 In one run, alternating, beside one platform on its virtual segment with a cycle of 500 us: without and with a recording
-of every signal of every cycle (MCAP). Medians of the wake-up over the rounds; the ratio is that of the medians of p99.
+of every signal of every cycle (MCAP), and with the live view and a client of it that asked for everything and reads
+nothing. Medians of the wake-up over the rounds; the ratios are those of the medians of p99.
 Then one recording of `--minutes` for the resident memory without what is shared: at its quarters, and its slope by
-least squares in the second half. Exit code 1 where the ratio is above 1.1, the recorder takes more than 10 % of a
-core, or cycles are missing in a file.
+least squares in the second half. Exit code 1 where a ratio is above 1.1, the recorder takes more than 10 % of a core,
+or cycles are missing in a file.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ import os
 import platform
 import signal
 import statistics
+import subprocess
 import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -30,6 +32,7 @@ import psutil
 from rich.console import Console
 from rich.table import Table
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parent))
 
 from cycle import Array, figures, keep_moving, spread
@@ -38,6 +41,7 @@ from rtcp.api import RtcpError, connect
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
 from rtcp.launch.launcher import StartOptions, start
+from tests.viewer import Viewer
 
 CYCLE_US = 500.0
 AIM_RATIO, AIM_CPU_PERCENT = 1.1, 10.0
@@ -78,6 +82,19 @@ def recorded(directory: Path, cost: Cost) -> Iterator[psutil.Process]:
         path.unlink()
 
 
+@contextlib.contextmanager
+def hanging_viewer() -> Iterator[None]:
+    """Serve the live view, while inside, to a client that does not read."""
+    command = [sys.executable, "-m", "rtcp.cli", "live", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            with Viewer(process.stdout.readline().partition(": ")[0]):
+                yield
+        finally:
+            process.terminate()
+
+
 def wakeups(seconds: float) -> Array:
     """Return the wake-up latencies of the cycle for a while, us."""
     with contextlib.closing(Observer(blackboard_file(runtime_directory()))) as observer:
@@ -93,12 +110,17 @@ def wakeups(seconds: float) -> Array:
 
 
 def rounds(directory: Path, seconds: float, count: int, cost: Cost) -> dict[str, list[Array]]:
-    """Alternate without and with a recording; return the wake-ups of each round."""
-    found: dict[str, list[Array]] = {"without": [], "with": []}
+    """Alternate without anybody, with a recording, with a live view; return the wake-ups of each round."""
+    beside: dict[str, Callable[[], contextlib.AbstractContextManager[object]]] = {
+        "without": contextlib.nullcontext,
+        "recording": lambda: recorded(directory, cost),
+        "live view, hanging client": hanging_viewer,
+    }
+    found: dict[str, list[Array]] = {kind: [] for kind in beside}
     for turn in range(count):
         # To and fro: what the host does to whoever comes first hits each of them as often.
         for kind in list(found)[:: -1 if turn % 2 else 1]:
-            with recorded(directory, cost) if kind == "with" else contextlib.nullcontext():
+            with beside[kind]():
                 found[kind].append(wakeups(seconds))
     return found
 
@@ -161,19 +183,20 @@ def main() -> int:
     wakeup = {kind: figures(samples) for kind, samples in found.items()}
     how = "holding" if given.hold else "joint motion"
     table = Table(title=f"wake-up, {CYCLE_US:g} us cycle, {given.rounds} rounds of {given.seconds:g} s, {how}; us")
-    for heading in ("recording", "p50", "p99", "p50 over the rounds", "p99 over the rounds"):
-        table.add_column(heading, justify="left" if heading == "recording" else "right")
+    for heading in ("", "p50", "p99", "p50 over the rounds", "p99 over the rounds"):
+        table.add_column(heading, justify="left" if not heading else "right")
     for kind, samples in found.items():
         medians = [f"{wakeup[kind][key]:.1f}" for key in ("p50", "p99")]
         table.add_row(kind, *medians, spread(samples, "p50"), spread(samples, "p99"))
     console.print(table)
-    ratio = wakeup["with"]["p99"] / wakeup["without"]["p99"]
+    ratios = {kind: one["p99"] / wakeup["without"]["p99"] for kind, one in wakeup.items() if kind != "without"}
     cpu = statistics.median(short.cpu_percent)
     missing, records = short.missing + long.missing, short.records + long.records
     slope = slope_mb_per_hour(long.resident)
     quarters = [long.resident[min(part * len(long.resident) // 4, len(long.resident) - 1)][1] for part in range(5)]
     console.print(
-        f"wake-up p99, with / without: {ratio:.2f} (aim {AIM_RATIO:g})\n"
+        f"wake-up p99 by that without: {', '.join(f'{kind} {one:.2f}' for kind, one in ratios.items())}"
+        f" (aim {AIM_RATIO:g})\n"
         f"CPU of the recorder: {cpu:.1f} % of a core, {long.cpu_percent[0]:.1f} % over {given.minutes:g} min"
         f" (aim {AIM_CPU_PERCENT:g} %); {1e6 * long.megabytes / max(long.records, 1):.0f} bytes a cycle\n"
         f"resident memory of its own: {', '.join(f'{one:.1f}' for one in quarters)} MB at the quarters,"
@@ -182,11 +205,11 @@ def main() -> int:
     )
     if given.json:
         result = {"machine": machine, "date": date.today().isoformat(), "load": load, "motion": how, "wakeup": wakeup,
-                  "ratio": ratio, "cpu_percent": short.cpu_percent, "cpu_percent_long": long.cpu_percent[0],
+                  "ratios": ratios, "cpu_percent": short.cpu_percent, "cpu_percent_long": long.cpu_percent[0],
                   "resident_mb": quarters, "slope_mb_per_hour": slope, "resident": long.resident,
                   "records": records, "missing": missing}  # fmt: skip
         given.json.write_text(json.dumps(result, indent=2))
-    return 0 if ratio <= AIM_RATIO and cpu <= AIM_CPU_PERCENT and not missing else 1
+    return 0 if max(ratios.values()) <= AIM_RATIO and cpu <= AIM_CPU_PERCENT and not missing else 1
 
 
 if __name__ == "__main__":

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import inspect
 import json
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 from nicegui import Client, ui
@@ -275,13 +276,9 @@ class View:
             else:
                 self.warn(f"{holder} keeps the arm")
 
-        with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
-            text("h2", f"{holder} operates the arm")
-            text("p", "Whoever takes over stops what moves.")
-            with ui.element("div").classes("buttons"):
-                button("Ask to take over", take)
-                button("Leave it", dialog.close, plain=True)
-        dialog.open()
+        with self._question(f"{holder} operates the arm", "Whoever takes over stops what moves.") as dialog:
+            button("Ask to take over", take)
+            button("Leave it", dialog.close, plain=True)
 
     def _ask(self, who: str, answer: asyncio.Future[bool]) -> None:
         def give(value: bool) -> None:
@@ -289,11 +286,19 @@ class View:
             if not answer.done():
                 answer.set_result(value)
 
-        with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
-            text("h2", f"{who} asks for the arm")
-            text("p", f"Without an answer it changes hands in {TAKE_OVER_S:g} s. What moves is stopped first.")
-            with ui.element("div").classes("buttons"):
-                button("Give it", lambda: give(True))
-                button("Keep it", lambda: give(False), plain=True)
-        dialog.open()
+        note = f"Without an answer it changes hands in {TAKE_OVER_S:g} s. What moves is stopped first."
+        with self._question(f"{who} asks for the arm", note) as dialog:
+            button("Give it", lambda: give(True))
+            button("Keep it", lambda: give(False), plain=True)
         answer.add_done_callback(lambda _: dialog.close())
+
+    @contextlib.contextmanager
+    def _question(self, title: str, note: str) -> Iterator[ui.dialog]:
+        """Ask the person, with the buttons that are made inside."""
+        with self._client, ui.dialog().props(_BESIDE) as dialog, ui.card():
+            dialog.props["aria-label"] = title
+            text("h2", title)
+            text("p", note)
+            with ui.element("div").classes("buttons"):
+                yield dialog
+        dialog.open()

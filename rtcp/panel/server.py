@@ -8,6 +8,7 @@ import inspect
 import logging
 import secrets
 import socket
+import threading
 import webbrowser
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
@@ -112,7 +113,10 @@ class Panel:
     async def _lifespan(self, server: FastAPI) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._live.watch())]
         if self._options.open:
-            asyncio.get_running_loop().call_later(0.5, webbrowser.open, self.url)
+            # Not in the event loop: a browser of the terminal is waited for.
+            opening = threading.Timer(0.5, webbrowser.open, (self.url,))
+            opening.daemon = True
+            opening.start()
         try:
             yield
         finally:

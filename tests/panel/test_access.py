@@ -7,6 +7,7 @@ import base64
 import contextlib
 import http.client
 import json
+import os
 import re
 import shutil
 import signal
@@ -287,6 +288,24 @@ def test_a_platform_is_started_with_its_panel_and_both_end_together() -> None:
         assert not answers()
     finally:
         running.kill()
+        platform.end()
+
+
+def test_open_shows_the_panel_in_a_browser_and_does_not_wait_for_it(tmp_path: Path) -> None:
+    browser, shown = tmp_path / "browser", tmp_path / "shown"
+    browser.write_text(f'#!/bin/sh\necho "$1" $$ >{shown}\nexec sleep 60 >/dev/null 2>&1\n')
+    browser.chmod(0o700)
+    platform = Platform()
+    platform.environment["BROWSER"] = f"{browser} %s"  # Python waits for one that is named so
+    try:
+        with begun(platform, "--open") as (_, url):
+            address, pid = until(lambda: shown.exists() and shown.read_text(), "the browser").split()
+            try:
+                assert address.rstrip("/") == url
+                assert ask(url, "GET", "/", PAGE).status == 303
+            finally:
+                os.kill(int(pid), signal.SIGKILL)
+    finally:
         platform.end()
 
 

@@ -208,8 +208,9 @@ def test_a_jog_ends_with_the_attention_of_its_page(
 
 
 @pytest.mark.parametrize("motion", ["jog", "move"])
-@pytest.mark.parametrize("killed", ["browser", "panel"])
-def test_kill_stops_the_arm(chromium: BrowserType, platform: Platform, motion: str, killed: str) -> None:
+@pytest.mark.parametrize("loss", ["browser killed", "panel killed", "lid closed"])
+def test_the_arm_stops_with_the_processes(chromium: BrowserType, platform: Platform, motion: str, loss: str) -> None:
+    """A machine whose lid is closed stands still, with its connections open: as the browser does after SIGSTOP."""
     before = set(psutil.Process().children(recursive=True))
     own = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
     browser = set(psutil.Process().children(recursive=True)) - before
@@ -219,13 +220,18 @@ def test_kill_stops_the_arm(chromium: BrowserType, platform: Platform, motion: s
             begin(page, platform, motion)
             with contextlib.closing(Feed(platform.directory)) as feed:
                 now = time.monotonic_ns()
-                for process in browser if killed == "browser" else [psutil.Process(panel.pid)]:
+                for process in [psutil.Process(panel.pid)] if loss == "panel killed" else browser:
                     with contextlib.suppress(psutil.Error):
-                        process.kill()
+                        process.suspend() if loss == "lid closed" else process.kill()
                 took = moved_after(platform, feed, now)
+                if loss == "lid closed":
+                    for process in browser:
+                        process.resume()
+                    time.sleep(1.0)  # what was pressed before moves nothing
+                    assert np.ptp(feed.records()[0]["commanded_position"][:, 0]) < 1e-9
         with contextlib.suppress(Error):
             own.close()
-    assert took < JOG_S + SLACK_S
+    assert took < (PRESENCE_S if (motion, loss) == ("move", "lid closed") else JOG_S) + SLACK_S
     assert platform.status()["state"] == "holding"
 
 
@@ -391,8 +397,11 @@ def test_the_arm_is_handed_over_only_when_asked(browser: Browser, panel: str, ho
             re.compile(r"local at this machine \(page \d+\) operates the arm")
         )
         second.get_by_role("button", name="Disable").click()
+        expect(second.get_by_role("button", name="Ask to take over")).to_be_visible()
+        assert barriers(second) == {}
         second.get_by_role("button", name="Ask to take over").click()
         expect(first.get_by_role("button", name="Keep it")).to_be_visible()
+        assert barriers(first) == {}
         # The question covers nothing.
         first.get_by_role("button", name="STOP not the emergency stop").click(trial=True)
         first.get_by_role("button", name="Keep it").click()
