@@ -192,15 +192,23 @@ def moving(page: Page) -> None:
     page.get_by_role("button", name="Send", exact=True).click()
 
 
-def let_go(page: Page, begin: Callable[[Page], None]) -> None:
-    """Release the pad of a jog; press STOP in a move."""
+def let_go(page: Page, begin: Callable[[Page], None]) -> int:
+    """Release the pad of a jog; press STOP in a move. Return when the browser got that, CLOCK_MONOTONIC, ns.
+
+    Playwright waits for the screen before it clicks: for a few hundred ms where software draws the arm.
+    """
+    page.evaluate("addEventListener('pointerup', (e) => { letGo = performance.timeOrigin + e.timeStamp; }, true)")
     if begin is jogging:
         page.mouse.up()
     else:
         page.get_by_role("button", name="STOP not the emergency stop").click()
+    ago_ns = time.time_ns() - int(page.evaluate("letGo") * 1e6)
+    return time.monotonic_ns() - ago_ns
 
 
-LOSSES = ("button released", "focus lost", "page overloaded", "page closed", "browser killed", "panel killed")
+LOSSES = (
+    "button released", "focus lost", "page overloaded", "lid closed", "page closed", "browser killed", "panel killed"
+)  # fmt: skip
 NETWORKS = {"network cut": (0.0, 1.0), "network 0.3 s slow": (0.15, 0.0), "network loses a fifth": (0.0, 0.2)}
 """Delay, s, and loss of each way. The last two let a move go on: STOP is pressed as they begin, and the pad of a jog
 released where a fifth is lost."""
@@ -210,12 +218,11 @@ def to_standstill(
     playwright: Playwright, loss: str, begin: Callable[[Page], None], cable: Cable | None = None
 ) -> float:
     """Return the time from the loss until the arm stands, ms; not a number where it had not moved."""
-    before = set(psutil.Process().children(recursive=True))
     chromium = cable.far(CHROMIUM, Path(os.environ["RTCP_STATE_DIR"])) if cable else CHROMIUM
-    browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
-    own = set(psutil.Process().children(recursive=True)) - before
     where = ("--host", NEAR) if cable else ()
     with panel(*where) as (process, url), contextlib.closing(Feed()) as feed, connect("benchmark") as robot:
+        before = set(psutil.Process().children(recursive=True))
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS)
         if cable:
             cable.delay_s, cable.loss = 0.0, 0.0
             page = visit(browser, url)
@@ -231,7 +238,7 @@ def to_standstill(
         if cable:
             cable.delay_s, cable.loss = NETWORKS[loss]
         if loss in ("button released", "network loses a fifth") or (loss == "network 0.3 s slow" and begin is moving):
-            let_go(page, begin)
+            at_ns = let_go(page, begin)
         elif loss == "focus lost":
             page.evaluate("window.dispatchEvent(new Event('blur'))")
         elif loss == "page overloaded":
@@ -239,11 +246,15 @@ def to_standstill(
         elif loss == "page closed":
             page.close()
         elif not cable:
-            for one in own if loss == "browser killed" else {process}:
+            own = set(psutil.Process().children(recursive=True)) - before
+            for one in {process} if loss == "panel killed" else own:
                 with contextlib.suppress(psutil.Error):
-                    one.kill()
+                    one.suspend() if loss == "lid closed" else one.kill()
         time.sleep(3.5)  # longer than the lease of a jog on a shared host
         records, _ = feed.records()
+        if loss == "lid closed":
+            for one in own:
+                one.resume()
         with contextlib.suppress(Error):
             browser.close()
         robot.halt()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import gc
 import inspect
 import pydoc
 import time
@@ -238,6 +239,29 @@ def test_a_call_that_its_own_progress_callback_cancels_ends_its_move(directory: 
         assert (await robot.status()).holder == ""
 
     run(directory, work)
+
+
+def test_a_call_that_is_cancelled_as_its_connection_ends_leaves_no_error_behind(
+    directory: Path, loop: FakeLoop
+) -> None:
+    loop.state, loop.moves_for = State.HOLDING, LONG
+    left: list[dict[str, Any]] = []
+
+    async def work(robot: AsyncRobot) -> None:
+        asyncio.get_running_loop().set_exception_handler(lambda _, context: left.append(context))
+        move = asyncio.create_task(robot.move_joints(Q))
+        while await robot.state() is not State.MOVING:
+            pass
+        closing = asyncio.create_task(robot.close())
+        await asyncio.sleep(0)
+        move.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await move
+        await closing
+
+    run(directory, work)
+    gc.collect()
+    assert left == []
 
 
 def test_async_errors_are_the_same(directory: Path, loop: FakeLoop, tmp_path: Path) -> None:

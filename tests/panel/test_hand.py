@@ -211,13 +211,13 @@ def test_a_jog_ends_with_the_attention_of_its_page(
 @pytest.mark.parametrize("loss", ["browser killed", "panel killed", "lid closed"])
 def test_the_arm_stops_with_the_processes(chromium: BrowserType, platform: Platform, motion: str, loss: str) -> None:
     """A machine whose lid is closed stands still, with its connections open: as the browser does after SIGSTOP."""
-    before = set(psutil.Process().children(recursive=True))
-    own = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-    browser = set(psutil.Process().children(recursive=True)) - before
     with begun(platform) as (panel, url):
         ready(platform)
+        before = set(psutil.Process().children(recursive=True))
+        own = chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         with contextlib.suppress(Error), visitor(own, url) as page:
             begin(page, platform, motion)
+            browser = set(psutil.Process().children(recursive=True)) - before
             with contextlib.closing(Feed(platform.directory)) as feed:
                 now = time.monotonic_ns()
                 for process in [psutil.Process(panel.pid)] if loss == "panel killed" else browser:
