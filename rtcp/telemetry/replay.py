@@ -19,6 +19,7 @@ POSITIONS = ("sent_position", "commanded_position", "actual_position")
 """The first of them that a recording has is replayed."""
 TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
 """Largest distance of the trajectory from the recorded positions; the first whose points fit into a request."""
+_ROUNDING = 1e-10
 _REQUEST = LINE_LIMIT - 1024
 _SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
 """Time before and after a sample over which its velocity is taken; shortest time between two points."""
@@ -59,11 +60,15 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
     t = np.append(0.0, np.cumsum(cycles))[kept] * (recorded.period_s / scale)
     q = q[whole][kept]
     v = _velocities(t, q, max(1, round(_SLOPE_S / recorded.period_s)))
+    low, high = q.min(axis=0), q.max(axis=0)
+    rounded = np.clip(np.round(q, 6), low, high)
+    # There a joint rests or turns, perhaps at its limit: what is left of a speed would lead beyond.
+    v[(rounded == low) | (rounded == high)] = 0.0
     least = ceil(_SHORTEST_S * scale / recorded.period_s)
     points: list[dict[str, Any]] = []
     for tolerance in TOLERANCES_RAD:
         points = [
-            {"t": round(t[at] - t[0], 6), "q": np.round(q[at], 6).tolist(), "v": np.round(v[at], 5).tolist()}
+            {"t": round(t[at] - t[0], 6), "q": rounded[at].tolist(), "v": np.round(v[at], 5).tolist()}
             for at in _knots(t, q, v, least, tolerance)
         ]
         if len(json.dumps(points)) <= _REQUEST:
@@ -111,9 +116,11 @@ def _knots(t: Array, q: Array, v: Array, least: int, tolerance: float) -> list[i
 
 
 def _fits(t: Array, q: Array, v: Array, begin: int, end: int, tolerance: float) -> bool:
+    """Return whether one cubic stays within `tolerance` of the samples and within the range of them all."""
     length = t[end] - t[begin]
     x = ((t[begin : end + 1] - t[begin]) / length)[:, None]
     way = q[end] - q[begin]
     bend = v[begin] * length * (1 - x) - v[end] * length * x + way * (2 * x - 1)
     curve = q[begin] + way * x + x * (1 - x) * bend
-    return bool(np.abs(curve - q[begin : end + 1]).max() <= tolerance)
+    inside = (curve >= q.min(axis=0) - _ROUNDING).all() and (curve <= q.max(axis=0) + _ROUNDING).all()
+    return bool(inside and np.abs(curve - q[begin : end + 1]).max() <= tolerance)

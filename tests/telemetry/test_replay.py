@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,10 @@ LIMITS = Limits(CONFIG)
 TARGETS = ([0.4, -0.3, 0.5, 0.2, -0.4, 1.0], [0.1, 0.2, 0.9, -0.3, 0.2, 0.0], [0.0] * 6)
 
 
-def moved(count_at_rest: int = 400) -> Any:
-    """Cycle records of three moves at the limits of the joints, with rest between, as a controller sends them."""
+def moved(count_at_rest: int = 400, targets: Sequence[Sequence[float]] = TARGETS) -> Any:
+    """Cycle records of moves as fast as the joints may, with rest between, as a controller sends them."""
     rows, at = [np.zeros((count_at_rest, 6))], [0.0] * 6
-    for target in TARGETS:
+    for target in targets:
         given = InputParameter(6)
         given.current_position, given.target_position = at, target
         given.max_velocity, given.max_acceleration = LIMITS.velocity, LIMITS.acceleration
@@ -90,6 +91,14 @@ def test_the_trajectory_deviates_by_less_than_1_mrad_with_few_points(tmp_path: P
 
 def test_a_motion_at_the_limits_of_the_joints_is_accepted_a_little_slower(tmp_path: Path) -> None:
     points = trajectory(read(mcap(tmp_path / "a.mcap", moved()), ["*_position"]), 0.9)
+    plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
+
+
+def test_a_motion_that_turns_at_the_end_of_a_range_stays_within_it(tmp_path: Path) -> None:
+    """The first stop of joint 3 is short of its end; its last there is followed by a motion of the others alone."""
+    top = LIMITS.high[2]
+    targets = ([0.5, -0.3, 0.4, 0.0, -0.2, 1.0], [0.0, 0.2, top, 0.0, 0.6, 0.0], [0.3, 0.2, top, 0.0, 0.6, 0.0])
+    points = trajectory(read(mcap(tmp_path / "a.mcap", moved(targets=targets)), ["*_position"]), 0.9)
     plan_trajectory([Point(one["t"], one["q"], one["v"]) for one in points], LIMITS, points[0]["q"])
 
 
