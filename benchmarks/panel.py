@@ -207,7 +207,8 @@ def let_go(page: Page, begin: Callable[[Page], None]) -> int:
 
 
 LOSSES = (
-    "button released", "focus lost", "page overloaded", "lid closed", "page closed", "browser killed", "panel killed"
+    "button released", "focus lost", "page overloaded", "browser stopped", "page closed", "browser killed",
+    "panel killed",
 )  # fmt: skip
 NETWORKS = {"network cut": (0.0, 1.0), "network 0.3 s slow": (0.15, 0.0), "network loses a fifth": (0.0, 0.2)}
 """Delay, s, and loss of each way. The last two let a move go on: STOP is pressed as they begin, and the pad of a jog
@@ -234,6 +235,7 @@ def to_standstill(
         while robot.state.name != "MOVING" and time.monotonic() < until:
             time.sleep(0.01)
         time.sleep(0.6)
+        own = set(psutil.Process().children(recursive=True)) - before
         at_ns = time.monotonic_ns()
         if cable:
             cable.delay_s, cable.loss = NETWORKS[loss]
@@ -246,15 +248,15 @@ def to_standstill(
         elif loss == "page closed":
             page.close()
         elif not cable:
-            own = set(psutil.Process().children(recursive=True)) - before
             for one in {process} if loss == "panel killed" else own:
                 with contextlib.suppress(psutil.Error):
-                    one.suspend() if loss == "lid closed" else one.kill()
+                    one.suspend() if loss == "browser stopped" else one.kill()
         time.sleep(3.5)  # longer than the lease of a jog on a shared host
         records, _ = feed.records()
-        if loss == "lid closed":
+        if loss == "browser stopped":
             for one in own:
-                one.resume()
+                with contextlib.suppress(psutil.Error):
+                    one.resume()
         with contextlib.suppress(Error):
             browser.close()
         robot.halt()

@@ -120,7 +120,7 @@ class _Pending:
         self._call = call
         self._was_heard = False
         self.answer: asyncio.Future[Mapping[str, Any]] = asyncio.get_running_loop().create_future()
-        # Whoever was cancelled asks no more: asyncio would log an error that nobody has asked for.
+        # A cancelled call never retrieves the error: without this asyncio logs it.
         self.answer.add_done_callback(lambda answer: answer.cancelled() or answer.exception())
         self.is_open = True
         """The platform has not answered and may yet."""

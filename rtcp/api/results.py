@@ -48,7 +48,8 @@ class Status:
     sent_positions: Positions
     """Target positions in the frame, rad: what left on the wire."""
     goal: Positions | None
-    """Joint positions at the end of the motion under way, rad; None: no motion, or one without an end (jog, stream)."""
+    """Joint positions at the end of the motion under way, rad; None: nothing moves, the arm stops, or the motion has no
+    known end (jog, stream, a package's own command)."""
     holder: str
     """Who commands the arm; empty: nobody."""
     raw: Mapping[str, Any]

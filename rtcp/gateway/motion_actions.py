@@ -157,7 +157,7 @@ class MotionActions:
         self._planner = planner
         self._count = len(channel.config.joints)
         self.goal: Sequence[float] | None = None
-        """Joint positions at the end of the motion under way, rad; None: no motion, or a package's own."""
+        """Joint positions to which the call under way moves, rad, until it returns; None: none, or a package's own."""
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
@@ -328,7 +328,7 @@ class MotionActions:
 
         def outcome() -> T | None:
             nonlocal rested
-            self.goal = goal  # accepted: it moves there
+            self.goal = goal  # only once the loop has accepted it
             if not rested:
                 if at_rest() is None:
                     return None

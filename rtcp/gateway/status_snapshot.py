@@ -257,8 +257,10 @@ class StatusSnapshot:
             "joints": {
                 name: [round(float(value), 7) for value in record[name]] for name, code in PER_JOINT if code == "d"
             },
-            # Not while it stops: it goes there no more.
-            "goal": [round(value, 7) for value in goal] if goal is not None and state is State.MOVING else None,
+            # An arm that stops does not go there any more.
+            "goal": None
+            if goal is None or problem or state is not State.MOVING
+            else [round(value, 7) for value in goal],
             "statuswords": [int(word) for word in record["statusword"]],
             "inputs": int(record["inputs"]),
             "outputs": int(record["outputs"]),

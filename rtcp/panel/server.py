@@ -44,7 +44,7 @@ PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
     "/health": ("Health", health.build, False),
 }
 """Path -> name, function that builds it, whether the arm in space stands beside it."""
-_COLOURS = {"primary": "#1864ab", "positive": "#2b8a3e", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
+_COLOURS = {"primary": "#1864ab", "positive": "#237032", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class Panel:
     async def _lifespan(self, server: FastAPI) -> AsyncIterator[None]:
         tasks = [asyncio.create_task(self._live.follow()), asyncio.create_task(self._live.watch())]
         if self._options.open:
-            # Not in the event loop: a browser of the terminal is waited for.
+            # Not in the event loop: for a text browser `webbrowser.open` waits until it ends.
             opening = threading.Timer(0.5, webbrowser.open, (self.url,))
             opening.daemon = True
             opening.start()
@@ -199,6 +199,8 @@ class Panel:
             view.page.scope = None
             while view.leaving:
                 view.leaving.pop()()
+            if view.arm is not None:
+                view.arm.preview([], 0.0)  # planned on the page that is left
             if beside_arm:
                 self._draw(view, space)
             main.classes(remove="alone") if beside_arm else main.classes("alone")

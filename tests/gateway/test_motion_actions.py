@@ -14,6 +14,7 @@ from rtcp.config.model import Stop
 from rtcp.gateway.command_channel import Caller
 from rtcp.gateway.motion_actions import Planner
 from rtcp.ipc.commands import MoveJoints, RunLines, RunTrajectory
+from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import BoxReached, PermissionWithdrawn, SlaveLost, Stopped
 from rtcp.ipc.refusals import EmergencyStopPressed
 from rtcp.ipc.states import ControlMode, State
@@ -22,6 +23,7 @@ from tests.gateway.fake_platform import FakePlatform
 
 Q = BENT = [0.0, 0.2, math.pi / 2, 0.0, 0.4, 0.0]
 THERE = [0.2, *BENT[1:]]
+LONG = 1_000_000
 
 
 def tool(arm: FakePlatform, q: list[float]) -> list[float]:
@@ -60,34 +62,46 @@ def test_the_status_has_the_goal_while_the_arm_moves_there(arm: FakePlatform, mo
         "run_trajectory": (THERE, {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]}),
         "move_line": (end_of_line(arm, pose), {"poses": [pose]}),
     }[motion]
-    arm.loop.ends[RunLines] = arm.loop.ends[RunTrajectory] = goal
+    arm.loop.ends[RunLines], arm.loop.moves_for = goal, LONG
 
-    async def shown() -> list[Any]:
-        found = []
+    async def work() -> None:
         moving = asyncio.create_task(arm.call(motion, params))
-        while not moving.done():
-            found.append((await arm.call("status", {}))["goal"])
-            await asyncio.sleep(0.002)
-        await moving
-        return [*found, (await arm.call("status", {}))["goal"]]
-
-    found = arm.run(shown)
-    assert found[0] is found[-1] is None
-    assert next(filter(None, found)) == pytest.approx(list(goal), abs=1e-7)
-
-
-def test_an_arm_that_stops_has_no_goal(arm: FakePlatform) -> None:
-    async def stop() -> Any:
-        moving = asyncio.create_task(arm.call("move_joints", {"q": THERE}))
-        while (await arm.call("status", {}))["goal"] is None:
-            await asyncio.sleep(0.002)
+        assert (await status_in(arm, State.MOVING, moving))["goal"] == pytest.approx(list(goal), abs=1e-7)
+        with pytest.raises(RtcpError, match="one"):
+            await arm.call("move_joints", {"q": BENT}, "two", 2)
+        assert (await arm.call("status", {}))["goal"] is not None
         arm.loop.state = State.STOPPING
-        while (status := await arm.call("status", {}))["state"] == "moving":
-            await asyncio.sleep(0.002)
+        assert (await status_in(arm, State.STOPPING, moving))["goal"] is None
+        arm.loop.state = State.HOLDING
         await moving
-        return status
+        assert arm.methods._motion.goal is None
 
-    assert arm.run(stop)["goal"] is None
+    arm.run(work)
+
+
+@pytest.mark.parametrize("method", ["jog", "move_joints"])
+def test_a_jog_and_a_refused_motion_have_no_goal(arm: FakePlatform, method: str) -> None:
+    arm.loop.refusals[MoveJoints] = EmergencyStopPressed()
+
+    async def work() -> Any:
+        if method == "jog":
+            await arm.call("jog", {"velocity": [0.01] + [0.0] * 5})
+        else:
+            with pytest.raises(RtcpError):
+                await arm.call("move_joints", {"q": THERE})
+            arm.loop.state = State.MOVING
+        return await status_in(arm, State.MOVING)
+
+    assert arm.run(work)["goal"] is None
+
+
+async def status_in(arm: FakePlatform, state: State, moving: asyncio.Task[Any] | None = None) -> Any:
+    """Return the first status in a state with whatever goal is known by then."""
+    while (status := await arm.call("status", {}))["state"] != state.name.lower():
+        assert moving is None or not moving.done()
+        await asyncio.sleep(0.002)
+    await asyncio.sleep(0.02)
+    return await arm.call("status", {}) if state is State.MOVING else status
 
 
 def test_a_line_is_planned_from_the_commanded_position_and_ends_at_the_pose(arm: FakePlatform) -> None:

@@ -50,7 +50,7 @@ class Written:
     @property
     def status(self) -> dict[str, Any]:
         self.snapshot.follow()
-        return self.snapshot.status(Processes(), None)
+        return self.snapshot.status(Processes(), [0.1] * JOINTS)
 
     @property
     def headline(self) -> str:
@@ -112,14 +112,15 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
 def test_a_silent_loop_is_reported_with_the_way_out_and_its_last_values_do_not_count(
     written: Written, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written.publish(State.HOLDING)
-    assert (written.status["wkc"]["actual"], written.status["dc"]["locked"]) == (21, True)
+    written.publish(State.MOVING)
+    status = written.status
+    assert (status["wkc"]["actual"], status["dc"]["locked"], status["goal"]) == (21, True, [0.1] * JOINTS)
     monkeypatch.setattr(status_snapshot, "_SILENT_S", -1.0)
     status = written.status
     assert "has published nothing for " in status["message"]
     assert " s; the drives' watchdog stops them" in status["message"]
     assert "`rtcp stop`, then `rtcp start`, if it stays so" in status["message"]
-    assert (status["wkc"]["actual"], status["dc"]["locked"]) == (-1, False)
+    assert (status["wkc"]["actual"], status["dc"]["locked"], status["goal"]) == (-1, False, None)
 
 
 # -- RobotStatus ------------------------------------------------------------------------------------------------------

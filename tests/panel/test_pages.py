@@ -101,9 +101,17 @@ def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platf
 
 
 def test_a_ghost_stands_where_a_move_from_elsewhere_ends(page: Page, holding: Platform) -> None:
-    show(page, "/arm")
+    show(page, "/targets")
     view = page.locator(".arm-view")
+    page.get_by_label("joint1, rad").fill("0.2")
+    page.get_by_role("button", name="Plan").click()
+    expect(view).to_have_attribute("data-ghost", "plan")
+    page.get_by_role("link", name="Arm").click()
     expect(view).to_have_attribute("data-ghost", "")
+    page.get_by_role("link", name="Targets").click()
+    page.get_by_label("joint1, rad").fill("0.2")
+    page.get_by_role("button", name="Plan").click()
+    expect(view).to_have_attribute("data-ghost", "plan")
     holding.background("move", "1.2", *(str(q) for q in BENT[1:]), "--speed", "0.1")
     expect(view).to_have_attribute("data-ghost", "goal")
     assert page.evaluate("rtcp.state.goal") == pytest.approx([1.2, *BENT[1:]])

@@ -1,4 +1,4 @@
-// The arm in space: solid links of its URDF, live; a ghost along a planned path, else where the motion under way ends; the
+// The arm in space: solid links of its URDF, live; a ghost where the motion under way ends, else along a planned path; the
 // tool's path of the last seconds; boxes.
 import { THREE, OrbitControls } from "nicegui-scene";
 
@@ -110,6 +110,10 @@ export default {
   },
   methods: {
     show(state) {
+      if (state.goal && this.plan) { // what moves counts more than what is planned
+        this.plan = null;
+        if (!state.mine) this.path.geometry.setDrawRange(0, 0);
+      }
       if (!this.plan) this.aim(state.goal);
       if (!state.joints && this.points?.length) { this.points = []; this.trace.geometry.setDrawRange(0, 0); this.drawBoxes({ box: null, keep_out: {} }); this.draw(); }
       if (!state.joints || !this.$el.clientWidth) return;
@@ -162,7 +166,7 @@ export default {
       shown.forEach((q, at) => points.array.set(this.ghost.toolAt(q).toArray(), 3 * at));
       points.needsUpdate = true;
       this.path.geometry.setDrawRange(0, shown.length);
-      this.aim(path?.at(-1));
+      this.aim(path?.at(-1) ?? window.rtcp.state.goal);
       this.draw();
     },
     aim(q) {
