@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import struct
 from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
@@ -89,9 +90,10 @@ class CommandChannel:
         self.config = config
         self.names = snapshot.names
         self._ring = asyncio.Lock()
-        self._answer_poll_s = min(0.5e-6 * config.cycle.period_us, _POLL_S)
+        self._answer_poll_s = min(0.2e-6 * config.cycle.period_us, _POLL_S)
         self._waiters: list[_Waiter[Any]] = []
         self._has_waiters = asyncio.Event()
+        self._sleeper = ThreadPoolExecutor(1, "follow")
 
     # -- what the loop shows now --------------------------------------------------------------------------------------
 
@@ -234,7 +236,9 @@ class CommandChannel:
             await self._has_waiters.wait()
             for waiter in list(self._waiters):
                 waiter.update()
-            await asyncio.sleep(min((waiter.interval_s for waiter in self._waiters), default=_POLL_S))
+            interval_s = min((waiter.interval_s for waiter in self._waiters), default=_POLL_S)
+            # Not `asyncio.sleep`: epoll's resolution makes at least 1 ms of it, two cycles more for each answer.
+            await asyncio.get_running_loop().run_in_executor(self._sleeper, sleep, interval_s)
             if not self._waiters:
                 self._has_waiters.clear()
 
