@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, settings
 
 from kinematics.compiled import BUILD
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.schema import arm_schema
 
 _UNHURRIED = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.register_profile("same", parent=_UNHURRIED, derandomize=True)
@@ -58,6 +59,6 @@ def path() -> Iterator[Path]:
 @pytest.fixture
 def board(path: Path) -> Iterator[Blackboard]:
     """A blackboard of six joints."""
-    made = Blackboard(path, 6, 500_000)
+    made = Blackboard(path, arm_schema(6), 500_000)
     yield made
     made.close()

@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
-    ("kinematics",), ("config",), ("virtual",), ("fieldbus",), ("devices",), ("ipc",), ("api",), ("motion",),
+    ("kinematics",), ("config",), ("virtual",), ("fieldbus",), ("ipc",), ("devices",), ("api",), ("motion",),
     ("realtime",), ("control",), ("gateway",), ("launch",), ("telemetry",), ("panel", "ros"), ("cli",),
 )  # fmt: skip
 """The folders from the top of the list down; each imports itself and what stands above it, and not its neighbour."""

@@ -17,6 +17,7 @@ from rtcp.api.results import (
 )
 from rtcp.api.robot import Robot, connect
 from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
+from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ __all__ = [
     "NotRunning",
     "Preview",
     "Progress",
+    "RecordSchema",
     "RecorderStatus",
     "Refused",
     "Robot",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import time
@@ -12,6 +13,8 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from rtcp.config.find import load_messages
+from rtcp.config.model import PluginError
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import BlackboardError, Observer
@@ -34,6 +37,7 @@ class Feed:
     Attributes:
         config: what was started.
         period_ns: of a cycle.
+        schema: of the records: name, type, unit and meaning of each field.
 
     Raises:
         NotRunning: no platform runs there.
@@ -47,6 +51,7 @@ class Feed:
         except (BlackboardError, SessionError) as error:
             raise _not_running(directory, str(error)) from error
         self.period_ns = self._observer.period_ns
+        self.schema = self._observer.schema
         self._loop = select.poll()
         try:
             self._process = os.pidfd_open(self._observer.loop_pid)
@@ -55,6 +60,8 @@ class Feed:
             message = f"the loop (process {self._observer.loop_pid}) has ended"
             raise _not_running(directory, message) from error
         self._loop.register(self._process, select.POLLIN)
+        with contextlib.suppress(PluginError):
+            load_messages()
         self._names = Names(self.config)
         self._at, self._event = self._observer.head, self._observer.last_event
         self._texts_read_ns = time.monotonic_ns()

@@ -360,9 +360,9 @@ class Methods:
     # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
 
     @Method
-    def set_output(self, output: int, value: bool) -> Call[None]:
-        """Set a digital output of the IO box, counted from 1."""
-        return Call("set_output", {"output": output, "value": value}, _nothing)
+    def set_output(self, output: int, value: bool, box: str | None = None) -> Call[None]:
+        """Set a digital output, counted from 1, of an IO box; `box`: its slave, needed with several."""
+        return Call("set_output", {"output": output, "value": value, "box": box}, _nothing)
 
     @Method
     def gripper(self, open: bool) -> Call[GripperRest]:

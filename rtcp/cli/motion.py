@@ -90,13 +90,14 @@ def _mode(
 def _output(
     number: Annotated[int, typer.Argument(metavar="N", help="Output of the IO box, from 1.")],
     value: Annotated[str, typer.Argument(metavar="on|off")],
+    box: Annotated[str | None, option("--box", "NAME", "The IO box, by its slave; needed with several.")] = None,
 ) -> None:
     """Switch a digital output of the IO box."""
     level = {"on": True, "1": True, "off": False, "0": False}.get(value.lower())
     if level is None:
         raise CommandError(f"{value!r} is not a level of an output: on or off")
     with connect("output") as robot:
-        robot.set_output(number, level)
+        robot.set_output(number, level, box)
     report(f"output {number} is {'on' if level else 'off'}")
 
 

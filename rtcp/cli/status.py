@@ -217,8 +217,8 @@ def _facts(status: Json) -> Table:
         clock = Text("not tracked: no answer", "yellow")
     rows.add_row("frames", counted)
     rows.add_row("clocks", clock)
-    rows.add_row("inputs", _bits(status["inputs"]))
-    rows.add_row("outputs", _bits(status["outputs"]))
+    for device, fields in status["devices"].items():
+        rows.add_row(Text(device), Text(", ".join(_value(name, **shown) for name, shown in fields.items())))
     rows.add_row("real time", realtime_line(status["realtime"]))
     if skipped := status.get("skipped_ticks"):
         rows.add_row("cycle", Text(f"{skipped['message']}; {skipped['remedy']}", "yellow"))
@@ -226,6 +226,14 @@ def _facts(status: Json) -> Table:
         rows.add_row("lease", Text(status["lease"]["holder"]))
     rows.add_row("processes", ", ".join(f"{name} {pid}" for name, pid in status["pids"].items() if pid))
     return rows
+
+
+def _value(name: str, value: Any, unit: str) -> str:
+    """Return a field of a device: levels of inputs and outputs as bits."""
+    if name in ("inputs", "outputs"):
+        return f"{name} {_bits(value)}"
+    number = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return f"{name} {number} {unit}".rstrip()
 
 
 def _robot(robot: Json) -> Text:

@@ -111,6 +111,18 @@ def registered(group: str) -> dict[str, EntryPoint]:
     return found
 
 
+def load_messages() -> None:
+    """Import the controllers and drivers of other packages: that registers their commands, refusals and events.
+
+    Raises:
+        PluginError: one cannot be imported.
+    """
+    for group in ("rtcp.controllers", "rtcp.devices"):
+        for entry in installed(group):
+            if not entry.value.startswith("rtcp."):
+                load_class(entry, object)
+
+
 def load_class(entry: EntryPoint, base: type[T]) -> type[T]:
     """Return the class of an entry point.
 

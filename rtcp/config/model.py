@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 
 from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
@@ -35,12 +35,21 @@ from rtcp.config.numbers import (
     Vector,
 )
 
+
+class HasBox(Protocol):
+    """What hangs on an IO box."""
+
+    @property
+    def box(self) -> str | None:
+        """Name of the box; None: the only one."""
+
+
 VIRTUAL = "virtual"
 """Name of the bus that is a segment in software."""
 JOINTS = 6
 """Joints of an arm that has `kinematics`."""
 MOST_AXES = 10
-"""Joints, a gripper's among them, that a command has room for."""
+"""Joints, a gripper's among them: as many as commands, plans and recordings have room for."""
 MOST_POINTS = 4096
 """Points or poses of a motion file."""
 
@@ -98,6 +107,8 @@ class PdoEntry:
     """Channel name; the kind of device determines which names are needed."""
     factor: float = 1.0
     """SI units per count; not 0."""
+    unit: str = ""
+    """Unit of the value, for people and recordings; at most 32 characters, no comma, colon or line break."""
 
 
 @dataclass(frozen=True)
@@ -234,6 +245,8 @@ class GripperConfig:
 
     output: Terminal | None = None
     """Output that moves the gripper."""
+    box: Name | None = None
+    """IO box of `output`; needed with several boxes."""
     closed: Literal["on", "off"] | None = None
     """Output state that closes the gripper; none: on. Only with `output`."""
     joint: Joint | None = None
@@ -395,6 +408,8 @@ class InputConfig:
     """Active level."""
     debounce_ms: Milliseconds = 5.0
     """Debounce time, ms."""
+    box: Name | None = None
+    """IO box of the input; needed with several boxes."""
 
 
 @dataclass(frozen=True)
@@ -425,6 +440,8 @@ class JoystickConfig:
     """Level that means pressed, for all six."""
     debounce_ms: Milliseconds = 5.0
     """Debounce time, ms."""
+    box: Name | None = None
+    """IO box of the joystick; needed with several boxes."""
 
 
 @dataclass(frozen=True)
@@ -450,6 +467,8 @@ class OutputsConfig:
     """Output terminal: on while the arm moves."""
     heartbeat: Terminal | None = None
     """Output terminal: toggled each cycle, for an oscilloscope."""
+    box: Name | None = None
+    """IO box of these outputs; needed with several boxes."""
 
 
 @dataclass(frozen=True)
@@ -585,10 +604,21 @@ class ArmConfig(ArmSettings):
     source: Path = Path()
     """The file it was read from."""
 
+    @property
+    def boxes(self) -> tuple[str, ...]:
+        """Names of the IO boxes, in the order of the cable."""
+        return tuple(slave.name for slave in self.slaves if slave.device.kind == "io")
+
+    def box_of(self, user: HasBox | None) -> str:
+        """Return the IO box that an input or output with a function hangs on; empty: there is none."""
+        boxes = self.boxes
+        named = None if user is None else user.box
+        return named if named is not None else boxes[0] if boxes else ""
+
 
 # -- motion files ------------------------------------------------------------------------------------------------------
 
-_Numbers = Annotated[tuple[Angle, ...], MinLen(1), MaxLen(6)]
+_Numbers = Annotated[tuple[Angle, ...], MinLen(1), MaxLen(MOST_AXES)]
 _Coordinates = Annotated[tuple[Angle, ...], MinLen(6), MaxLen(6)]
 
 

@@ -21,6 +21,7 @@ from rtcp.config.model import (
     Box,
     DeviceDescription,
     GripperConfig,
+    HasBox,
     Joint,
     KeepOut,
     Kinematics,
@@ -284,27 +285,41 @@ def _jog_speeds(arm: ArmFile) -> Iterator[Finding]:
 
 @rule(ArmFile, "inputs")
 def _input_terminals(arm: ArmFile) -> Iterator[Finding]:
-    return _repeated(_inputs(arm), "input")
+    return _repeated_by_box(_inputs(arm), "input")
 
 
 @rule(ArmFile, "outputs", "gripper")
 def _output_terminals(arm: ArmFile) -> Iterator[Finding]:
-    return _repeated(_outputs(arm), "output")
+    return _repeated_by_box(_outputs(arm), "output")
 
 
-def _inputs(arm: ArmFile) -> Iterator[Place]:
+Terminals = Iterator[tuple[KeyPath, HasBox, tuple[Place, ...]]]
+"""What hangs on a box: its section, its key `box`, and its terminals."""
+
+
+def _inputs(arm: ArmFile) -> Terminals:
     if joystick := arm.inputs.joystick:
-        yield from ((("inputs", "joystick", key), getattr(joystick, key)) for key in JOYSTICK_TERMINALS)
+        places = tuple((("inputs", "joystick", key), getattr(joystick, key)) for key in JOYSTICK_TERMINALS)
+        yield ("inputs", "joystick"), joystick, places
     for key in ("arm_toggle", "enabling_switch", "emergency_stop"):
         if terminal := getattr(arm.inputs, key):
-            yield ("inputs", key, "number"), terminal.number
+            yield ("inputs", key), terminal, ((("inputs", key, "number"), terminal.number),)
 
 
-def _outputs(arm: ArmFile) -> Iterator[Place]:
-    outputs = {("outputs", key): getattr(arm.outputs, key) for key in ("state_lamp", "motion_lamp", "heartbeat")}
-    if arm.gripper:
-        outputs["gripper", "output"] = arm.gripper.output
-    return ((where, number) for where, number in outputs.items() if number is not None)
+def _outputs(arm: ArmFile) -> Terminals:
+    lamps = ((("outputs", key), getattr(arm.outputs, key)) for key in ("state_lamp", "motion_lamp", "heartbeat"))
+    if found := tuple((where, number) for where, number in lamps if number is not None):
+        yield ("outputs",), arm.outputs, found
+    if arm.gripper and arm.gripper.output is not None:
+        yield ("gripper",), arm.gripper, ((("gripper", "output"), arm.gripper.output),)
+
+
+def _repeated_by_box(terminals: Terminals, what: str) -> Iterator[Finding]:
+    boxes: dict[str | None, list[Place]] = {}
+    for _, user, places in terminals:
+        boxes.setdefault(user.box, []).extend(places)
+    for of_box in boxes.values():
+        yield from _repeated(of_box, what)
 
 
 def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
@@ -333,13 +348,21 @@ def drive_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> It
 
 
 def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) -> Iterator[Finding]:
-    """Yield the terminals of an arm that has no IO box; `devices`: the valid ones by name."""
+    """Yield terminals without an IO box, or without a word on which one; `devices`: the valid ones by name."""
     found = [devices.get(slave.device) for slave in arm.slaves]
-    if any(device is None or device.kind != "cia402" for device in found):
+    if None in found:
         return
+    boxes = [slave.name for slave in arm.slaves if devices[slave.device].kind == "io"]
     for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
-        for where, number in terminals:
-            yield where, f"found {kind} {number}, but no slave is of kind io; leave it out for such an arm"
+        for where, user, places in terminals:
+            if not boxes and all(device is not None and device.kind == "cia402" for device in found):
+                for place, number in places:
+                    yield place, f"found {kind} {number}, but no slave is of kind io; leave it out for such an arm"
+            elif user.box is not None and user.box not in boxes:
+                allowed = ", ".join(boxes) or "none: no slave is of kind io"
+                yield (*where, "box"), f'found the text "{user.box}", which is no IO box; allowed is {allowed}'
+            elif user.box is None and len(boxes) > 1:
+                yield (*where, "box"), f"the key is missing; with several IO boxes it must be one of {', '.join(boxes)}"
 
 
 def _beyond_the_wire(axis: KeyPath, joint: Joint, device: DeviceDescription) -> Iterator[Finding]:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.gripper import TRACKED_RAD, DrivenGripper
+from rtcp.control.part import Part
 from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command, Jog, MoveJoints
 from rtcp.ipc.events import EmergencyStop
+from rtcp.ipc.schema import ARM_MODES, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup, load_controllers
 from rtcp.motion.controllers.jog import JogController
@@ -32,8 +35,8 @@ RANGE_MARGIN_RAD = 0.02
 leave an arm that no command can move."""
 
 
-class Arm:
-    """What a cycle does with the joints.
+class Arm(Part):
+    """What a cycle does with the joints. Its setpoints move on where the machine commands it, in `command`.
 
     Args:
         config: joints, limits, cycle, the mode at the start.
@@ -50,6 +53,7 @@ class Arm:
         plan: Callable[[int], memoryview[float]],
     ) -> None:
         joints = config.joints
+        super().__init__("arm", arm_fields(len(joints)))
         self.period_s = config.cycle.period_us * 1e-6
         self.drives = [drive for _, drive in drives]
         self.pairs = list(drives)
@@ -104,15 +108,31 @@ class Arm:
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque
-        if self.gripper is not None:
-            self.gripper.decode(data)
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""
         for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
-        if self.gripper is not None:
-            self.gripper.encode(data)
+
+    def publish(self, values: list[Any]) -> None:
+        """Write modes, progress and what the joints measure and are sent."""
+        state, controller, at = self.state, self.active, self.at
+        values[at : at + len(ARM_MODES)] = (
+            self.mode,
+            self.control_mode,
+            self.output_limiter.held | self.trajectory_guard.held,
+            controller.elapsed_s,
+            controller.duration_s,
+        )
+        n, at = len(self.drives), at + len(ARM_MODES)
+        values[at : at + 4 * n] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)
+        at += 4 * n
+        for drive in self.drives:
+            values[at] = drive.target_position
+            values[at + n] = drive.target_velocity
+            values[at + 2 * n] = drive.target_torque
+            values[at + 3 * n] = drive.statusword
+            at += 1
 
     def advance(self, target: TargetState) -> None:
         """Command every drive one step towards `target`."""

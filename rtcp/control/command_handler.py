@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
-from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import (
     Command,
@@ -55,6 +55,7 @@ from rtcp.ipc.refusals import (
     TorqueLimitTooLow,
     TorquePresent,
     UnknownAxis,
+    UnknownBox,
     UnknownOutput,
     WrongControlMode,
     WrongRowCount,
@@ -74,17 +75,15 @@ class CommandHandler:
     """Takes at most one command a cycle.
 
     Args:
-        machine: the state machine.
-        box: the IO box, or None.
+        machine: the state machine; a command that a part names goes to that part.
         blackboard: where commands come from and answers go.
     """
 
-    def __init__(self, machine: StateMachine, box: IoBox | None, blackboard: Blackboard) -> None:
+    def __init__(self, machine: StateMachine, blackboard: Blackboard) -> None:
         self._machine = machine
         self._context = machine.context
         self._arm = machine.context.arm
         self._operator = machine.context.operator
-        self._box = box
         self._blackboard = blackboard
         self._handlers: dict[type[Command], Callable[[Any, int], Refusal | None]] = {
             Enable: self._enable,
@@ -100,6 +99,11 @@ class CommandHandler:
             Home: self._home,
             Shutdown: self._shut_down,
         }
+        for part in machine.context.parts:
+            for kind in part.commands:
+                if kind in self._handlers or issubclass(kind, MotionCommand):
+                    raise ConfigError([f"{part.name}: the command {kind.name} is already taken by another part"])
+                self._handlers[kind] = part.accept
 
     def handle(self) -> None:
         """Carry out the next command and answer it; called only when one waits."""
@@ -257,12 +261,15 @@ class CommandHandler:
         return None
 
     def _set_output(self, command: SetOutput, lease: int) -> Refusal | None:
-        box, output = self._box, command.output
-        if box is None:
+        boxes, output = self._context.boxes, command.output
+        if not boxes:
             return NoOutputs()
+        if not 0 <= command.box < len(boxes):
+            return UnknownBox(command.box + 1, len(boxes))
+        _, box = boxes[command.box]
         if not 1 <= output <= box.output_count:
             return UnknownOutput(output, box.output_count)
-        if output in self._operator.reserved:
+        if (box.name, output) in self._operator.reserved:
             return ReservedOutput(output)
         box.set_output(output, command.value)
         return None

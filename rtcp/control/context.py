@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.homing import HomingSequence
 from rtcp.control.operator import Operator
+from rtcp.control.part import Device, Part, PartContext
 from rtcp.devices.cia402 import DriveState
+from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
     ClockLost,
@@ -35,13 +39,14 @@ from rtcp.realtime.discipline import Discipline
 _IN_FAULT = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 
 
-class Context:
+class Context(PartContext):
     """One for the machine; a state reads it and calls it, and writes only what is said to be a state's to write.
 
     Args:
         config: timeouts, how many cycles may be lost, and the stop reactions.
         arm: the joints.
         operator: the inputs and outputs with a function.
+        devices: the slaves that are no drives.
         blackboard: where events go, and where the lease is.
         service: the thread beside the cycle.
         discipline: follows the reference clock, or None without distributed clocks.
@@ -52,16 +57,21 @@ class Context:
         config: ArmConfig,
         arm: Arm,
         operator: Operator,
+        devices: Sequence[Device],
         blackboard: Blackboard,
         service: BusService,
         discipline: Discipline | None,
     ) -> None:
+        super().__init__(config.cycle.period_us * 1e-6)
         self.config = config
         self.arm = arm
         self.operator = operator
+        self.parts: list[Part] = [arm, *([] if arm.gripper is None else [arm.gripper]), operator, *devices]
+        """The parts of the cycle; the operator's outputs are written before its boxes encode them."""
+        self.boxes = [(one.slot + 1, one.driver) for one in devices if isinstance(one.driver, IoBox)]
+        """Position on the cable and driver of each IO box, in the order of the cable."""
         self.blackboard = blackboard
         self.service = service
-        self.period_s = config.cycle.period_us * 1e-6
         self.supervision = Supervision(config, arm.limits)
         self.homing = HomingSequence(arm, self.period_s)
         self.reactions = reactions(config.stops)
@@ -69,23 +79,14 @@ class Context:
         self._lost_limit = config.bus.lost_cycles
         self._clock_cycles = round(config.bus.clock_lost_s / self.period_s)
         self._unlocked = 0
-        self.state = State.STARTING
-        """Written by the machine alone."""
-        self.cycle = 0
         self.entered = 0
         """Cycle in which the machine changed to its state."""
-        self.now_ns = 0
-        """Instant of the cycle, ns of the clock of the loop."""
-        self.good = False
-        """Whether the exchange of this cycle had the expected working counter."""
         self.lost = 0
         """Cycles in a row without it."""
         self.wkc_error_count = 0
         """Cycles without it, less those with it, 0 to `bus.lost_cycles`."""
         self.lease = 0
         """Lease of the commander whose motion runs; 0: the joystick's, which needs none."""
-        self.all_enabled = False
-        """Written by states: whether all drives are in Operation Enabled."""
         self.limited = False
         """Written by states: whether the stop under way ends in the state stopped by limit."""
         self.pending: ClockLost | None = None
@@ -126,21 +127,28 @@ class Context:
         return self._discipline is None or self._discipline.locked
 
     @property
-    def box_in_op(self) -> bool:
-        """Whether there is an IO box, and in OP."""
-        box = self.operator.box_position
-        return box > 0 and self.blackboard.in_op(box)
+    def stop_box_in_op(self) -> bool:
+        """Whether there is a box for the emergency stop, and in OP."""
+        position = self.operator.stop_position
+        return position > 0 and self.blackboard.in_op(position)
 
-    @property
-    def box_left_op(self) -> bool:
-        """Whether the IO box is not in OP; where it was the first slave lost, until the reset."""
-        box = self.operator.box_position
-        return box > 0 and (self.service.lost_slave == box or not self.box_in_op)
+    def clear_lost_boxes(self) -> None:
+        """Clear the outputs of each box that is not in OP; where it was the first slave lost, until the reset."""
+        for position, box in self.boxes:
+            if self.service.lost_slave == position or not self.blackboard.in_op(position):
+                self.operator.clear_outputs(box)
+
+    def make_safe(self) -> None:
+        """Tell every part to set its outputs to their safe state."""
+        for part in self.parts:
+            part.safe()
 
     # -- what ends a state from outside ---------------------------------------------------------------------------
 
     def bus_fault(self) -> Event | None:
-        """Return what was lost of frames, slaves and clock."""
+        """Return what was lost of frames, slaves and clock, or what a part has reported."""
+        if self.reported is not None:
+            return self.reported
         # Not those in a row alone: one good cycle in ten would keep an arm moving that is hardly heard.
         if not self.good and self.wkc_error_count >= self._lost_limit:
             return ProcessDataLost(self.lost, self._lost_limit)

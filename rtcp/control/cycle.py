@@ -1,13 +1,15 @@
 """The cycle.
 
-wake -> send the outputs of the last cycle -> receive -> decode -> command -> state machine (controller -> guards ->
-writer -> limiter) -> encode -> publish -> clock discipline. Nothing in here logs, blocks, opens or grows.
+wake -> send the outputs of the last cycle -> receive -> each part's decode -> command -> state machine (controller ->
+guards -> writer -> limiter) -> each part's update and encode -> publish -> clock discipline. Nothing in here logs,
+blocks, opens or grows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from time import monotonic_ns
+from typing import Any
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.control.arm import Arm
@@ -17,13 +19,14 @@ from rtcp.control.context import Context
 from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
+from rtcp.control.part import make_devices
 from rtcp.devices.cia402 import Cia402Drive, drive_of
-from rtcp.devices.driver import Driver, make_driver
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ClockLocked, ClockUnlocked
-from rtcp.ipc.layout import (
+from rtcp.ipc.schema import (
+    CYCLE_FIELDS,
     FLAG_ALL_OP,
     FLAG_ARM_HAS_JOYSTICK,
     FLAG_DC_LOCKED,
@@ -31,8 +34,11 @@ from rtcp.ipc.layout import (
     FLAG_ENABLED,
     FLAG_MOTION_ALLOWED,
     FLAG_SWITCHING,
-    PER_JOINT,
-    SCALARS,
+    GRIPPER_FIELDS,
+    OPERATOR_FIELDS,
+    RecordSchema,
+    arm_fields,
+    schema_of,
 )
 from rtcp.realtime.discipline import Discipline
 from rtcp.realtime.scheduling import Sleeper
@@ -40,9 +46,8 @@ from rtcp.realtime.scheduling import Sleeper
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""
 _LONGEST_NS = 2_000_000_000
-_WAY = 20
+_TRANSIT_DIVISOR = 20
 """A frame is on its way for this part of the period at most."""
-_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
 
 
 class Cycle:
@@ -69,18 +74,23 @@ class Cycle:
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
     ) -> None:
-        others = make_others(config)
-        box = next(((slot, driver) for slot, driver in others if isinstance(driver, IoBox)), None)
-        self.others = [one for one in others if one != box]
-        """Index of the slave and driver of each device of another kind than drive and IO box."""
+        devices = make_devices(config)
         self.arm = Arm(config, make_drives(config), make_gripper(config), blackboard.plan)
-        self.box = None if box is None else box[1]
-        self.operator = Operator(config, self.box)
-        context = Context(config, self.arm, self.operator, blackboard, service, discipline)
+        self.operator = Operator(config, {one.name: one.driver for one in devices if isinstance(one.driver, IoBox)})
+        context = Context(config, self.arm, self.operator, devices, blackboard, service, discipline)
         self.machine = StateMachine(context)
-        self.commands = CommandHandler(self.machine, self.box, blackboard)
+        self.commands = CommandHandler(self.machine, blackboard)
+        self.parts = context.parts
         self._context = context
-        self._box_slot = -1 if box is None else box[0]
+        self._stop_device = next((one for one in devices if one.slot + 1 == self.operator.stop_position), None)
+        at = len(CYCLE_FIELDS) - 1
+        for part in self.parts:
+            part.at = at
+            at += sum(field.count for field in part.fields)
+        self._values: list[Any] = [0] * at
+        """The numbers of the record but its own number, which the blackboard gives it."""
+        if blackboard.schema != schema_of(part.fields for part in self.parts):
+            raise ValueError("the blackboard was made for other records: make it with `record_schema`")
         self._data = data
         self._blackboard = blackboard
         self._service = service
@@ -92,9 +102,8 @@ class Cycle:
         # Half of what is left to SYNC0; the other half is for the frame's way.
         self._late_ns = ahead_ns // 2
         # After a frame that SYNC0 has overtaken, the next tick's would come before the same SYNC0 as that one.
-        self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _WAY)
+        self._apart_ns = max(self._period_ns // 2, self._period_ns - ahead_ns + self._period_ns // _TRANSIT_DIVISOR)
         self._spin_ns = round(config.cycle.spin_us * 1000)
-        self._values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * len(self.arm.drives))
         self._locked = False
         self._shutdown = False
         self.missed = 0
@@ -119,35 +128,30 @@ class Cycle:
 
     def cycle(self, planned: int, woken: int) -> int:
         """Do one cycle, planned at `planned` and begun at `woken` (ns of the clock); return when the next is due."""
-        data, arm, machine, box = self._data, self.arm, self.machine, self.box
+        data, machine, parts = self._data, self.machine, self.parts
         data.send()
         sent = self._now()
         wkc = data.receive()
         received = self._now()
         good = wkc == self._expected
         context = self._context
-        context.now_ns = arm.state.now_ns = woken
+        context.now_ns = self.arm.state.now_ns = woken
         if good:
-            arm.decode(data)
-            if box is not None:
-                box.decode(data.input(self._box_slot))
-            for slot, driver in self.others:
-                driver.decode(data.input(slot))
-        elif wkc > 0 and box is not None and context.box_in_op:
+            for part in parts:
+                part.decode(data)
+        elif wkc > 0 and self._stop_device is not None and context.stop_box_in_op:
             # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
             # fill in as it was, so these are the inputs of the box, of now or of before.
-            box.decode(data.input(self._box_slot))
+            self._stop_device.decode(data)
             self.operator.read_emergency_stop()
         if self._blackboard.command_waits():
             self.commands.handle()
         if self._shutdown:
             machine.close()
         machine.update(good)
-        arm.encode(data)
-        if box is not None:
-            data.set_output(self._box_slot, box.encode())
-        for slot, driver in self.others:
-            data.set_output(slot, driver.encode())
+        for part in parts:
+            part.update(context)
+            part.encode(data)
         self._publish(woken, planned, received, wkc)
         discipline = self._discipline
         if discipline is None:
@@ -173,8 +177,8 @@ class Cycle:
 
     def _publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
         """Publish the record of the cycle."""
-        values, machine, discipline, box = self._values, self.machine, self._discipline, self.box
-        arm, operator, context = self.arm, self.operator, self._context
+        values, machine, discipline = self._values, self.machine, self._discipline
+        operator, context = self.operator, self._context
         flags = FLAG_ALL_OP if self._service.all_op else 0
         offset = filtered = 0
         if discipline is not None:
@@ -194,19 +198,12 @@ class Cycle:
             flags |= FLAG_MOTION_ALLOWED
         if operator.joystick_granted:
             flags |= FLAG_ARM_HAS_JOYSTICK
-        inputs = outputs = counter = 0
-        if box is not None:
-            inputs, outputs, counter = box.inputs, box.outputs, box.counter
-        controller = arm.active
-        # One slice, in the order of layout.SCALARS: cheaper than an index a field.
-        values[: len(_AT)] = (
+        # One slice, in the order of CYCLE_FIELDS: cheaper than an index a field.
+        values[: len(CYCLE_FIELDS) - 1] = (
             context.cycle,
             woken,
             self._data.dc_time,
             context.state,
-            arm.mode,
-            arm.control_mode,
-            operator.joystick_mode,
             flags,
             min(wkc, _LARGEST_COUNTER),
             self._expected,
@@ -217,40 +214,32 @@ class Cycle:
             min(self._compute_ns, _LONGEST_NS),
             offset,
             filtered,
-            inputs,
-            outputs,
-            counter,
             machine.fault,
             machine.limit,
-            arm.output_limiter.held | arm.trajectory_guard.held,
             machine.enables,
             machine.motions,
-            controller.elapsed_s,
-            controller.duration_s,
         )
-        state, n = arm.state, len(arm.drives)
-        at = len(_AT) + 4 * n
-        values[len(_AT) : at] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)
-        for drive in arm.drives:
-            values[at] = drive.target_position
-            values[at + n] = drive.target_velocity
-            values[at + 2 * n] = drive.target_torque
-            values[at + 3 * n] = drive.statusword
-            at += 1
+        for part in self.parts:
+            part.publish(values)
         self._blackboard.publish(values)
+
+
+def record_schema(config: ArmConfig) -> RecordSchema:
+    """Return what the records of the cycle of this platform hold.
+
+    Raises:
+        DeviceError: the description of a device does not suit its use.
+        SchemaError: two slaves have names that differ too little for the names of fields.
+    """
+    driven = config.gripper is not None and config.gripper.joint is not None
+    arm = (arm_fields(len(config.joints)), GRIPPER_FIELDS if driven else (), OPERATOR_FIELDS)
+    return schema_of((*arm, *(device.fields for device in make_devices(config))))
 
 
 def make_drives(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
     """Return the driver of each joint with the index of its slave; raises DeviceError."""
     zeros = config.zero_offsets or (0.0,) * len(config.axes)
     return [drive_of(config, joint, zero) for joint, zero in zip(config.joints, zeros, strict=False)]
-
-
-def make_others(config: ArmConfig) -> list[tuple[int, Driver]]:
-    """Return the drivers of the slaves that are no drives, with the indices of the slaves; raises DeviceError."""
-    period_s = config.cycle.period_us * 1e-6
-    made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
-    return [(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
 
 
 def ahead_of_sync0(config: ArmConfig) -> int:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rtcp.config.model import ArmConfig, Joint, SupervisionConfig
+from rtcp.control.part import Part, PartContext
 from rtcp.devices.cia402 import Cia402Drive, DriveState, drive_of
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import EmergencyStop, FollowingError, GripperAtRest, OverSpeed
+from rtcp.ipc.schema import GRIPPER_FIELDS
 from rtcp.motion.controllers.gripper import GripperMotion
 
 _RANGE_MARGIN_RAD = 0.02
@@ -16,16 +20,17 @@ TRACKED_RAD = 0.03
 a joint may stand outside its range."""
 
 
-class DrivenGripper:
+class DrivenGripper(Part):
     """The drive of the gripper in CSP: enabled and disabled with the arm, moved by itself.
 
-    `decode` and `encode` beside those of the arm; `track_actual` or `command` in each cycle in which the arm does so.
+    `track_actual` or `command` in each cycle in which the arm does so.
     """
 
     def __init__(
         self, slot: int, drive: Cia402Drive, motion: GripperMotion, supervision: GripperSupervision, axis: int
     ) -> None:
         """Take the index of its slave, its driver, its motion, its supervision and its axis; see `make_gripper`."""
+        super().__init__("gripper", GRIPPER_FIELDS)
         self.slot = slot
         self.drive = drive
         self.motion = motion
@@ -42,6 +47,19 @@ class DrivenGripper:
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drive."""
         data.set_output(self.slot, self.drive.encode())
+
+    def update(self, context: PartContext) -> None:
+        """Report where it came to rest."""
+        at_rest = self.came_to_rest()
+        if at_rest is not None and context.all_enabled:
+            context.publish(at_rest)
+
+    def publish(self, values: list[Any]) -> None:
+        """Write what its drive measures and is sent."""
+        drive, at = self.drive, self.at
+        values[at : at + len(GRIPPER_FIELDS)] = (
+            drive.position, drive.velocity, drive.torque, drive.target_position, drive.statusword,
+        )  # fmt: skip
 
     @property
     def enabled(self) -> bool:

@@ -67,6 +67,8 @@ _ENDED_BY_EMERGENCY_STOP = frozenset(
 )
 """States that the input of the emergency stop ends: those with torque, and those after a fault. On the way to OP the
 inputs are not yet valid; while ready no drive has torque, and enabling is refused while it is pressed."""
+_SAFE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.CLOSING})
+"""States at whose beginning all outputs become safe. Inputs that are stale for too long lead to the fault."""
 _SLAVES_RETURN = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
 """States in which a slave that has left OP may return to it."""
 
@@ -138,12 +140,12 @@ class StateMachine:
             event = self._active.update(ctx)
             if event is not None:
                 self._handle(event)
-        if ctx.state in _SLAVES_RETURN and ctx.box_left_op:
-            operator.clear_outputs()
-        operator.write_outputs(ctx.all_enabled, ctx.state is State.MOVING)
-        gripper = ctx.arm.gripper
-        if gripper is not None and (at_rest := gripper.came_to_rest()) is not None and ctx.all_enabled:
-            ctx.publish(at_rest)
+        if ctx.state in _SLAVES_RETURN:
+            ctx.clear_lost_boxes()
+        if ctx.reported is not None:
+            if self.fault != ctx.reported.number:
+                ctx.publish(ctx.reported)  # of a state that no fault ends: it is in one already
+            ctx.reported = None
 
     def change(self, cause: Cause, lease: int | None = None) -> None:
         """Change to the state that a command, an event or a signal leads to; an event is published.
@@ -162,6 +164,8 @@ class StateMachine:
             ctx.lease = lease
         self._count(cause, target)
         ctx.state, ctx.entered = target, ctx.cycle
+        if target in _SAFE:
+            ctx.make_safe()
         if target is not State.OFF:
             self._active = self._states[target]
             self._active.enter(ctx, cause, before)

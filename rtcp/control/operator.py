@@ -1,9 +1,13 @@
-"""Controls and lamps at the arm: joystick, toggle, enabling switch, emergency stop."""
+"""Controls and lamps at the arm: joystick, toggle, enabling switch, emergency stop; each hangs on an IO box."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
+from rtcp.control.part import Part, PartContext
 from rtcp.devices.io_box import Inputs, IoBox, JoystickInput, Outputs
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
@@ -14,63 +18,81 @@ from rtcp.ipc.events import (
     JoystickWithdrawn,
     UnknownJoystickCode,
 )
-from rtcp.ipc.states import ControlMode
+from rtcp.ipc.schema import OPERATOR_FIELDS
+from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.controllers.joystick import Joystick
 from rtcp.motion.state import Phase
 
 
-class Operator:
+class Operator(Part):
     """Reads the inputs with a function, jogs the arm by the joystick, and writes the outputs with a function.
 
     Args:
         config: which they are.
-        box: the IO box, or None: then nothing is pressed, nothing is forbidden and there is no joystick.
+        boxes: the IO boxes by name; none: nothing is pressed, nothing is forbidden and there is no joystick.
     """
 
-    def __init__(self, config: ArmConfig, box: IoBox | None) -> None:
+    def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox]) -> None:
+        super().__init__("operator", OPERATOR_FIELDS)
         cycle_s = config.cycle.period_us * 1e-6
-        self._box = box
-        self.box_position = 0 if box is None else 1 + [slave.name for slave in config.slaves].index(box.name)
-        """The box's position on the cable; 0: there is none."""
-        self._inputs = Inputs(config.inputs, cycle_s)
-        self._outputs = Outputs(config.outputs, config.gripper)
-        self._input = JoystickInput(config.inputs, cycle_s)
+        inputs, outputs, gripper = config.inputs, config.outputs, config.gripper
+        self._inputs = Inputs(inputs, cycle_s)
+        self._outputs = Outputs(outputs, gripper)
+        self._input = JoystickInput(inputs, cycle_s)
         self._joystick = Joystick(config.jog)
+        self._stop_box = boxes.get(config.box_of(inputs.emergency_stop))
+        self._switch_box = boxes.get(config.box_of(inputs.enabling_switch))
+        self._toggle_box = boxes.get(config.box_of(inputs.arm_toggle))
+        self._stick_box = boxes.get(config.box_of(inputs.joystick))
+        self._lamp_box = boxes.get(config.box_of(outputs))
+        self._grip_box = boxes.get(config.box_of(gripper))
+        names = [slave.name for slave in config.slaves]
+        self.stop_position = 0 if self._stop_box is None else 1 + names.index(self._stop_box.name)
+        """Position on the cable of the box with the emergency stop; 0: there is no box."""
         self._was_granted = True
         self._code_reported = False
-        self.emergency_stop = box is not None and self._inputs.emergency_stop.active
+        self.emergency_stop = self._stop_box is not None and self._inputs.emergency_stop.active
         """Whether it is pressed; until the box was read it is."""
-        self.permitted = box is None or self._inputs.enabling_switch.active
+        self.permitted = self._switch_box is None or self._inputs.enabling_switch.active
         """Whether the enabling switch allows motion."""
         self.joystick_granted = False
-        self.reserved = self._outputs.meant
-        """Numbers of the outputs with a function."""
-        self.has_button = box is not None and config.inputs.emergency_stop is not None
-        """Whether there is an emergency stop at the box."""
-        self.has_gripper = box is not None and config.gripper is not None and config.gripper.output is not None
+        lamps = [(config.box_of(outputs), one) for one in (outputs.state_lamp, outputs.motion_lamp, outputs.heartbeat)]
+        grip = None if gripper is None else gripper.output
+        self.reserved = frozenset((*lamps, (config.box_of(gripper), grip)))
+        """Box and number of the outputs that commands may not switch."""
+        self.has_button = self._stop_box is not None and inputs.emergency_stop is not None
+        """Whether there is an emergency stop at a box."""
+        self.has_gripper = self._grip_box is not None and grip is not None
 
     @property
     def joystick_mode(self) -> int:
         """0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper."""
         return self._joystick.mode
 
+    def publish(self, values: list[Any]) -> None:
+        """Write the joystick's mode."""
+        values[self.at] = self._joystick.mode
+
     def read(self) -> None:
         """Read the inputs of the cycle."""
-        box, inputs = self._box, self._inputs
-        if box is None:
-            return
-        levels = box.inputs
-        inputs.read(levels)
-        self._input.read(levels)
-        self.emergency_stop = inputs.emergency_stop.active
-        self.permitted = inputs.enabling_switch.active
-        self.joystick_granted = inputs.arm_toggle.active
+        inputs = self._inputs
+        if self._stop_box is not None:
+            inputs.emergency_stop.read(self._stop_box.inputs)
+            self.emergency_stop = inputs.emergency_stop.active
+        if self._switch_box is not None:
+            inputs.enabling_switch.read(self._switch_box.inputs)
+            self.permitted = inputs.enabling_switch.active
+        if self._toggle_box is not None:
+            inputs.arm_toggle.read(self._toggle_box.inputs)
+            self.joystick_granted = inputs.arm_toggle.active
+        if self._stick_box is not None:
+            self._input.read(self._stick_box.inputs)
 
     def read_emergency_stop(self) -> None:
         """Read that the emergency stop is pressed; never that it was released."""
-        if self._box is not None:
+        if self._stop_box is not None:
             stop = self._inputs.emergency_stop
-            stop.read_active(self._box.inputs)
+            stop.read_active(self._stop_box.inputs)
             self.emergency_stop = stop.active
 
     @property
@@ -81,22 +103,22 @@ class Operator:
     @property
     def button_known(self) -> bool:
         """Whether the emergency stop was read for long enough since `assume_released`."""
-        return self._box is None or self._inputs.emergency_stop.settled
+        return self._stop_box is None or self._inputs.emergency_stop.settled
 
     def assume_released(self) -> None:
-        """Let the emergency stop count as released until the box shows otherwise."""
+        """Let the emergency stop count as released until its box shows otherwise."""
         self._inputs.emergency_stop.forget()
         self.emergency_stop = False
 
-    def write_outputs(self, powered: bool, moving: bool) -> None:
+    def update(self, context: PartContext) -> None:
         """Switch the lamps and toggle the heartbeat."""
-        if self._box is not None:
-            self._box.outputs = self._outputs.write(self._box.outputs, powered, moving)
+        box = self._lamp_box
+        if box is not None:
+            box.outputs = self._outputs.write(box.outputs, context.all_enabled, context.state is State.MOVING)
 
-    def clear_outputs(self) -> None:
-        """Clear all outputs but the lamps, as a box does that leaves OP."""
-        if self._box is not None:
-            self._box.outputs = self._outputs.lamps(self._box.outputs)
+    def clear_outputs(self, box: IoBox) -> None:
+        """Clear all outputs of a box but the lamps, as a box does that leaves OP."""
+        box.outputs = self._outputs.lamps(box.outputs) if box is self._lamp_box else 0
 
     def require_neutral(self) -> None:
         """Ignore the joystick until it has been neutral."""
@@ -104,8 +126,8 @@ class Operator:
 
     def grip(self, close: bool) -> None:
         """Close or open the gripper on its output."""
-        if self._box is not None:
-            self._box.outputs = self._outputs.grip(self._box.outputs, close)
+        if self._grip_box is not None:
+            self._grip_box.outputs = self._outputs.grip(self._grip_box.outputs, close)
 
     def jog_by_joystick(self, arm: Arm, blackboard: Blackboard) -> bool:
         """Command the jog in control mode joystick; return whether the arm has to start moving.

@@ -23,7 +23,7 @@ from kinematics.compiled import BUILD
 from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
-from rtcp.control.cycle import Cycle, make_discipline, position_of
+from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
 from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, TargetState
 from rtcp.devices.driver import DeviceError, make_codec
 from rtcp.fieldbus.bus import ProcessData
@@ -32,6 +32,7 @@ from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.soem import SoemBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.schema import SchemaError
 from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, read_session, write_exit_report
 from rtcp.ipc.stop_reactions import quick_stop_s
 from rtcp.realtime import scheduling
@@ -91,7 +92,7 @@ def main() -> int:
     try:
         bus.open()
         _work(bus, session, given.directory, report)
-    except (BusError, DeviceError, ConfigError) as error:
+    except (BusError, DeviceError, ConfigError, SchemaError) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
         sys.stderr.write("\n".join(sentences) + "\n")
@@ -120,7 +121,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         report.tell("phase", text=note)
     report.tell("phase", text="all slaves in SAFE-OP")
     discipline = make_discipline(config)
-    blackboard = Blackboard(blackboard_file(directory), len(config.joints), period_ns)
+    blackboard = Blackboard(blackboard_file(directory), record_schema(config), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)
     scheduling.share_interpreter_quickly()
     service = BusService(

@@ -582,7 +582,7 @@ class FaultReaction:
 
     def _estop_unobservable(self, ctx: Context) -> bool:
         """Return whether the emergency stop could not be read for too long: it counts as pressed, as a broken wire."""
-        if ctx.good or not ctx.operator.has_button or ctx.box_in_op:
+        if ctx.good or not ctx.operator.has_button or ctx.stop_box_in_op:
             self._unobservable = 0
             return False
         self._unobservable += 1

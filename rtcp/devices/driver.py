@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from mypy_extensions import mypyc_attr
 
 from rtcp.config.find import load_class, registered
 from rtcp.config.model import SlaveConfig
 from rtcp.fieldbus.pdo import TYPES, Channel, ImageLayout, layout
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import Event
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.schema import Field, identifier
+from rtcp.ipc.states import State
 
 Number = int | float
 ENTRY_POINTS = "rtcp.devices"
@@ -28,8 +33,9 @@ class Driver:
 
     A kind of device is one subclass: it names the channels that it cannot do without, unpacks the inputs in `decode`
     and packs the outputs in `encode`, each called once a cycle. This class keeps the layout of both images, and by
-    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name. In the
-    loop, `rtcp.control.cycle.Cycle.others` holds the drivers that are neither a drive nor the IO box.
+    itself offers every mapped channel: `values` (inputs) and `targets` (outputs) hold SI values by channel name; all of
+    them are in the cycle record, named SLAVE_CHANNEL. A driver that is commanded names its `commands` and overrides
+    `accept`; one that does something by itself, or reports events, overrides `update`.
 
     Args:
         slave: the slave's name and description.
@@ -43,6 +49,8 @@ class Driver:
     """Channels of `rpdo` that the driver cannot do without."""
     REQUIRED_INPUTS: ClassVar[tuple[str, ...]] = ()
     """Channels of `tpdo` that the driver cannot do without."""
+    commands: ClassVar[tuple[type[Command], ...]] = ()
+    """Commands that `accept` takes; no other part of the platform takes them."""
 
     def __init__(self, slave: SlaveConfig, period_s: float) -> None:
         device = slave.device
@@ -71,6 +79,47 @@ class Driver:
             if channel.index:
                 self.values[channel.name] = counts * channel.factor
 
+    def accept(self, command: Command) -> Refusal | None:
+        """Carry out one of `commands`; or return why not, and change nothing."""
+        raise NotImplementedError
+
+    def update(self, state: State, now_ns: int) -> Event | None:
+        """Do a cycle, between `decode` and `encode`; return what has happened, a fault among it, or None.
+
+        Args:
+            state: of the machine.
+            now_ns: the loop's clock, ns.
+        """
+        return None
+
+    def safe(self) -> None:
+        """Set the outputs to their safe state, by default 0; called on a fault, on stale inputs and at the end."""
+        for name in self.targets:
+            self.targets[name] = 0.0
+
+    def fields(self) -> Sequence[Field]:
+        """Return what it publishes in the cycle record, without the slave's name; by default every mapped channel."""
+        return [
+            Field(
+                identifier(channel.name) + ("_sent" if image is self.rpdo and channel.name in self.values else ""),
+                "float64",
+                channel.unit,
+                f"{about} 0x{channel.index:04X}:{channel.sub_index:02X}",
+            )
+            for image, about in ((self.tpdo, "Input"), (self.rpdo, "Output"))
+            for channel in image.channels
+            if channel.index
+        ]
+
+    def publish(self, values: list[Any], at: int) -> None:
+        """Write the values of `fields` into the record, from index `at` on."""
+        for value in self.values.values():
+            values[at] = value
+            at += 1
+        for value in self.targets.values():
+            values[at] = value
+            at += 1
+
     def encode(self) -> bytes:
         """Return the outputs of the cycle (`output_bytes` long)."""
         return self.codec_out.pack(*(self._counts_of(channel) for channel in self.rpdo.channels))
@@ -87,14 +136,18 @@ def make_driver(slave: SlaveConfig, period_s: float) -> Driver:
         DeviceError: no installed package has a driver for this kind, or the description cannot serve.
         PluginError: what is registered for this kind is no driver.
     """
-    kind = slave.device.kind
+    return driver_of(slave.device.kind, slave.device.name)(slave, period_s=period_s)
+
+
+def driver_of(kind: str, device: str = "") -> type[Driver]:
+    """Return the class that is registered for a kind of device; raises as `make_driver`."""
     found = registered(ENTRY_POINTS)
     if kind not in found:
+        where = device or "a device"
         raise DeviceError(
-            f"{slave.device.name}: no driver is installed for kind {kind} (key `kind`); installed are "
-            f"{', '.join(found)}"
+            f"{where}: no driver is installed for kind {kind} (key `kind`); installed are {', '.join(found)}"
         )
-    return load_class(found[kind], Driver)(slave, period_s=period_s)
+    return load_class(found[kind], Driver)
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
+from typing import Any
 
 from rtcp.config.model import GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
 from rtcp.devices.driver import DeviceError, Driver
 from rtcp.fieldbus.pdo import TYPES, ImageLayout
+from rtcp.ipc.schema import Field
 
 
 class IoBox(Driver):
@@ -44,6 +47,24 @@ class IoBox(Driver):
         """Return the outputs of the cycle."""
         before, after = self._around
         return before + self._outputs.pack(self.outputs) + after
+
+    def safe(self) -> None:
+        """Keep the outputs: a gripper on one would drop what it holds."""
+
+    def fields(self) -> Sequence[Field]:
+        """Return inputs, outputs and, where there is one, the counter."""
+        made = [
+            Field("inputs", "uint32", "", "Levels of the inputs, bit 0 is input 1."),
+            Field("outputs", "uint32", "", "Levels of the outputs, bit 0 is output 1."),
+        ]
+        return made if self._counter is None else [*made, Field("counter", "int32", "", "Counts of the encoder.")]
+
+    def publish(self, values: list[Any], at: int) -> None:
+        """Write them into the record."""
+        values[at] = self.inputs
+        values[at + 1] = self.outputs
+        if self._counter is not None:
+            values[at + 2] = self.counter
 
     @property
     def output_count(self) -> int:
@@ -129,7 +150,7 @@ class Switch:
 
 
 class Inputs:
-    """The switches at the box; `read` once a cycle.
+    """The switches; each is read once a cycle, from the levels of its box.
 
     Args:
         config: which there are.
@@ -144,22 +165,16 @@ class Inputs:
         self.enabling_switch = Switch(config.enabling_switch, config.enabling_switch is None, cycle_s)
         self.arm_toggle = Switch(config.arm_toggle, config.arm_toggle is None, cycle_s)
 
-    def read(self, levels: int) -> None:
-        """Update from the levels of all inputs of a cycle."""
-        self.emergency_stop.read(levels)
-        self.enabling_switch.read(levels)
-        self.arm_toggle.read(levels)
-
 
 class Outputs:
-    """The outputs with a meaning, as masks; `write` changes nothing but them.
+    """The outputs with a meaning, as masks: lamps on one box, the gripper on that or another one.
 
     Args:
         config: which there are.
         gripper: its output, or None.
     """
 
-    __slots__ = ("_closed", "_gripper", "_heartbeat", "_moving", "_powered", "meant")
+    __slots__ = ("_closed", "_gripper", "_heartbeat", "_moving", "_powered")
 
     def __init__(self, config: OutputsConfig, gripper: GripperConfig | None) -> None:
         self._powered = _mask(config.state_lamp)
@@ -167,9 +182,6 @@ class Outputs:
         self._heartbeat = _mask(config.heartbeat)
         self._gripper = 0 if gripper is None else _mask(gripper.output)
         self._closed = gripper is not None and gripper.closed != "off"
-        numbers = (config.state_lamp, config.motion_lamp, config.heartbeat, None if gripper is None else gripper.output)
-        self.meant = frozenset(number for number in numbers if number is not None)
-        """Numbers of the outputs that commands may not switch."""
 
     def write(self, outputs: int, powered: bool, moving: bool) -> int:
         """Return `outputs` with the lamps set and the heartbeat inverted."""
@@ -225,7 +237,8 @@ class JoystickInput:
         self._debounce = round(joystick.debounce_ms * 1e-3 / cycle_s)
         self._byte_at = (min(numbers) - 1) // 8 * 8
         others = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
-        meant = sum(1 << one.number - 1 for one in others if one is not None)
+        here = [one for one in others if one is not None and one.box in (joystick.box, None)]
+        meant = sum(1 << one.number - 1 for one in here)
         bytes_used = {(number - 1) // 8 for number in numbers}
         self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~meant
 

@@ -43,6 +43,7 @@ class Channel:
     factor: float
     bit_offset: int
     bits: int
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,9 @@ def layout(pdos: Sequence[Pdo]) -> ImageLayout:
         for entry in pdo.channels:
             bits = TYPES[entry.type][0]
             channels.append(
-                Channel(entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, bits)
+                Channel(
+                    entry.name, entry.index, entry.sub_index, entry.type, entry.factor, offset, bits, entry.unit
+                )
             )  # fmt: skip
             offset += bits
     return ImageLayout(tuple(channels), offset)

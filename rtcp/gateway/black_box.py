@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.ipc.events import ResetDone
-from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
+from rtcp.ipc.layout import EVENTS, TEXTS
 from rtcp.ipc.names import Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, listed, versions, write
@@ -307,7 +307,9 @@ class BlackBox:
             notes=(*_lacking(records, at, silent_s), *notes),
             timeline=timeline,
         )
-        return FaultRecording(about, {name: records[name] for name, _ in (*SCALARS, *PER_JOINT)})
+        return FaultRecording(
+            about, {name: records[name] for name in self._observer.schema.names}, self._observer.schema
+        )
 
     def _timeline(self, fault: FaultRecord, ends_ns: int) -> tuple[tuple[Moment, ...], list[str]]:
         """Return what was said in the recording's time, and what of that is lost."""

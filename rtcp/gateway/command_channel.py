@@ -16,9 +16,9 @@ from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc.commands import Command
 from rtcp.ipc.errors import ErrorKind, RtcpError
 from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn
-from rtcp.ipc.layout import FLAG_SWITCHING
 from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
 from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.schema import FLAG_SWITCHING
 from rtcp.ipc.states import ControlMode, State
 
 T = TypeVar("T")

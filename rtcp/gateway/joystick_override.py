@@ -9,7 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 
 from rtcp.config.model import VIRTUAL, ArmConfig, InputConfig
 from rtcp.gateway.command_channel import Caller, Json
@@ -40,18 +41,17 @@ class JoystickOverride:
         self._actions = actions
         self._config = config
         self._bus = bus
-        boxes = (at for at, slave in enumerate(config.slaves, 1) if slave.device.kind == "io")
-        self._slave = next(boxes, 0)
+        self._boxes = {slave.name: at for at, slave in enumerate(config.slaves, 1) if slave.device.kind == "io"}
         self._owner: Caller | None = None
         self._until = 0.0
-        self._written: dict[int, int] = {}
+        self._written: dict[tuple[str, int], int] = {}
         self._writing = asyncio.Lock()
         self._repeated = 0.0
 
     @property
     def possible(self) -> bool:
         """Whether there is a virtual IO box."""
-        return self._bus == VIRTUAL and self._slave > 0
+        return self._bus == VIRTUAL and bool(self._boxes)
 
     async def force(self, caller: Caller, pressed: Sequence[str] | None, byte: int | None, hold_s: float) -> Json:
         """Hold the joystick as `pressed` names it, or at `byte`, for `hold_s`; None and None: release it.
@@ -64,13 +64,13 @@ class JoystickOverride:
         if self._owner is not None and self._owner.connection != caller.connection:
             # What it holds ends by itself within a second.
             raise RtcpError("refused", f"the joystick is held by {self._owner.name}: wait until it is released")
-        mask, levels = (0, 0) if pressed is None and byte is None else forced(self._config, pressed or (), byte)
-        if mask == 0:
+        inputs = {} if pressed is None and byte is None else forced(self._config, pressed or (), byte)
+        if not any(mask for mask, _ in inputs.values()):
             await self.release()
-            return {"mask": 0, "levels": 0}
+            return {}
         self._owner, self._until = caller, time.monotonic() + hold_s
-        await self._write(mask, levels)
-        return {"mask": mask, "levels": levels}
+        await self._write(inputs)
+        return {box: {"mask": mask, "levels": levels} for box, (mask, levels) in inputs.items()}
 
     async def release(self) -> None:
         """Release everything; what fails is tried again by `watch`."""
@@ -78,7 +78,7 @@ class JoystickOverride:
         self._repeated = 0.0
         if self.possible:
             with contextlib.suppress(RtcpError):
-                await self._write(0, 0)
+                await self._write({})
 
     async def end(self, connection: int) -> None:
         """Release what a connection that has closed was holding."""
@@ -90,28 +90,31 @@ class JoystickOverride:
         while True:
             await asyncio.sleep(_POLL_S)
             expired = self._owner is not None and time.monotonic() > self._until
-            if expired or (self._owner is None and self._written.get(MASK) != 0):
+            if expired or (self._owner is None and any(self._written.get((box, MASK)) != 0 for box in self._boxes)):
                 await self.release()
 
-    async def _write(self, mask: int, levels: int) -> None:
+    async def _write(self, inputs: Mapping[str, tuple[int, int]]) -> None:
         async with self._writing:
-            if mask and time.monotonic() - self._repeated > _REPEAT_S:
-                await self._write_object(HOLD, _BOX_HOLD_MS)
-                self._repeated = time.monotonic()
-            # Levels first, so that no input takes one that nobody asked for; but none is released late.
-            for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
-                if self._written.get(subindex) != value:
-                    self._written.pop(subindex, None)
-                    await self._write_object(subindex, value)
-                    self._written[subindex] = value
+            repeats = time.monotonic() - self._repeated > _REPEAT_S
+            for box in self._boxes:
+                mask, levels = inputs.get(box, (0, 0))
+                if mask and repeats:
+                    await self._write_object(box, HOLD, _BOX_HOLD_MS)
+                    self._repeated = time.monotonic()
+                # Levels first, so that no input takes one that nobody asked for; but none is released late.
+                for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
+                    if self._written.get((box, subindex)) != value:
+                        self._written.pop((box, subindex), None)
+                        await self._write_object(box, subindex, value)
+                        self._written[box, subindex] = value
 
-    async def _write_object(self, subindex: int, value: int) -> None:
-        request = {"slave": self._slave, "index": OBJECT, "subindex": subindex}
+    async def _write_object(self, box: str, subindex: int, value: int) -> None:
+        request = {"slave": self._boxes[box], "index": OBJECT, "subindex": subindex}
         await self._actions.service({"do": "sdo_write", **request, "hex": value.to_bytes(2, "little").hex()})
 
 
-def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> tuple[int, int]:
-    """Return the mask of the inputs that are forced and their levels.
+def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> dict[str, tuple[int, int]]:
+    """Return the mask of the inputs that are forced and their levels, by box.
 
     Args:
         config: where joystick, toggle, emergency stop and enabling switch are.
@@ -128,7 +131,7 @@ def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> tuple
         EMERGENCY_STOP: (inputs.emergency_stop, True),
         ENABLING_SWITCH: (inputs.enabling_switch, True),
     }
-    mask = levels = 0
+    masks, levels = Counter[str](), Counter[str]()
     for name in pressed:
         if name not in DIRECTIONS and name not in switches:
             allowed = ", ".join((*DIRECTIONS, *switches))
@@ -138,21 +141,28 @@ def forced(config: ArmConfig, pressed: Sequence[str], byte: int | None) -> tuple
             if switch is None:
                 key = "arm_toggle" if name == CHAIR else name
                 raise RtcpError("refused", f"the input inputs.{key} is missing in {config.source}")
-            mask |= 1 << switch.number - 1
-            levels |= ((switch.active == "high") is active) << switch.number - 1
+            box = config.box_of(switch)
+            masks[box] |= 1 << switch.number - 1
+            levels[box] |= ((switch.active == "high") is active) << switch.number - 1
     joystick = inputs.joystick
     if joystick is None:
         if byte is not None or any(name in DIRECTIONS for name in pressed):
             raise RtcpError("refused", f"there is no joystick: inputs.joystick is missing in {config.source}")
-        return mask, levels
+        return {box: (mask, levels[box]) for box, mask in masks.items()}
     bits = {name: 1 << getattr(joystick, name) - 1 for name in DIRECTIONS}
     place = (min(bits.values()).bit_length() - 1) // 8 * 8
-    others = sum(1 << one.number - 1 for one, _ in switches.values() if one is not None)
+    box = config.box_of(joystick)
+    here = (one for one, _ in switches.values() if one is not None and config.box_of(one) == box)
+    others = sum(1 << one.number - 1 for one in here)
     lines = sum(bits.values())
     if byte is None:
         shown = sum(bits[name] for name in DIRECTIONS if name in pressed)
-        return mask | lines, levels | (lines & ~shown if joystick.active == "low" else shown)
-    if not 0 <= byte <= _BYTE:
+        level = lines & ~shown if joystick.active == "low" else shown
+    elif not 0 <= byte <= _BYTE:
         raise RtcpError("invalid", f"byte: found {byte}, allowed is 0 to 255")
-    whole = _BYTE << place & ~others
-    return mask | whole, levels | byte << place & whole
+    else:
+        lines = _BYTE << place & ~others
+        level = byte << place & lines
+    masks[box] |= lines
+    levels[box] |= level
+    return {box: (mask, levels[box]) for box, mask in masks.items()}

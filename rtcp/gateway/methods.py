@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
 from annotated_types import Ge, Gt, Le
 
-from rtcp.config.find import registered
+from rtcp.config.find import load_messages
 from rtcp.config.model import Point, RecordingConfig, RecordingFormat, Stop
 from rtcp.config.validation import Checker
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
@@ -118,8 +118,7 @@ class Methods:
         self.table = self._table()
 
     def _table(self) -> dict[str, Method]:
-        for entry in registered("rtcp.controllers").values():
-            entry.load()  # registers the commands that its controller accepts
+        load_messages()
         found = (getattr(self, name) for name in dir(type(self)) if hasattr(getattr(type(self), name), "method_flags"))
         table = {one.name: one for one in map(_method_of, found)}
         for kind in COMMANDS:
@@ -363,6 +362,17 @@ class Methods:
             command = commands.MoveAtVelocity(velocity, hold_s)
         return await self._streaming.send(caller, command)
 
+    @method()
+    async def set_output(self, caller: Caller, output: int, value: bool, box: str | None = None) -> Json:
+        """Set a digital output, from 1, of an IO box; `box`: its slave, needed with several."""
+        boxes = self._config.boxes
+        if (box is None and len(boxes) > 1) or (box is not None and box not in boxes):
+            found = "the key is missing" if box is None else f'found the text "{box}"'
+            raise RtcpError("invalid", f"box: {found}, allowed is one of {', '.join(boxes) or 'none: there is no box'}")
+        async with self.channel.lease(caller) as lease:
+            await self.channel.send(lease, commands.SetOutput(output, value, boxes.index(box) if box else 0))
+        return {}
+
     # -- commands without a function of their own ---------------------------------------------------------------------
 
     def _command_method(self, kind: type[Command]) -> Method:
@@ -444,8 +454,10 @@ def _parameters_of_command(kind: Any) -> Checker[Any]:
     """Return what checks the fields of a command; one with a hold time needs none, and has `sent_s` beside."""
     hints = _fields_of(kind)
     held = "hold_s" in hints
+    defaults = {one.name: one.default for one in dataclasses.fields(kind)}
     fields: list[tuple[str, Any, Any]] = [
-        (name, _parameter(hint), field(default=HOLD_S) if name == "hold_s" else field()) for name, hint in hints.items()
+        (name, _parameter(hint), field(default=HOLD_S) if name == "hold_s" else field(default=defaults[name]))
+        for name, hint in hints.items()
     ]
     if held:
         fields.append(("sent_s", float | None, field(default=None)))

@@ -13,7 +13,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.ipc.events import JOYSTICK_MODES, ProcessDataLost, ResetDone
-from rtcp.ipc.layout import (
+from rtcp.ipc.names import Names
+from rtcp.ipc.observer import EventRecord, Observer
+from rtcp.ipc.schema import (
     FLAG_ARM_HAS_JOYSTICK,
     FLAG_DC_LOCKED,
     FLAG_EMERGENCY_STOP,
@@ -22,8 +24,6 @@ from rtcp.ipc.layout import (
     FLAG_SWITCHING,
     PER_JOINT,
 )
-from rtcp.ipc.names import Names
-from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.realtime.statistics import SlidingPercentiles, diagnose
@@ -33,6 +33,8 @@ _MESSAGES = 50
 _SHOWN = 10
 """The last so many of them are shown."""
 _SILENT_S = 1.0
+_PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
+"""Parts that the status shows in words of their own; the others are devices."""
 _UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
 _FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "compute_ns", "offset": "dc_offset_ns",
             "filtered": "dc_filtered_ns"}  # fmt: skip
@@ -209,6 +211,19 @@ class StatusSnapshot:
             for position, (slave, (al, code), health) in enumerate(found, 1)
         ]
 
+    def _devices(self, record: np.void) -> dict[str, dict[str, dict[str, Any]]]:
+        """Return value and unit of what each slave that is no drive publishes, by slave and field."""
+        found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
+        for field in self._observer.schema.fields:
+            if field.part in _PLATFORM_PARTS:
+                continue
+            value = record[field.name].tolist()
+            numbers = value if field.shape else [value]
+            known = [one if math.isfinite(one) else None for one in numbers]  # no JSON has the others
+            shown = {"value": known if field.shape else known[0], "unit": field.unit}
+            found.setdefault(field.part, {})[field.local_name] = shown
+        return found
+
     def _skipped_ticks(self, cycles: int, missed: int) -> dict[str, Any] | None:
         """Return why the loop skips more ticks than it should and what to do, or None."""
         wakeup, exchange, compute = (self._figures[name].read() for name in ("wakeup", "exchange", "compute"))
@@ -255,16 +270,16 @@ class StatusSnapshot:
             "slaves": self._slaves(),
             "joint_names": [joint.name for joint in self._session.config.joints],
             "joints": {
-                name: [round(float(value), 7) for value in record[name]] for name, code in PER_JOINT if code == "d"
+                name: [round(float(value), 7) for value in record[name]]
+                for name in PER_JOINT
+                if record[name].dtype.kind == "f"
             },
             # An arm that stops does not go there any more.
             "goal": None
             if goal is None or problem or state is not State.MOVING
             else [round(value, 7) for value in goal],
             "statuswords": [int(word) for word in record["statusword"]],
-            "inputs": int(record["inputs"]),
-            "outputs": int(record["outputs"]),
-            "counter": int(record["counter"]),
+            "devices": self._devices(record),
             "wakeup_us": figures["wakeup"],
             "exchange_us": figures["exchange"],
             "compute_us": figures["compute"],

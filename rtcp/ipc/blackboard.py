@@ -46,6 +46,8 @@ from rtcp.ipc.layout import (
     PORTS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
+    SCHEMA_AT,
+    SCHEMA_SIZE,
     SLAVES_AT,
     SLAVES_MAX,
     TEMPERATURE,
@@ -54,12 +56,13 @@ from rtcp.ipc.layout import (
     TEXTS_AT,
     TEXTS_HEAD_AT,
     AtomicWords,
-    RecordLayout,
+    file_size,
     plan_slot,
     records_for,
 )
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import Malformed, Refusal
+from rtcp.ipc.schema import RecordSchema, SchemaError
 
 _HOTTEST = 1e6
 _U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
@@ -71,15 +74,20 @@ class Blackboard:
 
     Args:
         path: file to make, on a memory file system; an older one is replaced.
-        joints: number of joints.
+        schema: of the cycle records.
         period_ns: the cycle.
+
+    Raises:
+        SchemaError: the schema is longer than its place.
     """
 
-    def __init__(self, path: Path, joints: int, period_ns: int) -> None:
-        layout, records = RecordLayout(joints), records_for(period_ns)
-        size = layout.file_size(records)
+    def __init__(self, path: Path, schema: RecordSchema, period_ns: int) -> None:
+        records, text = records_for(period_ns), schema.as_json().encode()
+        if len(text) > SCHEMA_SIZE:
+            raise SchemaError(f"the schema of the cycle record has {len(text)} bytes, at most {SCHEMA_SIZE} fit")
+        size = file_size(schema.size, records)
         self.path = path
-        self.joints = joints
+        self.schema = schema
         # A new file, not the old one emptied: whoever still maps the old one keeps reading something whole.
         fresh = path.with_name(path.name + f".{os.getpid()}")
         fresh.unlink(missing_ok=True)
@@ -90,13 +98,14 @@ class Blackboard:
         finally:
             os.close(descriptor)
         HEADER.pack_into(
-            self._map, 0, MAGIC, joints, layout.size, records, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
+            self._map, 0, MAGIC, len(text), schema.size, records, COMMANDS, EVENTS, TEXTS, period_ns, os.getpid(), 0
         )
+        self._map[SCHEMA_AT : SCHEMA_AT + len(text)] = text
         os.replace(fresh, path)
-        self._record_size = layout.size
+        self._record_size = schema.size
         self._ring_mask = records - 1
         # The record without its first number, which is published last.
-        self._pack_record = struct.Struct("<" + layout.format[2:]).pack_into
+        self._pack_record = struct.Struct("<" + schema.format[2:]).pack_into
         self._words = AtomicWords(self._map)
         self._plans = [plan_slot(self._map, slot) for slot in range(PLANS)]
         self._records = 0
@@ -111,7 +120,7 @@ class Blackboard:
             self._map[page] = self._map[page]
 
     def publish(self, values: Sequence[float]) -> None:
-        """Append a cycle record: the fields of `layout.SCALARS` after the number, then those of each joint, flat."""
+        """Append a cycle record: the numbers of the schema's fields but the first, which is the record's own."""
         number = self._records + 1
         at = RECORDS_AT + (number & self._ring_mask) * self._record_size
         words, fence = self._words.plain, self._words.fence

@@ -101,6 +101,8 @@ class SetOutput(Command):
     output: int
     """From 1."""
     value: bool
+    box: int = 0
+    """Index among the IO boxes, in the order of the cable."""
 
 
 class MoveGripper(Command):

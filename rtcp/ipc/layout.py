@@ -10,7 +10,7 @@
 | 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
 | 3072 | slave health: lost, recovered, temperature, error counters | service thread |
-| 16384 | service text, texts, events, commands, plans, cycle records | loop and commanders |
+| 16384 | service text, texts, events, commands, plans, schema, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
 """
@@ -23,13 +23,13 @@ import mmap
 import struct
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from rtcp.config.model import MOST_AXES
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_0007
+MAGIC = 0x5254_4350_0000_0008
 HEADER = struct.Struct("<QIIIIIIQIi")
-"""magic, joints, record size, records, commands, events, texts, period ns, loop pid, reserved"""
+"""magic, length of the schema, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
 LEASE_ID_AT = 128
 """0: free. Written last when the lease is taken."""
@@ -90,76 +90,22 @@ COMMAND = struct.Struct("<QQQ")
 COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
 COMMANDS = 64
 
-PLAN_ROWS, PLAN_COLUMNS = 4096, 20
-"""A plan: rows of 20 doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
+PLAN_ROWS, PLAN_COLUMNS = 4096, 2 + 3 * MOST_AXES
+"""A plan: rows of doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS = 2
 """Two places: one is written while the plan in the other runs."""
 PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND_SIZE + 4095) & ~4095
 
-RECORDS_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
+SCHEMA_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
+SCHEMA_SIZE = 1 << 18
+"""The schema of the cycle records (`rtcp.ipc.schema`), JSON: written once, by the loop."""
+
+RECORDS_AT = (SCHEMA_AT + SCHEMA_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
 """The ring of a cycle of 366 us and longer; a shorter one has a longer ring, see `records_for`."""
 RING_S = 12.0
 """Seconds that every ring holds: those that are written down before a fault, and until they have been read."""
-
-SCALARS = (
-    ("number", "Q"),
-    ("cycle", "Q"),
-    ("time_ns", "q"),
-    ("dc_time_ns", "q"),
-    ("state", "B"),
-    ("drive_mode", "B"),
-    ("control_mode", "B"),
-    ("joystick_mode", "B"),
-    ("flags", "H"),
-    ("wkc", "h"),
-    ("wkc_expected", "h"),
-    ("missed", "I"),
-    ("lost", "I"),
-    ("wakeup_ns", "i"),
-    ("exchange_ns", "i"),
-    ("compute_ns", "i"),
-    ("dc_offset_ns", "i"),
-    ("dc_filtered_ns", "i"),
-    ("inputs", "I"),
-    ("outputs", "I"),
-    ("counter", "i"),
-    ("fault", "I"),
-    ("limit", "I"),
-    ("held", "I"),
-    ("enables", "I"),
-    ("moves", "I"),
-    ("elapsed_s", "f"),
-    ("duration_s", "f"),
-)
-"""Fields of a cycle record that are one number: name and struct code. `number` is written last."""
-
-PER_JOINT = (
-    ("actual_position", "d"),
-    ("actual_velocity", "d"),
-    ("actual_torque", "d"),
-    ("commanded_position", "d"),
-    ("sent_position", "d"),
-    ("sent_velocity", "d"),
-    ("sent_torque", "d"),
-    ("statusword", "H"),
-)
-"""Fields of a cycle record that are one number a joint, rad, rad/s, Nm.
-
-`commanded_position` is the setpoint of the controller after the trajectory guard; `sent_...` are the targets in the
-frame, after the output limiter: of those, the drive mode decides which one the drive follows.
-"""
-
-FLAG_DC_LOCKED = 1
-FLAG_ALL_OP = 2
-FLAG_ENABLED = 4
-FLAG_SWITCHING = 8
-FLAG_EMERGENCY_STOP = 16
-"""The emergency stop's input is pressed."""
-FLAG_MOTION_ALLOWED = 32
-"""The enabling switch is pressed, or there is none."""
-FLAG_ARM_HAS_JOYSTICK = 64
 
 
 def records_for(period_ns: int) -> int:
@@ -167,26 +113,9 @@ def records_for(period_ns: int) -> int:
     return max(RECORDS, 1 << (math.ceil(RING_S * 1e9 / period_ns) - 1).bit_length())
 
 
-@dataclass(frozen=True)
-class RecordLayout:
-    """The cycle record for a number of joints, as a struct; readers make a numpy type of it (`observer`)."""
-
-    joints: int
-
-    @property
-    def format(self) -> str:
-        """The struct format, without padding; the record's number again at the end."""
-        per_joint = "".join(f"{self.joints}{code}" for _, code in PER_JOINT)
-        return "<" + "".join(code for _, code in SCALARS) + per_joint + "Q"
-
-    @property
-    def size(self) -> int:
-        """Size of a record in the ring: a multiple of 64 bytes."""
-        return (struct.calcsize(self.format) + 63) & ~63
-
-    def file_size(self, records: int) -> int:
-        """Size of a whole blackboard with so many records."""
-        return RECORDS_AT + records * self.size
+def file_size(record_size: int, records: int) -> int:
+    """Return the size of a whole blackboard."""
+    return RECORDS_AT + records * record_size
 
 
 class AtomicWords:

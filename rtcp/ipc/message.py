@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeAlias, TypeVar, get_type_hints
 
+from rtcp.config.model import MOST_AXES
+
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
 else:
@@ -22,15 +24,14 @@ else:
         return lambda kind: kind
 
 
-JOINTS_MAX = 8
 Joints: TypeAlias = tuple[float, ...]
-"""One number a joint, at most `JOINTS_MAX`."""
-PAYLOAD_SIZE = 112
+"""One number a joint, at most `MOST_AXES`."""
+PAYLOAD_SIZE = 8 * (MOST_AXES + 6)
 """Bytes of the largest message: a number for each joint, its count, and five more fields."""
 
 _CODES: dict[object, str] = {int: "q", float: "d", bool: "?"}
-_JOINTS = struct.Struct(f"<q{JOINTS_MAX}d")
-_PADDING = (0.0,) * JOINTS_MAX
+_JOINTS = struct.Struct(f"<q{MOST_AXES}d")
+_PADDING = (0.0,) * MOST_AXES
 
 
 class MalformedMessage(ValueError):
@@ -78,7 +79,7 @@ class Message:
         """Write the fields, `PAYLOAD_SIZE` bytes at most.
 
         Raises:
-            ValueError: more joints than `JOINTS_MAX`.
+            ValueError: more joints than `MOST_AXES`.
         """
         values: list[Any] = []
         for name, kind in self._fields:
@@ -86,8 +87,8 @@ class Message:
             if kind != Joints:
                 values.append(value)
                 continue
-            if len(value) > JOINTS_MAX:
-                raise ValueError(f"{self.name}.{name}: {len(value)} joints, at most {JOINTS_MAX} fit")
+            if len(value) > MOST_AXES:
+                raise ValueError(f"{self.name}.{name}: {len(value)} joints, at most {MOST_AXES} fit")
             values.append(_JOINTS.pack(len(value), *value, *_PADDING[len(value) :]))
         self._format.pack_into(memory, at, *values)
 
@@ -152,8 +153,8 @@ def _decoder(kind: Any) -> Callable[[Any], Any]:
 
 def _joints(packed: bytes) -> Joints:
     count, *values = _JOINTS.unpack(packed)
-    if not 0 <= count <= JOINTS_MAX:
-        raise MalformedMessage(f"{count} joints, at most {JOINTS_MAX} are possible")
+    if not 0 <= count <= MOST_AXES:
+        raise MalformedMessage(f"{count} joints, at most {MOST_AXES} are possible")
     return tuple(values[:count])
 
 

@@ -44,11 +44,11 @@ from rtcp.ipc.layout import (
     LEASE_ID_AT,
     LEASE_RENEWED_AT,
     MAGIC,
-    PER_JOINT,
     PORTS,
     RECORDS_AT,
     RECORDS_HEAD_AT,
-    SCALARS,
+    SCHEMA_AT,
+    SCHEMA_SIZE,
     SERVICE_LENGTH_AT,
     SERVICE_STATE_AT,
     SERVICE_TEXT_AT,
@@ -60,26 +60,27 @@ from rtcp.ipc.layout import (
     TEXTS_AT,
     TEXTS_HEAD_AT,
     AtomicWords,
-    RecordLayout,
+    file_size,
     records_for,
     write_plan,
 )
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import REFUSALS, Refusal
+from rtcp.ipc.schema import RecordSchema, SchemaError
 
-_NUMPY_CODES = {"Q": "<u8", "q": "<i8", "B": "u1", "H": "<u2", "h": "<i2", "I": "<u4", "i": "<i4", "f": "<f4",
-                "d": "<f8"}  # fmt: skip
+NUMBER_AGAIN, PADDING = "_number_again", "_padding"
+"""Behind the fields of a record in the ring; no field's name begins with an underscore."""
 
 
-def record_type(layout: RecordLayout) -> np.dtype[np.void]:
-    """Return the numpy type of a cycle record: the layout's fields, padded to its size."""
-    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = [(name, _NUMPY_CODES[code]) for name, code in SCALARS]
-    fields += [(name, _NUMPY_CODES[code], (layout.joints,)) for name, code in PER_JOINT]
-    fields.append(("number_again", "<u8"))
-    padding = layout.size - struct.calcsize(layout.format)
-    if padding:
-        fields.append(("padding", "u1", (padding,)))
-    return np.dtype(fields)
+def numpy_fields(schema: RecordSchema) -> list[Any]:
+    """Return the fields as numpy describes them."""
+    return [(one.name, np.dtype(one.type).newbyteorder("<"), one.shape) for one in schema.fields]
+
+
+def record_type(schema: RecordSchema) -> np.dtype[np.void]:
+    """Return the numpy type of a cycle record in the ring: the schema's fields, padded to its size."""
+    padding = schema.size - struct.calcsize(schema.format)
+    return np.dtype([*numpy_fields(schema), (NUMBER_AGAIN, "<u8"), (PADDING, "u1", (padding,))])
 
 
 class BlackboardError(Exception):
@@ -164,17 +165,19 @@ class Observer:
             raise BlackboardError(f"blackboard {path} is cut short: {size} bytes, at least {RECORDS_AT} expected")
         self._map = mmap.mmap(self._descriptor, size)
         self._words = AtomicWords(self._map)
-        magic, joints, record_size, records, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
-        # A number of joints that no record has would be a layout of gigabytes.
-        layout = RecordLayout(joints) if magic == MAGIC and joints <= record_size else None
-        whole = layout is not None and period > 0 and records == records_for(period)
-        if layout is None or not whole or record_size != layout.size or size != layout.file_size(records):
+        magic, length, record_size, records, _, _, _, period, pid, _ = HEADER.unpack_from(self._map, 0)
+        schema = None
+        if magic == MAGIC and length <= SCHEMA_SIZE:
+            with contextlib.suppress(SchemaError):
+                schema = RecordSchema.from_json(self._map[SCHEMA_AT : SCHEMA_AT + length])
+        whole = schema is not None and period > 0 and records == records_for(period)
+        if schema is None or not whole or record_size != schema.size or size != file_size(record_size, records):
             self.close()
             raise BlackboardError(f"blackboard {path} is not of this version (magic 0x{magic:X}): start anew")
-        self.joints = int(joints)
+        self.schema = schema
         self.period_ns = int(period)
         self.loop_pid = int(pid)
-        self._dtype = record_type(layout)
+        self._dtype = record_type(schema)
         self.records = int(records)
         """Cycle records that the ring holds."""
         self._ring = np.frombuffer(self._map, dtype=self._dtype, count=self.records, offset=RECORDS_AT)
@@ -217,7 +220,7 @@ class Observer:
         copied = self._ring[(numbers % np.uint64(self.records)).astype(np.intp)]
         # What the writer reached meanwhile may be torn although both numbers agree: it is dropped.
         overtaken = self.head - self.records + 1
-        whole = (copied["number"] == numbers) & (copied["number_again"] == numbers) & (numbers > max(overtaken, 0))
+        whole = (copied["number"] == numbers) & (copied[NUMBER_AGAIN] == numbers) & (numbers > max(overtaken, 0))
         kept = copied[whole]
         return kept, int(head - max(number, 0)) - len(kept)
 

@@ -1,8 +1,8 @@
 """Cycle records on disk: the form of their files, read with distrust; one MCAP file a fault, whole or not at all.
 
-Foxglove, PlotJuggler and `ros2 bag` open them. Topic `/cycle` has a message a cycle (schema `rtcp_msgs/msg/Cycle`, the
-fields of `rtcp.ipc.layout`, in CDR), `/log` the messages of the loop (schema `foxglove.Log`); the metadata `rtcp/about`
-says what happened, when, to which arm.
+Foxglove, PlotJuggler and `ros2 bag` open them. Topic `/cycle` has a message a cycle (`rtcp_msgs/msg/Cycle`, the fields
+of `rtcp.ipc.schema`, in CDR), `/log` the messages of the loop (schema `foxglove.Log`); the metadata `rtcp/about` says
+what happened, when, to which arm.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import platform
 import re
 import struct
 import zlib
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -33,8 +33,10 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 import rtcp
+from rtcp.config.model import MOST_AXES
 from rtcp.config.zero import state_directory
-from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.observer import numpy_fields
+from rtcp.ipc.schema import RecordSchema
 
 FORMAT = 2
 KEPT = 100
@@ -49,13 +51,8 @@ _LARGEST_RECORD, _LARGEST = 1 << 26, 1 << 28
 _MAGIC = b"\x89MCAP0\r\n"
 _RECORD, _MESSAGE = struct.Struct("<BQ"), struct.Struct("<HIQQ")
 """Opcode and length of a record in a chunk; channel, sequence, log and publish time before the data of a message."""
-_JOINTS_MAX = 10
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """CDR, little endian (OMG DDSI-RTPS, 10.5)."""
-_TYPES = {"Q": ("uint64", "<u8"), "q": ("int64", "<i8"), "B": ("uint8", "u1"), "H": ("uint16", "<u2"),
-          "h": ("int16", "<i2"), "I": ("uint32", "<u4"), "i": ("int32", "<i4"), "f": ("float32", "<f4"),
-          "d": ("float64", "<f8")}  # fmt: skip
-"""Struct code to the types of ROS 2 messages and of numpy."""
 LOG_SCHEMA = {
     "type": "object",
     "title": "foxglove.Log",
@@ -71,7 +68,9 @@ LOG_SCHEMA = {
 }
 INFORMATION, WARNING, ERROR = 2, 3, 4
 """Levels of `foxglove.Log`."""
-FIELDS = tuple(name for name, _ in (*SCALARS, *PER_JOINT))
+_NEEDED = ("number", "time_ns", "state", "wkc", "wkc_expected", "missed", "lost", "actual_position", "actual_torque",
+           "commanded_position", "sent_position", "statusword", "flags")  # fmt: skip
+"""What every recording of a fault has, whatever else its cycles hold."""
 
 Records = dict[str, npt.NDArray[Any]]
 
@@ -142,6 +141,7 @@ class FaultRecording:
 
     about: About
     records: Records
+    schema: RecordSchema
 
 
 @dataclass(frozen=True)
@@ -227,8 +227,8 @@ def _fill(path: Path, recording: FaultRecording) -> None:
 
 def _write_cycles(writer: Writer, recording: FaultRecording) -> None:
     about, records = recording.about, recording.records
-    messages = cycle_messages(records, cycle_type(len(about.joints)))
-    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", cycle_definition(len(about.joints)))
+    messages = cycle_messages(records, cycle_type(recording.schema))
+    schema = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", recording.schema.definition())
     channel = writer.register_channel(_CYCLE, "cdr", schema)
     # The record's clock is CLOCK_MONOTONIC; the file's is that of the fault's instant, CLOCK_REALTIME.
     offset_ns = about.time_ns - int(records["time_ns"][about.at]) if messages else 0
@@ -237,18 +237,9 @@ def _write_cycles(writer: Writer, recording: FaultRecording) -> None:
         writer.add_message(channel, when, data, when, int(number) & 0xFFFF_FFFF)
 
 
-def cycle_type(joints: int, names: Collection[str] = FIELDS) -> np.dtype[np.void]:
+def cycle_type(schema: RecordSchema) -> np.dtype[np.void]:
     """Return a cycle's message: CDR aligns each number to its size, as numpy's aligned types do."""
-    fields: list[Any] = [(name, _TYPES[code][1]) for name, code in SCALARS if name in names]
-    fields += [(name, _TYPES[code][1], (joints,)) for name, code in PER_JOINT if name in names]
-    return np.dtype(fields, align=True)
-
-
-def cycle_definition(joints: int, names: Collection[str] = FIELDS) -> bytes:
-    """Return the same as a ROS 2 message definition."""
-    lines = [f"{_TYPES[code][0]} {name}" for name, code in SCALARS if name in names]
-    lines += [f"{_TYPES[code][0]}[{joints}] {name}" for name, code in PER_JOINT if name in names]
-    return ("\n".join(lines) + "\n").encode()
+    return np.dtype(numpy_fields(schema), align=True)
 
 
 def cycle_messages(
@@ -326,10 +317,14 @@ def read(path: Path) -> FaultRecording:
         if about is None:
             raise ValueError(f"it has no metadata {ABOUT}")
         file.seek(0)
-        rows = _cycles(file, len(about.joints))
+        schema, rows = _cycles(file)
+        if lacking := [name for name in _NEEDED if name not in schema.names]:
+            raise ValueError(f"its cycles lack {', '.join(lacking)}")
+        if schema.joints != len(about.joints):
+            raise ValueError(f"its cycles have {schema.joints} joints, {len(about.joints)} are named")
         if not (0 <= about.at < len(rows) or (about.at == -1 and not len(rows))):
             raise ValueError(f"it gives {about.at} as the cycle of the fault, and has {len(rows)} cycles")
-    return FaultRecording(about, {name: np.ascontiguousarray(rows[name]) for name in rows.dtype.names or ()})
+    return FaultRecording(about, {name: np.ascontiguousarray(rows[name]) for name in schema.names}, schema)
 
 
 def files(directory: Path) -> list[tuple[int, Path]]:
@@ -398,13 +393,13 @@ class ChunkDecoder:
     """Decodes the chunks of one file in turn: each may announce channels for those that follow.
 
     Attributes:
-        joints: of a cycle.
+        schema: of a cycle.
         kind: of a cycle; without fields until the channel of the cycles is announced.
         cycle_channel, log_channel: their numbers; -1: not announced.
     """
 
     def __init__(self) -> None:
-        self.joints = 0
+        self.schema = RecordSchema(())
         self.kind: np.dtype[np.void] = np.dtype([])
         self._schemas: dict[int, bytes] = {}
         self.cycle_channel = self.log_channel = -1
@@ -454,12 +449,10 @@ class ChunkDecoder:
         if channel.topic == _LOG:
             self.log_channel = channel.id
         elif channel.topic == _CYCLE:
-            definition = self._schemas[channel.schema_id]
-            names = re.findall(r"(\w+)$", definition.decode(), re.MULTILINE)
-            self.joints = int(next(iter(re.findall(r"\[(\d{1,2})\]", definition.decode())), 0))
-            if self.joints > _JOINTS_MAX or definition != cycle_definition(self.joints, names):
-                raise ValueError("its cycles are none of this version")
-            self.kind, self.cycle_channel = cycle_type(self.joints, names), channel.id
+            schema = RecordSchema.from_definition(self._schemas[channel.schema_id])
+            if lacking := {"number", "time_ns"} - set(schema.names):
+                raise ValueError(f"its cycles lack {', '.join(sorted(lacking))}")
+            self.schema, self.kind, self.cycle_channel = schema, cycle_type(schema), channel.id
 
 
 def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
@@ -472,16 +465,16 @@ def _abouts(file: IO[bytes]) -> Iterator[tuple[About, float]]:
             yield _checked(metadata), float(_of(metadata, "seconds", float))
 
 
-def _cycles(file: IO[bytes], joints: int) -> npt.NDArray[np.void]:
-    """Return the cycles of a file, oldest first."""
+def _cycles(file: IO[bytes]) -> tuple[RecordSchema, npt.NDArray[np.void]]:
+    """Return the schema and the cycles of a file, oldest first."""
     decoder, left, found = ChunkDecoder(), _LARGEST, []
     for record in contents(file):
         if isinstance(record, Chunk):
             found.append(decoder.decode(record, left).cycles)
             left -= record.uncompressed_size
-    if decoder.kind != cycle_type(joints):
-        raise ValueError(f"no cycles of this version and {joints} joints")
-    return np.concatenate([rows for rows in found if rows.dtype.names])
+    if not decoder.schema.fields:
+        raise ValueError("no channel of cycles")
+    return decoder.schema, np.concatenate([rows for rows in found if rows.dtype.names])
 
 
 def _checked(metadata: Mapping[str, Any]) -> About:
@@ -491,7 +484,7 @@ def _checked(metadata: Mapping[str, Any]) -> About:
     about = About(
         **numbers,
         **texts,
-        joints=tuple(str(name) for name in _of(metadata, "joints", list)[:_JOINTS_MAX]),
+        joints=tuple(str(name) for name in _of(metadata, "joints", list)[:MOST_AXES]),
         versions={str(name): str(version) for name, version in _of(metadata, "versions", dict).items()},
         notes=tuple(str(note) for note in _of(metadata, "notes", list)),
         timeline=tuple(moments),

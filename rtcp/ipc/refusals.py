@@ -97,6 +97,13 @@ class NoOutputs(Refusal):
     """no IO box is configured (slaves in {file})"""
 
 
+class UnknownBox(Refusal):
+    """IO box {box} does not exist: 1 to {highest}, in the order of slaves in {file}"""
+
+    box: int
+    highest: int
+
+
 class UnknownOutput(Refusal):
     """output {output} does not exist: 1 to {highest}"""
 

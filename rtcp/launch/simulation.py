@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, cast
 from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.control.bus_service import BusService
-from rtcp.control.cycle import Cycle, make_discipline, position_of
+from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command
@@ -83,7 +83,7 @@ class Simulation:
         memory = _SHARED_MEMORY if _SHARED_MEMORY.is_dir() else None
         self._directory = Path(tempfile.mkdtemp(prefix="rtcp-simulation-", dir=memory))
         path = self._directory / "blackboard"
-        self.board = Blackboard(path, len(config.joints), self.period_ns)
+        self.board = Blackboard(path, record_schema(config), self.period_ns)
         self.observer = Observer(path)
         self.service = InlineService(self.bus, self.board, config)
         discipline = make_discipline(config) if follow_clock else None

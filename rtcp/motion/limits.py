@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import TypeAlias
 
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeJoint, LimitWidened, Refusal
-from rtcp.motion.planning.plan import COLUMNS, MOST_JOINTS
+from rtcp.motion.planning.plan import COLUMNS
 
 LEAST_PART = 1e-3
 """Of a configured speed, acceleration, jerk or torque: less of it is no limit, but an arm that does not move."""
@@ -74,7 +74,7 @@ def read(plan: memoryview[float], count: int) -> Values | None:
     if not 0 < count <= len(plan) // COLUMNS:
         return None
     n, with_box, boxes = plan[0], plan[1], plan[2]
-    if n not in range(1, MOST_JOINTS + 1) or with_box not in (0.0, 1.0) or count != 1 + n + with_box + boxes:
+    if n not in range(1, MOST_AXES + 1) or with_box not in (0.0, 1.0) or count != 1 + n + with_box + boxes:
         return None
     first = 1 + int(n)
     rows = [[plan[at * COLUMNS + column] for column in range(6)] for at in range(1, count)]

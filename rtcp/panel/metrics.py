@@ -81,6 +81,15 @@ class PlatformCollector(Collector):
                 family.add_metric([joint], value)
             yield family
 
+        devices = GaugeMetricFamily(
+            "rtcp_device_value", "What a slave that is no drive publishes.", labels=["device", "field", "unit"]
+        )
+        for device, fields in raw["devices"].items():
+            for name, shown in fields.items():
+                if isinstance(shown["value"], (int, float)):
+                    devices.add_metric([device, name, shown["unit"]], shown["value"])
+        yield devices
+
 
 def exposition(live: Live) -> bytes:
     """Return the metrics in Prometheus' text format."""

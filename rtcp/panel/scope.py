@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rtcp.api import RtcpError
+from rtcp.api import RecordSchema, RtcpError
 from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
 
-PER_JOINT = ("actual_position", "actual_velocity", "actual_torque", "commanded_position", "following_error",
-             "sent_position", "sent_velocity", "sent_torque")  # fmt: skip
-SINGLE = ("wakeup_us", "exchange_us", "compute_us", "dc_offset_us", "dc_filtered_us", "state", "wkc", "inputs",
-          "outputs", "missed", "counter")  # fmt: skip
+_HIDDEN = frozenset({"number", "cycle", "time_ns", "dc_time_ns", "flags", "held", "statusword", "wkc_expected"})
+"""Fields that no curve shows anything of."""
 EVENTS = {"state": "the machine's state changes", "fault": "a fault begins", "inputs": "an input changes"}
 SHORTEST_S, LONGEST_S = 0.02, 60.0
 MOST_SIGNALS = 8
@@ -24,11 +23,18 @@ _BEFORE = 0.2
 """Share of the picture before its trigger."""
 
 
-def signals_of(config: ArmConfig) -> dict[str, str]:
-    """Return the signals, `name` or `name.joint`, with what a person reads."""
+def signals_of(config: ArmConfig, schema: RecordSchema) -> dict[str, str]:
+    """Return the signals, `name` or `name.number`, with what a person reads: every field, and the following error."""
     joints = [joint.name for joint in config.joints]
-    named = {f"{name}.{at}": f"{_words(name)} {joint}" for name in PER_JOINT for at, joint in enumerate(joints)}
-    return named | {name: _words(name) for name in SINGLE}
+    vectors = {one.name: one.count for one in schema.fields if one.shape and one.name not in _HIDDEN}
+    vectors["following_error"] = len(joints)
+    named = {
+        f"{name}.{at}": f"{_words(name)} {joints[at] if count == len(joints) else at}"
+        for name, count in vectors.items()
+        for at in range(count)
+    }
+    single = [one.name for one in schema.fields if not one.shape and one.name not in _HIDDEN]
+    return named | {name: _words(name) for one in single for name in [one[:-3] + "_us" if one.endswith("_ns") else one]}
 
 
 def _words(name: str) -> str:
@@ -39,7 +45,7 @@ class Scope:
     """One picture.
 
     Args:
-        config: the arm.
+        allowed: the signals that there are, of `signals_of`.
         signals: of `signals_of`, at most `MOST_SIGNALS`.
         span_s: of the picture, s.
         trigger: a signal, or of `EVENTS`; empty: none, the picture rolls.
@@ -51,9 +57,8 @@ class Scope:
     """
 
     def __init__(
-        self, config: ArmConfig, signals: list[str], span_s: float, trigger: str, level: float, period_ns: int
+        self, allowed: Collection[str], signals: list[str], span_s: float, trigger: str, level: float, period_ns: int
     ) -> None:
-        allowed = signals_of(config)
         for one in (*signals, *([trigger] if trigger and trigger not in EVENTS else [])):
             if one not in allowed:
                 raise RtcpError("invalid", f'signals: found "{one}", allowed are {", ".join(allowed)}')
@@ -135,6 +140,13 @@ def _column(records: Records, signal: str) -> npt.NDArray[Any]:
             return error
         column: npt.NDArray[Any] = records[name][:, at]
         return column
+    if name == "inputs":
+        # Any box: a number that changes whenever one of them does.
+        boxes = [records[one].astype(np.int64) for one in records.dtype.names or () if one.endswith("_inputs")]
+        mixed: npt.NDArray[Any] = sum(
+            (box << 16 * at for at, box in enumerate(boxes)), np.zeros(len(records), np.int64)
+        )
+        return mixed
     if name.endswith("_us"):
         in_us: npt.NDArray[Any] = records[f"{name[:-3]}_ns"] / 1e3
         return in_us

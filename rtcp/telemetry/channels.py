@@ -2,7 +2,7 @@
 
 | topic | schema | how often |
 |---|---|---|
-| `/cycle` | `rtcp_msgs/msg/Cycle`: the fields of `rtcp.ipc.layout`, or those that were chosen | each record |
+| `/cycle` | `rtcp_msgs/msg/Cycle`: the fields of the record's schema, or those that were chosen | each record |
 | `/joint_states` | `sensor_msgs/msg/JointState`: measured | each record |
 | `/joint_commands`, `/joint_targets` | the same: commanded; sent | each record |
 | `/tf` | `tf2_msgs/msg/TFMessage`: the frames from base_link to tool0 | up to 100 Hz |
@@ -28,16 +28,15 @@ from kinematics.urdf import to_urdf
 from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
 from rtcp.devices.cia402 import STATE_BITS, state_of
-from rtcp.ipc import layout
+from rtcp.ipc import schema as record
 from rtcp.ipc.recording import (
-    FIELDS,
     INFORMATION,
     LOG_SCHEMA,
-    cycle_definition,
     cycle_messages,
     cycle_type,
     log_entry,
 )
+from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.telemetry.cdr import CdrTemplate, stamps
@@ -63,37 +62,36 @@ _JOINTS = {
     "/joint_targets": ("sent_position", "sent_velocity", "sent_torque"),
 }
 _FLAGS = {
-    "clock locked": layout.FLAG_DC_LOCKED, "all slaves in OP": layout.FLAG_ALL_OP, "enabled": layout.FLAG_ENABLED,
-    "mode changing": layout.FLAG_SWITCHING, "emergency stop": layout.FLAG_EMERGENCY_STOP,
-    "motion allowed": layout.FLAG_MOTION_ALLOWED, "arm has joystick": layout.FLAG_ARM_HAS_JOYSTICK,
+    "clock locked": record.FLAG_DC_LOCKED, "all slaves in OP": record.FLAG_ALL_OP, "enabled": record.FLAG_ENABLED,
+    "mode changing": record.FLAG_SWITCHING, "emergency stop": record.FLAG_EMERGENCY_STOP,
+    "motion allowed": record.FLAG_MOTION_ALLOWED, "arm has joystick": record.FLAG_ARM_HAS_JOYSTICK,
 }  # fmt: skip
 _WATCHED = ("state", "drive_mode", "control_mode", "flags")
-_WORDS_AT = len(_WATCHED) + 2
-"""Inputs and outputs stand before the statuswords."""
 
 
 class UnknownSignal(ValueError):
     """A signal that no record has: the message names it and those that there are."""
 
-    def __init__(self, signal: str) -> None:
-        super().__init__(f"{signal}: there is no such signal; allowed are {', '.join(FIELDS)}")
-        self.signal = signal
+    def __init__(self, signal: str, allowed: Sequence[str]) -> None:
+        super().__init__(f"{signal}: there is no such signal; allowed are {', '.join(allowed)}")
+        self.signal, self.allowed = signal, list(allowed)
 
 
-def fields_of(signals: Sequence[str]) -> list[str]:
-    """Return the fields of a record that match; none given: all.
+def fields_of(schema: RecordSchema, signals: Sequence[str]) -> list[str]:
+    """Return the names of the fields of a record that match; none given: all.
 
     Args:
+        schema: of the record.
         signals: names of fields or patterns (`*_position`); number and time are always there.
 
     Raises:
         UnknownSignal: no field matches.
     """
     for signal in signals:
-        if not any(fnmatchcase(name, signal) for name in FIELDS):
-            raise UnknownSignal(signal)
+        if not any(fnmatchcase(name, signal) for name in schema.names):
+            raise UnknownSignal(signal, schema.names)
     wanted = (*signals, "number", "time_ns") if signals else ("*",)
-    return [name for name in FIELDS if any(fnmatchcase(name, signal) for signal in wanted)]
+    return [name for name in schema.names if any(fnmatchcase(name, signal) for signal in wanted)]
 
 
 class Channels:
@@ -101,6 +99,7 @@ class Channels:
 
     Args:
         config: the arm.
+        schema: of its records.
         offset_ns: CLOCK_REALTIME less CLOCK_MONOTONIC, ns: one for the whole recording, so that setting the clock
             does not tear it.
         signals: of `/cycle`; see `fields_of`.
@@ -108,14 +107,19 @@ class Channels:
     """
 
     def __init__(
-        self, config: ArmConfig, offset_ns: int, signals: Sequence[str] = (), context: foxglove.Context | None = None
+        self,
+        config: ArmConfig,
+        schema: RecordSchema,
+        offset_ns: int,
+        signals: Sequence[str] = (),
+        context: foxglove.Context | None = None,
     ) -> None:
         self._config = config
         self._offset_ns = offset_ns
         self._context = context or foxglove.Context()
-        fields, joints = fields_of(signals), len(config.joints)
-        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", cycle_definition(joints, fields).decode())
-        self._cycle_type = cycle_type(joints, fields)
+        chosen = schema.subset(fields_of(schema, signals))
+        self._cycle = self._ros_channel("/cycle", "rtcp_msgs/msg/Cycle", chosen.definition().decode())
+        self._cycle_type = cycle_type(chosen)
         names = [joint.name for joint in config.joints]
         self._joints = {
             topic: (
@@ -131,8 +135,12 @@ class Channels:
         self._machine = self._json_channel("/machine", {"type": "object", "title": "rtcp.Machine"})
         self._log = self._json_channel("/log", LOG_SCHEMA)
         self._last: npt.NDArray[np.int64] | None = None
-        self._inputs, self._outputs = terminals(config.inputs), terminals(config.outputs)
+        self._inputs, self._outputs = terminals(config, config.inputs), terminals(config, config.outputs)
         self._outputs.pop("heartbeat", None)  # it changes in every cycle
+        for places, which in ((self._inputs, "inputs"), (self._outputs, "outputs")):
+            for name in [name for name, (box, _) in places.items() if box_field(box, which) not in schema.names]:
+                del places[name]  # of a recording that lacks its box
+        self._boxes = _masks(self._inputs, "inputs") | _masks(self._outputs, "outputs")
         self._description = self._ros_channel("/robot_description", "std_msgs/msg/String", "string data\n")
 
     def _ros_channel(self, topic: str, name: str, definition: str) -> foxglove.Channel:
@@ -204,19 +212,19 @@ class Channels:
         # Bits of a statusword that tell no state may change in every cycle.
         columns = [
             *(records[name] for name in _WATCHED),
-            records["inputs"] & _bits(self._inputs),
-            records["outputs"] & _bits(self._outputs),
+            *(records[name] & mask for name, mask in self._boxes.items()),
             *(records["statusword"] & STATE_BITS).T,
         ]
         rows = np.column_stack([column.astype(np.int64) for column in columns])
         before = np.vstack([rows[:1] - 1 if self._last is None else self._last, rows[:-1]])
         for at in np.flatnonzero((rows != before).any(axis=1)).tolist():
             row = rows[at].tolist()
-            self._machine.log(self._in_words(row[:_WORDS_AT], row[_WORDS_AT:]), log_time=instants[at])
+            self._machine.log(self._in_words(row), log_time=instants[at])
         self._last = rows[-1]
 
-    def _in_words(self, watched: Sequence[int], words: Sequence[int]) -> dict[str, Any]:
-        state, drive_mode, control_mode, flags, inputs, outputs = watched
+    def _in_words(self, row: Sequence[int]) -> dict[str, Any]:
+        (state, drive_mode, control_mode, flags), words = row[: len(_WATCHED)], row[len(_WATCHED) + len(self._boxes) :]
+        boxes = dict(zip(self._boxes, row[len(_WATCHED) :], strict=False))
         config = self._config
         drives = {joint.name: state_of(word).value for joint, word in zip(config.joints, words, strict=True)}
         return {
@@ -225,8 +233,8 @@ class Channels:
             "control_mode": _name(ControlMode, control_mode),
             "flags": [name for name, bit in _FLAGS.items() if flags & bit],
             "drives": drives,
-            "inputs": {name: bool(inputs >> number - 1 & 1) for name, number in self._inputs.items()},
-            "outputs": {name: bool(outputs >> number - 1 & 1) for name, number in self._outputs.items()},
+            "inputs": {name: _level(boxes, place, "inputs") for name, place in self._inputs.items()},
+            "outputs": {name: _level(boxes, place, "outputs") for name, place in self._outputs.items()},
         }
 
     def log(self, time_ns: int, message: str, level: int = INFORMATION) -> None:
@@ -240,21 +248,41 @@ def urdf_of(config: ArmConfig) -> str:
     return to_urdf(config.arm, [joint.torque for joint in config.joints])
 
 
-def terminals(config: Any) -> dict[str, int]:
-    """Return the terminals that a configuration of inputs or outputs names, from 1, by the name of the key."""
-    found: dict[str, int] = {}
-    for key, value in vars(config).items():
+Terminal = tuple[str, int]
+"""Box and number, from 1."""
+
+
+def terminals(config: ArmConfig, section: Any) -> dict[str, Terminal]:
+    """Return the terminals that a section of inputs or outputs names, by the name of the key."""
+    if not config.boxes:
+        return {}
+    found: dict[str, Terminal] = {}
+    for key, value in vars(section).items():
         if isinstance(value, int):
-            found[key] = value
+            found[key] = config.box_of(section), value
         elif hasattr(value, "number"):
-            found[key] = value.number
-        elif value is not None:
-            found |= {name: one for name, one in vars(value).items() if isinstance(one, int)}
+            found[key] = config.box_of(value), value.number
+        elif hasattr(value, "box"):
+            found |= {name: (config.box_of(value), one) for name, one in vars(value).items() if isinstance(one, int)}
     return found
 
 
-def _bits(numbers: Mapping[str, int]) -> int:
-    return sum({1 << number - 1 for number in numbers.values()})
+def box_field(box: str, which: str) -> str:
+    """Return the field of the record with the `inputs` or the `outputs` of a box."""
+    return f"{record.identifier(box)}_{which}"
+
+
+def _masks(places: Mapping[str, Terminal], which: str) -> dict[str, int]:
+    masks: dict[str, int] = {}
+    for box, number in places.values():
+        name = box_field(box, which)
+        masks[name] = masks.get(name, 0) | 1 << number - 1
+    return masks
+
+
+def _level(words: Mapping[str, int], place: Terminal, which: str) -> bool:
+    box, number = place
+    return bool(words[box_field(box, which)] >> number - 1 & 1)
 
 
 def _name(kind: Any, value: int) -> str:

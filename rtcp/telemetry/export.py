@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.recording import RecordingError
+from rtcp.ipc.schema import arm_schema
 from rtcp.telemetry.channels import Channels
 from rtcp.telemetry.reading import Reader
 from rtcp.telemetry.recorder import CSV_NAMES, CsvWriter, McapWriter
@@ -49,7 +49,7 @@ def export(reader: Reader, out: Path, replace: bool = False) -> int:
 def _to_csv(reader: Reader, new: Path) -> int:
     """Write the columns of the recorder's CSV where no signals were chosen and the recording has them."""
     columns: Sequence[str] = reader.names if reader.signals or not set(CSV_NAMES) <= set(reader.names) else ()
-    writer, count = CsvWriter(reader.joints, columns), 0
+    writer, count = CsvWriter(reader.schema, columns), 0
     writer.open(new)
     try:
         for part in reader:
@@ -64,10 +64,10 @@ def _to_mcap(reader: Reader, new: Path) -> int:
     if reader.config is None:
         defect = "it has no configuration of this version, which MCAP files carry: csv and npz can be written"
         raise RecordingError("signals", reader.path, defect)
-    if lacking := [name for name, _ in (*SCALARS, *PER_JOINT) if name not in reader.names]:
+    if lacking := [name for name in arm_schema(1).names if name not in reader.names]:
         defect = f"MCAP files need every signal, it lacks {', '.join(lacking)}: csv and npz can be written"
         raise RecordingError("signals", reader.path, defect, found=reader.names)
-    channels = Channels(reader.config, reader.offset_ns)
+    channels = Channels(reader.config, reader.schema, reader.offset_ns)
     writer, count = McapWriter(channels, reader.config, channels.wall_ns(reader.first_ns)), 0
     writer.open(new)
     try:

@@ -56,7 +56,9 @@ class LiveView:
         self._every = every
         self._subscriptions = _Subscriptions()
         context = foxglove.Context()
-        self._channels = Channels(self._feed.config, time.time_ns() - time.monotonic_ns(), context=context)
+        self._channels = Channels(
+            self._feed.config, self._feed.schema, time.time_ns() - time.monotonic_ns(), context=context
+        )
         try:
             self._server = foxglove.start_server(
                 name=f"rtcp: {self._feed.config.name}", host=host, port=port, context=context,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import chain, islice
 from pathlib import Path
@@ -22,7 +22,6 @@ from numpy.lib.recfunctions import repack_fields
 
 from rtcp.config.model import ArmConfig
 from rtcp.config.serialization import from_json
-from rtcp.ipc.layout import FLAG_ENABLED, PER_JOINT
 from rtcp.ipc.recording import (
     ABOUT,
     Batch,
@@ -34,6 +33,7 @@ from rtcp.ipc.recording import (
     is_complete,
     opened,
 )
+from rtcp.ipc.schema import FLAG_ENABLED, PER_JOINT, Field, RecordSchema, SchemaError, arm_schema
 from rtcp.telemetry.recorder import CSV_NAMES
 
 Records = npt.NDArray[np.void]
@@ -53,7 +53,7 @@ class Reader:
 
     Args:
         path: MCAP of a recorder or of the black box, or CSV (`.csv`) of a recorder.
-        signals: fields of `rtcp.ipc.layout` or patterns (`*_position`); none: all that the file has. number and
+        signals: names of fields or patterns (`*_position`); none: all that the file has. number and
             time_ns are always there.
         start_s: from the first record; None: from it.
         end_s: from the first record; None: to the last one.
@@ -62,7 +62,7 @@ class Reader:
         about: what the file says about itself, by name: arm, joints, period_us, versions; of a fault also `fault`.
         config: the arm at that time; None where the file has none, or that of another version.
         signals, names: those that were asked for; the fields that its records have.
-        joints: how many.
+        schema: of its records; joints: how many.
         first_ns: time_ns of the first record of the file.
         offset_ns: CLOCK_REALTIME less time_ns; 0 in CSV, which has no date.
         truncated: whether its end is missing or something in it is damaged; known when all parts are read.
@@ -77,7 +77,7 @@ class Reader:
         self.path = path
         self.about: dict[str, str] = {}
         self.config: ArmConfig | None = None
-        self.joints = 0
+        self.schema = RecordSchema(())
         self.first_ns = self.offset_ns = 0
         self.truncated = False
         self.signals, self.names = signals, list[str]()
@@ -99,6 +99,11 @@ class Reader:
         if not found:
             span = f"{self._start_s:g} to {self._end_s:g} s"
             raise RecordingError("empty", self.path, f"it has no record from {span}; it ends at {self._last_s:.3f} s")
+
+    @property
+    def joints(self) -> int:
+        """Joints of the arm."""
+        return self.schema.joints
 
     @property
     def period_s(self) -> float:
@@ -170,15 +175,14 @@ class Reader:
                         self._last_s = last_s
                         continue
                     batch = decoder.decode(record)
-                    self.joints = decoder.joints
+                    self.schema = decoder.schema
                     yield batch
 
     def _csv(self) -> Iterator[Batch]:
         with opened(self.path) as file:
             header = file.readline(_CSV_HEADER).decode().rstrip("\r\n").split(",")
-            columns = _columns(header)
-            self.joints = max(map(len, columns.values()))
-            kind, count = cycle_type(self.joints, {*columns, *_ALWAYS}), 0
+            self.schema, columns = _columns(header)
+            kind, count = cycle_type(self.schema), 0
             while lines := list(islice(file, _CSV_ROWS)):
                 if not lines[-1].endswith(b"\n"):
                     self.truncated = True
@@ -211,20 +215,30 @@ def _about(metadata: dict[str, str]) -> dict[str, str]:
     }
 
 
-def _columns(header: Sequence[str]) -> dict[str, list[int]]:
-    """Return the places of each field in the columns of a recorder's CSV; raises ValueError."""
-    full = {short: name for name, short in CSV_NAMES.items()}
-    per_joint = {name for name, _ in PER_JOINT}
+def _columns(header: Sequence[str]) -> tuple[RecordSchema, dict[str, list[int]]]:
+    """Return the schema of a recorder's CSV, and the places of each field in its columns; raises ValueError.
+
+    A CSV tells no types: those of an arm's fields are known, what a device publishes is float64.
+    """
+    full, known = {short: name for name, short in CSV_NAMES.items()}, arm_schema(1)
     found: dict[str, list[int]] = {}
     for at, column in enumerate(header):
         match = fullmatch(r"J\d+_(\w+)", column)
         if at:
             found.setdefault(full.get(match[1], match[1]) if match else column, []).append(at)
-    joints = {len(places) for name, places in found.items() if name in per_joint}
-    kind = cycle_type(max(joints, default=0), found).names or ()
-    if header[0] != "Time" or not found or len(joints) > 1 or set(kind) != set(found):
-        raise ValueError(f"its columns begin with {', '.join(header)[:60]}, those of a recording with Time, J1_pos")
-    return found
+    joints = {len(places) for name, places in found.items() if name in PER_JOINT}
+    try:
+        if header[0] != "Time" or not set(found) & set(known.names) or len(joints) > 1:
+            raise SchemaError
+        fields = [known[name] for name in _ALWAYS]
+        for name, places in found.items():
+            vector = fullmatch(r"J\d+_\w+", header[places[0]])
+            field = known[name] if name in known.names else Field(name)
+            fields += [replace(field, shape=(len(places),) if vector else ())] if name not in _ALWAYS else []
+        return RecordSchema(tuple(fields)), found
+    except SchemaError as error:
+        begin = ", ".join(header)[:60]
+        raise ValueError(f"its columns begin with {begin}, those of a recording with Time, J1_pos") from error
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,8 @@ from rtcp.api.feed import Feed, Records
 from rtcp.config.model import ArmConfig, RecordingConfig, RecordingFormat
 from rtcp.config.serialization import from_json, to_json
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.layout import PER_JOINT
-from rtcp.ipc.recording import FIELDS, versions
+from rtcp.ipc.recording import versions
+from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.session import identify
 from rtcp.telemetry.channels import Channels, UnknownSignal, fields_of, urdf_of
 
@@ -190,13 +190,13 @@ class CsvWriter:
     """A recording as CSV.
 
     Args:
-        joints: how many.
+        schema: of the records.
         names: of the records' fields, in the order of the columns; none: those of the source.
     """
 
-    def __init__(self, joints: int, names: Sequence[str] = ()) -> None:
+    def __init__(self, schema: RecordSchema, names: Sequence[str] = ()) -> None:
         self.path: Path | None = None
-        self._joints = joints
+        self._schema = schema
         self._names = list(names or CSV_NAMES)
         self._began_ns: int | None = None
 
@@ -204,11 +204,10 @@ class CsvWriter:
         """Begin a file with its header."""
         self._file = open(path, "x", newline="")  # noqa: SIM115
         self.path = path
-        per_joint = {name for name, _ in PER_JOINT}
         header = ["Time"]
         for name in self._names:
-            short = CSV_NAMES.get(name, name)
-            header += [f"J{axis}_{short}" for axis in range(1, self._joints + 1)] if name in per_joint else [name]
+            field, short = self._schema[name], CSV_NAMES.get(name, name)
+            header += [f"J{axis}_{short}" for axis in range(1, field.count + 1)] if field.shape else [name]
         self._file.write(",".join(header) + "\n")
 
     def write(self, records: Records, chosen: Records) -> None:
@@ -263,18 +262,17 @@ class Recorder:
         self._directory, self._options = directory, options
         self._feed = Feed(directory)
         config = self._feed.config
-        self._channels = Channels(config, time.time_ns() - time.monotonic_ns(), options.signals)
+        schema = self._feed.schema
+        self._channels = Channels(config, schema, time.time_ns() - time.monotonic_ns(), options.signals)
         self._ended = False
         self._rotates = options.max_file_mb is not None or options.max_file_seconds is not None
         if options.keep is not None and not self._rotates:
             message = f"keep: found {options.keep} without max_file_mb or max_file_seconds, which begin new files"
             raise RtcpError("invalid", message, "keep_without_limit", {"keep": options.keep})
         self._stem, formats = _place(options)
-        more = [one for one in fields_of(options.signals) if one not in CSV_NAMES] if options.signals else []
+        more = [one for one in fields_of(schema, options.signals) if one not in CSV_NAMES] if options.signals else []
         self._writers: dict[str, Writer] = {
-            name: McapWriter(self._channels, config)
-            if name == "mcap"
-            else CsvWriter(len(config.joints), [*CSV_NAMES, *more])
+            name: McapWriter(self._channels, config) if name == "mcap" else CsvWriter(schema, [*CSV_NAMES, *more])
             for name in formats
         }
         me = identify(os.getpid())
@@ -457,7 +455,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         recorder = Recorder(given.directory, from_json(RecordingConfig, given.options))
     except UnknownSignal as error:
-        fields = {"signal": error.signal, "allowed": list(FIELDS)}
+        fields = {"signal": error.signal, "allowed": error.allowed}
         return _refuse(RtcpError("invalid", str(error), "unknown_signal", fields))
     except RtcpError as error:
         return _refuse(error)

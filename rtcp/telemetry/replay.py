@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rtcp.ipc.jsonrpc import LINE_LIMIT
-from rtcp.ipc.layout import FLAG_ENABLED
 from rtcp.ipc.recording import RecordingError
+from rtcp.ipc.schema import FLAG_ENABLED
 from rtcp.telemetry.reading import Recorded
 
 Array = npt.NDArray[np.float64]

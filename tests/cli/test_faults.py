@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from rtcp.cli import faults
-from rtcp.ipc.layout import FLAG_ENABLED, RecordLayout
 from rtcp.ipc.observer import record_type
 from rtcp.ipc.recording import About, FaultRecording, Moment, faults_directory, write
+from rtcp.ipc.schema import FLAG_ENABLED, arm_schema
 from rtcp.ipc.states import State
 
 JOINTS, PERIOD_NS, CYCLES, AT = 3, 1_000_000, 1200, 800
@@ -30,7 +30,8 @@ def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def recording() -> FaultRecording:
     """An arm that moves for 0.8 s and faults; after the fault no frame comes for 40 cycles."""
-    whole = np.zeros(CYCLES, dtype=record_type(RecordLayout(JOINTS)))
+    schema = arm_schema(JOINTS)
+    whole = np.zeros(CYCLES, dtype=record_type(schema))
     cycles = np.arange(CYCLES)
     whole["number"] = cycles + 5
     whole["time_ns"] = (cycles + 7) * PERIOD_NS
@@ -45,7 +46,6 @@ def recording() -> FaultRecording:
     whole["actual_position"] = whole["sent_position"] - 0.001
     whole["actual_velocity"][:AT] = (0.1, 0.2, -0.1)
     whole["actual_torque"][AT] = (1.0, -2.0, 3.0)
-    names = [name for name in whole.dtype.names or () if name not in ("number_again", "padding")]
     about = About(
         number=0, time_ns=WHEN_NS, what=WHAT, before="moving", arm="arm", bus="virtual", period_ns=PERIOD_NS,
         joints=("base", "elbow", "wrist"), versions={"rtcp": "9.9"}, began_ns=5, event=7, at=AT,
@@ -53,7 +53,7 @@ def recording() -> FaultRecording:
         timeline=(Moment(WHEN_NS - 500_000_000, "a sentence before"), Moment(WHEN_NS, WHAT),
                   Moment(WHEN_NS + 20_000_000, "slave 3 sent emergency 0x8611")),
     )  # fmt: skip
-    return FaultRecording(about, {name: whole[name] for name in names})
+    return FaultRecording(about, {name: whole[name] for name in schema.names}, schema)
 
 
 def test_without_a_recording_the_list_says_so(rtcp: Callable[..., Any], state: Path) -> None:
@@ -177,7 +177,7 @@ def test_who_has_recorded_nothing_is_referred_to_where_the_service_records(
 def test_a_fault_without_a_single_cycle_is_shown(rtcp: Callable[..., Any]) -> None:
     made = recording()
     none = {name: array[:0] for name, array in made.records.items()}
-    write(faults_directory(), FaultRecording(replace(made.about, at=-1), none))
+    write(faults_directory(), FaultRecording(replace(made.about, at=-1), none, made.schema))
     ended = rtcp("faults", "show", "1")
     assert ended.code == 0
     assert "slave 3 sent emergency" in ended.out
@@ -226,7 +226,7 @@ def test_two_faults_that_begin_alike_are_distinct_at_80_columns(rtcp: Callable[.
     made = recording()
     for end in ("drive1 with statusword 0x0218", "drive2 with statusword 0x0208"):
         what = f"a long sentence about something that went wrong with the drive {end}"
-        write(faults_directory(), FaultRecording(replace(made.about, what=what), made.records))
+        write(faults_directory(), replace(made, about=replace(made.about, what=what)))
     ended = rtcp("faults")
     shown = " ".join(ended.out.split())
     assert "0x0218" in shown

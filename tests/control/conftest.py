@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config.model import ArmConfig
+from rtcp.control.cycle import record_schema
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Observer
 
@@ -19,7 +20,7 @@ from .rig import CONFIG, PERIOD_S, SWITCH_INPUT, LoopRig, with_switch
 def rig_board() -> Iterator[tuple[Blackboard, Observer]]:
     """One for all rigs of a file: making one touches 18 MB of memory."""
     path = Path(f"/dev/shm/rtcp-rig-{os.getpid()}")
-    written = Blackboard(path, len(CONFIG.joints), round(PERIOD_S * 1e9))
+    written = Blackboard(path, record_schema(CONFIG), round(PERIOD_S * 1e9))
     observer = Observer(path)
     path.unlink()
     yield written, observer
@@ -38,7 +39,7 @@ def new_rig(rig_board: tuple[Blackboard, Observer]) -> Iterator[Callable[..., Lo
 
     yield make
     for rig in made:
-        rig_board[1].release(rig.lease)
+        rig.release()
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import NamedTuple
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputConfig
 from rtcp.control.bus_service import BusService
-from rtcp.control.cycle import Cycle
+from rtcp.control.cycle import Cycle, record_schema
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command, Disable, Enable, Halt, Home, MoveJoints, Reset, SetDriveMode, Shutdown
@@ -190,26 +190,39 @@ class LoopRig:
     ) -> None:
         self.data = Segment()
         self.models = self.data.drives
-        self.board, self.observer = board, observer
         period_ns = round(PERIOD_S * 1e9)
+        if not with_box:
+            config = replace(
+                config, slaves=(replace(config.slaves[0], device=config.slaves[1].device), *config.slaves[1:])
+            )
+        self._own: list[Blackboard | Observer] = []
+        if board.schema != (schema := record_schema(config)):
+            board = Blackboard(board.path.with_suffix(".own"), schema, period_ns)
+            observer = Observer(board.path)
+            board.path.unlink()
+            self._own = [observer, board]
+        self.board, self.observer = board, observer
         self.discipline = Followed(period_ns, 0)
         self.discipline.locked = True
         self.service = BusService(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
         self.slaves_come_back = True
         for position in range(1, 1 + len(config.slaves)):
             board.slave(position, AlState.OP, 0)
-        if not with_box:
-            config = replace(
-                config, slaves=(replace(config.slaves[0], device=config.slaves[1].device), *config.slaves[1:])
-            )
         self.now_ns = monotonic_ns()
         self.loop = Cycle(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
-        self.arm, self.box, self.operator = self.loop.arm, self.loop.box, self.loop.operator
+        self.arm, self.operator = self.loop.arm, self.loop.operator
+        self.box = next((box for _, box in self.loop.machine.context.boxes), None)
         self.machine, self.context = self.loop.machine, self.loop.machine.context
         self.names = Names(config)
         self.log: list[CycleFrame] = []
         self._events_before = max((event.number for event in observer.events_since(0)), default=0)
         self.lease = observer.acquire("the rig", 3600.0)
+
+    def release(self) -> None:
+        """Release the lease, and the blackboard where it is the rig's own."""
+        self.observer.release(self.lease)
+        for own in self._own:
+            own.close()
 
     @property
     def state(self) -> State:

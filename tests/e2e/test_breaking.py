@@ -12,9 +12,9 @@ import pytest
 
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.layout import FLAG_ALL_OP, FLAG_DC_LOCKED, RecordLayout
 from rtcp.ipc.observer import Observer, record_type
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, segment_control
+from rtcp.ipc.schema import FLAG_ALL_OP, FLAG_DC_LOCKED, arm_schema
 from rtcp.telemetry.reading import target_steps
 from rtcp.virtual.faults.control import SegmentClient
 from tests.e2e.conftest import Platform, gone, kill, lives
@@ -295,4 +295,4 @@ def test_a_terminated_process_is_no_traceback(running: Platform, name: str) -> N
 
 def test_the_record_layout_is_the_same_for_writer_and_reader() -> None:
     for joints in (1, 6, 7):
-        assert record_type(RecordLayout(joints)).itemsize == RecordLayout(joints).size
+        assert record_type(arm_schema(joints)).itemsize == arm_schema(joints).size

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rtcp.config import load
+from rtcp.control.part import Device
 from rtcp.ipc.commands import Enable, Halt
 from rtcp.ipc.names import Names
 from rtcp.ipc.states import State
@@ -61,19 +62,46 @@ def sway(path: Path) -> Any:
 
 
 def thermometer(path: Path) -> Any:
-    """What the driver decodes, beside the bytes on the bus and the model's own temperatures."""
+    """What the driver decodes and the record shows, beside the bytes on the bus and the model's own temperatures."""
     with started(path) as simulation:
         frames: list[Frame] = []
         simulation.on_frame = frames.append
         simulation.run(0.5)
-        (slot, driver), *_ = simulation.loop.others
+        part = next(one for one in simulation.loop.parts if one.name == "thermometer")
+        assert isinstance(part, Device)
+        slot, driver = part.slot, part.driver
         counts = struct.unpack("<hh", frames[-1].received[slot])
+        record = simulation.observer.latest()
+        assert record is not None
         model: Any = simulation.bus.slaves[slot].device
         return {
             "driver": type(driver).__name__,
             "values": driver.values,
             "counts": counts,
             "model": model.kelvin,
+            "record": [float(record[0]["thermometer_first"]), float(record[0]["thermometer_second"])],
+            "unit": simulation.observer.schema["thermometer_first"].unit,
+        }
+
+
+def alarm(path: Path) -> Any:
+    """Its command, refused and accepted, the event that follows, and the fault that stops the arm."""
+    from rtcp_example.thermometer import SetAlarm
+
+    with started(path) as simulation:
+        names = Names(simulation.config)
+        refused = simulation.send(SetAlarm(200.0)).refusal
+        accepted = simulation.send(SetAlarm(302.0)).refusal is None
+        simulation.until(lambda: simulation.events[-1].event.name == "warm", 5.0)
+        states = [simulation.state.name]
+        simulation.until(lambda: simulation.state is State.FAULT, 5.0)
+        states.append(simulation.state.name)
+        return {
+            "refused": refused and names.message(refused),
+            "accepted": accepted,
+            "states": states,
+            "events": [names.message(one.event) for one in simulation.events if one.event.number > 1000],
+            "fault": int(simulation.loop.machine.fault),
         }
 
 
@@ -136,4 +164,6 @@ def methods(path: Path) -> Any:
 
 if __name__ == "__main__":
     _, scene, config = sys.argv
-    json.dump({one.__name__: one for one in (sway, thermometer, wire_break, methods)}[scene](Path(config)), sys.stdout)
+    json.dump(
+        {one.__name__: one for one in (sway, thermometer, alarm, wire_break, methods)}[scene](Path(config)), sys.stdout
+    )

@@ -12,16 +12,15 @@ from typing import Any, TypeVar
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory, SetLimits, SetZero
 from rtcp.ipc.events import Event, ZeroSet
-from rtcp.ipc.layout import PER_JOINT, PLAN_COLUMNS, SCALARS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
+from rtcp.ipc.layout import PLAN_COLUMNS, SERVICE_LENGTH_AT, SERVICE_STATE_AT, SERVICE_TEXT_AT
 from rtcp.ipc.refusals import Malformed, Refusal
+from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.states import ControlMode, State
+from tests.records import numbers
 
 C = TypeVar("C", bound=Command)
 JOINTS = 6
 GRIPPER_AT = 0.4
-_SCALAR_AT = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
-_JOINTS_AT = {name: len(SCALARS) - 1 + at * JOINTS for at, (name, _) in enumerate(PER_JOINT)}
-_FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
 _FOR_EVER = 1_000_000_000
 
 
@@ -34,7 +33,7 @@ class FakeLoop:
     """
 
     def __init__(self, path: Path, q: Sequence[float] = (0.0,) * JOINTS, state: State = State.READY) -> None:
-        self.board = Blackboard(path, JOINTS, 500_000)
+        self.board = Blackboard(path, arm_schema(JOINTS), 500_000)
         self.commands: list[Command] = []
         self.plans: list[list[list[float]]] = []
         self.requests: list[dict[str, Any]] = []
@@ -103,13 +102,9 @@ class FakeLoop:
             self.state = self.ends_in
 
     def _publish(self) -> None:
-        record: list[float] = [0] * _FIELDS
-        record[_SCALAR_AT["time_ns"]] = time.monotonic_ns()
-        record[_SCALAR_AT["state"]] = self.state
-        record[_SCALAR_AT["control_mode"]] = self.control_mode
-        for name in ("actual_position", "commanded_position", "sent_position"):
-            record[_JOINTS_AT[name] : _JOINTS_AT[name] + JOINTS] = self.q
-        self.board.publish(record)
+        told = {"time_ns": time.monotonic_ns(), "state": self.state, "control_mode": self.control_mode}
+        told |= dict.fromkeys(("actual_position", "commanded_position", "sent_position"), self.q)
+        self.board.publish(numbers(self.board.schema, **told))
 
     def _handle(self) -> None:
         number, lease, command = self.board.take_command()

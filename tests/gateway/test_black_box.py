@@ -30,17 +30,18 @@ from rtcp.ipc.events import (
     ResetWhileMoving,
     SlaveLost,
 )
-from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS
+from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.recording import FaultRecording, listed, read
 from rtcp.ipc.runtime_directory import stop_marker
+from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.session import Pid, Processes, Session, identify
 from rtcp.ipc.states import State
 from rtcp.launch import launcher
 from rtcp.launch.simulation import Simulation
+from tests.records import numbers
 
 JOINTS = 6
-AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
 BEGAN_NS = 77
 LOST, DRIVE = ProcessDataLost(5, 3), DriveFault(2, 0x21F)
 
@@ -60,7 +61,7 @@ class Written:
         self.period_ns = period_ns
         self.directory = directory
         self.session = Session(config, "virtual", "ecat0", 0, BEGAN_NS)
-        self.board = Blackboard(path, JOINTS, period_ns)
+        self.board = Blackboard(path, arm_schema(JOINTS), period_ns)
         self.observer = Observer(path)
         self.reports: list[str] = []
 
@@ -68,13 +69,15 @@ class Written:
         """Publish so many cycles, the last of them now (CLOCK_MONOTONIC); from `fault_at` on they are in fault."""
         ends_ns = ends_ns or time.monotonic_ns()
         for cycle in range(1, cycles + 1):
-            values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
-            values[AT["cycle"]] = cycle
-            values[AT["time_ns"]] = ends_ns - (cycles - cycle) * self.period_ns
             broken = 0 < fault_at <= cycle
-            values[AT["state"]] = State.FAULT if broken else State.MOVING
-            values[AT["fault"]] = event.number if broken else 0
-            values[len(SCALARS) - 1] = cycle * 1e-4
+            values = numbers(
+                self.board.schema,
+                cycle=cycle,
+                time_ns=ends_ns - (cycles - cycle) * self.period_ns,
+                state=State.FAULT if broken else State.MOVING,
+                fault=event.number if broken else 0,
+                actual_position=[cycle * 1e-4, *[0.0] * (JOINTS - 1)],
+            )
             self.board.publish(values)
         return ends_ns
 
@@ -334,7 +337,7 @@ def test_cycles_that_were_overwritten_before_they_were_read_are_reported(write_b
     box = written.watched()
     written.fill(16_410, fault_at=16_410)
     for number in range(1, 11):
-        written.observer._ring[number]["number_again"] = 0
+        written.observer._ring[number]["_number_again"] = 0
     recording = written.lost(box)
     note = "8.2 s before the fault instead of 10 s: older cycles had been overwritten"
     assert note in recording.about.notes
@@ -357,7 +360,7 @@ def test_torn_records_are_reported_and_not_taken(write_board: WriteBoard) -> Non
     written.fill(1000, fault_at=900)
     for number in (10, 11, 500):
         slot = written.observer._ring[number % written.observer.records]
-        slot["number_again"] = 0
+        slot["_number_again"] = 0
     recording = written.lost(box)
     assert "3 cycles were overwritten before they were read, or torn" in recording.about.notes
     assert len(recording.records["cycle"]) == 997

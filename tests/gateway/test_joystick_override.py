@@ -34,16 +34,16 @@ CODES = {
 @pytest.mark.parametrize(("pressed", "byte"), CODES.values(), ids=CODES.keys())
 def test_each_position_makes_the_byte_of_the_device_description(pressed: list[str], byte: int) -> None:
     config = load(default_config())
-    mask, levels = forced(config, pressed, None)
+    mask, levels = forced(config, pressed, None)["io"]
     assert (mask, levels) == (0x3F, byte)
     # As a byte, all eight inputs are forced: those beside the lines too, for bytes that are no code.
-    assert forced(config, [], byte) == (0xFF, byte)
+    assert forced(config, [], byte) == {"io": (0xFF, byte)}
 
 
 def test_toggle_and_emergency_stop_are_forced_to_the_level_that_means_them() -> None:
     config = load(default_config())
-    assert forced(config, ["chair"], 63) == (0x1FF, 63)
-    assert forced(config, ["emergency_stop"], 63) == (0x2FF, 63)
+    assert forced(config, ["chair"], 63) == {"io": (0x1FF, 63)}
+    assert forced(config, ["emergency_stop"], 63) == {"io": (0x2FF, 63)}
 
 
 @pytest.mark.parametrize(

@@ -15,26 +15,26 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from rtcp.ipc import recording as module
-from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
 from rtcp.ipc.recording import About, FaultRecording, Moment, RecordingError, files, listed, read, write
+from rtcp.ipc.schema import arm_schema
 
 CYCLES = 50
 
 
 def recording(cycles: int = CYCLES, joints: int = 2) -> FaultRecording:
     """A recording with other numbers in each cycle."""
-    kinds = record_type(RecordLayout(joints))
-    whole = np.zeros(cycles, dtype=kinds)
+    schema = arm_schema(joints)
+    whole = np.zeros(cycles, dtype=record_type(schema))
     whole["number"] = whole["time_ns"] = np.arange(cycles) + 1
     whole["actual_position"] = np.arange(cycles * joints).reshape(cycles, joints) * 0.1
-    records = {name: whole[name] for name in kinds.names or () if name not in ("number_again", "padding")}
+    records = {name: whole[name] for name in schema.names}
     about = About(
         number=0, time_ns=1_790_000_000_123_456_789, what="process data lost: ü", before="moving", arm="arm",
         bus="virtual", period_ns=500_000, joints=tuple(f"joint{i}" for i in range(joints)), versions={"rtcp": "1"},
         began_ns=5, event=7, at=cycles // 2 if cycles else -1, notes=("a note",), timeline=(Moment(9, "a sentence"),),
     )  # fmt: skip
-    return FaultRecording(about, records)
+    return FaultRecording(about, records, schema)
 
 
 def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -55,8 +55,8 @@ def test_any_reader_of_mcap_opens_a_recording(tmp_path: Path) -> None:
     cycles = [(schema, message) for schema, channel, message in found if channel.topic == "/cycle"]
     schema, first = cycles[0]
     assert (schema.name, schema.encoding, len(cycles)) == ("rtcp_msgs/msg/Cycle", "ros2msg", CYCLES)
-    assert b"uint64 number\n" in schema.data
-    assert b"float64[2] actual_position\n" in schema.data
+    assert b"uint64 number  # cycle, : Number" in schema.data
+    assert b"float64[2] actual_position  # arm, rad: Measured position.\n" in schema.data
     # By the clock of the fault's instant, its cycle is at that instant.
     assert cycles[made.about.at][1].log_time == made.about.time_ns
     # CDR: four bytes of header, then each number at a multiple of its size.
@@ -174,9 +174,9 @@ def _written(path: Path, about: Any = None, **options: Any) -> None:
         writer.start()
         if about is not False:
             writer.add_metadata(options.get("metadata", "rtcp/about"), {"json": options.get("json", json.dumps(told))})
-        definition = options.get("definition", module.cycle_definition(2))
+        definition = options.get("definition", arm_schema(2).definition())
         channel = writer.register_channel("/cycle", "cdr", writer.register_schema("a", "ros2msg", definition))
-        size = options.get("size", 4 + module.cycle_type(2).itemsize)
+        size = options.get("size", 4 + module.cycle_type(arm_schema(2)).itemsize)
         for number in range(options.get("cycles", CYCLES)):
             writer.add_message(channel, number, bytes(size), number)
         writer.finish()
@@ -187,7 +187,7 @@ FOREIGN: dict[str, dict[str, Any]] = {
     "metadata of another name": {"metadata": "other"},
     "metadata that is no JSON": {"json": "{"},
     "metadata that is no object": {"json": "[]"},
-    "other joints": {"definition": module.cycle_definition(3)},
+    "other joints": {"definition": arm_schema(3).definition()},
     "a cycle too short": {"size": 20},
     "another compression": {"compression": CompressionType.LZ4},
     "another format": {"about": {"format": 1}},

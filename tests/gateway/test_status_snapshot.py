@@ -15,21 +15,19 @@ from rtcp.gateway import status_snapshot
 from rtcp.gateway.status_snapshot import StatusSnapshot, robot_status
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import Arrived, DriveFault, EmergencyStopActivated
-from rtcp.ipc.layout import (
+from rtcp.ipc.observer import Observer
+from rtcp.ipc.schema import (
     FLAG_DC_LOCKED,
     FLAG_EMERGENCY_STOP,
     FLAG_ENABLED,
     FLAG_MOTION_ALLOWED,
     FLAG_SWITCHING,
-    PER_JOINT,
-    SCALARS,
 )
-from rtcp.ipc.observer import Observer
 from rtcp.ipc.session import Processes, Session
 from rtcp.ipc.states import ControlMode, State
+from tests.records import numbers
 
 JOINTS = 6
-AT = {name: i for i, (name, _) in enumerate(SCALARS[1:])}
 
 
 class Written:
@@ -41,11 +39,8 @@ class Written:
         self.snapshot = StatusSnapshot(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
 
     def publish(self, state: State, moves: int = 0, wkc: int = 21) -> None:
-        record: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
         told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED}
-        for name, value in {**told, "time_ns": time.monotonic_ns()}.items():
-            record[AT[name]] = value
-        self.board.publish(record)
+        self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns()))
 
     @property
     def status(self) -> dict[str, Any]:

@@ -12,13 +12,15 @@ import pytest
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Enable, MoveJoints, SetDriveMode
 from rtcp.ipc.events import OverSpeed
-from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, PER_JOINT, RECORDS, SCALARS, records_for
+from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, RECORDS, records_for
 from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
 from rtcp.ipc.refusals import Malformed, PositionOutOfRange
+from rtcp.ipc.schema import PER_JOINT, arm_schema
 from rtcp.ipc.states import DriveMode
+from tests.records import numbers
 
 JOINTS = 6
-FIELDS = len(SCALARS) - 1 + len(PER_JOINT) * JOINTS
+SCHEMA = arm_schema(JOINTS)
 
 
 @pytest.fixture
@@ -29,15 +31,13 @@ def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
 
 
 def record(cycle: int) -> list[float]:
-    return [cycle, *([0] * (len(SCALARS) - 2)), *(float(cycle) for _ in range(7 * JOINTS)), *([cycle & 0xFFFF] * 6)]
+    return numbers(SCHEMA, cycle=cycle, **dict.fromkeys(PER_JOINT[:-1], cycle), statusword=cycle & 0xFFFF)
 
 
 def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observer) -> None:
-    values: list[float] = [0] * FIELDS
-    for at, (name, _) in enumerate(SCALARS[1:]):
-        values[at] = {"state": 4, "wkc": -1, "dc_filtered_ns": -77, "elapsed_s": 0.5}.get(name, at)
-    values[len(SCALARS) - 1 :] = [*(0.1 * i for i in range(7 * JOINTS)), *range(100, 100 + JOINTS)]
-    board.publish(values)
+    scalars = {"state": 4, "wkc": -1, "dc_filtered_ns": -77, "elapsed_s": 0.5}
+    vectors = {name: [0.1 * (i + JOINTS * at) for i in range(JOINTS)] for at, name in enumerate(PER_JOINT[:-1])}
+    board.publish(numbers(SCHEMA, **scalars, **vectors, statusword=range(100, 100 + JOINTS)))
     latest = observer.latest()
     assert latest is not None
     assert int(latest[0]["number"]) == 1
@@ -85,7 +85,7 @@ def test_the_ring_holds_twelve_seconds_of_every_cycle(period_us: int) -> None:
 def test_a_writer_in_another_process_is_never_read_torn(path: Path) -> None:
     child = os.fork()
     if child == 0:
-        board = Blackboard(path, JOINTS, 500_000)
+        board = Blackboard(path, arm_schema(JOINTS), 500_000)
         for cycle in range(1, 100_000):
             board.publish(record(cycle))
         os._exit(0)

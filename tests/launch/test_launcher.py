@@ -18,8 +18,8 @@ from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.ipc.runtime_directory import LockHeld, blackboard_file, control_socket, exclusive, stop_marker
+from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.session import (
     Pid,
     Processes,
@@ -31,6 +31,7 @@ from rtcp.ipc.session import (
 )
 from rtcp.launch import launcher, platform
 from rtcp.launch.platform import Platform
+from tests.records import numbers
 
 JOINTS = 6
 
@@ -63,8 +64,8 @@ def session_of(config: ArmConfig) -> Session:
 @pytest.fixture
 def dead_loop(directory: Path, other: subprocess.Popen[bytes]) -> Iterator[None]:
     """A platform whose loop (this process has its number) has ended uncleanly, and whose segment lives."""
-    board = Blackboard(blackboard_file(directory), JOINTS, 500_000)
-    board.publish([0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS))
+    board = Blackboard(blackboard_file(directory), arm_schema(JOINTS), 500_000)
+    board.publish(numbers(board.schema))
     Processes(loop=Pid(os.getpid(), 1), segment=identify(other.pid)).write(directory)
     yield
     board.close()

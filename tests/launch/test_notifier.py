@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.states import State
 from rtcp.launch.supervisor import Notifier
+from tests.records import numbers
 
 JOINTS = 6
-STATE = [name for name, _ in SCALARS[1:]].index("state")
 AT_ONCE = 1e-6
 """A watchdog interval, s, for which a ping is due at every look."""
 
@@ -25,12 +25,10 @@ class Cycle:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.board = Blackboard(path, JOINTS, 500_000)
+        self.board = Blackboard(path, arm_schema(JOINTS), 500_000)
 
     def publish(self, state: State = State.READY) -> None:
-        values: list[float] = [0] * (len(SCALARS) - 1 + len(PER_JOINT) * JOINTS)
-        values[STATE] = state
-        self.board.publish(values)
+        self.board.publish(numbers(self.board.schema, state=state))
 
 
 @pytest.fixture

@@ -25,6 +25,7 @@ from rtcp.ipc.events import SlaveLost
 from rtcp.ipc.layout import EVENTS_AT, EVENTS_HEAD_AT, RECORDS_AT, RECORDS_HEAD_AT, TEXTS_AT, TEXTS_HEAD_AT
 from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.session import (
     Pid,
     Processes,
@@ -188,7 +189,7 @@ def test_a_damaged_file_of_limits_kept_is_as_none(tmp_path: Path) -> None:
 def test_a_damaged_blackboard_is_refused_in_a_sentence_or_read_without_an_exception(tmp_path: Path) -> None:
     random = Random(1)
     path = tmp_path / "board"
-    board = Blackboard(path, 6, 500_000)
+    board = Blackboard(path, arm_schema(6), 500_000)
     for number in range(5):
         board.event(SlaveLost(number + 1))
         board.text("a sentence")
@@ -257,7 +258,7 @@ def test_a_gateway_that_finds_a_damaged_file_says_so_without_a_traceback(tmp_pat
     Session(load(default_config()), "virtual", "ecat0", 0, time.monotonic_ns()).write(tmp_path)
     (tmp_path / "started.json").write_text("{}")
     file = blackboard_file(tmp_path)
-    Blackboard(file, 6, 500_000).close()
+    Blackboard(file, arm_schema(6), 500_000).close()
     damage = {"blackboard": file, "session": session_file(tmp_path)}.get(name, tmp_path / name)
     damage.write_bytes(b"{")
     done = subprocess.run(

@@ -15,7 +15,7 @@ from rtcp.config.model import Stop
 from rtcp.motion.controllers.line import LineController
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import LINE, Plan, PlanRefused
+from rtcp.motion.planning.plan import KIND, LINE, Plan, PlanRefused
 
 PERIOD = 0.0005
 Q = (0.0, 0.3, 1.2, 0.0, 0.8, 0.0)
@@ -140,7 +140,7 @@ def test_rows_carry_length_speed_and_how_long_all_takes(arm: Any, plan: Any, mov
     made = plan([moved(0.0, 0.1, speed=0.05), moved(0.0, 0.1), moved(0.0, 0.1, 0.05)])
     assert len(made.rows) == 2
     first, second = made.rows
-    assert (first[17], second[17], first[19]) == pytest.approx((0.1, 0.05, LINE))
+    assert (first[17], second[17], first[KIND]) == pytest.approx((0.1, 0.05, LINE))
     assert first[14] == pytest.approx(0.05 / 0.1)
     assert made.length_m == pytest.approx(0.15)
     assert made.duration_s == first[18] > second[18] > 0.0

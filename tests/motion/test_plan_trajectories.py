@@ -9,15 +9,17 @@ from typing import Any
 
 import pytest
 
-from rtcp.config.model import Point
+from rtcp.config.model import MOST_AXES, Point
 from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.planning.plan import CUBIC, KIND, QUINTIC, Plan, PlanRefused
+from rtcp.motion.planning.plan import ACCELERATIONS, CUBIC, KIND, QUINTIC, VELOCITIES, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import Phase
 
 PERIOD = 0.0005
 ZERO = (0.0,) * 6
 NAMES = [f"j{i}" for i in range(1, 7)]
+
+UNUSED = (0.0,) * (MOST_AXES - 6)
 
 
 def at(*first: float) -> tuple[float, ...]:
@@ -124,13 +126,13 @@ def test_a_plan_through_a_box_is_refused(plan: Any, points: list[Point], where: 
 
 def test_rows_have_times_numbers_and_kind(plan: Any) -> None:
     made = plan([Point(0.0, ZERO, ZERO), Point(2.0, at(0.4), ZERO)])
-    assert made.rows[1] == (2.0, *at(0.4), *ZERO, *ZERO, CUBIC)
+    assert made.rows[1] == (2.0, *at(0.4), *UNUSED, *ZERO, *UNUSED, *ZERO, *UNUSED, CUBIC)
     assert (made.duration_s, made.slowed, made.length_m, made.end) == (2.0, 1.0, 0.0, at(0.4))
     made = plan([Point(0.0, ZERO), Point(2.0, at(0.4)), Point(4.0, ZERO)])
     assert [row[KIND] for row in made.rows] == [QUINTIC] * 3
     # The spline through a hat is level at its top.
-    assert made.rows[1][7] == pytest.approx(0.0)
-    assert made.rows[1][13] == pytest.approx(-6 * 0.4 / 4)
+    assert made.rows[1][VELOCITIES] == pytest.approx(0.0)
+    assert made.rows[1][ACCELERATIONS] == pytest.approx(-6 * 0.4 / 4)
 
 
 def test_an_arm_of_fewer_joints_is_planned_for_too(arm: Any, drive: Any) -> None:

@@ -16,7 +16,7 @@ from rtcp.ipc.commands import RunTrajectory
 from rtcp.ipc.events import PlanDamaged
 from rtcp.ipc.refusals import DamagedRow, PlanStartsElsewhere, PlanStartsMoving
 from rtcp.motion.controllers.trajectory import TrajectoryController
-from rtcp.motion.planning.plan import COLUMNS, KIND, PlanRefused
+from rtcp.motion.planning.plan import COLUMNS, KIND, VELOCITIES, PlanRefused
 from rtcp.motion.planning.trajectories import plan_trajectory
 from rtcp.motion.state import ArmState, Phase
 from tests.samples import examples
@@ -158,7 +158,16 @@ def test_plans_that_interrupt_each_other_never_jump(new_drive: Any, memory: Call
     drive.until_rest(mode)
 
 
-DAMAGES = [(0, math.nan), (0, 1.0), (0, math.inf), (0, -1.0), (3, math.nan), (4, 99.0), (9, 5.0), (KIND, 4.0)]
+DAMAGES = [
+    (0, math.nan),
+    (0, 1.0),
+    (0, math.inf),
+    (0, -1.0),
+    (3, math.nan),
+    (4, 99.0),
+    (VELOCITIES + 2, 5.0),
+    (KIND, 4.0),
+]
 
 
 @pytest.mark.parametrize(("column", "value"), DAMAGES)
@@ -190,7 +199,7 @@ def test_a_plan_whose_ends_are_damaged_is_not_started(
 
 def test_a_plan_that_does_not_end_at_rest_is_brought_to_rest(drive: Any, mode: TrajectoryController, rows: Any) -> None:
     plan, count = rows([Point(0.0, ZERO, ZERO), Point(2.0, A, ZERO)])
-    plan[COLUMNS + 7] = 0.2
+    plan[COLUMNS + VELOCITIES] = 0.2
     drive.execute(mode, plan, count)
     drive.until_rest(mode)
     assert mode.ended == PlanDamaged(1, pytest.approx(0.2))

@@ -11,19 +11,23 @@ from rtcp.api import Invalid
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.ipc.recording import cycle_type
-from rtcp.panel.scope import COLUMNS, LONGEST_S, SHORTEST_S, Scope
+from rtcp.ipc.schema import Field, RecordSchema, arm_schema
+from rtcp.panel.scope import COLUMNS, LONGEST_S, SHORTEST_S, Scope, signals_of
 
 PERIOD_NS = 500_000
 
 
 def cycles(count: int, begin: int = 0) -> Any:
-    found = np.zeros(count, dtype=cycle_type(6))
+    schema = RecordSchema((*arm_schema(6).fields, Field("io_inputs", "uint32", part="io")))
+    found = np.zeros(count, dtype=cycle_type(schema))
     found["time_ns"] = (np.arange(count) + begin) * PERIOD_NS
     return found
 
 
 def scope(span_s: float, trigger: str = "", level: float = 0.0) -> Scope:
-    return Scope(load(default_config()), ["actual_position.0"], span_s, trigger, level, PERIOD_NS)
+    return Scope(
+        signals_of(load(default_config()), arm_schema(6)), ["actual_position.0"], span_s, trigger, level, PERIOD_NS
+    )
 
 
 @pytest.mark.parametrize("span_s", [SHORTEST_S, 1.0, LONGEST_S])
@@ -45,7 +49,7 @@ def test_a_peak_of_one_cycle_is_shown_at_every_time_base(span_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("trigger", "field", "value"), [("state", "state", 3), ("inputs", "inputs", 4), ("fault", "fault", 1)]
+    ("trigger", "field", "value"), [("state", "state", 3), ("inputs", "io_inputs", 4), ("fault", "fault", 1)]
 )
 def test_an_event_holds_the_picture(trigger: str, field: str, value: int) -> None:
     shown = scope(1.0, trigger)

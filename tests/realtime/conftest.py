@@ -11,9 +11,9 @@ import pytest
 
 from kinematics.compiled import Build
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.ipc.layout import PER_JOINT, SCALARS
 from rtcp.realtime.doctor import Case, Finding, Severity, examine
 from rtcp.realtime.host import Coalescing, Host
+from tests.records import numbers
 
 CPUS = "sys/devices/system/cpu"
 ETH0 = "sys/class/net/eth0"
@@ -229,9 +229,8 @@ def laptop(patient: Callable[[str], Patient]) -> Patient:
 @pytest.fixture
 def publish() -> Callable[..., None]:
     """Publish a cycle record with these scalars; the others are 0."""
-    names = [name for name, _ in SCALARS[1:]]
 
     def publish(board: Blackboard, **scalars: int) -> None:
-        board.publish([*(scalars.get(name, 0) for name in names), *[0] * (len(PER_JOINT) * 6)])
+        board.publish(numbers(board.schema, **scalars))
 
     return publish

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from kinematics.compiled import Build
 from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.schema import arm_schema
 from rtcp.realtime import host
 from rtcp.realtime.doctor import CHECKS, Case, Severity, examine
 from rtcp.realtime.host import Coalescing, Host, NotKnown, format_cpus, parse_cpus
@@ -352,7 +353,7 @@ def test_a_running_platform_that_skips_ticks_is_told_apart(
     good: Any, missed: int, severity: Severity, publish: Callable[..., None]
 ) -> None:
     path = Path(f"/dev/shm/rtcp-test-doctor-{os.getpid()}")
-    board = Blackboard(path, 6, 500_000)
+    board = Blackboard(path, arm_schema(6), 500_000)
     try:
         assert good.finding("skipped-ticks", blackboard=path).severity is OK  # no cycle yet
         for number in range(300):

@@ -105,7 +105,7 @@ def test_an_error_in_the_middle_leaves_nothing_half_written(tmp_path: Path, monk
     ("source", "said"), [("a.csv", "it has no configuration of this version"), ("b.mcap", "it lacks cycle, dc_time_ns")]
 )
 def test_mcap_is_not_made_of_what_lacks_signals_or_the_configuration(tmp_path: Path, source: str, said: str) -> None:
-    path = csv(tmp_path / source) if source.endswith("csv") else mcap(tmp_path / source, signals=("wkc", "inputs"))
+    path = csv(tmp_path / source) if source.endswith("csv") else mcap(tmp_path / source, signals=("wkc", "held"))
     with pytest.raises(RecordingError, match=said):
         export(Reader(path), tmp_path / "out.mcap")
 

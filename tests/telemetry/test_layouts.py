@@ -9,10 +9,12 @@ from typing import Any
 from xml.etree import ElementTree
 
 from rtcp.config import default_config
-from rtcp.ipc.layout import PER_JOINT, SCALARS
+from rtcp.ipc.schema import PER_JOINT, arm_schema
 
 LAYOUTS = default_config().parent / "layouts"
-FIELDS = {f"/cycle {name}" for name, _ in SCALARS} | {f"/cycle {name}[{j}]" for name, _ in PER_JOINT for j in range(6)}
+FIELDS = {f"/cycle {name}" for name in arm_schema(6).names} | {
+    f"/cycle {name}[{j}]" for name in PER_JOINT for j in range(6)
+}
 MACHINE = {f"/machine {name}" for name in ("state", "drive_mode", "control_mode")}
 
 

@@ -12,31 +12,32 @@ from mcap.writer import Writer
 
 from rtcp.api.feed import Records
 from rtcp.config import default_config, load
-from rtcp.ipc.layout import PER_JOINT
 from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_type, write
+from rtcp.ipc.schema import PER_JOINT, arm_schema
 from rtcp.telemetry.channels import Channels, fields_of
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
 
 CONFIG = load(default_config())
 PERIOD_NS, OFFSET_NS = 500_000, 1_790_000_000_000_000_000
+SCHEMA = arm_schema(6)
 
 
 def cycles(count: int = 4000, first: int = 1000) -> Records:
     """Cycle records; every number of a joint tells cycle, field and joint apart."""
-    made = np.zeros(count, cycle_type(6))
+    made = np.zeros(count, cycle_type(SCHEMA))
     numbers = np.arange(first, first + count)
     made["number"] = made["cycle"] = numbers
     made["time_ns"] = 7_000_000_000 + numbers * PERIOD_NS
     made["wakeup_ns"] = numbers % 50_000
-    for field, (name, code) in enumerate(PER_JOINT):
-        made[name] = 0x1237 if code == "H" else (1e-4 * numbers[:, None] + field + 0.1 * np.arange(6))
+    for field, name in enumerate(PER_JOINT):
+        made[name] = 0x1237 if name == "statusword" else (1e-4 * numbers[:, None] + field + 0.1 * np.arange(6))
     return made
 
 
 def mcap(path: Path, records: Records | None = None, signals: tuple[str, ...] = ()) -> Path:
     """Write records as the recorder does, in chunks of 500, with a message in the log after the first of them."""
-    channels = Channels(CONFIG, OFFSET_NS, signals)
+    channels = Channels(CONFIG, SCHEMA, OFFSET_NS, signals)
     writer = McapWriter(channels, CONFIG)
     writer.open(path)
     given = cycles() if records is None else records
@@ -50,7 +51,7 @@ def mcap(path: Path, records: Records | None = None, signals: tuple[str, ...] = 
 
 
 def csv(path: Path, records: Records | None = None, signals: tuple[str, ...] = ()) -> Path:
-    writer = CsvWriter(6, fields_of(signals) if signals else ())
+    writer = CsvWriter(SCHEMA, fields_of(SCHEMA, signals) if signals else ())
     writer.open(path)
     given = cycles() if records is None else records
     writer.write(given, given)
@@ -104,7 +105,7 @@ def test_a_fault_of_the_black_box_is_read_by_the_same_reader(tmp_path: Path) -> 
         joints=tuple(joint.name for joint in CONFIG.joints), versions={"rtcp": "1"}, began_ns=5, event=7, at=50,
         notes=(), timeline=(),
     )  # fmt: skip
-    _, path = write(tmp_path, FaultRecording(about, {name: records[name] for name in records.dtype.names or ()}))
+    _, path = write(tmp_path, FaultRecording(about, {name: records[name] for name in SCHEMA.names}, SCHEMA))
     found = read(path, ["actual_torque"])
     assert np.array_equal(found.records["actual_torque"], records["actual_torque"])
     assert (found.about["fault"], found.period_s, found.config) == ("a fault", pytest.approx(500e-6), None)
@@ -155,7 +156,7 @@ def test_one_field_of_many_cycles_needs_a_fraction_of_the_files_memory(tmp_path:
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found.records) == 20_000
-    assert peak < 4e6 < 20_000 * cycle_type(6).itemsize / 2
+    assert peak < 4e6 < 20_000 * cycle_type(SCHEMA).itemsize / 2
 
 
 def foreign(path: Path) -> Path:

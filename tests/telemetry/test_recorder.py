@@ -32,16 +32,21 @@ from rtcp.config.model import RecordingConfig
 from rtcp.config.serialization import to_json
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ResetDone
-from rtcp.ipc.layout import EVENTS, PER_JOINT, SCALARS, TEXTS
-from rtcp.ipc.recording import FIELDS
+from rtcp.ipc.layout import EVENTS, TEXTS
 from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.session import Session
+from tests.records import numbers
 
 CONFIG = load(default_config())
 PERIOD_NS = 2_000_000
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 HOUR_NS = 3600 * 10**9
-PLACES = {name: at for at, (name, _) in enumerate(SCALARS[1:])}
+SCHEMA = arm_schema(6)
+SCHEMA = RecordSchema(
+    (*SCHEMA.fields, Field("io_inputs", "uint32", part="io"), Field("io_outputs", "uint32", part="io"))
+)
+"""An arm with an IO box."""
 
 
 class Loop:
@@ -50,20 +55,20 @@ class Loop:
     def __init__(self, directory: Path) -> None:
         Session(CONFIG, "inprocess", "", 0, time.monotonic_ns()).write(directory)
         self.directory = directory
-        self.board = Blackboard(blackboard_file(directory), 6, PERIOD_NS)
+        self.board = Blackboard(blackboard_file(directory), SCHEMA, PERIOD_NS)
         self.cycles = 0
 
     def publish(self, count: int = 1, inputs: int = 0x3F) -> None:
         """Publish cycles as fast as it goes; every number of a joint tells cycle, field and joint apart."""
         for _ in range(count):
             self.cycles += 1
-            values: list[float] = [0] * len(PLACES)
-            values[PLACES["cycle"]] = self.cycles
-            values[PLACES["time_ns"]] = time.monotonic_ns()
-            values[PLACES["inputs"]] = inputs
-            for field, (_, code) in enumerate(PER_JOINT):
-                values += [0x1237 if code == "H" else 1e-4 * self.cycles + field + 0.1 * axis for axis in range(6)]
-            self.board.publish(values)
+            joints: dict[str, Any] = {
+                name: [1e-4 * self.cycles + field + 0.1 * axis for axis in range(6)]
+                for field, name in enumerate(PER_JOINT)
+            }
+            joints["statusword"] = 0x1237
+            scalars = {"cycle": self.cycles, "time_ns": time.monotonic_ns(), "io_inputs": inputs}
+            self.board.publish(numbers(SCHEMA, **scalars, **joints))
 
 
 @pytest.fixture
@@ -359,7 +364,7 @@ def test_a_recording_ends_before_the_disk_is_full(loop: Loop) -> None:
 @pytest.mark.parametrize(
     ("given", "reason", "fields"),
     [
-        ({"signals": ("time_ns", "nothing")}, "unknown_signal", {"signal": "nothing", "allowed": list(FIELDS)}),
+        ({"signals": ("time_ns", "nothing")}, "unknown_signal", {"signal": "nothing", "allowed": list(SCHEMA.names)}),
         ({"out": "/proc/nowhere"}, "not_writable", {"file": "/proc/nowhere", "error": "No such file or directory"}),
         (
             {"out": "/tmp/one.csv", "formats": ("mcap",)},

@@ -11,8 +11,8 @@ import pytest
 from ruckig import InputParameter, Ruckig, Trajectory
 
 from rtcp.config.model import Point
-from rtcp.ipc.layout import FLAG_ENABLED
 from rtcp.ipc.recording import RecordingError
+from rtcp.ipc.schema import FLAG_ENABLED
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, value
 from rtcp.motion.planning.trajectories import plan_trajectory

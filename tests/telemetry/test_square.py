@@ -12,8 +12,8 @@ import pytest
 from kinematics import forward
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, Box
-from rtcp.ipc.layout import RecordLayout
 from rtcp.ipc.observer import record_type
+from rtcp.ipc.schema import arm_schema
 from rtcp.telemetry.reading import Recorded
 from rtcp.telemetry.square import PLANES, SIDE_M, NoSquare, Square, distance_from, draw, judge, place
 
@@ -29,7 +29,7 @@ def recorded(square: Square, config: ArmConfig, off_m: float) -> Recorded:
     rotation = forward(config.arm, square.start).rotation
     corners = np.array(square.corners)
     points = np.concatenate([a + (b - a) * np.linspace(0, 1, 50)[:, None] for a, b in itertools.pairwise(corners)])
-    records = np.zeros(len(points), dtype=record_type(RecordLayout(6)))
+    records = np.zeros(len(points), dtype=record_type(arm_schema(6)))
     near = square.start
     for number, (x, y, z) in enumerate(points):
         found = inverse.solve_near(Pose((x, y, z), rotation), near)
@@ -86,6 +86,6 @@ def test_what_is_beside_the_square_is_measured_and_drawn(tmp_path: Path) -> None
 def test_a_recording_without_motion_is_none() -> None:
     square = place(CONFIG, "xy")
     assert CONFIG.arm is not None
-    still = replace(recorded(square, CONFIG, 0.0), records=np.zeros(10, dtype=record_type(RecordLayout(6))))
+    still = replace(recorded(square, CONFIG, 0.0), records=np.zeros(10, dtype=record_type(arm_schema(6))))
     with pytest.raises(NoSquare, match="nothing moved"):
         judge(CONFIG.arm, square, still)

@@ -19,7 +19,17 @@ from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_acceleration, find_way, leaves_range
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import Coefficients, cubic, quintic
-from rtcp.motion.planning.plan import CUBIC, KIND, LONGEST_S, QUINTIC, first_not_finite, read_row
+from rtcp.motion.planning.plan import (
+    ACCELERATIONS,
+    CUBIC,
+    KIND,
+    LONGEST_S,
+    POSITIONS,
+    QUINTIC,
+    VELOCITIES,
+    first_not_finite,
+    read_row,
+)
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 AT_START_RAD = 1e-3
@@ -82,9 +92,12 @@ class Approach:
             allowed_acceleration(acceleration[i], velocity[i], limits.velocity[i], bounds[i], limits.jerk[i])
             for i in range(n)
         ]
-        way.target_position, way.target_velocity = list(waypoint[1 : 1 + n]), list(waypoint[7 : 7 + n])
+        way.target_position, way.target_velocity = (
+            list(waypoint[POSITIONS : POSITIONS + n]),
+            list(waypoint[VELOCITIES : VELOCITIES + n]),
+        )
         # A cubic begins with any acceleration.
-        wanted = waypoint[13 : 13 + n] if waypoint[KIND] == QUINTIC else [0.0] * n
+        wanted = waypoint[ACCELERATIONS : ACCELERATIONS + n] if waypoint[KIND] == QUINTIC else [0.0] * n
         way.target_acceleration = [min(max(a, -b * _INSIDE), b * _INSIDE) for a, b in zip(wanted, bounds, strict=True)]
         way.max_velocity = [max(b, abs(v)) for b, v in zip(limits.velocity, velocity, strict=True)]
         way.max_acceleration = list(bounds)
@@ -226,7 +239,7 @@ class TrajectoryController(Controller):
             return row[KIND]
         limits = self.limits
         for i in self._joints:
-            q, v = row[1 + i], row[7 + i]
+            q, v = row[POSITIONS + i], row[VELOCITIES + i]
             if not limits.low[i] - _SLACK <= q <= limits.high[i] + _SLACK:
                 return q
             if not -limits.velocity[i] - _SLACK <= v <= limits.velocity[i] + _SLACK:
@@ -235,15 +248,18 @@ class TrajectoryController(Controller):
 
     def _is_elsewhere(self, state: ArmState, first: list[float]) -> Refusal | None:
         for i in self._joints:
-            if not abs(state.commanded[i] - first[1 + i]) <= AT_START_RAD:
-                return PlanStartsElsewhere(i, first[1 + i], state.commanded[i])
-            if not abs(state.commanded_velocity[i] - first[7 + i]) <= AT_START_RAD_S:
-                return PlanStartsMoving(i, first[7 + i], state.commanded_velocity[i])
+            if not abs(state.commanded[i] - first[POSITIONS + i]) <= AT_START_RAD:
+                return PlanStartsElsewhere(i, first[POSITIONS + i], state.commanded[i])
+            if not abs(state.commanded_velocity[i] - first[VELOCITIES + i]) <= AT_START_RAD_S:
+                return PlanStartsMoving(i, first[VELOCITIES + i], state.commanded_velocity[i])
         return None
 
     def _fade_out(self, state: ArmState, first: list[float], last_s: float) -> None:
         for i in self._joints:
-            ahead, faster = state.commanded[i] - first[1 + i], state.commanded_velocity[i] - first[7 + i]
+            ahead, faster = (
+                state.commanded[i] - first[POSITIONS + i],
+                state.commanded_velocity[i] - first[VELOCITIES + i],
+            )
             if abs(ahead) > _EXACT or abs(faster) > _EXACT:
                 self._fade_s = min(_FADE_S, last_s)
             self._fade[i] = quintic(ahead, faster, 0.0, 0.0, 0.0, 0.0, min(_FADE_S, last_s))
@@ -312,7 +328,7 @@ class TrajectoryController(Controller):
         else:
             waypoint = self._waypoint
             n = len(position)
-            position[:], velocity[:] = waypoint[1 : 1 + n], waypoint[7 : 7 + n]
+            position[:], velocity[:] = waypoint[POSITIONS : POSITIONS + n], waypoint[VELOCITIES : VELOCITIES + n]
         if at_s < self._fade_s:
             x, over = at_s / self._fade_s, 1.0 / self._fade_s
             for i, (c0, c1, c2, c3, c4, c5) in enumerate(self._fade):
@@ -335,16 +351,22 @@ class TrajectoryController(Controller):
         pieces = self._pieces
         if waypoint[KIND] == CUBIC:
             for i in self._joints:
-                pieces[i] = cubic(before[1 + i], before[7 + i], waypoint[1 + i], waypoint[7 + i], length)
+                pieces[i] = cubic(
+                    before[POSITIONS + i],
+                    before[VELOCITIES + i],
+                    waypoint[POSITIONS + i],
+                    waypoint[VELOCITIES + i],
+                    length,
+                )
         else:
             for i in self._joints:
                 pieces[i] = quintic(
-                    before[1 + i],
-                    before[7 + i],
-                    before[13 + i],
-                    waypoint[1 + i],
-                    waypoint[7 + i],
-                    waypoint[13 + i],
+                    before[POSITIONS + i],
+                    before[VELOCITIES + i],
+                    before[ACCELERATIONS + i],
+                    waypoint[POSITIONS + i],
+                    waypoint[VELOCITIES + i],
+                    waypoint[ACCELERATIONS + i],
                     length,
                 )
         self._row, self._waypoint = index, waypoint

@@ -16,7 +16,7 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose
 from rtcp.config.model import MOST_POINTS, CartesianConfig, Stop
 from rtcp.motion.planning.interpolation import Quaternion, quaternion, rotation, turn_between, turned_by
-from rtcp.motion.planning.plan import LINE, Plan, PlanRefused, ZoneAt
+from rtcp.motion.planning.plan import KIND, LINE, Plan, PlanRefused, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -25,6 +25,7 @@ SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
 """A line is looked at whenever the tool has moved or turned so far."""
 _JUMP_RAD = 0.3
 """A joint that moves by more between two samples changes its branch, or is at a singularity."""
+_UNUSED = (0.0,) * (KIND - 19)
 _NO_WAY_M, _NO_WAY_RAD = 1e-6, 1e-6
 _OF_LIMIT = 0.95
 """Of a joint's limits a line uses so much: between the samples they hold too."""
@@ -98,7 +99,7 @@ def plan_lines(
     duration = 0.0
     for at in range(len(rows) - 1, -1, -1):
         duration += rows[at][18]
-        rows[at] = (*rows[at][:18], duration, rows[at][19])
+        rows[at] = (*rows[at][:18], duration, *rows[at][19:])
     return Plan(tuple(rows), duration, length, slowed, q)
 
 
@@ -213,7 +214,7 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
             acceleration = min(acceleration, left / first)
     row = (
         *piece.start.position, *piece.turns[0], *piece.end.position, *piece.turns[1],
-        speed, acceleration, jerk, length, _duration(speed, acceleration, jerk, where), LINE,
+        speed, acceleration, jerk, length, _duration(speed, acceleration, jerk, where), *_UNUSED, LINE,
     )  # fmt: skip
     return row, speed / wanted
 

@@ -1,12 +1,12 @@
-"""Plans: rows of 20 doubles, written outside the cycle (`rtcp.motion.planning`) and read in it, row by row.
+"""Plans: rows of `COLUMNS` doubles, written outside the cycle (`rtcp.motion.planning`) and read in it, row by row.
 
-A waypoint of a trajectory (`WAYPOINT`), for n <= 6 joints:
+A waypoint of a trajectory (`WAYPOINT`), for up to `MOST_AXES` joints:
 
-    column 0          t, s from the start of the motion; rising from waypoint to waypoint
-    columns 1 .. 6    position of each joint, rad          (those beyond n are 0)
-    columns 7 .. 12   velocity of each joint, rad/s
-    columns 13 .. 18  acceleration of each joint, rad/s^2
-    column 19         the piece that ends here: `CUBIC` (its accelerations are ignored) or `QUINTIC`
+    column 0              t, s from the start of the motion; rising from waypoint to waypoint
+    POSITIONS and on      position of each joint, rad          (those beyond the joints are 0)
+    VELOCITIES and on     velocity of each joint, rad/s
+    ACCELERATIONS and on  acceleration of each joint, rad/s^2
+    column KIND           the piece that ends here: `CUBIC` (its accelerations are ignored) or `QUINTIC`
 
 A straight piece of a path (`LINE`), from rest to rest, travelled by a fraction that goes from 0 to 1:
 
@@ -17,7 +17,7 @@ A straight piece of a path (`LINE`), from rest to rest, travelled by a fraction 
     columns 14 .. 16  largest speed, acceleration and jerk of the fraction, 1/s, 1/s^2, 1/s^3
     column 17         its length, m
     column 18         how long it and all pieces after it take, s
-    column 19         `LINE`
+    column KIND       `LINE`
 """
 
 from __future__ import annotations
@@ -26,8 +26,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 
-COLUMNS = 20
-MOST_JOINTS = 6
+from rtcp.config.model import MOST_AXES
+from rtcp.ipc.layout import PLAN_COLUMNS
+
+COLUMNS = PLAN_COLUMNS
+POSITIONS, VELOCITIES, ACCELERATIONS = 1, 1 + MOST_AXES, 1 + 2 * MOST_AXES
 KIND = COLUMNS - 1
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
 LONGEST_S = 86_400.0
@@ -53,9 +56,9 @@ class PlanTooFast(PlanRefused):
 class Plan:
     """What the loop is given.
 
-    rows: of 20 doubles each, `len(rows)` is the count of the command. duration_s: from the start to rest. length_m: of
-    the lines, 0 for a trajectory. slowed: 1 where the lines keep the speed asked for, less where a joint's limits made
-    them slower. end: the joints' position at the end, rad.
+    rows: of `COLUMNS` doubles each, `len(rows)` is the count of the command. duration_s: from the start to rest.
+    length_m: of the lines, 0 for a trajectory. slowed: 1 where the lines keep the speed asked for, less where a joint's
+    limits made them slower. end: the joints' position at the end, rad.
     """
 
     rows: tuple[tuple[float, ...], ...]
@@ -66,7 +69,7 @@ class Plan:
 
 
 def read_row(rows: memoryview[float], index: int) -> list[float]:
-    """Return the 20 numbers of a row."""
+    """Return the numbers of a row."""
     at = index * COLUMNS
     return list(rows[at : at + COLUMNS])
 

@@ -12,7 +12,7 @@ from kinematics.pose import Pose
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, quintic, rotation, turn_between, turned_by, value
-from rtcp.motion.planning.plan import CUBIC, KIND, LINE, Plan
+from rtcp.motion.planning.plan import ACCELERATIONS, CUBIC, KIND, LINE, POSITIONS, VELOCITIES, Plan
 from rtcp.motion.state import ArmState
 
 SAMPLES = 60
@@ -71,8 +71,8 @@ def _trajectory(plan: Plan, q_now: Sequence[float]) -> JointPath:
         length = after[0] - before[0]
         row = []
         for i in range(joints):
-            q0, v0, a0 = before[1 + i], before[7 + i], before[13 + i]
-            q1, v1, a1 = after[1 + i], after[7 + i], after[13 + i]
+            q0, v0, a0 = before[POSITIONS + i], before[VELOCITIES + i], before[ACCELERATIONS + i]
+            q1, v1, a1 = after[POSITIONS + i], after[VELOCITIES + i], after[ACCELERATIONS + i]
             piece = cubic(q0, v0, q1, v1, length) if after[KIND] == CUBIC else quintic(q0, v0, a0, q1, v1, a1, length)
             row.append(value(piece, (t - before[0]) / length))
         path.append(tuple(row))

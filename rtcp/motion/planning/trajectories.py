@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import ceil, isfinite
 from typing import TYPE_CHECKING
 
-from rtcp.config.model import MOST_POINTS, Point
+from rtcp.config.model import MOST_AXES, MOST_POINTS, Point
 from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
 from rtcp.motion.planning.interpolation import (
     Coefficients,
@@ -19,7 +19,7 @@ from rtcp.motion.planning.interpolation import (
     spline_velocities,
     value,
 )
-from rtcp.motion.planning.plan import CUBIC, LONGEST_S, MOST_JOINTS, QUINTIC, Plan, PlanRefused, PlanTooFast, ZoneAt
+from rtcp.motion.planning.plan import CUBIC, LONGEST_S, QUINTIC, Plan, PlanRefused, PlanTooFast, ZoneAt
 
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
@@ -74,8 +74,6 @@ def plan_trajectory(
 
 
 def _check_points(points: Sequence[Point], names: Sequence[str]) -> None:
-    if len(names) > MOST_JOINTS:
-        raise PlanRefused(f"a trajectory can move {MOST_JOINTS} joints, this arm has {len(names)}")
     if not points:
         raise PlanRefused("the trajectory has no points, at least one is needed")
     if len(points) > MOST_POINTS:
@@ -249,5 +247,5 @@ def _check_zone(q: Sequence[float], at_s: float, where: str, zone_at: ZoneAt) ->
 
 
 def _row(waypoint: _Knot) -> tuple[float, ...]:
-    rest = (0.0,) * (MOST_JOINTS - len(waypoint.q))
+    rest = (0.0,) * (MOST_AXES - len(waypoint.q))
     return (waypoint.t, *waypoint.q, *rest, *waypoint.v, *rest, *waypoint.a, *rest, waypoint.kind)

@@ -30,7 +30,7 @@ def build(view: View) -> None:
     if config is None or feed is None:
         no_platform()
         return
-    allowed = signals_of(config)
+    allowed = signals_of(config, feed.schema)
     chosen = ["actual_position.0", "commanded_position.0"]
     with ui.element("div").classes("fields"):
         signal = choice("Signal", allowed, "actual_position.0")
@@ -55,7 +55,7 @@ def build(view: View) -> None:
             view.page.scope = None
             return
         try:
-            view.page.scope = Scope(config, list(chosen), span.number(), trigger.value, level.number(), feed.period_ns)
+            view.page.scope = Scope(allowed, list(chosen), span.number(), trigger.value, level.number(), feed.period_ns)
         except RtcpError as error:
             listed.text = error.message
 

@@ -1,0 +1,142 @@
+"""What a cycle is made of: parts, each with its inputs, its outputs and its fields of the cycle record.
+
+send -> receive -> each part's `decode` -> command -> machine -> each part's `update` and `encode` -> each part's
+`publish`. Who adds a part writes one class. A part never switches itself on: the machine decides, and tells all parts
+by `safe` when their outputs have to be safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from mypy_extensions import mypyc_attr
+
+from rtcp.config.model import ArmConfig
+from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.driver import Driver, make_driver
+from rtcp.fieldbus.bus import ProcessData
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import Event
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.schema import Field, device_field
+from rtcp.ipc.states import State
+
+
+class PartContext:
+    """What a part sees of its cycle; `rtcp.control.context.Context` fills it.
+
+    Args:
+        period_s: the cycle, s.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self.period_s = period_s
+        self.state = State.STARTING
+        """The machine's state; written by the machine alone."""
+        self.cycle = 0
+        self.now_ns = 0
+        """Instant of the cycle, ns of the clock of the loop."""
+        self.good = False
+        """Whether the exchange of this cycle had the expected working counter."""
+        self.all_enabled = False
+        """Whether all drives are in Operation Enabled."""
+        self.reported: Event | None = None
+        """A fault that a part has reported; the machine takes it in the next cycle."""
+
+    def publish(self, event: Event) -> None:
+        """Report an event that changes no state."""
+        raise NotImplementedError
+
+    def report(self, event: Event) -> None:
+        """Report an event of a part; one that is a fault stops the arm in the next cycle."""
+        if event.is_fault:
+            self.reported = event
+        else:
+            self.publish(event)
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Part:
+    """Base of all parts of the cycle.
+
+    Args:
+        name: unique in the platform; a device has that of its slave.
+        fields: of the record, in the order in which `publish` writes them.
+        commands: that are no motions, and that `accept` takes.
+    """
+
+    def __init__(
+        self, name: str, fields: Sequence[Field] = (), commands: Sequence[type[Command]] = ()
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.fields = tuple(fields)
+        self.commands = tuple(commands)
+        self.at = 0
+        """Index of its first number among the values of a record; set when the record is laid out."""
+
+    def decode(self, data: ProcessData) -> None:
+        """Read the inputs of a cycle in which every slave took part."""
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        """Carry out one of `commands`, or return why not and change nothing."""
+        raise NotImplementedError
+
+    def update(self, context: PartContext) -> None:
+        """Do what the cycle asks for, after the machine."""
+
+    def encode(self, data: ProcessData) -> None:
+        """Write the outputs of the cycle."""
+
+    def publish(self, values: list[Any]) -> None:
+        """Write the values of `fields` into the record, from index `at` on."""
+
+    def safe(self) -> None:
+        """Set the outputs to their safe state: called by the machine on a fault, on stale inputs and at the end."""
+
+
+class Device(Part):
+    """A slave that is no drive: its driver, which a package may have brought.
+
+    Args:
+        slot: index of the slave.
+        driver: of the slave's kind.
+    """
+
+    def __init__(self, slot: int, driver: Driver) -> None:
+        super().__init__(driver.name, [device_field(driver.name, one) for one in driver.fields()], driver.commands)
+        self.slot = slot
+        self.driver = driver
+
+    def decode(self, data: ProcessData) -> None:
+        """Read the inputs of the slave."""
+        self.driver.decode(data.input(self.slot))
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        """Let the driver carry out the command."""
+        return self.driver.accept(command)
+
+    def update(self, context: PartContext) -> None:
+        """Let the driver do its cycle."""
+        event = self.driver.update(context.state, context.now_ns)
+        if event is not None:
+            context.report(event)
+
+    def encode(self, data: ProcessData) -> None:
+        """Write the outputs of the slave."""
+        data.set_output(self.slot, self.driver.encode())
+
+    def publish(self, values: list[Any]) -> None:
+        """Write what the driver shows."""
+        self.driver.publish(values, self.at)
+
+    def safe(self) -> None:
+        """Set the driver's outputs to their safe state."""
+        self.driver.safe()
+
+
+def make_devices(config: ArmConfig) -> list[Device]:
+    """Return a part for each slave that is no drive; raises DeviceError."""
+    period_s = config.cycle.period_us * 1e-6
+    made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
+    return [Device(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
