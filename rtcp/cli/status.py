@@ -244,10 +244,11 @@ def _clocks(status: Json) -> Text:
     clocks, second = status["dc"], status["last_second"]
     if status["wkc"]["actual"] <= 0:
         return Text("not tracked: no answer", "yellow")
-    line = Text(clock_state(clocks), "" if clocks["locked"] else "yellow")
-    line.append(f", offset {clocks['offset_ns'] / 1000:+.1f} us, filtered {clocks['filtered_ns'] / 1000:+.1f} us")
+    shown = clock_state(clocks)
     if second["tracked"] < second["cycles"]:
-        line.append(f", tracked in {second['tracked']} of {second['cycles']} cycles")
+        shown = f"locked in {second['tracked']} of {second['cycles']} cycles"
+    line = Text(shown, "" if clocks["locked"] else "yellow")
+    line.append(f", offset {clocks['offset_ns'] / 1000:+.1f} us, filtered {clocks['filtered_ns'] / 1000:+.1f} us")
     return line
 
 

@@ -157,7 +157,7 @@ def test_cycles_without_an_answer_are_counted_over_the_last_second(platform: Any
     platform.status["last_second"] = {"cycles": 2000, "unanswered": 12, "incomplete": 3, "tracked": 1988}
     shown = " ".join(rtcp("status").out.split())
     assert "working counter 21 of 21, 12 of 2000 cycles unanswered, 3 of 2000 cycles incomplete" in shown
-    assert "filtered +0.4 us, tracked in 1988 of 2000 cycles" in shown
+    assert "clocks locked in 1988 of 2000 cycles, offset -3.2 us, filtered +0.4 us" in shown
 
 
 def test_what_the_host_refuses_is_one_line_that_names_the_doctor(platform: Any, rtcp: Callable[..., Any]) -> None:
