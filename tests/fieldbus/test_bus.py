@@ -101,7 +101,7 @@ def test_a_scan_tells_identity_states_map_clocks_and_delays(start_segment):
         ("missing", ["3 slaves answer", "lists 4", "position 4 (drive3)", "found nothing"]),
         ("surplus", ["3 slaves answer", "lists 2", "position 3", "expected nothing", "found Cubemars"]),
         ("longer", ["slave 1 (io)", "key `tpdo`", "expected 64 bits", "found 48 bits"]),
-        ("unmappable", ["slave 2 (drive1)", "refused", "0x1600", "abort code 0x060400"]),
+        ("unmappable", ["slave 2 (drive1)", "refused", "0x1600", "abort code 0x060400", "orh.yaml (key `rpdo`)"]),
         ("absent objects", ["slave 2 (drive1)", "slave 3 (drive2)", "0x5FFF:1", "0x06020000", "does not exist"]),
     ],
 )
