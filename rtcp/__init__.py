@@ -56,3 +56,7 @@ def __getattr__(name: str) -> Any:
     import rtcp.api
 
     return getattr(rtcp.api, name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

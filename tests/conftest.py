@@ -1,5 +1,5 @@
-"""What holds for every test: properties are tried with the same values in every run, none has a time limit, and none
-reads or writes the zero offsets of the arm at this host.
+"""What holds for every test: properties are tried with the same values in every run, none has a time limit, none reads
+or writes the zero offsets of the arm at this host, and none sees the plug-ins of other installed packages.
 
 A test that fails once in a hundred runs names a mistake to whoever happens to run it. To search on with values of
 chance: `HYPOTHESIS_PROFILE=search make test`.
@@ -10,12 +10,15 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator
+from functools import cache
+from importlib.metadata import EntryPoints
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from kinematics.compiled import BUILD
+from rtcp.config import find
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.schema import arm_schema
 
@@ -27,6 +30,17 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     # Begun in the background by a shell, which has its children ignore Ctrl-C, and so all that the tests start.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+_installed = find.installed
+
+
+@cache
+def _own(group: str) -> EntryPoints:
+    """Return the entry points of this package."""
+    return EntryPoints(entry for entry in _installed(group) if entry.dist is not None and entry.dist.name == "rtcp")
+
+
+find.installed = _own
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

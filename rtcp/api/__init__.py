@@ -65,3 +65,7 @@ def __getattr__(name: str) -> Any:
 
         return Feed
     raise AttributeError(f"module 'rtcp.api' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

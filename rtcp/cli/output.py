@@ -129,7 +129,10 @@ def facts() -> Table:
 
 @contextmanager
 def progress() -> Iterator[ShowProgress]:
-    """Yield a function that shows the progress of a motion: a bar on a terminal, else a line every 10 %."""
+    """Yield a function that shows the progress of a motion: a bar on a terminal, else a line every 10 %.
+
+    While the motion is planned, and may still be refused, nothing is shown.
+    """
     if not sys.stdout.isatty():
         yield _line_reporter()
         return
@@ -137,10 +140,20 @@ def progress() -> Iterator[ShowProgress]:
     from rich.progress import Progress as Bar
 
     columns = (TextColumn("moving"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[left]}"))
-    with Bar(*columns, console=console()) as bar:
-        task = bar.add_task("move", total=1.0, left="")
-        yield lambda update: bar.update(task, completed=update.fraction, left=_left(update))
+    bar = Bar(*columns, console=console())
+    task = bar.add_task("move", total=1.0, left="")
+
+    def draw(update: Progress) -> None:
+        if _has_begun(update):
+            bar.start()
+            bar.update(task, completed=update.fraction, left=_left(update))
+
+    try:
+        yield draw
         bar.update(task, completed=1.0, left="")
+    finally:
+        if bar.live.is_started:
+            bar.stop()
 
 
 def _line_reporter() -> ShowProgress:
@@ -149,15 +162,19 @@ def _line_reporter() -> ShowProgress:
     def line(update: Progress) -> None:
         nonlocal shown
         tenth = int(update.fraction * 10)
-        if tenth > shown:
+        if _has_begun(update) and tenth > shown:
             shown = tenth
             report(f"moving: {update.fraction:4.0%}{_left(update)}")
 
     return line
 
 
+def _has_begun(update: Progress) -> bool:
+    return update.remaining_s > 0 or update.fraction > 0
+
+
 def _left(update: Progress) -> str:
-    return f" {update.remaining_s:.1f} s left" if update.remaining_s > 0 else ""  # 0 while it is planned
+    return f" {update.remaining_s:.1f} s left" if update.remaining_s > 0 else ""
 
 
 # -- the end of a command -------------------------------------------------------------------------------------------

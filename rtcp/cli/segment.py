@@ -49,7 +49,10 @@ def _segment(
         option("--interface", "NAME", "Name of the master's interface, here. Default: in a network namespace."),
     ] = None,
     poll: Poll = False,
-    cpu: Annotated[int | None, option("--cpu", "N", "CPU of the segment.")] = None,
+    cpu: Annotated[
+        int | None,
+        option("--cpu", "N", "CPU of the segment. Default: any but the last, on which a cycle runs by default."),
+    ] = None,
     script: Annotated[Path | None, option("--faults", "SCRIPT", "Faults with their times, s after the start.")] = None,
 ) -> None:
     """Run a segment of software slaves until stopped, or inject faults into a running one."""
@@ -64,6 +67,7 @@ def _segment(
 
 
 def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, script: Path | None) -> None:
+    from rtcp.realtime.scheduling import available_cpus, choose_cpu
     from rtcp.virtual.network import NetworkError
     from rtcp.virtual.server import run
 
@@ -71,6 +75,8 @@ def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, scrip
     control = _control()
 
     def ready(started: dict[str, int | str | bool]) -> None:
+        if cpu is None and (others := set(available_cpus()) - {choose_cpu(None)}):
+            os.sched_setaffinity(0, others)
         # The segment has its own handler of SIGTERM by now; a terminal that closes ends it in the same way.
         signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))
         count, name, pid = started["slaves"], started["interface"], started["pid"]

@@ -41,6 +41,8 @@ CYCLE_TIMES = (("wake-up", "wakeup_us"), ("exchange", "exchange_us"), ("compute"
 QUANTILES = ("p50", "p99", "max")
 _STALE_S = 0.1
 """Joint values older than this are marked."""
+_LOST_SHARE = 0.01
+"""Share of unanswered or incomplete cycles from which on they are highlighted."""
 _DIFFERENT_RAD = 1e-6
 """Commanded positions are shown where a limiter changed them by more."""
 _MESSAGES = 5
@@ -142,15 +144,14 @@ def _headline(status: Json) -> Panel:
 def _joints(status: Json) -> Table:
     joints = status["joints"]
     columns = {
-        "position rad": joints["actual_position"],
-        "velocity rad/s": joints["actual_velocity"],
-        "torque Nm": joints["actual_torque"],
-        "target rad": joints["sent_position"],
+        "position\nrad": joints["actual_position"],
+        "velocity\nrad/s": joints["actual_velocity"],
+        "torque\nNm": joints["actual_torque"],
+        "target\nrad": joints["sent_position"],
     }
     differences = zip(joints["commanded_position"], joints["sent_position"], strict=True)
     if any(abs(commanded - sent) > _DIFFERENT_RAD for commanded, sent in differences):
-        columns["commanded rad"] = joints["commanded_position"]
-        columns = {heading.replace(" ", "\n"): values for heading, values in columns.items()}
+        columns["commanded\nrad"] = joints["commanded_position"]
     rows = table(("joint", *columns), ("joint",), expand=True)
     if status["lost_s"] > _STALE_S:
         rows.caption = f"last received {status['lost_s']:.1f} s ago: not every slave has answered since"
@@ -161,17 +162,18 @@ def _joints(status: Json) -> Table:
 
 
 def _slaves(status: Json) -> Table:
-    """Return the slaves in two columns, down the first and then the second, in the order of the cable."""
+    """Return the slaves in the order of the cable: down the first column, then the second; in one with their errors."""
     from rich.text import Text
 
     slaves = status["slaves"]
     with_errors = any(_error_counts(slave) for slave in slaves)
     headings = ("#", "slave", "state", *(("lost/err/links",) if with_errors else ()))
-    rows = table(headings * (2 if len(slaves) > 1 else 1), ("state", "lost/err/links"), expand=True, fill="slave")
-    half = (len(slaves) + 1) // 2
-    for row in range(half):
+    columns = 1 if with_errors or len(slaves) == 1 else 2
+    rows = table(headings * columns, ("state", "lost/err/links"), expand=True, fill="slave")
+    height = -(-len(slaves) // columns)
+    for row in range(height):
         cells: list[RenderableType] = []
-        for slave in slaves[row::half]:
+        for slave in slaves[row::height]:
             cells += [str(slave["position"]), slave["name"]]
             cells.append(Text(slave["state"], "green" if slave["state"] == "OP" else "red"))
             if with_errors:
@@ -207,21 +209,13 @@ def _facts(status: Json) -> Table:
     if status["control_mode"] == "joystick":
         joystick = status["joystick"]
         rows.add_row("joystick", f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}")
-    expected, actual, clocks = status["wkc"]["expected"], status["wkc"]["actual"], status["dc"]
-    if actual > 0:
-        counted = Text(f"working counter {actual} of {expected}", "" if actual == expected else "bold red")
-        clock = Text(clock_state(clocks), "" if clocks["locked"] else "yellow")
-        clock.append(f", offset {clocks['offset_ns'] / 1000:+.1f} us, filtered {clocks['filtered_ns'] / 1000:+.1f} us")
-    else:  # 0: no slave took part; -1: the frame did not come back
-        counted = Text(f"no answer, {expected} expected", "bold red")
-        clock = Text("not tracked: no answer", "yellow")
-    rows.add_row("frames", counted)
-    rows.add_row("clocks", clock)
+    rows.add_row("frames", _frames(status))
+    rows.add_row("clocks", _clocks(status))
     for device, fields in status["devices"].items():
         rows.add_row(Text(device), Text(", ".join(_value(name, **shown) for name, shown in fields.items())))
     rows.add_row("real time", realtime_line(status["realtime"]))
-    if skipped := status.get("skipped_ticks"):
-        rows.add_row("cycle", Text(f"{skipped['message']}; {skipped['remedy']}", "yellow"))
+    if problems := _host_problems(status):
+        rows.add_row("host", Text(f"{', '.join(problems)}: see `rtcp doctor`", "yellow"))
     if status["lease"]["holder"]:
         rows.add_row("lease", Text(status["lease"]["holder"]))
     rows.add_row("processes", ", ".join(f"{name} {pid}" for name, pid in status["pids"].items() if pid))
@@ -234,6 +228,43 @@ def _value(name: str, value: Any, unit: str) -> str:
         return f"{name} {_bits(value)}"
     number = f"{value:.6g}" if isinstance(value, float) else str(value)
     return f"{name} {number} {unit}".rstrip()
+
+
+def _frames(status: Json) -> Text:
+    """Return the working counter of the last answer, and how many cycles of the last second were not answered."""
+    from rich.text import Text
+
+    expected, actual, second = status["wkc"]["expected"], status["wkc"]["actual"], status["last_second"]
+    if actual <= 0:  # 0: no slave took part; -1: no frame came back
+        return Text(f"no answer in the last second, {expected} expected", "bold red")
+    line = Text(f"working counter {actual} of {expected}", "" if actual == expected else "bold red")
+    for what in ("unanswered", "incomplete"):
+        if second[what]:
+            style = "yellow" if second[what] > _LOST_SHARE * second["cycles"] else ""
+            line.append(f", {second[what]} of {second['cycles']} cycles {what}", style)
+    return line
+
+
+def _clocks(status: Json) -> Text:
+    """Return whether the master is locked to the reference clock, and in how many cycles of the last second it was."""
+    from rich.text import Text
+
+    clocks, second = status["dc"], status["last_second"]
+    if status["wkc"]["actual"] <= 0:
+        return Text("not tracked: no answer", "yellow")
+    shown = clock_state(clocks)
+    if second["tracked"] < second["cycles"]:
+        shown = f"locked in {second['tracked']} of {second['cycles']} cycles"
+    line = Text(shown, "" if clocks["locked"] else "yellow")
+    line.append(f", offset {clocks['offset_ns'] / 1000:+.1f} us, filtered {clocks['filtered_ns'] / 1000:+.1f} us")
+    return line
+
+
+def _host_problems(status: Json) -> list[str]:
+    """Return what of the host stands in the way of real time, a few words each; `rtcp doctor` explains them."""
+    refused, skipped = len(status["realtime"].get("notes", ())), status.get("skipped_ticks")
+    problems = [f"{refused} setting{'s' * (refused > 1)} refused"] if refused else []
+    return problems + ([f"{100 * skipped['share']:.2g} % of the ticks skipped"] if skipped else [])
 
 
 def _robot(robot: Json) -> Text:
@@ -256,13 +287,12 @@ def clock_state(clocks: Json) -> str:
 
 
 def realtime_line(realtime: Json) -> str:
-    """Return scheduling and memory of the loop in one line, and what the system refused in the lines below."""
+    """Return scheduling, memory and CPU of the loop, and whether it runs compiled, in one line."""
     if not realtime:
         return "-"
     memory = "memory locked" if realtime["memory_locked"] else "memory not locked"
     cpu = "no CPU of its own" if realtime["cpu"] is None else f"CPU {realtime['cpu']}"
-    code = "runs compiled" if realtime.get("compiled") else f"runs as source ({realtime.get('interpreted_because')})"
-    return "\n".join([f"{realtime['scheduler']}, {memory}, {cpu}", f"the cycle {code}", *realtime["notes"]])
+    return f"{realtime['scheduler']}, {memory}, {cpu}, {'compiled' if realtime.get('compiled') else 'not compiled'}"
 
 
 def _messages(status: Json) -> list[RenderableType]:

@@ -93,7 +93,9 @@ def load(path: Path) -> ArmConfig:
         raise ConfigError(document.sentences(findings) + in_devices)
     return ArmConfig(
         **{field.name: getattr(arm, field.name) for field in fields(ArmSettings)},
-        slaves=tuple(SlaveConfig(slave.name, devices[slave.device]) for slave in arm.slaves),
+        slaves=tuple(
+            SlaveConfig(slave.name, devices[slave.device], str(device_path(path, slave.device))) for slave in arm.slaves
+        ),
         arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
         source=path,
     )

@@ -200,6 +200,8 @@ class SlaveConfig:
 
     name: Name
     device: DeviceDescription
+    file: str = ""
+    """Path of the device's file; empty: made by a program."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.recovery import MonitoredSlave
 from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
-from rtcp.realtime.scheduling import thread_beside
+from rtcp.realtime.scheduling import cpu_hint, thread_beside
 
 _PUBLISH_S = 0.1
 """Interval at which slave states and counters are published and emergencies are read, s."""
@@ -201,7 +201,7 @@ class BusService(threading.Thread):
         elif turn * self._watch_s > _LOCK_S:
             self.refused = (
                 f"the cycle did not lock onto the reference clock within {_LOCK_S:g} s: the frames come too unevenly "
-                "or do not come back (see `rtcp status`, bus.send_phase)",
+                f"or do not come back (see `rtcp status`, bus.send_phase){cpu_hint(self._cycle_cpu)}",
             )
         elif turn % self._publish_turns == 0:
             self._publish_states(self._bus.read_states())

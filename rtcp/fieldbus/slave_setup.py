@@ -262,7 +262,12 @@ def configure_slave(
     notes: list[str] = []
     for assignment, pdos, key in ((RX_ASSIGN, device.rpdo, "rpdo"), (TX_ASSIGN, device.tpdo, "tpdo")):
         if device.configurable_pdos:
-            yield from write_mapping(sdo, assignment, mapping_of(pdos))
+            try:
+                yield from write_mapping(sdo, assignment, mapping_of(pdos))
+            except SdoAborted as error:
+                file = config.file or "the device's file"
+                sentence = f"{error.sentences[0]}; the device does not take the mapping of {file} (key `{key}`)"
+                raise SdoAborted(sentence, error.code) from error
         yield from compare_mapping(sdo, assignment, mapping_of(pdos), key)
     for startup in device.sdo:
         notes += yield from write_startup(sdo, startup)

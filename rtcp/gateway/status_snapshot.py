@@ -35,9 +35,14 @@ _SHOWN = 10
 _SILENT_S = 1.0
 _PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
 """Parts that the status shows in words of their own; the others are devices."""
+_SECOND_NS = 1_000_000_000
 _UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
 _FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "compute_ns", "offset": "dc_offset_ns",
             "filtered": "dc_filtered_ns"}  # fmt: skip
+
+_SECOND = ("cycles", "unanswered", "incomplete", "tracked")
+"""What is counted of the last second, in cycles: all, those without an answer, those with another working counter than
+the expected, those with an answer and a locked clock."""
 
 _IN_ERROR = frozenset({State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING})
 _IN_MOTION = frozenset({State.MOVING, State.STOPPING, State.HOMING})
@@ -93,6 +98,9 @@ class StatusSnapshot:
         self._event = 0
         self._text = 0
         self._figures = {name: SlidingPercentiles() for name in _FIGURES}
+        self._recent: deque[tuple[int, npt.NDArray[np.int64], int]] = deque()
+        """Of the batches of the last second: instant of its last cycle, ns; counts as `_SECOND` names them; working
+        counter of its last answer, -1: none."""
         self._enables = 0
         self.fault = ""
         """Message of the present fault: why the machine is in it."""
@@ -124,6 +132,7 @@ class StatusSnapshot:
         self.messages.append((time.time_ns(), message))
 
     def _count(self, records: npt.NDArray[np.void]) -> None:
+        self._note_answers(records)
         now = time.monotonic()
         if int(records[-1]["enables"]) != self._enables:
             self._enables = int(records[-1]["enables"])
@@ -132,6 +141,23 @@ class StatusSnapshot:
             records = records[records["enables"] == self._enables]
         for name, field in _FIGURES.items():
             self._figures[name].add(now, np.abs(records[field]) / 1e3 if "dc" in field else records[field] / 1e3)
+
+    def _note_answers(self, records: npt.NDArray[np.void]) -> None:
+        """Count the cycles that were answered, wholly or not, and those in which the clock was tracked."""
+        wkc, answered = records["wkc"], records["wkc"] >= 0
+        incomplete = answered & (wkc != records["wkc_expected"])
+        tracked = answered & (records["flags"] & FLAG_DC_LOCKED != 0)
+        counts = [len(records), *map(np.count_nonzero, (~answered, incomplete, tracked))]
+        last = int(wkc[answered][-1]) if answered.any() else -1
+        self._recent.append((int(records["time_ns"][-1]), np.array(counts), last))
+
+    def _last_second(self) -> tuple[dict[str, int], int]:
+        """Return the counts of the last second by name, and the working counter of its last answer, -1: none."""
+        while self._recent and self._recent[0][0] < time.monotonic_ns() - _SECOND_NS:
+            self._recent.popleft()
+        counts = sum((batch for _, batch, _ in self._recent), np.zeros(len(_SECOND), dtype=np.int64))
+        last = next((counter for _, _, counter in reversed(self._recent) if counter >= 0), -1)
+        return dict(zip(_SECOND, map(int, counts), strict=True)), last
 
     def _note_motion(self, records: npt.NDArray[np.void]) -> None:
         """Find the last cycle in which a motion began: from rest, or one that took another's place."""
@@ -249,6 +275,7 @@ class StatusSnapshot:
         )
         figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
         shown = list(self.messages)[-_SHOWN:]
+        last_second, wkc = self._last_second()
         return {
             "state": "fault" if problem else state.name.lower(),
             "message": problem or self._headline(state),
@@ -266,7 +293,8 @@ class StatusSnapshot:
             "missed": int(record["missed"]),
             "skipped_ticks": self._skipped_ticks(int(record["cycle"]), int(record["missed"])),
             "lost_s": round(int(record["lost"]) * self._observer.period_ns * 1e-9, 3),
-            "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else int(record["wkc"])},
+            "wkc": {"expected": int(record["wkc_expected"]), "actual": -1 if problem else wkc},
+            "last_second": last_second,
             "slaves": self._slaves(),
             "joint_names": [joint.name for joint in self._session.config.joints],
             "joints": {

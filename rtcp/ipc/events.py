@@ -400,6 +400,11 @@ class OutOfReach(MotionEnded, number=102):
     distance: float
 
 
+class NoSolution(MotionEnded, number=112):
+    """no joint positions reach the motion's next tool pose: its orientation is out of reach, the arm is singular, or
+    its wrist is not spherical; the arm holds, then `rtcp reset`, and move or jog the joints"""
+
+
 class JointLimitReached(MotionEnded, number=103):
     """{joint}: the motion wanted {value:.6g}, the limit is {limit:.6g} ({key} in {file}, or `rtcp limits`); the arm
     holds, then `rtcp reset`"""

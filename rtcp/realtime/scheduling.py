@@ -173,6 +173,19 @@ def thread_beside(avoid_cpu: int, priority: int) -> None:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(max(priority, 1)))
 
 
+def cpu_hint(cpu: int) -> str:
+    """Return what software on this host that answers the frames must know of the cycle's CPU; without SCHED_FIFO none.
+
+    The cycle waits for its frame without sleeping: an ordinary process on its CPU runs after that, too late to answer.
+    """
+    if os.sched_getscheduler(os.getpid()) != os.SCHED_FIFO:
+        return ""
+    return (
+        f"; the cycle keeps CPU {cpu} under SCHED_FIFO while it waits: software on this host that answers the frames "
+        "needs another CPU (`taskset`, or cycle.cpu)"
+    )
+
+
 def share_interpreter_quickly() -> None:
     """Return the interpreter to the cycle from another thread within 50 us instead of 5 ms."""
     sys.setswitchinterval(50e-6)

@@ -418,7 +418,7 @@ def _place(options: RecordingConfig) -> tuple[Path, tuple[str, ...]]:
     assert options.out is not None
     out, formats = Path(options.out), tuple(dict.fromkeys(options.formats))
     ending = out.suffix.removeprefix(".")
-    if ending not in FORMATS or out.is_dir():
+    if ending not in FORMATS or os.path.isdir(out):  # False where the folder may not be read
         stem = time.strftime("recording-%Y-%m-%dT%H-%M-%S") + f"-{os.getpid()}"
         return out / stem, formats or FORMATS[:1]
     if formats not in ((), (ending,)):

@@ -7,7 +7,7 @@ It is found by name among the entry points `rtcp.virtual_models`, or as `module:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from math import isfinite
@@ -18,7 +18,10 @@ from rtcp.config.document import Finding, shown
 from rtcp.config.find import load_class, registered
 from rtcp.config.model import PluginError
 from rtcp.virtual.objects import DataType, Entry, ObjectDictionary
+from rtcp.virtual.protocol import MailboxType
 
+MailboxHandler = Callable[[bytes, int], Iterable[bytes]]
+"""Answers a mailbox message: it gets the message without its mailbox header, and the most bytes of an answer."""
 ENTRY_POINTS = "rtcp.virtual_models"
 """Entry points of device models, by the name that a segment's file uses."""
 LONGEST_QUEUE = 16
@@ -142,6 +145,8 @@ class DeviceModel:
         )  # fmt: skip
         self.emergencies: deque[Emergency] = deque(maxlen=LONGEST_QUEUE)
         """Emergency messages that wait to be sent; the slave's mailbox takes them from the left."""
+        self.mailbox_protocols: dict[MailboxType, MailboxHandler] = {}
+        """Mailbox protocols beside CoE, as FoE, that a subclass adds in its `__init__`; its SII lists them."""
         self.outputs_valid = False
         self.objects = ObjectDictionary()
         self._define_identity()

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import struct
 from collections import deque
+from collections.abc import Mapping
 from enum import IntEnum
+from types import MappingProxyType
 
 from rtcp.virtual.coe import ABORT, CoeService, SdoInformation, SdoServer, emergency_message
-from rtcp.virtual.device import DeviceModel, Emergency, SlaveFaults
+from rtcp.virtual.device import DeviceModel, Emergency, MailboxHandler, SlaveFaults
 from rtcp.virtual.esc import SyncManager
 from rtcp.virtual.objects import ObjectDictionary
+from rtcp.virtual.protocol import MailboxType
 
 _HEADER = struct.Struct("<HHBB")
 _ERROR_REPLY = struct.Struct("<HH")
@@ -19,18 +22,6 @@ MINIMUM_SIZE = 16
 """Smallest mailbox: header, CoE header and an expedited SDO."""
 MAX_WAITING = 64
 """Answers that may wait before the mailbox has no more memory."""
-
-
-class MailboxType(IntEnum):
-    """Protocols of a mailbox message (ETG.1000.4, table 29)."""
-
-    ERROR = 0x0
-    AOE = 0x1
-    EOE = 0x2
-    COE = 0x3
-    FOE = 0x4
-    SOE = 0x5
-    VOE = 0xF
 
 
 class MailboxError(IntEnum):
@@ -60,8 +51,9 @@ class Mailbox:
         receive_size: int,
         send_size: int,
         faults: SlaveFaults | None = None,
+        protocols: Mapping[MailboxType, MailboxHandler] = MappingProxyType({}),
     ) -> None:
-        """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes.
+        """Serve `objects` over mailboxes of `receive_size` (SM0) and `send_size` (SM1) bytes, and further `protocols`.
 
         Raises:
             ValueError: a mailbox smaller than 16 bytes.
@@ -71,6 +63,8 @@ class Mailbox:
                 raise ValueError(f"the {name} mailbox has {size} bytes, allowed are {MINIMUM_SIZE} and more")
         self._emergencies = emergencies
         self._receive_size = receive_size
+        self._room = send_size - _HEADER.size
+        self._protocols = protocols
         self._faults = SlaveFaults() if faults is None else faults
         self._sdo = SdoServer(objects, send_size, self._faults)
         self._information = SdoInformation(objects, send_size)
@@ -99,12 +93,16 @@ class Mailbox:
                 self._refuse(address, MailboxError.NO_MORE_MEMORY)
         elif length > min(len(data), self._receive_size) - _HEADER.size:
             self._refuse(address, MailboxError.INVALID_SIZE)
-        elif kind & 0xF != MailboxType.COE:
+        elif (protocol := kind & 0xF) != MailboxType.COE and protocol not in self._protocols:
             self._refuse(address, MailboxError.UNSUPPORTED_PROTOCOL)
         elif channel & 0x3F:
             self._refuse(address, MailboxError.INVALID_CHANNEL)
         else:
-            self._coe(address, bytes(data[_HEADER.size : _HEADER.size + length]), state, t)
+            content = bytes(data[_HEADER.size : _HEADER.size + length])
+            if protocol == MailboxType.COE:
+                self._coe(address, content, state, t)
+            else:
+                self._of_model(address, MailboxType(protocol), content)
 
     def pending(self, t: int = 0) -> bool:
         """Return whether a message waits to be put in SM1 at instant `t`."""
@@ -148,6 +146,14 @@ class Mailbox:
         else:
             self._refuse(address, MailboxError.INVALID_HEADER)
 
+    def _of_model(self, address: int, protocol: MailboxType, content: bytes) -> None:
+        """Let the device model answer a message of a protocol that it has added."""
+        for answer in self._protocols[protocol](content, self._room):
+            if len(answer) > self._room:
+                self._refuse(address, MailboxError.INVALID_SIZE)
+            else:
+                self._waiting.append((protocol, address, answer, 0))
+
     def _sdo_request(self, address: int, content: bytes, state: int, t: int) -> None:
         if len(content) < SdoServer.MINIMUM_REQUEST:
             self._refuse(address, MailboxError.SIZE_TOO_SHORT)
@@ -179,7 +185,9 @@ class MailboxService:
         self._out = out
         self._in = in_
         device.emergencies.clear()
-        self._mailbox = Mailbox(device.objects, device.emergencies, out.length, in_.length, faults)
+        self._mailbox = Mailbox(
+            device.objects, device.emergencies, out.length, in_.length, faults, device.mailbox_protocols
+        )
         self._outbox: deque[bytes] = deque()
         self._present: bytes | None = None
         self._last: bytes | None = None

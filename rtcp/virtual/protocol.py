@@ -195,3 +195,15 @@ class DatagramCommand(IntEnum):
     LRW = 12
     ARMW = 13
     FRMW = 14
+
+
+class MailboxType(IntEnum):
+    """Protocols of a mailbox message (ETG.1000.4, table 29)."""
+
+    ERROR = 0x0
+    AOE = 0x1
+    EOE = 0x2
+    COE = 0x3
+    FOE = 0x4
+    SOE = 0x5
+    VOE = 0xF

@@ -12,6 +12,8 @@ from rtcp.config.document import Finding, read
 from rtcp.config.model import ConfigError
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.virtual.device import DeviceModel, OptionError, create
+from rtcp.virtual.objects import SdoAbort
+from rtcp.virtual.pdo import RX_ASSIGN, TX_ASSIGN, PdoImage
 from rtcp.virtual.protocol import Register
 from rtcp.virtual.slave import Slave, make_slaves
 from rtcp.virtual.wire import Miscount, Wire
@@ -305,15 +307,21 @@ def make_segment(config: SegmentConfig, t: int) -> Segment:
     """Build the slaves that `config` lists; their clocks start at instant `t` (ns, CLOCK_MONOTONIC).
 
     Raises:
-        ConfigError: one sentence for each mistake: an unknown model or option, or delays that fall along the chain.
+        ConfigError: one sentence for each mistake: an unknown model or option, process data that are too long or map
+            what does not exist, or delays that fall along the chain.
     """
     devices: list[DeviceModel] = []
     findings: list[Finding] = []
     for i, entry in enumerate(config.slaves):
         try:
-            devices.append(create(entry.model, **entry.options))
+            device = create(entry.model, **entry.options)
+            for assignment in (RX_ASSIGN, TX_ASSIGN):
+                PdoImage.from_assignment(device.objects, assignment)
+            devices.append(device)
         except OptionError as error:
             findings += [(("slaves", i, *where), text) for where, text in error.findings]
+        except (SdoAbort, ValueError) as error:
+            findings.append((("slaves", i, "model"), f"the process data of {entry.model} cannot be laid out: {error}"))
     delays = [
         usual if entry.delay_ns is None else entry.delay_ns
         for entry, usual in zip(config.slaves, default_delays(len(config.slaves)), strict=True)

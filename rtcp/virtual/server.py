@@ -148,7 +148,8 @@ class Server:
             elif not poll or now - arrived > SILENCE:
                 wait(descriptors, (), (), max(0, min(due, registry.due) - now) * 1e-9)
                 budget.slept += monotonic() - now
-            elif now > window_end:
+            elif now > window_end + REST_WINDOW:
+                # Only where frames are rare: right after a frame the sleep delays none.
                 window_end = budget.rest(now)
 
     def _answer_slowly(self, frame: bytearray, size: int, arrived: int, ancillary: Ancillary) -> None:

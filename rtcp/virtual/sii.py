@@ -20,7 +20,7 @@ from rtcp.virtual.pdo import (
     listed,
     split_mapping,
 )
-from rtcp.virtual.protocol import Register
+from rtcp.virtual.protocol import MailboxType, Register
 
 _CATEGORIES_AT = 2 * 0x40
 """Byte address of the first category (ETG.2010, table 2)."""
@@ -33,8 +33,11 @@ _SYNC_PULSE = 100
 """Length of a SYNC pulse in units of 10 ns."""
 _IDENTITY = struct.Struct("<4L")
 _MAILBOXES = struct.Struct("<8x9H")
-_COE = 0x0004
-"""Mailbox protocol CoE (ETG.1000.6, table 18)."""
+_PROTOCOLS = {
+    MailboxType.AOE: 0x01, MailboxType.EOE: 0x02, MailboxType.COE: 0x04, MailboxType.FOE: 0x08,
+    MailboxType.SOE: 0x10, MailboxType.VOE: 0x20,
+}  # fmt: skip
+"""Supported mailbox protocols (ETG.1000.6, table 18)."""
 _VERSION = 1
 _SMALLEST_KBIT = 16
 _GENERAL = struct.Struct("<4Bx5BxBhxx2H12x")
@@ -138,12 +141,13 @@ def _head(device: DeviceModel, layout: SyncManagerLayout, alias: int, kbit: int)
     configuration = _CONFIG.pack(_CONTROL, 0, _SYNC_PULSE, 0, alias)
     identity = device.identity
     receive, send = layout.mailbox_receive, layout.mailbox_send
-    # The bootstrap mailboxes are 0: there is no BOOT state without FoE.
+    protocols = sum(_PROTOCOLS[protocol] for protocol in {MailboxType.COE, *device.mailbox_protocols})
+    # The bootstrap mailboxes are 0: there is no BOOT state.
     head = (
         configuration
         + struct.pack("<H", crc8(configuration))
         + _IDENTITY.pack(identity.vendor_id, identity.product_code, identity.revision, identity.serial)
-        + _MAILBOXES.pack(0, 0, 0, 0, receive.start, receive.length, send.start, send.length, _COE)
+        + _MAILBOXES.pack(0, 0, 0, 0, receive.start, receive.length, send.start, send.length, protocols)
     )
     return head.ljust(_CATEGORIES_AT - 4, b"\0") + struct.pack("<HH", kbit - 1, _VERSION)
 
@@ -182,7 +186,8 @@ def _general(device: DeviceModel, strings: _Strings) -> bytes:
     order = strings.number(device.identity.order_code)
     name = strings.number(device.identity.name)
     # Group, image, order, name; CoE, FoE, EoE, SoE and DS402 details; flags; Ebus current; ports; identity address.
-    return _GENERAL.pack(group, 0, order, name, _coe_details(device.objects), 0, 0, 0, 0, 0, 0, _PORTS, 0)
+    foe, eoe = (protocol in device.mailbox_protocols for protocol in (MailboxType.FOE, MailboxType.EOE))
+    return _GENERAL.pack(group, 0, order, name, _coe_details(device.objects), foe, eoe, 0, 0, 0, 0, _PORTS, 0)
 
 
 def _coe_details(objects: ObjectDictionary) -> CoeDetail:

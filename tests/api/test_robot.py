@@ -78,6 +78,8 @@ def test_python_helps_with_a_robot_and_its_methods(shown: type) -> None:
 def test_the_package_shows_the_names_of_the_api() -> None:
     assert all(getattr(rtcp, name) is getattr(api, name) for name in rtcp.__all__)
     assert all(hasattr(api, name) for name in api.__all__)
+    assert {*rtcp.__all__} <= {*dir(rtcp)}
+    assert {*api.__all__} <= {*dir(api)}
     with pytest.raises(AttributeError):
         _ = rtcp.nothing  # type: ignore[attr-defined]
 

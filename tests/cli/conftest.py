@@ -81,6 +81,7 @@ def status() -> dict[str, Any]:
         "missed": 2,
         "lost_s": 0.0,
         "wkc": {"expected": 21, "actual": 21},
+        "last_second": {"cycles": 2000, "unanswered": 0, "incomplete": 0, "tracked": 2000},
         "slaves": [
             {
                 "position": at,

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import signal
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from rtcp.api import Progress, Refused
+from rtcp.cli.output import progress
 
 HOME = ("0", "0", "0", "0", "0", "0")
 
@@ -239,6 +244,20 @@ def test_on_a_terminal_a_move_draws_a_bar(platform: Any, rtcp_process: Callable[
     assert moving.wait() == 0
     assert "━".encode() in shown
     assert b"arrived, largest error" in shown
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_while_a_motion_is_planned_and_may_be_refused_no_progress_is_shown(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, terminal: bool
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal)
+    with contextlib.suppress(Refused), progress() as shown:
+        shown(Progress(fraction=0.0, remaining_s=0.0))
+        raise Refused("refused", "outside its range")
+    assert capsys.readouterr().out == ""
+    with progress() as shown:
+        shown(Progress(fraction=0.0, remaining_s=1.5))
+    assert "moving" in capsys.readouterr().out
 
 
 # -- poses and files ------------------------------------------------------------------------------------------------

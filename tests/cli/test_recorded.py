@@ -26,6 +26,16 @@ def test_a_recording_is_exported_beside_itself_and_drawn(rtcp: Callable[..., Any
     assert "<svg" in (tmp_path / "b.svg").read_text()
 
 
+def test_the_export_of_the_readme_works_as_written(
+    rtcp: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    mcap(Path("recording.mcap"), cycles(500))
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    (line,) = [line for line in readme.splitlines() if line.startswith("    rtcp export ")]
+    assert rtcp(*line.partition("rtcp ")[2].partition("#")[0].split()).code == 0
+
+
 def test_of_a_recording_that_is_cut_off_the_rest_is_exported_and_that_is_said(
     rtcp: Callable[..., Any], tmp_path: Path
 ) -> None:

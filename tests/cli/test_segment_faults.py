@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 from collections.abc import Callable
@@ -41,6 +42,14 @@ def begin(rtcp_process: Callable[..., Any], config: Path) -> Callable[..., Segme
         return process, said
 
     return start
+
+
+def test_a_segment_leaves_the_last_cpu_to_the_masters_cycle_unless_one_is_chosen(begin: Callable[..., Segment]) -> None:
+    cpus = os.sched_getaffinity(0)
+    process, _ = begin()
+    assert os.sched_getaffinity(process.pid) == (cpus - {max(cpus)} or cpus)
+    process, _ = begin("--cpu", str(max(cpus)))
+    assert os.sched_getaffinity(process.pid) == {max(cpus)}
 
 
 def test_faults_are_made_listed_and_cleared_on_the_segment_that_runs(

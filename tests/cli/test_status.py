@@ -153,13 +153,45 @@ def test_the_commanded_positions_are_shown_where_other_positions_were_sent(
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
+def test_cycles_without_an_answer_are_counted_over_the_last_second(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status["last_second"] = {"cycles": 2000, "unanswered": 12, "incomplete": 3, "tracked": 1988}
+    shown = " ".join(rtcp("status").out.split())
+    assert "working counter 21 of 21, 12 of 2000 cycles unanswered, 3 of 2000 cycles incomplete" in shown
+    assert "clocks locked in 1988 of 2000 cycles, offset -3.2 us, filtered +0.4 us" in shown
+
+
+def test_what_the_host_refuses_is_one_line_that_names_the_doctor(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status["realtime"]["notes"] = ["a long complaint about the host " * 4] * 3
+    platform.status["skipped_ticks"] = {
+        "share": 0.031, "part": "wake-up", "message": "a long sentence " * 6, "remedy": "a long remedy " * 6,
+    }  # fmt: skip
+    before, _, line = rtcp("status").out.partition("host ")
+    platform.status["realtime"]["notes"], platform.status["skipped_ticks"] = [], None
+    assert "host" not in (healthy := rtcp("status").out)
+    assert line.splitlines()[0] == "      3 settings refused, 3.1 % of the ticks skipped: see `rtcp doctor`"
+    assert (before + line).count("\n") == healthy.count("\n") + 1
+
+
+@pytest.mark.parametrize("lost", [0, 3])
+@pytest.mark.parametrize("sent", [0.1, 0.05])
+def test_no_heading_and_no_name_is_cut(platform: Any, rtcp: Callable[..., Any], lost: int, sent: float) -> None:
+    platform.status["joint_names"] = [f"shoulder_pan_joint_{n}" for n in range(1, 7)]
+    platform.status["joints"]["sent_position"] = [sent, *platform.status["joints"]["sent_position"][1:]]
+    for slave in platform.status["slaves"]:
+        slave |= {"state": "SAFE-OP + ERROR", "lost": lost, "errors": {"rx": [255] * 4, "links": [lost] * 4}}
+    words = rtcp("status").out.split()
+    assert "…" not in "".join(words)
+    for word in ("position", "velocity", "torque", "target", "slave", "state", "lost/err/links", "drive6", "io"):
+        assert word in words
+
+
 @pytest.mark.parametrize("actual", [-1, 0])
 def test_without_an_answer_the_clocks_are_not_followed_and_no_counter_is_made_up(
     platform: Any, rtcp: Callable[..., Any], actual: int
 ) -> None:
     platform.status["wkc"]["actual"] = actual
     shown = rtcp("status").out
-    assert "no answer, 21 expected" in shown
+    assert "no answer in the last second, 21 expected" in shown
     assert "working counter" not in shown
     assert "not tracked: no answer" in shown
     assert "offset" not in shown

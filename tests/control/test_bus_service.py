@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from rtcp.control import bus_service
 from rtcp.control.bus_service import BusService
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import SlaveState
@@ -96,6 +98,23 @@ class Bus:
 
     def reading_int(self, index: int, subindex: int) -> Steps[int]:
         return int.from_bytes((yield from self.reading(index, subindex)), "little")
+
+
+@pytest.mark.parametrize(("policy", "named"), [(os.SCHED_FIFO, True), (os.SCHED_OTHER, False)])
+def test_a_cycle_that_does_not_lock_under_fifo_names_the_cpu_that_it_keeps(
+    bus: Bus, board: Blackboard, monkeypatch: pytest.MonkeyPatch, policy: int, named: bool
+) -> None:
+    monkeypatch.setattr(bus_service, "_LOCK_S", 0.0)
+    monkeypatch.setattr(os, "sched_getscheduler", lambda pid: policy)
+    waiting = BusService(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)  # type: ignore[arg-type]
+    refused = threading.Event()
+    waiting.on_refused = refused.set
+    waiting.start()
+    refused.wait()
+    waiting.finish()
+    (sentence,) = waiting.refused
+    assert sentence.startswith("the cycle did not lock onto the reference clock")
+    assert ("the cycle keeps CPU 1 under SCHED_FIFO while it waits" in sentence) is named
 
 
 @pytest.fixture

@@ -46,7 +46,8 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
 def test_the_status_has_every_promised_field(shared: Platform) -> None:
     status = shared.status()
     assert {"state", "drive_mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "inputs",
-            "outputs", "wakeup_us", "exchange_us", "compute_us", "dc", "realtime", "pids"} <= set(status)  # fmt: skip
+            "outputs", "wakeup_us", "exchange_us", "compute_us", "dc", "last_second", "realtime",
+            "pids"} <= set(status)  # fmt: skip
     assert {"position", "name", "state"} <= set(status["slaves"][0])
     assert all(
         len(status["joints"][name]) == 6

@@ -129,6 +129,22 @@ def test_the_gateway_lists_the_command_as_a_method_that_checks_its_parameters(pl
     assert wrong[0] == ["frequency"]
 
 
+def test_no_other_test_sees_what_the_package_registers(installed: Path) -> None:
+    tests = REPOSITORY / "tests"
+    listing = (
+        "config/test_mistakes.py", "config/test_plugins.py", "cli/test_segment_faults.py",
+        "virtual/faults/test_leaks.py", "faults/test_soak.py",
+    )  # fmt: skip
+    chosen = "servo or registered or kind or random_fault_is"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-k", chosen]
+    done = subprocess.run(
+        [*command, *(str(tests / name) for name in listing)],
+        check=False, capture_output=True, text=True, cwd=REPOSITORY, env={**os.environ, "PYTHONPATH": str(installed)},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout
+    assert " passed" in done.stdout
+
+
 def test_the_page_shows_every_file_of_the_example_whole() -> None:
     page = (REPOSITORY / "docs" / "extending.md").read_text()
     assert len(page) <= 10_000

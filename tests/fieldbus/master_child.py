@@ -338,10 +338,9 @@ def killed(bus: SoemBus, count: int, pid: int) -> Any:
     return {"wkc": cycle.wkcs[-1], "states": cycle.run(lambda: [state.words() for state in bus.read_states()])}
 
 
-def interrupted(bus: SoemBus, count: int, pid: int) -> Any:
+def interrupted(bus: SoemBus, count: int, pid: int, child: subprocess.Popen[bytes]) -> Any:
     """A scan in a process of its own is ended by a signal, as `rtcp scan` does on Ctrl-C; the bus is its alone."""
     bus.close()
-    child = subprocess.Popen([sys.executable, "-m", "rtcp.launch.offline"], stdin=subprocess.PIPE)
     assert child.stdin is not None
     child.stdin.write(json.dumps({"do": "scan", "interface": INTERFACE, "namespace_pid": pid}).encode())
     child.stdin.close()
@@ -383,6 +382,10 @@ def main() -> None:
     question = json.loads(sys.argv[1])
     bus = SoemBus(INTERFACE, question.get("receive_fraction", 0.3), namespace_pid=question["pid"])
     answer: dict[str, Any] = {}
+    if question["scenario"] == "interrupted":
+        # Outside, as `rtcp scan` starts it: an ordinary user's program that begins inside has no rights there.
+        command = [sys.executable, "-m", "rtcp.launch.offline"]
+        question["arguments"]["child"] = subprocess.Popen(command, stdin=subprocess.PIPE)
     enter(question["pid"])
     flags = interface_flags(PROMISCUOUS if question["promiscuous"] else 0)
     listener = AlStatusListener()

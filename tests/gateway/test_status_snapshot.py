@@ -118,6 +118,25 @@ def test_a_silent_loop_is_reported_with_the_way_out_and_its_last_values_do_not_c
     assert (status["wkc"]["actual"], status["dc"]["locked"], status["goal"]) == (-1, False, None)
 
 
+def test_one_lost_frame_is_one_cycle_of_the_last_second_and_not_the_platforms_state(written: Written) -> None:
+    for wkc in (21, 21, 18, 21, -1):
+        written.publish(State.READY, wkc=wkc)
+    status = written.status
+    assert status["wkc"] == {"expected": 21, "actual": 21}
+    assert status["last_second"] == {"cycles": 5, "unanswered": 1, "incomplete": 1, "tracked": 4}
+    written.publish(State.READY, wkc=18)
+    assert written.status["wkc"]["actual"] == 18
+
+
+def test_what_is_older_than_a_second_does_not_count(written: Written, monkeypatch: pytest.MonkeyPatch) -> None:
+    written.publish(State.READY)
+    written.publish(State.READY)
+    assert written.status["last_second"]["cycles"] > 0
+    monkeypatch.setattr(status_snapshot, "_SECOND_NS", 0)
+    status = written.status
+    assert (status["last_second"]["cycles"], status["wkc"]["actual"]) == (0, -1)
+
+
 # -- RobotStatus ------------------------------------------------------------------------------------------------------
 
 ALLOWED = FLAG_ENABLED | FLAG_MOTION_ALLOWED

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
 from itertools import product
 
 import pytest
@@ -11,6 +12,10 @@ import pytest
 from kinematics.forward import forward, frames
 from kinematics.jacobian import jacobian, singularity_distances
 from rtcp.config import default_config, load
+from rtcp.ipc.commands import Jog
+from rtcp.ipc.events import NoSolution
+from rtcp.ipc.states import JogFrame
+from rtcp.motion.controllers import JogController
 from rtcp.motion.controllers.jog_inverse import JogInverse
 from rtcp.motion.state import Phase
 from tests.samples import some
@@ -164,3 +169,13 @@ def test_the_inverse_and_the_distances_are_those_of_the_kinematics():
         inverse.at(frames(MODEL, [a + 1e-7 * v for a, v in zip(q, speeds, strict=True)]))
         for old, new, rate in zip(before, inverse.distance, rates, strict=True):
             assert (new - old) / 1e-7 == pytest.approx(rate, abs=1e-4)
+
+
+def test_a_jog_of_a_tool_without_an_inverse_says_so_instead_of_a_distance_of_zero(drive):
+    wrist = replace(MODEL.rows[4], a=0.1)
+    model = replace(MODEL, rows=(*MODEL.rows[:4], wrist, *MODEL.rows[5:]))
+    mode = drive.at(BENT).controller(JogController, arm=model)
+    assert drive.command(mode, Jog((0.0, 0.0, 0.05, 0.0, 0.0, 0.0), JogFrame.BASE, 0.2)) is None
+    drive.until_rest(mode)
+    assert mode.ended == NoSolution()
+    assert drive.state.commanded == BENT

@@ -7,14 +7,16 @@ import random
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from kinematics import Pose, forward
 from kinematics.jacobian import singularity_distances
+from kinematics.solution import Near, Singularity
 from rtcp.config.model import SingularityLimits, Stop
-from rtcp.ipc.events import JointLimitReached, OutOfReach, PlanDamaged, SetpointJump, SingularityReached
+from rtcp.ipc.events import JointLimitReached, NoSolution, OutOfReach, PlanDamaged, SetpointJump, SingularityReached
 from rtcp.ipc.refusals import DamagedRow, PathNeedsRest, PathStartsElsewhere
 from rtcp.motion.controllers.line import LineController
 from rtcp.motion.planning.interpolation import quaternion, turn_between
@@ -213,6 +215,17 @@ def test_a_line_that_cannot_be_followed_ends_in_a_stop_that_says_why(
         assert drive.state.commanded == list(Q)
     else:
         assert abs(mode.ended.value) > mode.ended.limit
+
+
+@pytest.mark.interpreted
+def test_a_line_to_a_pose_in_reach_without_a_solution_does_not_name_a_distance_of_zero(
+    drive: Any, mode: LineController, rows: Any, moved: Any
+) -> None:
+    drive.at(Q)
+    assert drive.execute(mode, *rows([moved(dy=0.2)])) is None
+    mode._inverse = SimpleNamespace(solve_near=lambda *_: Near(None, "", Singularity.NONE, 0.0, -1))  # type: ignore[assignment]
+    drive.until_rest(mode)
+    assert mode.ended == NoSolution()
 
 
 def test_a_line_that_comes_near_a_singularity_after_all_ends_in_a_stop_before_it(

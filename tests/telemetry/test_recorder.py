@@ -40,7 +40,7 @@ from tests.records import numbers
 
 CONFIG = load(default_config())
 PERIOD_NS = 2_000_000
-PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
+PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH = 24, 1, 2
 HOUR_NS = 3600 * 10**9
 SCHEMA = arm_schema(6)
 SCHEMA = RecordSchema(
@@ -86,7 +86,8 @@ def record(
     options = to_json(RecordingConfig(**{"out": str(loop.directory)} | given))
 
     def narrow() -> None:
-        ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, CAP_DAC_OVERRIDE, 0, 0, 0)
+        for right in (CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH):
+            ctypes.CDLL(None).prctl(PR_CAPBSET_DROP, right, 0, 0, 0)
         if limit is not None:
             signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
             resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -388,9 +389,10 @@ def refused_with(recorder: subprocess.Popen[str], reason: str, fields: Mapping[s
     assert {name: found["fields"][name] for name in fields} == fields
 
 
-def test_a_directory_without_rights_is_refused(loop: Loop) -> None:
+@pytest.mark.parametrize("mode", [0o555, 0o000])
+def test_a_directory_without_rights_is_refused(loop: Loop, mode: int) -> None:
     closed = loop.directory / "closed"
-    closed.mkdir(mode=0o555)
+    closed.mkdir(mode=mode)
     recorder = record(loop, out=str(closed / "one.mcap"))
     refused_with(recorder, "not_writable", {"file": str(closed / "one.mcap"), "error": "Permission denied"})
 

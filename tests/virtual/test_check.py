@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from rtcp.config import ConfigError, default_config, load, segment_path
+from rtcp.config.segment import load_segment
 from rtcp.virtual.segment import check_segment
 
 MISTAKES = {
@@ -25,6 +26,10 @@ MISTAKES = {
             '6: slaves[0].options.counter_rate: found the text "yes", allowed is a number',
         ],
     ),
+    "a device whose process data are too long": (
+        "slaves:\n- model: diewu-io\n- model: tests.virtual.file_models:TooLong\n",
+        ["3: slaves[1].model: the process data of tests.virtual.file_models:TooLong cannot be laid out: the PDOs"],
+    ),
     "a delay that falls": (
         "slaves:\n- model: diewu-io\n  delay_ns: 900\n- model: diewu-io\n",
         ["4: slaves[1].delay_ns: found 820 ns, allowed is at least the 900 ns of the slave before it"],
@@ -42,5 +47,8 @@ def test_every_mistake_is_named_with_file_line_and_key(tmp_path: Path, text: str
         assert problem.startswith(f"{file}:{sentence}")
 
 
-def test_the_shipped_segment_has_no_mistakes() -> None:
-    check_segment(segment_path(load(default_config())))
+def test_the_shipped_segment_has_no_mistakes_and_no_serial_number_twice() -> None:
+    path = segment_path(load(default_config()))
+    check_segment(path)
+    serials = [slave.options.get("serial") for slave in load_segment(path).slaves]
+    assert sorted(serials) == list(range(1, 8))

@@ -8,6 +8,7 @@ from rtcp.virtual.device import Emergency
 from rtcp.virtual.mailbox import MAX_WAITING, Mailbox
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary
 from rtcp.virtual.pdo import define_pdo_objects
+from rtcp.virtual.protocol import MailboxType
 
 PREOP = 2
 UPLOAD = "0a00 0000 00 {counter}3 0020 40 0010 00 00000000"
@@ -171,6 +172,13 @@ def test_a_message_longer_than_the_receive_mailbox_is_refused():
 def test_a_mailbox_too_small_for_an_sdo_is_refused(receive, send, named):
     with pytest.raises(ValueError, match=named):
         Mailbox(dictionary(), deque(), receive, send)
+
+
+def test_a_protocol_that_a_model_adds_is_answered_and_an_answer_without_room_is_refused():
+    answers = [b"ab", bytes(123)]
+    box = Mailbox(dictionary(), deque(), 128, 128, protocols={MailboxType.VOE: lambda content, room: answers})
+    box.receive(message("0200 0000 00 0f 0102"), PREOP)
+    assert drain(box) == [message("0200 0000 00 1f 6162"), message("0400 0000 00 20 0100 0800")]
 
 
 INDICES = st.sampled_from([0x1000, 0x1600, 0x1C12, 0x2000, 0x2001, 0x2002, 0x3000, 0x7FFF])

@@ -123,6 +123,16 @@ def test_a_segment_that_polls_answers_too(config: Path) -> None:
         assert_all_in_op(master(str(segment.pid), "ecat0", 100))
 
 
+def test_a_model_of_another_package_serves_files_over_foe(tmp_path: Path) -> None:
+    config = tmp_path / "files.yaml"
+    config.write_text("slaves:\n  - model: tests.virtual.file_models:FileServer\n", encoding="utf-8")
+    with running(config) as (segment, _):
+        child = [sys.executable, str(CHILD.with_name("foe_child.py")), str(segment.pid), "ecat0"]
+        found = json.loads(subprocess.run(child, stdout=subprocess.PIPE, text=True, check=True).stdout)
+    assert found["firmware"] == (bytes(range(256)) * 2).hex()
+    assert found["settings"] == found["written"]
+
+
 def test_the_next_master_finds_the_slaves_as_the_first_one_did(config: Path) -> None:
     with running(config) as (segment, _):
         for _ in range(2):

@@ -4,9 +4,10 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from rtcp.virtual.device import Emergency, Identity
+from rtcp.virtual.device import Emergency, Identity, MailboxHandler
 from rtcp.virtual.objects import Access, DataType, ObjectDictionary
 from rtcp.virtual.pdo import SyncManagerLayout, define_pdo_objects
+from rtcp.virtual.protocol import MailboxType
 from rtcp.virtual.sii import build_sii, crc8
 
 IDENTITY = Identity(0xB5C, 0x40201, 0x10000, 77, "Cubemars ORH70", "Drives", "ORH70-E")
@@ -21,6 +22,7 @@ class Drive:
     objects: ObjectDictionary = field(default_factory=ObjectDictionary)
     emergencies: deque[Emergency] = field(default_factory=deque)
     supports_dc: bool = True
+    mailbox_protocols: dict[MailboxType, MailboxHandler] = field(default_factory=dict)
 
     def step(self, dt: float) -> None:
         """Nothing moves."""
@@ -205,3 +207,19 @@ def test_distributed_clocks_are_offered_with_sync0_and_without():
 
 def test_a_device_without_a_clock_offers_none():
     assert find(image(drive(supports_dc=False)), DC) is None
+
+
+def test_the_protocols_that_a_model_adds_are_listed():
+    made = drive()
+    made.mailbox_protocols[MailboxType.FOE] = lambda message, room: ()
+    sii = image(made)
+    assert word(sii, 0x1C) == 0x04 | 0x08
+    general = find(sii, GENERAL)
+    assert general is not None
+    assert tuple(general[5:8]) == (image_details(), 1, 0)
+
+
+def image_details() -> int:
+    general = find(image(), GENERAL)
+    assert general is not None
+    return general[5]

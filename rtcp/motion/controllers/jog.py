@@ -19,7 +19,7 @@ from kinematics.jacobian import jacobian_columns
 from kinematics.pose import Pose, Rotation, applied, times
 from rtcp.config.model import CartesianConfig
 from rtcp.ipc.commands import Command, Jog
-from rtcp.ipc.events import OutOfReach
+from rtcp.ipc.events import NoSolution
 from rtcp.ipc.refusals import JogSpeedOutOfRange, NoGeometry, Refusal
 from rtcp.ipc.states import JogFrame
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
@@ -262,7 +262,7 @@ class JogController(Controller):
         self._line = None
         self._fresh = True
         self._posed = False
-        self.ended = OutOfReach(0.0)
+        self.ended = NoSolution()
         if not any(speeds) and (self.phase is Phase.STOP or not any(self._asked)):
             self.phase = Phase.HOLD
         return self._answer(state.commanded, self.period_s)

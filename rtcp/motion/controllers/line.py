@@ -18,6 +18,7 @@ from rtcp.ipc.events import (
     ControllerFailed,
     JointLimitReached,
     MotionEnded,
+    NoSolution,
     OutOfReach,
     PlanDamaged,
     SetpointJump,
@@ -186,7 +187,7 @@ class LineController(Controller):
                 low, high, q_now = self.limits.low, self.limits.high, state.commanded[near.limited]
                 nearer = min((low[near.limited], high[near.limited]), key=lambda edge: abs(edge - q_now))
                 return JointLimitReached(near.limited, q_now, nearer)
-            return OutOfReach(near.out_of_reach)
+            return OutOfReach(near.out_of_reach) if near.out_of_reach > 0.0 else NoSolution()
         position = list(q)
         if self._rest_counts:
             left = _left(fraction / _FADED)

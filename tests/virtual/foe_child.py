@@ -1,0 +1,33 @@
+"""A real master, pysoem unchanged, reads and writes files over FoE: `foe_child.py PID INTERFACE`; tells in JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pysoem
+from soem_child import join, without_blocking
+
+PATIENCE_US = 2_000_000
+WRITTEN = bytes(range(200, 0, -1)) * 2
+
+
+def main() -> None:
+    pid, interface = sys.argv[1:]
+    join(pid)
+    pysoem.settings.timeouts.ret = 40_000
+    master = pysoem.Master()
+    without_blocking(master, interface)
+    master.config_init()
+    master.state_check(pysoem.PREOP_STATE, PATIENCE_US)
+    (slave,) = master.slaves
+    found = {"firmware": slave.foe_read("firmware", 0, 4096, PATIENCE_US).hex()}
+    slave.foe_write("settings", 0, WRITTEN, PATIENCE_US)
+    found["settings"] = slave.foe_read("settings", 0, 4096, PATIENCE_US).hex()
+    found["written"] = WRITTEN.hex()
+    master.close()
+    print(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
