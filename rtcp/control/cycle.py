@@ -222,7 +222,7 @@ class Cycle:
             counter,
             machine.fault,
             machine.limit,
-            arm.output_limiter.held | arm.trajectory_guard.held,
+            arm.output_limiter.held | arm.trajectory_guard.held | controller.held,
             machine.enables,
             machine.motions,
             controller.elapsed_s,

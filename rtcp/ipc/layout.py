@@ -161,6 +161,14 @@ FLAG_MOTION_ALLOWED = 32
 """The enabling switch is pressed, or there is none."""
 FLAG_ARM_HAS_JOYSTICK = 64
 
+HELD_SHOULDER = 1 << 16
+"""`held`, bits 0 to 15: a guard or the output limiter cut the target of this joint. From here on, what limits a jog:
+the singularity of the shoulder; elbow and wrist are the next two bits."""
+HELD_RANGE_AT, HELD_SPEED_AT = 19, 23
+"""4 bits each: 1 + the joint whose range, or whose speed, is the limit; 0: none."""
+HELD_BOX_AT = 27
+"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box, at most 31; 0: none."""
+
 
 def records_for(period_ns: int) -> int:
     """Return how many cycle records the ring of a cycle has: a power of two, `RING_S` seconds at least."""
