@@ -96,6 +96,7 @@ def load(path: Path) -> ArmConfig:
         slaves=tuple(SlaveConfig(slave.name, devices[slave.device]) for slave in arm.slaves),
         arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
         source=path,
+        warnings=tuple(document.sentences(rules.implausible(arm))),
     )
 
 
