@@ -51,7 +51,11 @@ def probe(cycles: int) -> None:
             angle = position[i % 6] + i
             total += sin(angle) * cos(angle)
         for i in range(6):
-            counts = int(position[i] * _COUNT_PER_RAD), int(velocity[i] * _COUNT_PER_RAD), int(torque[i] * _COUNT_PER_RAD)
+            counts = (
+                int(position[i] * _COUNT_PER_RAD),
+                int(velocity[i] * _COUNT_PER_RAD),
+                int(torque[i] * _COUNT_PER_RAD),
+            )
             outputs.pack_into(out, i * outputs.size, 15, *counts, 8)
 
 

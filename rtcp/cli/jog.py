@@ -193,10 +193,20 @@ def _jog(
         if at >= count:
             raise CommandError(f"{axis} does not exist: joint1 to joint{count}")
 
+        reported: set[str] = set()
+        due = time.monotonic() + SHOW_INTERVAL_S
+
         def jog(direction: float, now: float) -> None:
+            nonlocal due
             speeds = [0.0] * count
             speeds[at] = direction * wanted
             robot.jog(speeds, "joints" if of_joint else frame, JOG_HOLD_S, now)
+            if now > due:
+                due = now + SHOW_INTERVAL_S
+                limits = robot.status().raw["limited_by"]
+                for name in limits.keys() - reported:
+                    report(limits[name])
+                reported.update(limits)
 
         if seconds is not None:
             _jog_for(robot, jog, seconds)

@@ -98,6 +98,7 @@ def load(path: Path) -> ArmConfig:
         ),
         arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
         source=path,
+        warnings=tuple(document.sentences(rules.implausible(arm))),
     )
 
 

@@ -605,6 +605,8 @@ class ArmConfig(ArmSettings):
     """rad, what each axis' drive shows at the axis' zero, in the order of `axes`; empty: all 0."""
     source: Path = Path()
     """The file it was read from."""
+    warnings: tuple[str, ...] = ()
+    """Values that are allowed and implausible: file, line, key, value and the likely mistake."""
 
     @property
     def boxes(self) -> tuple[str, ...]:

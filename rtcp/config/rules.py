@@ -477,6 +477,55 @@ def _holds(outer: KeepOut, inner: Box) -> bool:
     return all(a <= b for a, b in zip((*outer.min, *inner.max), (*inner.min, *outer.max), strict=True))
 
 
+# -- plausibility ------------------------------------------------------------------------------------------------------
+
+_TWO_TURNS = 4 * math.pi
+_DEGREES, _MILLIMETRES, _GRAMS = ("degrees", math.radians(1)), ("millimetres", 1e-3), ("grams", 1e-3)
+Magnitude = tuple[KeyPath, float, float, str, tuple[str, float]]
+"""Key, value, largest plausible magnitude, unit, and the likely other unit with its factor."""
+
+
+def implausible(arm: ArmFile) -> Iterator[Finding]:
+    """Yield a warning for each value that is allowed, but plausible only in another unit."""
+    for where, value, most, unit, (likely, factor) in _magnitudes(arm):
+        if abs(value) > most:
+            yield (
+                where,
+                (
+                    f"found {value:g} {unit}, plausible is at most {most:.4g} {unit}: "
+                    f"if this is in {likely}, write {value * factor:.6g}"
+                ),
+            )
+
+
+def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
+    for where, joint in axes_of(arm):
+        yield (*where, "position", "min"), joint.position.min, _TWO_TURNS, "rad", _DEGREES
+        yield (*where, "position", "max"), joint.position.max, _TWO_TURNS, "rad", _DEGREES
+        yield (*where, "velocity"), joint.velocity, _TWO_TURNS, "rad/s", _DEGREES
+        yield (*where, "acceleration"), joint.acceleration, 200.0, "rad/s^2", _DEGREES
+    least = arm.cartesian.singularity
+    for key, value, unit, likely in (
+        ("shoulder", least.shoulder, "m", _MILLIMETRES),
+        ("elbow", least.elbow, "rad", _DEGREES),
+        ("wrist", least.wrist, "rad", _DEGREES),
+    ):
+        yield ("cartesian", "singularity", key), value, 1.0, unit, likely
+    if arm.kinematics is None:
+        return
+    for i, row in enumerate(arm.kinematics.dh):
+        for key in ("a", "d"):
+            yield ("kinematics", "dh", i, key), getattr(row, key), 5.0, "m", _MILLIMETRES
+    for i, limit in enumerate(arm.kinematics.limits or ()):
+        for key in ("min", "max"):
+            yield ("kinematics", "limits", i, key), getattr(limit, key), _TWO_TURNS, "rad", _DEGREES
+        yield ("kinematics", "limits", i, "velocity"), limit.velocity or 0.0, _TWO_TURNS, "rad/s", _DEGREES
+    for i, link in enumerate(arm.kinematics.links or ()):
+        yield ("kinematics", "links", i, "mass"), link.mass, 200.0, "kg", _GRAMS
+        yield ("kinematics", "links", i, "centre"), max(map(abs, link.centre)), 5.0, "m", _MILLIMETRES
+    yield ("kinematics", "tool", "position"), max(map(abs, arm.kinematics.tool.position)), 5.0, "m", _MILLIMETRES
+
+
 # -- motion files ------------------------------------------------------------------------------------------------------
 
 

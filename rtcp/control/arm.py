@@ -120,7 +120,7 @@ class Arm(Part):
         values[at : at + len(ARM_MODES)] = (
             self.mode,
             self.control_mode,
-            self.output_limiter.held | self.trajectory_guard.held,
+            self.output_limiter.held | self.trajectory_guard.held | controller.held,
             controller.elapsed_s,
             controller.duration_s,
         )

@@ -103,6 +103,7 @@ class Methods:
         end_platform: Callable[[], Awaitable[list[str]]],
     ) -> None:
         config, limits = session.config, Limits(session.config)
+        snapshot.limits = limits
         self._config = config
         self._snapshot = snapshot
         self._observer = observer

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kinematics.forward import frames
+from kinematics.jacobian import singularity_distances
 from rtcp.ipc.events import JOYSTICK_MODES, ProcessDataLost, ResetDone
-from rtcp.ipc.names import Names
+from rtcp.ipc.names import SINGULARITIES, Names
 from rtcp.ipc.observer import EventRecord, Observer
 from rtcp.ipc.schema import (
     FLAG_ARM_HAS_JOYSTICK,
@@ -22,10 +24,16 @@ from rtcp.ipc.schema import (
     FLAG_ENABLED,
     FLAG_MOTION_ALLOWED,
     FLAG_SWITCHING,
+    HELD_BOX_AT,
+    HELD_RANGE_AT,
+    HELD_SHOULDER,
+    HELD_SPEED_AT,
     PER_JOINT,
 )
 from rtcp.ipc.session import Processes, Session, is_running
 from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.motion.guards.zones import Zones
+from rtcp.motion.limits import Limits
 from rtcp.realtime.statistics import SlidingPercentiles, diagnose
 
 AL_NAMES = {1: "INIT", 2: "PRE-OP", 3: "BOOT", 4: "SAFE-OP", 8: "OP"}
@@ -94,6 +102,8 @@ class StatusSnapshot:
         self._session = session
         self._started = started
         self.names = Names(session.config)
+        self.limits = Limits(session.config)
+        """In force."""
         self._at = max(observer.head - 1, 0)
         self._event = 0
         self._text = 0
@@ -203,12 +213,49 @@ class StatusSnapshot:
             "message": self.names.message(record.event),
         }
 
-    def _headline(self, state: State) -> str:
+    def _limited_by(self, record: npt.NDArray[np.void]) -> dict[str, str]:
+        """Return what keeps the motion below the commanded velocity: a sentence under the name of each limit."""
+        held, q = int(record["held"]), [float(value) for value in record["commanded_position"]]
+        names, model, found = self.names, self._session.config.arm, {}
+        low, high = self.limits.low, self.limits.high
+        for axis in (axis for axis in range(len(q)) if held >> axis & 1):
+            name = names.joint(axis)
+            found[name] = f"a guard cuts the target of {name} (limits of {names.key(axis)} in {names.file})"
+        if (axis := (held >> HELD_SPEED_AT & 15) - 1) >= 0:
+            name, speed = names.joint(axis), self.limits.velocity[axis]
+            found[f"{name} speed"] = (
+                f"{name} moves at its speed limit, {speed:g} rad/s ({names.key(axis)}.velocity in {names.file})"
+            )
+        if (axis := (held >> HELD_RANGE_AT & 15) - 1) >= 0:
+            name, end = names.joint(axis), low[axis] if q[axis] - low[axis] < high[axis] - q[axis] else high[axis]
+            found[f"{name} range"] = (
+                f"{name} is {abs(end - q[axis]):.4f} rad from the end of its range, {end:g} rad "
+                f"({names.key(axis)}.position in {names.file})"
+            )
+        if model is None:
+            return found
+        distances = singularity_distances(model, q)
+        for which, (name, unit) in enumerate(SINGULARITIES):
+            if held & HELD_SHOULDER << which:
+                least = getattr(self._session.config.cartesian.singularity, name)
+                found[name] = (
+                    f"the {name} is {distances[which] or 0.0:.3f} {unit} from its singularity, limit {least:g} {unit} "
+                    f"(cartesian.singularity.{name} in {names.file}): jog away from it, or jog joints"
+                )
+        if (box := (held >> HELD_BOX_AT) - 2) >= -1:
+            zones = Zones(model, self.limits).clearances(frames(model, q), math.inf)
+            distance = next((one.distance for one in zones if one.box == box), 0.0)
+            found["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
+        return found
+
+    def _headline(self, state: State, limits: dict[str, str]) -> str:
         """Return why the machine is in fault, else the last message; while a motion lasts none of an earlier one."""
         if self.fault or int(state) not in _UNDER_WAY:
             return self.fault or self.message
         began_ns = self._began_ns + time.time_ns() - time.monotonic_ns()
-        return self.message if self._message_ns > began_ns else state.words
+        if self._message_ns > began_ns:
+            return self.message
+        return f"{state.words}, limited: {'; '.join(limits.values())}" if limits else state.words
 
     def _loop_problem(self, silent_s: float) -> str:
         """Return what is wrong with the loop's process; empty: it publishes."""
@@ -276,9 +323,11 @@ class StatusSnapshot:
         figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
         shown = list(self.messages)[-_SHOWN:]
         last_second, wkc = self._last_second()
+        limits = self._limited_by(record) if state is State.MOVING else {}
         return {
             "state": "fault" if problem else state.name.lower(),
-            "message": problem or self._headline(state),
+            "message": problem or self._headline(state, limits),
+            "limited_by": limits,
             "drive_mode": _name(DriveMode, int(record["drive_mode"])),
             "control_mode": _name(ControlMode, control_mode),
             "joystick": {

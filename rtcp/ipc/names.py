@@ -15,7 +15,7 @@ from rtcp.ipc.message import Message
 from rtcp.ipc.states import State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
 
-_SINGULARITIES = (("shoulder", "m"), ("elbow", "rad"), ("wrist", "rad"))
+SINGULARITIES = (("shoulder", "m"), ("elbow", "rad"), ("wrist", "rad"))
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -102,8 +102,8 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "supervision": lambda names, about: f"{names.config.supervision.cycles} cycles (supervision in {names.file})",
     "joystick_mode": lambda names, about: JOYSTICK_MODES[about.mode % len(JOYSTICK_MODES)],
     "direction_name": lambda names, about: _DIRECTIONS[about.direction % len(_DIRECTIONS)],
-    "singularity": lambda names, about: _SINGULARITIES[about.which % 3][0],
-    "singularity_unit": lambda names, about: _SINGULARITIES[about.which % 3][1],
+    "singularity": lambda names, about: SINGULARITIES[about.which % 3][0],
+    "singularity_unit": lambda names, about: SINGULARITIES[about.which % 3][1],
     "command_name": lambda names, about: COMMANDS[about.command].name,
     "accepting_states": lambda names, about: ", ".join(sorted(one.words for one in COMMANDS[about.command].states)),
     "way_out": lambda names, about: _way_out(about.command, about.state),

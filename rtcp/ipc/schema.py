@@ -207,7 +207,7 @@ OPERATOR_FIELDS = (Field("joystick_mode", "uint8", "", "0 X-Y, 1 Z-yaw, 2 roll-p
 ARM_MODES = (
     Field("drive_mode", "uint8", "", "Commanded mode of operation (CiA 402, 0x6060).", part="arm"),
     Field("control_mode", "uint8", "", "Commands that the arm takes (rtcp.ipc.states.ControlMode).", part="arm"),
-    Field("held", "uint32", "", "Bits of the joints at which a guard holds or slows the motion.", part="arm"),
+    Field("held", "uint32", "", "What holds or slows the motion; bits HELD_... of rtcp.ipc.schema.", part="arm"),
     Field("elapsed_s", "float32", "s", "Time since the motion began.", part="arm"),
     Field("duration_s", "float32", "s", "Duration of the motion, where it is known.", part="arm"),
 )
@@ -268,3 +268,11 @@ FLAG_EMERGENCY_STOP = 16
 FLAG_MOTION_ALLOWED = 32
 """The enabling switch is pressed, or there is none."""
 FLAG_ARM_HAS_JOYSTICK = 64
+
+HELD_SHOULDER = 1 << 16
+"""`held`, bits 0 to 15: a guard or the output limiter cut the target of this joint. From here on, what limits a jog:
+the singularity of the shoulder; elbow and wrist are the next two bits."""
+HELD_RANGE_AT, HELD_SPEED_AT = 19, 23
+"""4 bits each: 1 + the joint whose range, or whose speed, is the limit; 0: none."""
+HELD_BOX_AT = 27
+"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box, at most 31; 0: none."""

@@ -98,6 +98,8 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
         if not is_running(found.loop):
             clear(directory, found)
             config = _configure(options)
+            for warning in config.warnings:
+                report(f"warning: {warning}")
             _check_bus(config, check_segment)
             return _start_all(directory, config, options, began_ns, report)
         if is_running(found.gateway):

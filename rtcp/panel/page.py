@@ -173,6 +173,11 @@ def no_platform() -> None:
     text("p", "No platform runs: start one on the page Start.")
 
 
+def no_geometry() -> None:
+    """Say where an arm would be drawn that its geometry is unknown."""
+    text("p", "The arm has no geometry (the key kinematics is missing): joints alone move, no pose is known.")
+
+
 class View:
     """One open page of the panel, to the functions that build it."""
 

@@ -28,7 +28,7 @@ from rtcp.panel.access import Access, Sessions, Visitor, password_file, password
 from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
-from rtcp.panel.page import View, shown, text
+from rtcp.panel.page import View, no_geometry, shown, text
 from rtcp.panel.pages import arm, health, jog, limits, recorder, scope, segment, start, targets
 
 _STATIC = Path(__file__).parent / "static"
@@ -221,9 +221,14 @@ class Panel:
     def _draw(self, view: View, space: Element) -> None:
         """Draw the arm that runs; it stays over all pages."""
         config = self._live.config
-        if config is not None and config.arm is not None and (view.arm is None or view.arm.config != config):
-            space.clear()
-            with space:
+        if config is None or (view.arm is not None and view.arm.config == config):
+            return
+        space.clear()
+        view.arm = None
+        with space:
+            if config.arm is None:
+                no_geometry()
+            else:
                 view.arm = ArmView(config)
 
 

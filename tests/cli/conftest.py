@@ -69,6 +69,7 @@ def status() -> dict[str, Any]:
     return {
         "state": "holding",
         "message": "enabled: the arm holds",
+        "limited_by": {},
         "control_mode": "joint",
         "drive_mode": "csp",
         "joystick": {"mode": "X-Y", "controls_arm": True},

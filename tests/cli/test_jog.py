@@ -213,6 +213,13 @@ def test_a_jog_for_a_time_is_renewed_and_ends_in_a_halt(
     assert platform.methods[-2] == "halt"
 
 
+def test_a_jog_reports_what_limits_it_once(platform: Any, rtcp: Callable[..., Any]) -> None:
+    platform.status = {**platform.status, "limited_by": {"elbow": "the elbow is 0.08 rad from its singularity"}}
+    ended = rtcp("jog", "z", "0.1", "--seconds", "0.9")
+    assert (ended.code, ended.err) == (0, "")
+    assert ended.out.splitlines()[:-1] == ["the elbow is 0.08 rad from its singularity"]
+
+
 WRONG = {
     "an unknown axis": (("w", "0.1", "--seconds", "1"), "'w' is not an axis: x, y, z, rx, ry, rz, or joint1"),
     "a joint beyond the last": (("joint7", "0.1", "--seconds", "1"), "joint7 does not exist: joint1 to joint6"),

@@ -22,6 +22,9 @@ from rtcp.ipc.schema import (
     FLAG_ENABLED,
     FLAG_MOTION_ALLOWED,
     FLAG_SWITCHING,
+    HELD_BOX_AT,
+    HELD_RANGE_AT,
+    HELD_SHOULDER,
 )
 from rtcp.ipc.session import Processes, Session
 from rtcp.ipc.states import ControlMode, State
@@ -38,8 +41,8 @@ class Written:
         self.observer = Observer(path)
         self.snapshot = StatusSnapshot(self.observer, Session(load(default_config()), "virtual", "ecat0", 0, 0), {})
 
-    def publish(self, state: State, moves: int = 0, wkc: int = 21) -> None:
-        told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED}
+    def publish(self, state: State, moves: int = 0, wkc: int = 21, held: int = 0) -> None:
+        told = {"state": state, "moves": moves, "wkc": wkc, "wkc_expected": 21, "flags": FLAG_DC_LOCKED, "held": held}
         self.board.publish(numbers(self.board.schema, **told, time_ns=time.monotonic_ns()))
 
     @property
@@ -102,6 +105,26 @@ def test_while_the_arm_moves_the_message_is_not_the_end_of_the_last_motion(writt
     written.board.event(Arrived())
     written.publish(State.HOLDING, moves=3)
     assert written.headline == arrived
+
+
+def test_while_a_motion_is_limited_the_message_says_by_what_and_a_later_message_comes_first(written: Written) -> None:
+    written.publish(State.MOVING, moves=1, held=HELD_SHOULDER << 1 | 3 << HELD_RANGE_AT)
+    status = written.status
+    assert list(status["limited_by"]) == ["joint3 range", "elbow"]
+    assert status["message"] == "moving, limited: " + "; ".join(status["limited_by"].values())
+    time.sleep(0.002)
+    written.board.text("said meanwhile")
+    written.publish(State.MOVING, moves=1, held=HELD_SHOULDER)
+    assert written.headline == "said meanwhile"
+    written.publish(State.HOLDING, moves=1, held=HELD_SHOULDER)
+    assert written.status["limited_by"] == {}
+
+
+def test_a_joint_that_a_guard_cuts_and_a_keep_out_box_are_named_with_their_keys(written: Written) -> None:
+    written.publish(State.MOVING, held=0b10 | 2 << HELD_BOX_AT)
+    limits = written.status["limited_by"]
+    assert limits["joint2"] == "a guard cuts the target of joint2 (limits of joints[1] in assistive_arm.yaml)"
+    assert limits["box"].endswith("from the keep-out box user (cartesian.keep_out[0] in assistive_arm.yaml)")
 
 
 def test_a_silent_loop_is_reported_with_the_way_out_and_its_last_values_do_not_count(

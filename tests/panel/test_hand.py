@@ -102,6 +102,19 @@ def test_keys_jog_the_tool_while_they_are_held(page: Page, holding: Platform, fe
     assert after[:2] == pytest.approx(before[:2], abs=5e-3)
 
 
+def test_what_holds_a_jog_back_is_shown_while_the_pad_is_held(page: Page, holding: Platform) -> None:
+    holding.call("move_joints", q=[0.0] * 6)
+    holding.call("mode", name="cartesian")
+    show(page, "/jog")
+    page.get_by_role("button", name="Up, +Z").hover()
+    page.mouse.down()
+    expect(page.locator("[data-live=message]").first).to_contain_text(
+        "moving, limited: the elbow is 0.000 rad from its singularity, limit 0.08 rad (cartesian.singularity.elbow"
+    )
+    page.mouse.up()
+    holding.until(lambda found: found["state"] == "holding", "standstill")
+
+
 def test_the_gripper_is_opened_and_closed_by_its_buttons_and_keys(page: Page, holding: Platform) -> None:
     show(page, "/jog")
     page.get_by_role("button", name="Close gripper").click()

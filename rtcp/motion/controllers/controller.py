@@ -74,6 +74,8 @@ class Controller:
         """Why it ended the motion by itself; None from the beginning of each motion on."""
         self.elapsed_s = self.duration_s = 0.0
         """Progress; 0 and 0 where there is none."""
+        self.held = 0
+        """What keeps the motion below the commanded velocity in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
         self.setpoint = Setpoint(len(limits.velocity))
         self.motion = JointMotion(setup.period_s, limits.velocity, limits.acceleration, limits.jerk)
         """Brings the joints to rest; free for other use before that."""
@@ -137,6 +139,7 @@ class Controller:
 
     def update(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle; they are valid until the next call."""
+        self.held = 0
         if not self.phase:
             return self.rest(state)
         return self.follow_motion(state) if self._braking else self.advance(state)

@@ -21,6 +21,7 @@ from rtcp.config.model import CartesianConfig
 from rtcp.ipc.commands import Command, Jog
 from rtcp.ipc.events import NoSolution
 from rtcp.ipc.refusals import JogSpeedOutOfRange, NoGeometry, Refusal
+from rtcp.ipc.schema import HELD_SPEED_AT
 from rtcp.ipc.states import JogFrame
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.controllers.jog_bounds import JogBounds, stopping
@@ -150,7 +151,7 @@ class JogController(Controller):
         """Return the setpoints of the next cycle."""
         if self._by_joints:
             setpoint = self._velocity.update(state)
-            self.phase, self.ended = self._velocity.phase, self._velocity.ended
+            self.phase, self.ended, self.held = self._velocity.phase, self._velocity.ended, self._velocity.held
             return setpoint
         position, dt = state.commanded, self.period_s
         if state.now_ns > self._until_ns and self.phase is Phase.MOVE:
@@ -184,6 +185,7 @@ class JogController(Controller):
             ramp.held(_reached(poses, speeds))
         moving = any(speeds)
         self._posed = moving and bounds.watched
+        self.held = bounds.held | (joints.slowest + 1) << HELD_SPEED_AT
         if not moving and not any(wanted) and not any(ramp.velocity):
             self.phase = Phase.HOLD
         return self._answer(position, dt)
@@ -368,6 +370,8 @@ class ScaledTwist:
         self._limits = limits
         self.twist = [0.0] * 6
         self.speeds = [0.0] * 6
+        self.slowest = -1
+        """The joint whose speed limit scaled the last twist down; -1: none."""
 
     def make(self, rows: Sequence[Sequence[float]]) -> None:
         """Write the joint speeds for the twist, both scaled to what the joints' speeds allow.
@@ -378,11 +382,13 @@ class ScaledTwist:
         a, b, c, d, e, f = self.twist
         speeds, fastest = self.speeds, self._limits.velocity
         part = 1.0
+        self.slowest = -1
         for i, (g, h, k, m, n, o) in enumerate(rows):
             speeds[i] = v = a * g + b * h + c * k + d * m + e * n + f * o
             most = _FULL * fastest[i]
             if v * part > most or v * part < -most:
                 part = most / (v if v > 0.0 else -v)
+                self.slowest = i
         self.scale(part)
 
     def scale(self, part: float) -> None:

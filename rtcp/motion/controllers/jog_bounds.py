@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from math import sqrt
 
 from kinematics.pose import Pose
+from rtcp.ipc.schema import HELD_BOX_AT, HELD_RANGE_AT, HELD_SHOULDER
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.guards.zones import ELBOW, TOOL, Clearance
+from rtcp.motion.guards.zones import ELBOW, INNER_BOX, TOOL, Clearance
 from rtcp.motion.limits import Limits
 
 STANDOFF_M = 0.008
@@ -56,12 +57,14 @@ class JogBounds:
         self._idle = 0
         self._boxes: object = None
         self._turn2 = 1.0 / inverse.length**2
-        self.axis = self.box = self.singular = -2
-        """What held the motion back in this cycle: joint, box (-1: the inner one), singularity; -2: none."""
+        self.axis = self.box = -2
+        """What held the motion back in this cycle: joint, box (-1: the inner one); -2: none."""
+        self._singular = 0
 
     def look(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
         """Find the boundaries that are near. They are looked for again when a point can have come near to one."""
-        self.axis = self.box = self.singular = -2
+        self.axis = self.box = -2
+        self._singular = 0
         self._position = position
         zones, limits = self._zones, self._limits
         self.watched = zones is not None and zones.any
@@ -77,6 +80,16 @@ class JogBounds:
         self._idle = 0
         if not self.near:
             self._idle = int((zones.distance(poses)[0] - _WITHIN_M) / (_FASTEST_POINT_M_S * self._dt))
+
+    @property
+    def held(self) -> int:
+        """What held the motion back in this cycle: `HELD_...` of `rtcp.ipc.schema`."""
+        held = self._singular
+        if self.axis >= 0:
+            held |= (self.axis + 1) << HELD_RANGE_AT
+        if self.box >= INNER_BOX:
+            held |= min(self.box + 2, 31) << HELD_BOX_AT
+        return held
 
     def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
         """Return whether `twist`, with its joint speeds, passes a bound: `slide` is for that."""
@@ -105,10 +118,14 @@ class JogBounds:
         """
         weight = (1.0 if moves else 0.0, self._turn2 if turns else 0.0)
         basis: list[Sequence[float]] = []
+        which = -1
         for row in self._inverse.lost:
+            which = self._inverse.locked.index(True, which + 1)
             along = _along(row, twist)
-            if (along > _TOLERANCE or along < -_TOLERANCE) and not _taken(twist, row, along, weight, basis):
-                return False
+            if along > _TOLERANCE or along < -_TOLERANCE:
+                self._singular |= HELD_SHOULDER << which
+                if not _taken(twist, row, along, weight, basis):
+                    return False
         for _ in range(_PASSES):
             worst, excess = self._worst(poses, twist)
             if worst is None:
@@ -187,7 +204,7 @@ class JogBounds:
             allowed = stopping(distance - nearest, slow if slow < rate else rate, self._dt)
             if approach * share > allowed:
                 share = allowed / approach
-                self.singular = which
+                self._singular |= HELD_SHOULDER << which
         return share
 
     def stoppable(self, poses: Sequence[Pose], speeds: Sequence[float]) -> float:

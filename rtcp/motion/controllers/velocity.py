@@ -9,6 +9,7 @@ from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ru
 from rtcp.ipc.commands import Command, MoveAtVelocity
 from rtcp.ipc.events import CommandExpired, ControllerFailed
 from rtcp.ipc.refusals import JointSpeedOutOfRange, Refusal
+from rtcp.ipc.schema import HELD_RANGE_AT
 from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_accelerations
@@ -90,11 +91,20 @@ class VelocityController(Controller):
             return self.rest(state)
         target.position, target.velocity = output.new_position, output.new_velocity
         self._last = output.new_position
+        self._note_range(goals, target.velocity, state.commanded_velocity)
         output.pass_to_input(way)
         if self.phase is Phase.STOP and result == Result.Finished:
             self.phase = Phase.HOLD
             target.velocity = self._zero
         return target
+
+    def _note_range(self, goals: list[float], speeds: Sequence[float], before: Sequence[float]) -> None:
+        """Set `held` to the first joint that the edge of its range makes slower than it is wanted, rad/s."""
+        for i, wanted in enumerate(self._wanted):
+            speed = abs(speeds[i])
+            if goals[4 * i] == 1.0 and speed < abs(wanted) - _SLOWEST_RAD_S and speed <= abs(before[i]):
+                self.held = (i + 1) << HELD_RANGE_AT
+                return
 
     def _step(self) -> Result:
         try:

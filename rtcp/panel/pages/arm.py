@@ -23,6 +23,8 @@ def build(view: View) -> None:
         text("span", ", bus ")
         shown("bus", tag="b")
     _joints(config)
+    if config.arm is None:
+        return
     text("h2", "Tool")
     tool_pose()
     text("h2", "Distance from the singularities")

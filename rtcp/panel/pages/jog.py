@@ -55,22 +55,23 @@ def build(view: View) -> None:
             single.set_visibility(frame.value == "joints")
 
         with ui.element("div").classes("fields"):
-            frame = choice("Frame", FRAMES, config.jog.frame)
-            speed = number("Speed, m/s", str(config.jog.speed / 2), min="0", max=str(config.jog.speed), step="0.005")
-            turn = number(
-                "Turning, rad/s",
-                str(config.jog.angular_speed / 2),
-                min="0",
-                max=str(config.jog.angular_speed),
-                step="0.01",
-            )
+            if config.arm is None:
+                frame = choice("Frame", {"joints": FRAMES["joints"]}, "joints")
+            else:
+                frame = choice("Frame", FRAMES, config.jog.frame)
+            with ui.element("div").style("display: contents") as of_the_tool:
+                most = config.jog.speed
+                speed = number("Speed, m/s", str(most / 2), min="0", max=str(most), step="0.005")
+                most = config.jog.angular_speed
+                turn = number("Turning, rad/s", str(most / 2), min="0", max=str(most), step="0.01")
+            of_the_tool.set_visibility(config.arm is not None)
             joint = number("Joints, rad/s", "0.1", min="0", step="0.01")
         with ui.element("div").classes("pads"):
             cartesian = ui.element("div").classes("pads")
             single = ui.element("div")
             _gripper(view)
         with cartesian:
-            for name, buttons in _PADS.items():
+            for name, buttons in _PADS.items() if config.arm else ():
                 with ui.element("div"):
                     text("h2", name)
                     with ui.element("div").classes("pad"):
@@ -92,7 +93,8 @@ def build(view: View) -> None:
         "Keys, while the pads have the focus: arrows, page up, page down, q e, a d, w s; o opens and c closes the "
         "gripper. Gamepad: hold the left shoulder button; A closes and B opens.",
     )
-    tool_pose()
+    if config.arm is not None:
+        tool_pose()
 
 
 def _gripper(view: View) -> None:

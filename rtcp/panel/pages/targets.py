@@ -30,7 +30,7 @@ def build(view: View) -> None:
     """Build the page."""
     text("h1", "Targets")
     config, status = view.live.config, view.live.status
-    if config is None or status is None or config.arm is None:
+    if config is None or status is None:
         no_platform()
         return
     Targets(view, config)
@@ -67,7 +67,7 @@ class Targets:
         self._begin: Sequence[float] = ()
         """Where what was shown begins, rad."""
         with ui.element("div").classes("fields"):
-            self._way = choice("Target", _WAYS, "joints")
+            self._way = choice("Target", _WAYS if config.arm else {"joints": _WAYS["joints"]}, "joints")
             self._speed = number("Speed, rad/s or m/s (empty: the limit)", min="0")
         self._joints_part = ui.element("div").classes("fields")
         with self._joints_part:
@@ -81,7 +81,8 @@ class Targets:
             button("Here", self._here, plain=True)
             button("Plan", self._plan, when="ready holding")
             self._send_button = button("Send", self._send)
-            button("Solutions", self._solve, plain=True)
+            if config.arm is not None:
+                button("Solutions", self._solve, plain=True)
         self._said = text("p", "", role="status", **{"aria-live": "polite"})
         self._found = ui.element("div").classes("page")
         text("h2", "Named poses")
@@ -152,7 +153,8 @@ class Targets:
         if target != self._target():
             return  # changed meanwhile
         length = "" if found.length_m is None else f", {found.length_m:.3f} m"
-        self._said.text = f"{found.duration_s:.1f} s{length}: look at the ghost, then send it"
+        look = "" if self._view.arm is None else "look at the ghost, then "
+        self._said.text = f"{found.duration_s:.1f} s{length}: {look}send it"
         if self._view.arm is not None:
             self._view.arm.preview([list(q) for q in found.path], found.duration_s)
         self._planned, self._begin = target, found.path[0]

@@ -1,0 +1,82 @@
+"""Arms without `kinematics`, of 4 and of 7 joints: the panel says so, and offers what such an arm can do."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, Page, expect
+from ruamel.yaml import YAML
+
+from tests.e2e.conftest import Platform
+from tests.panel.conftest import begun, show, until, visitor
+
+pytestmark = [pytest.mark.alone, pytest.mark.browser]
+
+
+@pytest.fixture(scope="module", params=[4, 7])
+def platform(request: pytest.FixtureRequest) -> Iterator[Platform]:
+    """A platform of so many joints, enabled."""
+    made = Platform()
+    try:
+        made.be_patient(lost_ms=2000)
+        without_geometry(made, request.param)
+        made.rtcp("start", "--detach")
+        made.call("enable")
+        yield made
+    finally:
+        made.rtcp("stop", check=None)
+        shutil.rmtree(made.directory, ignore_errors=True)
+
+
+def without_geometry(platform: Platform, joints: int) -> None:
+    """Leave the geometry out of the platform's files, and let the arm have so many joints."""
+    yaml, directory = YAML(typ="safe"), platform.directory / "config"
+    arm = yaml.load((directory / "assistive_arm.yaml").read_text())
+    segment = yaml.load((directory / "segment.yaml").read_text())
+    for key in ("kinematics", "cartesian", "jog"):
+        del arm[key]
+    last = arm["joints"][-1]
+    names = [f"drive{n}" for n in range(1, joints + 1)]
+    arm["joints"] = [*arm["joints"], {**last, "name": "joint7", "slave": "drive7"}][:joints]
+    arm["slaves"] = [arm["slaves"][0], *({"name": name, "device": "cubemars-orh"} for name in names)]
+    segment["slaves"] = [*segment["slaves"], segment["slaves"][-1]][: joints + 1]
+    for file, data in (("assistive_arm.yaml", arm), ("segment.yaml", segment)):
+        with (directory / file).open("w") as written:
+            yaml.dump(data, written)
+
+
+@pytest.fixture
+def page(browser: Browser, platform: Platform) -> Iterator[Page]:
+    with begun(platform) as (_, url), visitor(browser, url) as found:
+        yield found
+
+
+def test_pages_say_that_there_is_no_geometry_and_offer_joints_alone(page: Page, platform: Platform) -> None:
+    joints = len(platform.status()["joint_names"])
+    for path in ("/arm", "/targets", "/jog"):
+        show(page, path)
+        expect(page.locator("#space")).to_contain_text("The arm has no geometry (the key kinematics is missing)")
+        expect(page.get_by_text("No platform runs")).to_have_count(0)
+        expect(page.locator("[data-live^='tool.'], [data-live^='singular.']")).to_have_count(0)
+    expect(page.get_by_label("Frame").locator("option")).to_have_text(["Joints"])
+    expect(page.get_by_role("button", name="Up, +Z")).to_have_count(0)
+    expect(page.get_by_label("Speed, m/s")).to_be_hidden()
+    page.get_by_role("button", name=f"joint{joints} +").hover()
+    page.mouse.down()
+    until(lambda: abs(platform.status()["joints"]["actual_position"][-1]) > 0.01, "the jog")
+    page.mouse.up()
+    platform.until(lambda found: found["state"] == "holding", "rest")
+
+
+def test_targets_of_the_joints_are_planned_and_sent(page: Page, platform: Platform) -> None:
+    joints = len(platform.status()["joint_names"])
+    show(page, "/targets")
+    expect(page.get_by_label("Target", exact=True).locator("option")).to_have_text(["Joint positions"])
+    expect(page.get_by_role("button", name="Solutions")).to_have_count(0)
+    page.get_by_label(f"joint{joints}, rad", exact=True).fill("0.2")
+    page.get_by_role("button", name="Plan", exact=True).click()
+    page.get_by_role("button", name="Send").click()
+    expect(page.get_by_text("There; largest error")).to_be_visible()
+    assert platform.status()["joints"]["actual_position"][-1] == pytest.approx(0.2, abs=1e-3)
