@@ -81,10 +81,8 @@ class Panel:
             self._socket.listen()  # whoever is quicker than the start waits
         except OSError as error:
             self._socket.close()
-            message = (
-                f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}: choose another"
-            )
-            raise RtcpError("refused", message) from error
+            problem = f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}"
+            raise RtcpError("refused", f"{problem}: choose another by --port") from error
         host = f"[{options.host}]" if ":" in options.host else options.host
         scheme = "http" if options.certificate is None else "https"
         self.url = f"{scheme}://{host}:{self._socket.getsockname()[1]}/"
