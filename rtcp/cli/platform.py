@@ -55,6 +55,10 @@ def _start(
     poll: Poll = False,
     detach: Annotated[bool, option("--detach", "Return when it runs; `rtcp stop` ends it.")] = False,
     panel: Annotated[bool, option("--panel", "Serve the panel too, and open it where there is a screen.")] = False,
+    port: Annotated[
+        int | None,
+        typer.Option("--port", min=0, max=65535, help="With --panel: its port; 0: a free one. Default: 8080."),
+    ] = None,
 ) -> None:
     """Start the platform: bring the slaves to OP and wait for commands."""
     mode = None if mode is None else mode.lower()
@@ -63,6 +67,8 @@ def _start(
     positive("--cycle-us", cycle_us, "us")
     if panel and detach:
         raise CommandError("--panel ends with this command, --detach leaves it at once: start `rtcp panel` beside")
+    if port is not None and not panel:
+        raise CommandError("--port is for the panel: give --panel --port N")
     if panel:
         require_panel()
     from rtcp.launch.launcher import StartOptions
@@ -79,18 +85,24 @@ def _start(
     def announce() -> None:
         report(_wait_ready("`rtcp enable` in another terminal; Ctrl-C or `rtcp stop`")[0])
 
-    with _panel() if panel else nullcontext():
+    with _panel(8080 if port is None else port) if panel else nullcontext():
         code = serve(options, announce)
     report("stopped" if code == 0 else "the platform has ended")
     raise typer.Exit(code)
 
 
 @contextmanager
-def _panel() -> Iterator[None]:
-    """Serve the panel in a process of its own meanwhile."""
+def _panel(port: int) -> Iterator[None]:
+    """Serve the panel in a process of its own meanwhile; raises Exit where it cannot, as at a busy port."""
     screen = ["--open"] if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") else []
-    serving = subprocess.Popen([sys.executable, "-m", "rtcp.cli", "panel", *screen])
+    command = [sys.executable, "-m", "rtcp.cli", "panel", "--port", str(port), *screen]
+    serving = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert serving.stdout is not None
     try:
+        address = serving.stdout.readline().rstrip()
+        if not address:
+            raise typer.Exit(serving.wait())  # it has said why
+        report(address)
         yield
     finally:
         serving.terminate()

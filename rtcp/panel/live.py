@@ -80,6 +80,10 @@ class HeldByAnother(Exception):
         self.holder = holder
 
 
+class EndedOnPurpose(Exception):
+    """STOP, a take-over or the end of a page has ended the command."""
+
+
 @dataclass(eq=False)
 class Page:
     """One open page: a tab of somebody's browser."""
@@ -120,6 +124,11 @@ class Page:
         return (now_ns - self.seen_ns) * 1e-9 if self.socket is not None else math.inf
 
 
+def operator_name(page: str) -> str:
+    """Return the name under which a page commands the platform."""
+    return f"panel: {page}"
+
+
 class Operator:
     """The one page that may move the arm, with a connection of its own: closing that stops what it moves."""
 
@@ -136,7 +145,7 @@ class Operator:
         """Return the connection, made anew where it was lost."""
         async with self._connecting:
             if not self._has_ended and (self._robot is None or not self._robot.is_open):
-                made = AsyncRobot(f"panel: {self.page}")
+                made = AsyncRobot(operator_name(str(self.page)))
                 await made.__aenter__()
                 self._robot = made
             robot = self._robot
@@ -152,7 +161,12 @@ class Operator:
         return bool(self._motions)
 
     async def run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        """Carry out a command; leaving, or `end`, ends its motion."""
+        """Carry out a command; leaving, or `end`, ends its motion.
+
+        Raises:
+            EndedOnPurpose: `end` was called.
+            RtcpError: as the command; Refused while another one is carried out.
+        """
         if self._motions:
             raise RtcpError("refused", "the last command of this page is still carried out: wait, or STOP")
         task = asyncio.ensure_future(self._run(command))
@@ -162,7 +176,7 @@ class Operator:
         except asyncio.CancelledError:
             if not self._has_ended:
                 raise
-            raise RtcpError("refused", "it was stopped") from None
+            raise EndedOnPurpose from None
         finally:
             self._motions.discard(task)
 
@@ -375,7 +389,7 @@ class Live:
             raise RtcpError("refused", "STOP was pressed after this click: click again")
 
     async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]], instead: bool = False) -> T:
-        """Carry out a command of a page; raises RtcpError, HeldByAnother. `instead`: what it moves stops first."""
+        """Carry out a command as `Operator.run`; raises HeldByAnother too. `instead`: what it moves stops first."""
         self.check_click(page)
         operator = self.claim(page)
         if instead and operator.moves:
@@ -508,9 +522,11 @@ class Live:
     async def _send(self, page: Page, socket: WebSocket, state: Json) -> None:
         page.sent_ns = time.monotonic_ns()
         notes, page.notes = page.notes, []
-        operator = self.operator
+        operator, holder = self.operator, str(state.get("holder", ""))
         mine = operator is not None and operator.page is page
         who = "" if operator is None else str(operator.page)
+        if holder and not (who and operator_name(who).startswith(holder)):  # a long name is cut off
+            who, mine = holder, False  # a command line, a program, another panel
         block, page.block = page.block, None
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):  # closed: `serve` handles that
             if block is not None:
@@ -529,6 +545,7 @@ class Live:
             "drive_mode": raw["drive_mode"],
             "control_mode": raw["control_mode"],
             "holder": raw["lease"]["holder"],
+            "age_s": round(raw["lost_s"] + max(0, time.monotonic_ns() - raw["time_ns"]) * 1e-9, 1),
             "bus": raw["bus"],
             "joints": {name: [_number(one, 5) for one in joints[name]] for name in _JOINTS},
             "goal": raw["goal"],

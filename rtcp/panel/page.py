@@ -17,7 +17,7 @@ from nicegui.elements.mixins.text_element import TextElement
 
 from rtcp.api import AsyncRobot, RtcpError
 from rtcp.panel.arm_view import ArmView
-from rtcp.panel.live import CLICK, TAKE_OVER_S, Click, HeldByAnother, Live, Page
+from rtcp.panel.live import CLICK, TAKE_OVER_S, Click, EndedOnPurpose, HeldByAnother, Live, Page
 
 T = TypeVar("T")
 Handler = Callable[[], Awaitable[object] | object]
@@ -186,9 +186,27 @@ class View:
         self.page = page
         self.arm: ArmView | None = None
         self.leaving: list[Callable[[], None]] = []
-        """Called when another page is shown or this one closes."""
+        """Called by `leave`."""
+        self._visit = 0
+        """Number of the page of the panel that is shown."""
         self._client = client
         page.notify, page.asked = self.warn, self._ask
+
+    def leave(self) -> None:
+        """Another page is shown, or this one closes."""
+        self._visit += 1
+        while self.leaving:
+            self.leaving.pop()()
+
+    @contextlib.contextmanager
+    def _visited(self) -> Iterator[None]:
+        """End the handler that awaits inside where its page is left meanwhile: it would draw on removed elements."""
+        visit = self._visit
+        try:
+            yield
+        finally:
+            if visit != self._visit:
+                raise asyncio.CancelledError
 
     def say(self, message: str) -> None:
         """Show that something went well."""
@@ -204,22 +222,30 @@ class View:
         self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False
     ) -> T | None:
         """Carry out a command; show what becomes of it. `instead`: what this page moves is stopped first."""
-        try:
-            found = await self.live.command(self.page, command, instead)
-        except HeldByAnother as held:
-            self._offer_to_take_over(held.holder)
-            return None
-        except (RtcpError, OSError) as error:
-            self.warn(str(error))
-            return None
-        if done:
-            self.say(done)
-        return found
+        with self._visited():
+            try:
+                found = await self.live.command(self.page, command, instead)
+            except HeldByAnother as held:
+                self._offer_to_take_over(held.holder)
+            except EndedOnPurpose:
+                self.say("Stopped")
+            except (RtcpError, OSError) as error:
+                self.warn(str(error))
+            else:
+                if done:
+                    self.say(done)
+                return found
+        return None
+
+    async def query(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T:
+        """Ask the platform something that commands nothing; raises RtcpError."""
+        with self._visited():
+            return await self.live.view(query)
 
     async def ask(self, query: Callable[[AsyncRobot], Awaitable[T]]) -> T | None:
-        """Ask the platform something that commands nothing."""
+        """Return what `query` does; None where its error is shown instead."""
         try:
-            return await self.live.view(query)
+            return await self.query(query)
         except RtcpError as error:
             self.warn(error.message)
             return None
@@ -254,6 +280,12 @@ class View:
         """Run the command `rtcp`; return its exit code and output; `show` gets each line. For operators alone."""
         if not self.may_command():
             return 3, "this is for operators"
+        visit = self._visit
+        with self._visited():
+            return await self._run(arguments, lambda line: show(line) if show and visit == self._visit else None)
+
+    @staticmethod
+    async def _run(arguments: Sequence[str], show: Callable[[str], None]) -> tuple[int, str]:
         async with _COMMANDS:
             process = await asyncio.create_subprocess_exec(
                 sys.executable, "-m", "rtcp.cli", *arguments, limit=_LONGEST_LINE,
@@ -263,8 +295,7 @@ class View:
             lines = []
             async for line in process.stdout:
                 lines.append(line.decode(errors="replace").rstrip())
-                if show is not None:
-                    show(lines[-1])
+                show(lines[-1])
             return await process.wait(), "\n".join(lines)
 
     def _offer_to_take_over(self, holder: str) -> None:

@@ -81,10 +81,8 @@ class Panel:
             self._socket.listen()  # whoever is quicker than the start waits
         except OSError as error:
             self._socket.close()
-            message = (
-                f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}: choose another"
-            )
-            raise RtcpError("refused", message) from error
+            problem = f"{options.host} port {options.port} cannot be listened at: {error.strerror or error}"
+            raise RtcpError("refused", f"{problem}: choose another by --port") from error
         host = f"[{options.host}]" if ":" in options.host else options.host
         scheme = "http" if options.certificate is None else "https"
         self.url = f"{scheme}://{host}:{self._socket.getsockname()[1]}/"
@@ -178,6 +176,7 @@ class Panel:
             role="alert",
             hidden="",
         )
+        text("div", "", id="old", role="status", hidden="")
         with ui.element("nav").props("id=menu").props('aria-label="Pages"'):
             for path, (name, _, _) in PAGES.items():
                 ui.link(name, path).props["data-path"] = path
@@ -188,8 +187,7 @@ class Panel:
         text("div", "", id="notes", role="status", **{"aria-live": "polite"})
 
     async def _close(self, view: View) -> None:
-        for one in view.leaving:
-            one()
+        view.leave()
         await self._live.close(view.page)
 
     def _builder(self, view: View, main: Element, space: Element, path: str) -> Callable[[], Any]:
@@ -197,8 +195,7 @@ class Panel:
 
         async def made() -> None:
             view.page.scope = None
-            while view.leaving:
-                view.leaving.pop()()
+            view.leave()
             if view.arm is not None:
                 view.arm.preview([], 0.0)  # planned on the page that is left
             if beside_arm:

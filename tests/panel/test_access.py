@@ -265,29 +265,35 @@ def test_many_requests_are_refused_and_others_are_still_served(closed_panel: str
 def test_a_platform_is_started_with_its_panel_and_both_end_together() -> None:
     platform = Platform()
     platform.be_patient(lost_ms=2000)
-    with contextlib.closing(socket.socket()) as probe:
-        if probe.connect_ex(("127.0.0.1", 8080)) == 0:
-            pytest.skip("something else listens at port 8080")
-    command = [sys.executable, "-m", "rtcp.cli", "start", "--panel"]
+    command = [sys.executable, "-m", "rtcp.cli", "start", "--panel", "--port", "0"]
     environment = {**platform.environment, "DISPLAY": "", "WAYLAND_DISPLAY": ""}
     running = subprocess.Popen(command, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    url = "http://127.0.0.1:8080"
-
-    def answers() -> bool:
-        with contextlib.suppress(OSError):
-            return bool(ask(url, "GET", "/", PAGE).status == 303)
-        return False
-
     try:
-        until(answers, "the panel")
+        assert running.stdout is not None
+        url, _, hint = running.stdout.readline().partition("/: ")
+        assert hint == "Ctrl-C ends the panel\n"
         until(lambda: "rtcp_up 1.0" in ask(url, "GET", "/metrics").text, "the platform")
         running.send_signal(signal.SIGINT)
-        out, complaints = running.communicate(timeout=30)
+        _, complaints = running.communicate(timeout=30)
         assert (running.returncode, "Traceback" in complaints) == (0, False), complaints
-        assert f"{url}/: Ctrl-C" in out
-        assert not answers()
+        with pytest.raises(ConnectionRefusedError):
+            ask(url, "GET", "/", PAGE)
     finally:
         running.kill()
+        platform.end()
+
+
+def test_a_busy_port_of_the_panel_refuses_the_start_before_the_platform() -> None:
+    platform = Platform()
+    try:
+        with socket.create_server(("127.0.0.1", 0)) as busy:
+            port = busy.getsockname()[1]
+            refused = platform.rtcp("start", "--panel", "--port", str(port), check=3)
+        assert refused.stderr.startswith(f"rtcp: 127.0.0.1 port {port} cannot be listened at")
+        assert "--port" in refused.stderr
+        assert (refused.stdout, list(platform.directory.iterdir())) == ("", [])
+        assert "--panel" in platform.rtcp("start", "--port", "8081", check=2).stderr
+    finally:
         platform.end()
 
 

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from mcap.reader import make_reader
 from playwright.sync_api import Browser, Page, expect
@@ -100,6 +101,32 @@ def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platf
     assert [is_kept_out for _, is_kept_out in shown_boxes] == [False, True, True]
 
 
+def test_the_header_names_the_command_that_moves_the_arm(page: Page, holding: Platform) -> None:
+    show(page, "/arm")
+    expect(page.locator("#operator")).to_have_text("Nobody operates the arm")
+    command = holding.background("move", "1.5", *(str(q) for q in BENT[1:]), "--speed", "0.1")
+    expect(page.locator("#operator")).to_have_text(f"rtcp move (pid {command.pid}) operates the arm")
+    page.get_by_role("button", name="STOP").click()
+    holding.end_commands()
+    expect(page.locator("#operator")).to_have_text("Nobody operates the arm")
+
+
+def test_old_values_are_marked_until_every_slave_answers_again(page: Page, holding: Platform) -> None:
+    show(page, "/arm")
+    mark = page.get_by_text(re.compile(r"^Joint values are [\d.]+ s old"))
+    position = page.locator("[data-live='actual_position.0']")
+    expect(position).not_to_have_text("–")
+    expect(mark).to_be_hidden()
+    fresh = position.evaluate("e => getComputedStyle(e).color")
+    holding.rtcp("segment", "fault", "cable", "after=3")
+    expect(page.locator("[data-live=state]")).to_have_text("fault")
+    expect(mark).to_be_visible()
+    assert position.evaluate("e => getComputedStyle(e).color") != fresh
+    assert barriers(page) == {}
+    holding.rtcp("segment", "clear")
+    expect(mark).to_be_hidden(timeout=40_000)
+
+
 def test_a_ghost_stands_where_a_move_from_elsewhere_ends(page: Page, holding: Platform) -> None:
     show(page, "/targets")
     view = page.locator(".arm-view")
@@ -176,6 +203,8 @@ def test_a_target_out_of_range_or_reach_is_refused_with_the_limit(page: Page, ho
 
 def test_a_pose_on_a_line_and_its_solutions(page: Page, holding: Platform) -> None:
     show(page, "/targets")
+    expect(page.get_by_role("button", name="Plan")).to_be_visible()
+    expect(page.get_by_role("button", name="Solutions")).to_be_hidden()  # its pose would be too
     page.get_by_label("Target").select_option("line")
     expect(page.get_by_label("y m")).not_to_have_value("")
     y = float(page.get_by_label("y m").input_value())
@@ -239,11 +268,15 @@ def test_limits_are_narrowed_and_never_widened(page: Page, limits_of_the_file: P
         expect(other.locator(".arm-view")).to_have_attribute("data-boxes", re.compile(r"1\.35\]"))
     page.get_by_label("joint2 max").fill("3")
     page.get_by_role("button", name="Set the limits").click()
-    expect(page.locator(".q-notification", has_text="joint2")).to_be_visible()
+    refusal = page.locator(".q-notification", has_text="joint2")
+    expect(refusal).to_be_visible()
+    colour = "element => getComputedStyle(element).color"
+    assert refusal.get_by_role("button", name="Close").evaluate(colour) == refusal.evaluate(colour)
     assert platform.call("limits")["limits"]["max"][1] == 1.5
+    platform.call("set_limits", changes={"joint3.max": 2.1})  # not from this page
     page.get_by_role("button", name="As the file allows").click()
-    page.get_by_role("button", name="Set the limits").click()
     until(lambda: platform.call("limits")["limits"] == platform.call("limits")["configured"], "the limits of the file")
+    expect(page.get_by_label("joint2 max")).to_have_value("2")
 
 
 def test_a_recording_is_made_downloaded_and_drawn(page: Page, holding: Platform, tmp_path: Path) -> None:
@@ -263,6 +296,41 @@ def test_a_recording_is_made_downloaded_and_drawn(page: Page, holding: Platform,
     picture = page.get_by_alt_text("Plot of cup.mcap")
     expect(picture).to_be_visible(timeout=30_000)
     assert picture.evaluate("image => image.naturalWidth") > 100
+
+
+def test_leaving_a_page_that_waits_for_a_command_prints_nothing(
+    browser: Browser, holding: Platform, tmp_path: Path
+) -> None:
+    program = tmp_path / "program.yaml"
+    program.write_text(f"trajectory:\n  - {{t: 0, q: {BENT}}}\n  - {{t: 3, q: {[0.2, *BENT[1:]]}}}\n")
+    recordings = Path(holding.environment["RTCP_STATE_DIR"], "recordings")
+    recordings.mkdir(parents=True, exist_ok=True)
+    (recordings / "left.mcap").unlink(missing_ok=True)
+    holding.rtcp("record", "start", "--out", str(recordings / "left.mcap"))
+    holding.rtcp("record", "stop")
+    with begun(holding) as (process, url), visitor(browser, url) as page:
+
+        def leave() -> None:
+            page.get_by_role("link", name="Arm").click()
+            expect(page.get_by_role("heading", name="Arm", exact=True)).to_be_visible()
+            children = psutil.Process(process.pid).children
+            until(lambda: not any("rtcp.cli" in one.cmdline() for one in children()), "the command has ended")
+            page.get_by_role("link", name="Start").click()
+            expect(page.get_by_role("heading", name="Machine")).to_be_visible()
+
+        show(page, "/recorder")
+        page.get_by_role("button", name="Show the files").click()
+        page.get_by_role("button", name="Plot left.mcap").click()
+        leave()
+        page.get_by_role("button", name="Scan the bus").click()
+        leave()
+        show(page, "/recorder")
+        page.get_by_label("Motion file").fill(str(program))
+        page.get_by_role("button", name="Run").click()
+        holding.until(lambda found: found["state"] == "moving", "moving")
+        leave()
+        holding.until(lambda found: found["state"] == "holding", "the program goes on to its end")
+        assert holding.status()["joints"]["actual_position"][0] == pytest.approx(0.2, abs=1e-3)
 
 
 def test_a_program_is_checked_run_and_stopped(page: Page, holding: Platform, tmp_path: Path) -> None:
@@ -291,6 +359,8 @@ def test_a_program_is_checked_run_and_stopped(page: Page, holding: Platform, tmp
     page.get_by_role("button", name="Stop the program").click()
     holding.until(lambda found: found["state"] == "holding", "holding")
     expect(page.get_by_text("It has not reached its end")).to_be_visible()
+    expect(page.locator(".q-notification")).not_to_have_count(0)
+    expect(page.locator(".q-notification.bg-negative")).to_have_count(0)
 
 
 def test_the_scope_shows_and_keeps_what_moves(page: Page, holding: Platform, tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def _events(view: View) -> None:
 
     async def refresh() -> None:
         try:
-            events = await view.live.view(lambda robot: robot.events())
+            events = await view.query(lambda robot: robot.events())
         except RtcpError:
             return
         if events and events[-1].number != last[0]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from nicegui import ui
@@ -36,9 +36,11 @@ async def build(view: View) -> None:
         if changes and await view.act(lambda robot: robot.set_limits(changes), "The limits are in force") is not None:
             kept.update({key: fields[key].value for key in changes})
 
-    def widest() -> None:
-        for key, _, allowed in _all(found):
-            fields[key].value = f"{allowed:g}"
+    async def widest() -> None:
+        changes = dict(_all(found["configured"], found["joint_names"]))
+        if await view.act(lambda robot: robot.set_limits(changes), "The limits of the file are in force") is not None:
+            for key, value in changes.items():
+                fields[key].value = kept[key] = f"{value:g}"
 
     headings = ("Joint", *(f"{name} {unit}" for name, unit in _JOINT.items()))
     with table(headings, "Limits of the joints", numbers=True):
@@ -61,9 +63,10 @@ async def build(view: View) -> None:
                         with ui.element("td"):
                             fields[f"{box}.{side}.{letter}"] = _field(f"{box} {side} {letter}", now, allowed)
     kept = {key: one.value for key, one in fields.items()}
+    when = f"ready {ENABLED} stopped_by_limit fault"
     with ui.element("div").classes("buttons"):
-        button("Set the limits", apply, when=f"ready {ENABLED} stopped_by_limit fault")
-        button("As the file allows", widest, plain=True)
+        button("Set the limits", apply, when=when)
+        button("As the file allows", widest, when=when, plain=True)
 
 
 def _field(name: str, now: float, allowed: float) -> Field:
@@ -77,13 +80,12 @@ def _boxes(limits: dict[str, Any]) -> dict[str, Any]:
     return {**inner, **limits["keep_out"]}
 
 
-def _all(found: dict[str, Any]) -> Iterator[tuple[str, float, float]]:
-    """Yield key, value in force and value of the file."""
-    now, allowed = found["limits"], found["configured"]
-    for at, name in enumerate(found["joint_names"]):
+def _all(limits: dict[str, Any], joints: Sequence[str]) -> Iterator[tuple[str, float]]:
+    """Yield key and value of every limit."""
+    for at, name in enumerate(joints):
         for key in _JOINT:
-            yield f"{name}.{key}", now[key][at], allowed[key][at]
-    for box, corners in _boxes(now).items():
+            yield f"{name}.{key}", limits[key][at]
+    for box, corners in _boxes(limits).items():
         for side in ("min", "max"):
             for axis, letter in enumerate("xyz"):
-                yield f"{box}.{side}.{letter}", corners[side][axis], _boxes(allowed)[box][side][axis]
+                yield f"{box}.{side}.{letter}", corners[side][axis]

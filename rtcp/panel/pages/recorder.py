@@ -61,7 +61,7 @@ def build(view: View) -> None:
 
     async def refresh() -> None:
         try:
-            running = [one for one in await view.live.view(lambda robot: robot.record_status()) if one.running]
+            running = [one for one in await view.query(lambda robot: robot.record_status()) if one.running]
         except RtcpError as error:
             running = []
             said.text = error.message
@@ -131,7 +131,7 @@ def _programs(view: View) -> None:
             return False
         path, first = file.value.strip(), bool(approach.value)
         try:
-            found = await view.live.view(lambda robot: robot.preview(file=path, approach=first))
+            found = await view.query(lambda robot: robot.preview(file=path, approach=first))
         except RtcpError as error:
             said.text = f"No: {error.message}"
             return False
@@ -141,6 +141,8 @@ def _programs(view: View) -> None:
         return True
 
     def progress(now: Progress) -> None:
+        if bar.is_deleted:
+            return  # the page was left; the program goes on
         bar.props["value"] = round(now.fraction, 3)
         said.text = f"{now.fraction:.0%}, {now.remaining_s:.1f} s left"
 

@@ -97,7 +97,7 @@ def _objects(view: View) -> None:
     async def read() -> None:
         try:
             where = place()
-            found = await view.live.view(lambda robot: robot.sdo_read(*where))
+            found = await view.query(lambda robot: robot.sdo_read(*where))
         except RtcpError as error:
             said.text = error.message
             return

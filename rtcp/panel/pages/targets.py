@@ -81,8 +81,7 @@ class Targets:
             button("Here", self._here, plain=True)
             button("Plan", self._plan, when="ready holding")
             self._send_button = button("Send", self._send)
-            if config.arm is not None:
-                button("Solutions", self._solve, plain=True)
+            self._solve_button = button("Solutions", self._solve, plain=True) if config.arm is not None else None
         self._said = text("p", "", role="status", **{"aria-live": "polite"})
         self._found = ui.element("div").classes("page")
         text("h2", "Named poses")
@@ -119,6 +118,8 @@ class Targets:
         self._send_button.props["disabled"] = True
         self._joints_part.set_visibility(self._way.value == "joints")
         self._pose_part.set_visibility(self._way.value != "joints")
+        if self._solve_button is not None:
+            self._solve_button.set_visibility(self._way.value != "joints")
         if self._view.arm is not None:
             self._view.arm.preview([], 0.0)
 
@@ -146,7 +147,7 @@ class Targets:
         self._changed()
         try:
             target = self._target()
-            found = await self._view.live.view(target.preview)
+            found = await self._view.query(target.preview)
         except RtcpError as error:
             self._said.text = f"No: {error.message}"
             return
@@ -182,7 +183,7 @@ class Targets:
             found = InverseKinematics(self._config.arm).solve(
                 pose, self._view.live.state()["joints"]["actual_position"]
             )
-            in_force = (await self._view.live.view(lambda robot: robot.limits()))["limits"]
+            in_force = (await self._view.query(lambda robot: robot.limits()))["limits"]
         except (Invalid, ValueError, LookupError) as error:
             self._said.text = f"No: {error}"
             return

@@ -3,6 +3,7 @@
 "use strict";
 window.rtcp = (() => {
   const STALE_MS = 500; // without a message for so long the page says so
+  const OLD_S = 0.1; // joint values older than this are marked
   let socket = null, token = 0, heard = 0, state = {}, connected = false;
   const listeners = new Set(), pictures = new Set();
 
@@ -91,8 +92,14 @@ window.rtcp = (() => {
     }
     const note = document.getElementById("operator");
     if (note) put(note, state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
-    const now = document.getElementById("lost");
-    if (now) now.hidden = connected;
+    const lost = document.getElementById("lost"), old = document.getElementById("old");
+    if (lost) lost.hidden = connected;
+    const isOld = connected && state.age_s > OLD_S;
+    document.body.classList.toggle("old", isOld);
+    if (old) {
+      old.hidden = !isOld;
+      if (isOld) put(old, `Joint values are ${state.age_s.toFixed(1)} s old: since then not every slave has answered.`);
+    }
   }
   setInterval(() => { if (performance.now() - heard > STALE_MS) { release(); show(); } }, 250);
 
