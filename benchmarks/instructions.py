@@ -1,8 +1,8 @@
 """What a cycle of the loop executes: `python benchmarks/instructions.py [hold joint cartesian joystick] [--source]`.
 
 Instructions, counted by callgrind (Debian: apt install valgrind gcc) over 1000 cycles on the bus `inprocess`: the same
-in every run, whatever else the host does. `loop` is a whole cycle less bus and device models; `probe` is the least that a
-cycle must do in this interpreter: six drives unpacked, 34 trigonometric calls, six drives packed. The cycle runs as
+in every run, whatever else the host does. `loop` is a whole cycle less bus and device models; `probe` is the least that
+a cycle must do in this interpreter: six drives unpacked, 34 trigonometric calls, six drives packed. The cycle runs as
 source and, where it was compiled (`make fast`), compiled. `CALLGRIND_OUT=FILE` keeps the profile of the last run for
 `callgrind_annotate`: of the compiled cycle it names the functions.
 """
