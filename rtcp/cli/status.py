@@ -212,7 +212,8 @@ def _facts(status: Json) -> Table:
     rows.add_row("frames", _frames(status))
     rows.add_row("clocks", _clocks(status))
     for device, fields in status["devices"].items():
-        rows.add_row(Text(device), Text(", ".join(_value(name, **shown) for name, shown in fields.items())))
+        for name, shown in fields.items():
+            rows.add_row(Text(f"{device} {name}"), Text(_value(name, **shown)))
     rows.add_row("real time", realtime_line(status["realtime"]))
     if problems := _host_problems(status):
         rows.add_row("host", Text(f"{', '.join(problems)}: see `rtcp doctor`", "yellow"))
@@ -223,11 +224,11 @@ def _facts(status: Json) -> Table:
 
 
 def _value(name: str, value: Any, unit: str) -> str:
-    """Return a field of a device: levels of inputs and outputs as bits."""
+    """Return the value of a device's field: levels of inputs and outputs as bits."""
     if name in ("inputs", "outputs"):
-        return f"{name} {_bits(value)}"
+        return _bits(int(value))
     number = f"{value:.6g}" if isinstance(value, float) else str(value)
-    return f"{name} {number} {unit}".rstrip()
+    return f"{number} {unit}".rstrip()
 
 
 def _frames(status: Json) -> Text:

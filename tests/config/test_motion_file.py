@@ -73,7 +73,7 @@ YAML = [
     ("trajectory:\n  - {t: 0, q: [.inf]}\n", "motion.yaml:2: trajectory[0].q[0]: "),
     ("trajectory:\n  - {t: 0, q: [fast]}\n", "motion.yaml:2: trajectory[0].q[0]: "),
     ("trajectory:\n  - {t: 0, q: []}\n", "motion.yaml:2: trajectory[0].q: "),
-    ("trajectory:\n  - {t: 0, q: [0, 0, 0, 0, 0, 0, 0]}\n", "motion.yaml:2: trajectory[0].q: "),
+    ("trajectory:\n  - {t: 0, q: [0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]}\n", "motion.yaml:2: trajectory[0].q: "),
     (
         "trajectory:\n" + POINT + "  - {t: 2, q: [0, 0]}\n  - {t: 1, q: [0, 0]}\n",
         "motion.yaml:4: trajectory[2].t: found 1 after 2; times must rise",

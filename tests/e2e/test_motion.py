@@ -214,7 +214,7 @@ def test_the_joystick_moves_the_arm_and_silence_releases_it(bent: Platform, clie
     assert moved["state"] == "moving"
     assert tool(moved)[0] < start[0] - 0.03
     found = bent.until(lambda found: found["state"] == "holding", "rest after the last word")
-    assert found["inputs"] & 0xFF == 63
+    assert found["devices"]["io"]["inputs"]["value"] & 0xFF == 63
 
 
 def test_an_emergency_stop_by_the_virtual_button_ends_a_move(bent: Platform) -> None:
@@ -248,7 +248,9 @@ def test_limits_are_narrowed_shown_and_kept_to(bent: Platform) -> None:
 def test_the_gripper_switches_its_output(bent: Platform) -> None:
     for word, on in (("close", True), ("open", False)):
         bent.call("move_gripper", open=word == "open")
-        bent.until(lambda found, on=on: bool(found["outputs"] >> 3 & 1) is on, f"gripper to {word}")
+        bent.until(
+            lambda found, on=on: bool(found["devices"]["io"]["outputs"]["value"] >> 3 & 1) is on, f"gripper to {word}"
+        )
 
 
 def test_a_joint_is_homed_and_holds_again(bent: Platform) -> None:
@@ -261,7 +263,7 @@ def test_a_joystick_is_released_by_the_box_itself_when_the_gateway_is_killed(run
 
     def shows(byte: int) -> bool:
         latest = observer.latest()
-        return latest is not None and int(latest[0]["inputs"]) & 0xFF == byte
+        return latest is not None and int(latest[0]["io_inputs"]) & 0xFF == byte
 
     with ControlClient("a test", control_socket(running.directory)) as client:
         client.call("joystick", {"byte": 62, "hold_s": 1.0})

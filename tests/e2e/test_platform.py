@@ -45,8 +45,8 @@ def test_every_slave_is_in_op_and_the_clock_is_followed(shared: Platform) -> Non
 
 def test_the_status_has_every_promised_field(shared: Platform) -> None:
     status = shared.status()
-    assert {"state", "drive_mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "inputs",
-            "outputs", "wakeup_us", "exchange_us", "compute_us", "dc", "last_second", "realtime",
+    assert {"state", "drive_mode", "bus", "cycle_ns", "cycles", "missed", "wkc", "slaves", "joints", "devices",
+            "wakeup_us", "exchange_us", "compute_us", "dc", "last_second", "realtime",
             "pids"} <= set(status)  # fmt: skip
     assert {"position", "name", "state"} <= set(status["slaves"][0])
     assert all(
@@ -57,7 +57,7 @@ def test_the_status_has_every_promised_field(shared: Platform) -> None:
     assert {"locked", "offset_ns"} <= set(status["dc"])
     assert {"scheduler", "memory_locked", "cpu"} <= set(status["realtime"])
     assert set(status["pids"]) == {"loop", "gateway", "segment"}
-    assert status["inputs"] & 0xFF == 63
+    assert status["devices"]["io"]["inputs"]["value"] & 0xFF == 63
 
 
 def test_the_mapping_that_was_written_is_read_back_over_sdo(shared: Platform) -> None:

@@ -118,11 +118,11 @@ def test_what_holds_a_jog_back_is_shown_while_the_pad_is_held(page: Page, holdin
 def test_the_gripper_is_opened_and_closed_by_its_buttons_and_keys(page: Page, holding: Platform) -> None:
     show(page, "/jog")
     page.get_by_role("button", name="Close gripper").click()
-    holding.until(lambda found: found["outputs"] & GRIPPER, "closed")
+    holding.until(lambda found: found["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
     expect(page.get_by_text("The gripper has closed")).to_be_visible()
     page.locator(".jog-area").focus()
     page.keyboard.press("o")
-    holding.until(lambda found: not found["outputs"] & GRIPPER, "open")
+    holding.until(lambda found: not found["devices"]["io"]["outputs"]["value"] & GRIPPER, "open")
 
 
 def test_a_key_ends_its_jog_also_where_its_letter_has_changed(page: Page, holding: Platform, feed: Feed) -> None:
@@ -174,7 +174,7 @@ def test_a_gamepad_jogs_while_its_shoulder_button_is_held(
         # The gripper ends the jog, which does not begin again by itself.
         now = time.monotonic_ns()
         page.evaluate("pad.buttons[0].pressed = true")
-        holding.until(lambda found: found["outputs"] & GRIPPER, "closed")
+        holding.until(lambda found: found["devices"]["io"]["outputs"]["value"] & GRIPPER, "closed")
         assert moved_after(holding, feed, now) < JOG_S + SLACK_S
         page.evaluate("pad.buttons[0].pressed = pad.buttons[4].pressed = false")
         page.wait_for_timeout(200)
@@ -375,7 +375,7 @@ def test_a_viewer_looks_and_stops_and_commands_nothing(browser: Browser, holding
             assert holding.events(since) == []
             assert holding.call("limits") == limits
             assert holding.call("record_status")["recordings"] == []
-            assert not found["outputs"] & GRIPPER
+            assert not found["devices"]["io"]["outputs"]["value"] & GRIPPER
             records, _ = feed.records()
             assert np.ptp(records["commanded_position"], axis=0).max() < 1e-9
             holding.background("move", "1.5", *map(str, BENT[1:]), "--speed", "0.1")
