@@ -26,6 +26,7 @@ _FILES: dict[str, tuple[type, str]] = {
     "arm": (model.ArmFile, ""),
     "device": (model.DeviceDescription, ""),
     "segment": (segment.SegmentSlave, "slaves[]."),
+    "motion": (model.MotionFile, ""),
 }
 
 

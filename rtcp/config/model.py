@@ -628,30 +628,35 @@ _Coordinates = Annotated[tuple[Angle, ...], MinLen(6), MaxLen(6)]
 
 @dataclass(frozen=True)
 class Point:
-    """A point of a trajectory: time, s, and position, rad; velocity, rad/s, and acceleration, rad/s², if given."""
+    """A point of a trajectory."""
 
     t: NotNegative
+    """Time, s; it rises from point to point."""
     q: _Numbers
+    """Joint positions from base to tool, rad."""
     v: _Numbers | None = None
+    """Joint velocities, rad/s; for all points or for none."""
     a: _Numbers | None = None
+    """Joint accelerations, rad/s²; only with `v`, for all points or for none."""
 
 
 @dataclass(frozen=True)
 class Stop:
-    """The end of a straight line: a pose (x, y, z, rx, ry, rz; m and rad) or the joints that have it; speed, m/s.
-
-    `speed` None: that of the whole path.
-    """
+    """The end of a straight line; it has either `pose` or `q`."""
 
     pose: _Coordinates | None = None
+    """x, y, z, rx, ry, rz of the tool, m and rad."""
     q: _Coordinates | None = None
+    """Joint positions that have the pose, rad."""
     speed: Positive | None = None
+    """Speed of the tool on the line to it, m/s; None: that of the whole path."""
 
 
 @dataclass(frozen=True)
 class MotionFile:
-    """A motion: either `trajectory` or `path` has entries. speed: m/s, of a path; None: the configuration's."""
+    """A motion: either `trajectory` or `path` has entries."""
 
     trajectory: Annotated[tuple[Point, ...], MaxLen(MOST_POINTS)] = ()
     path: Annotated[tuple[Stop, ...], MaxLen(MOST_POINTS)] = ()
     speed: Positive | None = None
+    """Speed of the tool on a path, m/s; None: `cartesian.speed` of the arm's file."""

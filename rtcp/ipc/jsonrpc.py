@@ -1,7 +1,7 @@
 """JSON-RPC 2.0 as the control socket speaks it: one message a line (`docs/protocol.md`); both ends use this file.
 
 No library: those on PyPI bring HTTP or Content-Length framing, or answer a request only when it is complete, while a
-motion reports its progress before (`docs/dependencies.md`).
+motion reports its progress before.
 """
 
 from __future__ import annotations

@@ -168,7 +168,7 @@ def test_what_the_host_refuses_is_one_line_that_names_the_doctor(platform: Any, 
     before, _, line = rtcp("status").out.partition("host ")
     platform.status["realtime"]["notes"], platform.status["skipped_ticks"] = [], None
     assert "host" not in (healthy := rtcp("status").out)
-    assert line.splitlines()[0] == "      3 settings refused, 3.1 % of the ticks skipped: see `rtcp doctor`"
+    assert line.splitlines()[0].strip() == "3 settings refused, 3.1 % of the ticks skipped: see `rtcp doctor`"
     assert (before + line).count("\n") == healthy.count("\n") + 1
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from docs.generate import FOLDER, generated, keys_of
-from rtcp.config.model import ArmFile, DeviceDescription
+from rtcp.config.model import ArmFile, DeviceDescription, MotionFile
 from rtcp.config.segment import SegmentSlave
 
 PAGES = sorted(FOLDER.glob("*.md"))
@@ -17,6 +17,7 @@ KEYS = {
     "arm": list(keys_of(ArmFile)),
     "device": list(keys_of(DeviceDescription)),
     "segment": list(keys_of(SegmentSlave, "slaves[].")),
+    "motion": list(keys_of(MotionFile)),
 }
 UNITS = r"\b(m|rad)(/s[²³]?)?\b|\bNm\b|\bkg\b|\b1/s\b|, (s|ms|us|ns)\b|parts per million"
 WITHOUT_UNIT = r"[Ff]raction|[Mm]ultiple|Factor|per count|Value to write"
@@ -31,7 +32,10 @@ def test_the_generated_parts_of_a_page_are_up_to_date(page: Path) -> None:
 @pytest.mark.parametrize("file", KEYS)
 def test_every_key_of_a_file_is_on_exactly_one_page(file: str) -> None:
     arm = "".join((FOLDER / name).read_text() for name in OWN[:4])
-    text = {"arm": arm, "device": (FOLDER / "devices.md").read_text(), "segment": (FOLDER / "segment.md").read_text()}
+    text = {"arm": arm} | {
+        kind: (FOLDER / page).read_text()
+        for kind, page in (("device", "devices.md"), ("segment", "segment.md"), ("motion", "motion.md"))
+    }
     written = re.findall(r"^\| `([\w.\[\]]+)` \|.*\|.*\|.*\|$", text[file], re.MULTILINE)
     assert sorted(set(written) & {key.path for key in KEYS[file]}) == sorted(key.path for key in KEYS[file])
     assert len(set(written)) == len(written)
@@ -42,6 +46,15 @@ def test_every_key_has_a_meaning_and_every_number_its_unit() -> None:
     numbers = [key for key in found if key.allowed.startswith(("a number", "a list of 3 numbers"))]
     assert [key.path for key in found if not key.meaning] == []
     assert [key.path for key in numbers if not re.search(f"{UNITS}|{WITHOUT_UNIT}", key.meaning)] == []
+
+
+def test_the_readme_leads_to_the_pages_for_programmers_and_no_link_is_dead() -> None:
+    readme, pages = FOLDER.parent / "README.md", (FOLDER / name for name in ("first_program.md", "motion.md", "api.md"))
+    for page in (readme, *pages):
+        links = re.findall(r"\]\(([^)#:]+)[)#]", page.read_text())
+        assert [link for link in links if not (page.parent / link).exists()] == []
+    wanted = {"first_program", "api", "extending", "segment", "motion"}
+    assert wanted <= set(re.findall(r"\]\(docs/(\w+)\.md", readme.read_text()))
 
 
 @pytest.mark.parametrize("name", OWN)
