@@ -87,7 +87,6 @@ REACHED: dict[TargetState, frozenset[DriveState]] = {
     TargetState.RESET: frozenset({_S.SWITCH_ON_DISABLED}),
 }
 
-_TARGET_STANDS = (ENABLE_OPERATION, QUICK_STOP)
 STATE_BITS = 0x6F
 """Bits of the statusword that tell the state."""
 _STATE_OF = tuple(
@@ -100,7 +99,6 @@ _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque"
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
-_WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
 _WINDOW_S = 0.02
 """Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
@@ -131,7 +129,7 @@ class Cia402Drive(Driver):
     Args:
         slave: the slave's name and description.
         period_s: the cycle, s.
-        speed_limit: what the drive is given as its speed limit in CSP, rad/s.
+        speed_limit: what the drive is given as its speed limit in CSP, rad/s; `limit_speed` changes it.
         zero: what the drive shows where the joint is at 0, rad.
 
     Raises:
@@ -147,6 +145,8 @@ class Cia402Drive(Driver):
         targets = [None if slot < 0 else self.rpdo.channels[slot] for slot in self._out[1:4]]
         if any(channel is not None and channel.factor == 0 for channel in targets):
             raise DeviceError(f"{self.device}: a factor of 0 in `rpdo` is not allowed")
+        for slot in (self._in[0], self._in[4]):
+            integer_range(self.tpdo.channels[slot])  # statusword and mode: raises where one is no integer
         self._limits = tuple((0, 0) if channel is None else integer_range(channel) for channel in targets)
         self._scales = tuple(0.0 if channel is None else 1.0 / channel.factor for channel in targets)
         self._in_factors = tuple(0.0 if slot < 0 else self.tpdo.channels[slot].factor for slot in self._in[1:4])
@@ -159,7 +159,7 @@ class Cia402Drive(Driver):
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.controlword = DISABLE_VOLTAGE
         self.mode = CSP
-        self.speed_limit = speed_limit
+        self.limit_speed(speed_limit)
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
         self._was_enabled = False
@@ -171,6 +171,11 @@ class Cia402Drive(Driver):
         """Whether the process data has what a mode (CSP, CSV, CST) needs."""
         outputs, inputs = _NEEDED[mode]
         return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
+
+    def limit_speed(self, speed: float) -> None:
+        """Give the drive `speed`, rad/s, as its speed limit in CSP."""
+        self.speed_limit = speed
+        self._limit_counts = self._counts(speed * self._scales[1], 1, 0)
 
     @property
     def zero(self) -> float:
@@ -189,18 +194,20 @@ class Cia402Drive(Driver):
         values = self._unpack(data)
         status, position, velocity, torque, mode = self._in
         by_position, by_velocity, by_torque = self._in_factors
-        self.statusword = word = int(values[status])
+        word: int = values[status]
+        if word != self.statusword:
+            self.statusword = word
+            self.state = _STATE_OF[word & STATE_BITS]
         shown = values[position] * by_position
-        self.position = shown - self._zero
+        self.position = here = shown - self._zero
         self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
         if torque >= 0:
             self.torque = values[torque] * by_torque
-        self.mode_display = int(values[mode])
-        self.state = _STATE_OF[word & STATE_BITS]
+        self.mode_display = values[mode]
         if self._temperature_slot >= 0:
             self.temperature = values[self._temperature_slot] * self.tpdo.channels[self._temperature_slot].factor
-        if self.controlword not in _TARGET_STANDS:
-            self.target_position = self.position
+        if self.controlword != ENABLE_OPERATION and self.controlword != QUICK_STOP:
+            self.target_position = here
 
     def _measured_velocity(self, shown: float) -> float:
         past = self._past
@@ -248,18 +255,20 @@ class Cia402Drive(Driver):
         fields = self._fields
         control, position, velocity, torque, mode = self._out
         by_position, by_velocity, by_torque = self._scales
-        fields[control] = self.controlword
+        fields[control] = word = self.controlword
         fields[mode] = commanded = self.mode
         counts = (self.target_position + self._zero) * by_position
         low, high = self._limits[0]
         fields[position] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[position])
         speed = effort = 0
-        if self.controlword == ENABLE_OPERATION and self.state is _ENABLED:
+        if word == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
-            elif commanded == self.mode_display and commanded in _WITH_SPEED:
-                wanted = self.speed_limit if commanded == CSP else self.target_velocity
-                speed = self._counts(wanted * by_velocity, 1, fields[velocity])
+            elif commanded == self.mode_display:
+                if commanded == CSP:
+                    speed = self._limit_counts
+                elif commanded == CSV:
+                    speed = self._counts(self.target_velocity * by_velocity, 1, fields[velocity])
         if velocity >= 0:
             fields[velocity] = speed
         if torque >= 0:
@@ -287,6 +296,6 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Cia402D
     drive = make_driver(slave, config.cycle.period_us * 1e-6)
     if not isinstance(drive, Cia402Drive):
         raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
-    drive.speed_limit = joint.velocity
+    drive.limit_speed(joint.velocity)
     drive.zero = zero
     return slot, drive

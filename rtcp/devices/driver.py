@@ -154,7 +154,7 @@ def driver_of(kind: str, device: str = "") -> type[Driver]:
 class Codec:
     """Packs and unpacks an image; values stand in the order of the channels, padding included."""
 
-    unpack: Callable[[bytes], tuple[Number, ...]]
+    unpack: Callable[[bytes], tuple[Any, ...]]
     pack: Callable[..., bytes]
 
 

@@ -135,6 +135,8 @@ class Switch:
         if not self._bit:
             return
         seen = bool(levels & self._bit) is not self._inverted
+        if seen is self._candidate and self._stable > self._debounce:
+            return
         if seen is not self._candidate:
             self._candidate = seen
             self._stable = 0
@@ -247,6 +249,8 @@ class JoystickInput:
         if not self._lines:
             return
         seen = levels & self._checked
+        if seen == self._candidate and self._stable > self._debounce:
+            return
         if seen != self._candidate:
             self._candidate = seen
             self._stable = 0

@@ -72,6 +72,8 @@ class OutputLimiter:
                 wanted = high if wanted > high else low if wanted < low else min(max(before, low), high)
             sent[i] = drive.target_position = wanted
             speed = drive.target_velocity
+            if speed == 0.0 == drive.target_torque and velocity[i] == 0.0:
+                continue  # as in CSP: zero is inside every bound, and changes nothing
             bound = fastest[i]
             if not (-bound <= speed <= bound):
                 held |= 1 << i

@@ -23,9 +23,12 @@ class Supervision:
         self._speed, self._torque, self._error = bounds.speed, bounds.torque, bounds.following_error
         self._joints = range(n)
         self._counts = [[0] * n, [0] * n, [0] * n]
+        self._counted = False
+        """Whether a count is not 0."""
 
     def reset(self) -> None:
         """Begin to count anew."""
+        self._counted = False
         for counts in self._counts:
             for i in self._joints:
                 counts[i] = 0
@@ -37,6 +40,19 @@ class Supervision:
         fastest, strongest = limits.velocity, limits.torque
         actual, commanded = state.actual, state.commanded
         actual_velocity, actual_torque = state.actual_velocity, state.actual_torque
+        if not self._counted:
+            for i in self._joints:
+                # What is no number is inside nothing.
+                if not (
+                    -speed * fastest[i] <= actual_velocity[i] <= speed * fastest[i]
+                    and -torque * strongest[i] <= actual_torque[i] <= torque * strongest[i]
+                    and -error <= actual[i] - commanded[i] <= error
+                ):
+                    self._counted = True
+                    break
+            else:
+                return None
+        counted = False
         for i in self._joints:
             bound = speed * fastest[i]
             value = actual_velocity[i]
@@ -44,6 +60,7 @@ class Supervision:
                 speeds[i] = 0
             else:
                 speeds[i] += 1
+                counted = True
                 if speeds[i] >= cycles:
                     return OverSpeed(i, value, bound)
             bound = torque * strongest[i]
@@ -52,6 +69,7 @@ class Supervision:
                 torques[i] = 0
             else:
                 torques[i] += 1
+                counted = True
                 if torques[i] >= cycles:
                     return OverTorque(i, value, bound)
             value = actual[i] - commanded[i]
@@ -59,6 +77,8 @@ class Supervision:
                 errors[i] = 0
             else:
                 errors[i] += 1
+                counted = True
                 if errors[i] >= cycles:
                     return FollowingError(i, value, error)
+        self._counted = counted
         return None

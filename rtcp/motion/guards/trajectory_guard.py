@@ -70,6 +70,8 @@ class TrajectoryGuard:
         """No watched point is nearer to a boundary, m; 0: not known."""
         self._poses_then: Sequence[Pose] | None = None
         self._box, self._keep_out = limits.box, limits.keep_out
+        self._rests = False
+        """Whether the last setpoint was at rest where the arm is commanded, and no guard held it."""
         self.stopping = False
         self.held = 0
         self.ended: MotionEnded | None = None
@@ -86,7 +88,7 @@ class TrajectoryGuard:
         """Begin at rest where `state` is."""
         for i in self._joints:
             self._mean[i] = state.commanded_velocity[i] = state.commanded_acceleration[i] = 0.0
-        self.stopping = False
+        self.stopping = self._rests = False
         self.held = 0
         self._state = state
         self._poses, self._room = None, 0.0
@@ -139,8 +141,13 @@ class TrajectoryGuard:
         """
         self._state = state
         if self.stopping:
+            self._rests = False
             return self._brake(state)
         wanted = target.position
+        if wanted is not state.commanded:
+            self._rests = False
+        elif self._rests:
+            return GuardResult.PASS  # a controller that holds hands back the state itself
         self.held = held = self._bound(state, wanted)
         position, mean, last, dt = self._position, self._next, self._mean, self._dt
         if held:
@@ -165,7 +172,10 @@ class TrajectoryGuard:
             velocity[i] = speed
             here[i] = wanted[i]
             last[i] = w
-        return GuardResult.CLAMPED if held else GuardResult.PASS
+        if held:
+            return GuardResult.CLAMPED
+        self._rests = wanted is here and not (any(last) or any(velocity) or any(acceleration))
+        return GuardResult.PASS
 
     def _bound(self, state: ArmState, wanted: Sequence[float]) -> int:
         """Put the allowed mean speeds into `_next`; return the mask of the joints whose target was cut."""
