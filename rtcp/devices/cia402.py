@@ -206,7 +206,7 @@ class Cia402Drive(Driver):
         self.mode_display = values[mode]
         if self._temperature_slot >= 0:
             self.temperature = values[self._temperature_slot] * self.tpdo.channels[self._temperature_slot].factor
-        if self.controlword != ENABLE_OPERATION and self.controlword != QUICK_STOP:
+        if self.controlword not in (ENABLE_OPERATION, QUICK_STOP):
             self.target_position = here
 
     def _measured_velocity(self, shown: float) -> float:
