@@ -103,13 +103,12 @@ class Arm(Part):
         """Read the inputs of the drives."""
         state = self.state
         actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
-        axis, read = 0, data.input
-        for slot, drive in self.pairs:
+        read = data.input
+        for axis, (slot, drive) in enumerate(self.pairs):
             drive.decode(read(slot))
             actual[axis] = drive.position
             speed[axis] = drive.velocity
             torque[axis] = drive.torque
-            axis += 1
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the drives."""
