@@ -128,11 +128,10 @@ class Arm(Part):
         n, at = len(self.drives), at + len(ARM_MODES)
         values[at : at + 4 * n] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)
         at += 4 * n
+        end = at + 4 * n
         for drive in self.drives:
-            values[at] = drive.target_position
-            values[at + n] = drive.target_velocity
-            values[at + 2 * n] = drive.target_torque
-            values[at + 3 * n] = drive.statusword
+            sent = drive.target_position, drive.target_velocity, drive.target_torque, drive.statusword
+            values[at:end:n] = sent
             at += 1
 
     def advance(self, target: TargetState) -> None:

@@ -99,6 +99,7 @@ _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque"
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
 CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
+_WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
 _WINDOW_S = 0.02
 """Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
@@ -129,7 +130,7 @@ class Cia402Drive(Driver):
     Args:
         slave: the slave's name and description.
         period_s: the cycle, s.
-        speed_limit: what the drive is given as its speed limit in CSP, rad/s; `limit_speed` changes it.
+        speed_limit: what the drive is given as its speed limit in CSP, rad/s; fixed once it is enabled.
         zero: what the drive shows where the joint is at 0, rad.
 
     Raises:
@@ -159,9 +160,10 @@ class Cia402Drive(Driver):
         self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.controlword = DISABLE_VOLTAGE
         self.mode = CSP
-        self.limit_speed(speed_limit)
+        self.speed_limit = speed_limit
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
+        self._sent_mode, self._sent_word, self._followed = 0, -1, False
         self._was_enabled = False
         self._reset_calls = 0
         self._past: list[float] = []
@@ -171,11 +173,6 @@ class Cia402Drive(Driver):
         """Whether the process data has what a mode (CSP, CSV, CST) needs."""
         outputs, inputs = _NEEDED[mode]
         return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
-
-    def limit_speed(self, speed: float) -> None:
-        """Give the drive `speed`, rad/s, as its speed limit in CSP."""
-        self.speed_limit = speed
-        self._limit_counts = self._counts(speed * self._scales[1], 1, 0)
 
     @property
     def zero(self) -> float:
@@ -252,28 +249,33 @@ class Cia402Drive(Driver):
         limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
         A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.
         """
-        fields = self._fields
-        control, position, velocity, torque, mode = self._out
-        by_position, by_velocity, by_torque = self._scales
-        fields[control] = word = self.controlword
-        fields[mode] = commanded = self.mode
-        counts = (self.target_position + self._zero) * by_position
+        fields, word, commanded, at = self._fields, self.controlword, self.mode, self._out[1]
+        counts = (self.target_position + self._zero) * self._scales[0]
         low, high = self._limits[0]
-        fields[position] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[position])
+        fields[at] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[at])
+        follows = self.state is _ENABLED and self.mode_display == commanded
+        # In CSP nothing but the position changes while the drive follows it.
+        if commanded != CSP or commanded != self._sent_mode or word != self._sent_word or follows is not self._followed:
+            self._sent_mode, self._sent_word, self._followed = commanded, word, follows
+            self._fill(fields, word, commanded)
+        return self._pack(*fields)
+
+    def _fill(self, fields: list[int], word: int, commanded: int) -> None:
+        """Fill in all outputs but the position."""
+        control, _, velocity, torque, mode = self._out
+        _, by_velocity, by_torque = self._scales
+        fields[control], fields[mode] = word, commanded
         speed = effort = 0
         if word == ENABLE_OPERATION and self.state is _ENABLED:
             if commanded == CST:
                 effort = self._counts(self.target_torque * by_torque, 2, fields[torque])
-            elif commanded == self.mode_display:
-                if commanded == CSP:
-                    speed = self._limit_counts
-                elif commanded == CSV:
-                    speed = self._counts(self.target_velocity * by_velocity, 1, fields[velocity])
+            elif commanded == self.mode_display and commanded in _WITH_SPEED:
+                wanted = self.speed_limit if commanded == CSP else self.target_velocity
+                speed = self._counts(wanted * by_velocity, 1, fields[velocity])
         if velocity >= 0:
             fields[velocity] = speed
         if torque >= 0:
             fields[torque] = effort
-        return self._pack(*fields)
 
     def _counts(self, value: float, which: int, last: int) -> int:
         low, high = self._limits[which]
@@ -296,6 +298,6 @@ def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Cia402D
     drive = make_driver(slave, config.cycle.period_us * 1e-6)
     if not isinstance(drive, Cia402Drive):
         raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
-    drive.limit_speed(joint.velocity)
+    drive.speed_limit = joint.velocity
     drive.zero = zero
     return slot, drive
