@@ -316,8 +316,11 @@ def _outputs(arm: ArmFile) -> Terminals:
 
 def _repeated_by_box(terminals: Terminals, what: str) -> Iterator[Finding]:
     boxes: dict[str | None, list[Place]] = {}
-    for _, user, places in terminals:
-        boxes.setdefault(user.box, []).extend(places)
+    users = [(user, places) for _, user, places in terminals]
+    named = {user.box for user, _ in users} - {None}
+    only = next(iter(named)) if len(named) == 1 else None  # what names no box hangs on the only one
+    for user, places in users:
+        boxes.setdefault(user.box or only, []).extend(places)
     for of_box in boxes.values():
         yield from _repeated(of_box, what)
 

@@ -98,7 +98,7 @@ class JoystickOverride:
             repeats = time.monotonic() - self._repeated > _REPEAT_S
             for box in self._boxes:
                 mask, levels = inputs.get(box, (0, 0))
-                if mask and repeats:
+                if mask and (repeats or not self._written.get((box, MASK))):
                     await self._write_object(box, HOLD, _BOX_HOLD_MS)
                     self._repeated = time.monotonic()
                 # Levels first, so that no input takes one that nobody asked for; but none is released late.

@@ -22,7 +22,6 @@ _BINS = 4096
 """More than a picture has pixels across."""
 _MARKS = 30
 _STATES = {int(state): state.words for state in State}
-_UNITS = {"position": "rad", "error": "rad", "velocity": "rad/s", "torque": "Nm", "ns": "ns", "s": "s"}
 
 
 class Envelope:
@@ -127,7 +126,7 @@ def _draw(
         for at, column in enumerate(values.T):
             label = joints[at] if len(joints) == values.shape[1] > 1 else None
             axes.plot(times + begin_s, column, color=COLOURS[at % len(COLOURS)], lw=0.9, label=label)
-        unit = _UNITS.get(name.rpartition("_")[2], "")
+        unit = "rad" if name == FOLLOWING_ERROR else reader.schema[name].unit
         axes.set_ylabel(name.removesuffix(f"_{unit}").replace("_", " ") + (f"\n{unit}" if unit else ""))
         axes.grid(alpha=0.25)
         axes.margins(x=0.0)

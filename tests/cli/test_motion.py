@@ -108,10 +108,10 @@ def test_an_unknown_word_is_refused_with_the_known_ones(
 
 def test_an_output_is_switched_by_number(platform: Any, rtcp: Callable[..., Any]) -> None:
     assert rtcp("output", "3", "on").code == 0
-    assert rtcp("output", "4", "OFF").code == 0
+    assert rtcp("output", "4", "OFF", "--box", "desk").code == 0
     assert platform.asked("set_output") == [
         {"output": 3, "value": True, "box": None},
-        {"output": 4, "value": False, "box": None},
+        {"output": 4, "value": False, "box": "desk"},
     ]
 
 

@@ -30,6 +30,12 @@ FINGER = (
 DRIVEN = f"gripper: {{joint: {FINGER}, open_position: 1.4, closed_position: 0.0}}"
 SIXTH = "  - {name: drive6, device: cubemars-orh}\n"
 
+ON_IO = [("joystick: {", "joystick: {box: io, "), ("arm_toggle: {", "arm_toggle: {box: io, "),
+         ("emergency_stop: {number", "emergency_stop: {box: io, number"), ("outputs:\n", "outputs:\n  box: io\n"),
+         ("gripper: {", "gripper: {box: io, ")]  # fmt: skip
+DESK = (SIXTH, SIXTH + "  - {name: desk, device: diewu-io}\n")
+TWO_BOXES = [DESK, *ON_IO]
+
 Changes = list[tuple[str, str]]
 
 
@@ -163,6 +169,16 @@ MISTAKES: list[tuple[str, Changes, str]] = [
      "gripper.output: found 2, the output of outputs.motion_lamp; each needs its own"),
     (ARM, [("  - {name: io, device: diewu-io}\n", "")],
      "inputs.emergency_stop.number: found input 10, but no slave is of kind io; leave it out for such an arm"),
+    (ARM, [DESK, *ON_IO[1:]],
+     "inputs.joystick.box: the key is missing; with several IO boxes it must be one of io, desk"),
+    (ARM, [DESK, *ON_IO[:3], ON_IO[4]],
+     "outputs.box: the key is missing; with several IO boxes it must be one of io, desk"),
+    (ARM, [*TWO_BOXES, ("gripper: {box: io", "gripper: {box: drive1")],
+     'gripper.box: found the text "drive1", which is no IO box; allowed is io, desk'),
+    (ARM, [*TWO_BOXES, ("emergency_stop: {box: io, number: 10", "emergency_stop: {box: io, number: 1")],
+     "inputs.emergency_stop.number: found 1, the input of inputs.joystick.forward; each needs its own"),
+    (ARM, [ON_IO[2], ("number: 10", "number: 1")],
+     "inputs.emergency_stop.number: found 1, the input of inputs.joystick.forward; each needs its own"),
     (ARM, [("lost_frames: quick_stop", "lost_frames: controlled_stop")],
      'stops.lost_frames: found the text "controlled_stop", allowed is one of quick_stop, torque_off'),
     (ARM, [("lease_ended: controlled_stop", "lease_ended: hold")],

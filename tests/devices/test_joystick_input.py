@@ -57,6 +57,17 @@ def test_of_the_256_bytes_only_those_of_the_table_are_codes():
     assert valid == set(TABLE)
 
 
+@pytest.mark.parametrize(
+    ("of_stick", "of_switch", "is_here"), [(None, "io", True), ("io", None, True), ("io", "desk", False)]
+)
+def test_a_switch_in_the_joysticks_byte_is_no_part_of_the_code_unless_it_is_at_another_box(
+    of_stick, of_switch, is_here
+):
+    switch, joystick = InputConfig(7, box=of_switch), JoystickConfig(debounce_ms=0.0, box=of_stick)
+    stick = held(JoystickInput(InputsConfig(joystick=joystick, arm_toggle=switch), CYCLE), NEUTRAL | 1 << 6, 1)
+    assert stick.valid is is_here
+
+
 @pytest.mark.parametrize("code", [60, 51, 15, 46, 0, 255, 127], ids=lambda code: f"code {code}")
 def test_contradictory_lines_and_strange_ones_are_no_code(code):
     stick = held(stick_of(), 62, 3)

@@ -12,6 +12,7 @@ from rtcp.gateway.joystick_override import forced
 from rtcp.ipc.errors import Refused, RtcpError
 from rtcp.ipc.states import State
 from tests.gateway.fake_platform import FakePlatform, fake_platform
+from tests.two_boxes import two_boxes
 
 Q = [0.0] * 6
 MASK, LEVELS = (0x2000, 1), (0x2000, 2)
@@ -44,6 +45,25 @@ def test_toggle_and_emergency_stop_are_forced_to_the_level_that_means_them() -> 
     config = load(default_config())
     assert forced(config, ["chair"], 63) == {"io": (0x1FF, 63)}
     assert forced(config, ["emergency_stop"], 63) == {"io": (0x2FF, 63)}
+
+
+def test_each_of_two_boxes_is_forced_and_released(tmp_path: Path) -> None:
+    config = load(two_boxes(tmp_path / "config"))
+    assert forced(config, ["left", "enabling_switch"], None) == {"io": (0x3F, 59), "desk": (1, 1)}
+    with fake_platform(tmp_path, Q, config=config) as arm:
+
+        async def force() -> None:
+            await arm.call("joystick", {"byte": 62})
+            await arm.call("joystick", {"pressed": ["enabling_switch"], "byte": 62})
+            await arm.call("joystick", {"byte": None})
+
+        arm.run(force)
+        requests = [(one["slave"], one["subindex"], int(one["hex"][:2], 16)) for one in arm.loop.requests]
+        io, desk = 1, 8
+        assert [one for one in requests if one[1] != 3] == [
+            (io, 2, 62), (io, 1, 0xFF), (desk, 1, 0), (desk, 2, 1), (desk, 1, 1), (io, 1, 0), (desk, 1, 0),
+        ]  # fmt: skip
+        assert [one[0] for one in requests if one[1] == 3] == [io, desk], "each is told when to release by itself"
 
 
 @pytest.mark.parametrize(

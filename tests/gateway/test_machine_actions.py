@@ -28,6 +28,7 @@ from rtcp.ipc.layout import EVENTS
 from rtcp.ipc.refusals import GripperDisabled, Refusal, TorquePresent, WrongState
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from tests.gateway.fake_platform import FakePlatform, fake_platform
+from tests.two_boxes import two_boxes
 
 Q = [0.25, 0.2, 1.0, 0.0, 0.4, 0.0]
 AXIS = 6
@@ -93,6 +94,15 @@ def test_a_wrong_parameter_is_named_and_nothing_is_commanded(
     assert message in str(error)
     assert arm.loop.commands == []
     assert arm.loop.requests == []
+
+
+def test_an_output_of_two_boxes_is_switched_at_the_named_one(tmp_path: Path) -> None:
+    with fake_platform(tmp_path, Q, config=load(two_boxes(tmp_path / "config"))) as arm:
+        arm.ask("set_output", output=3, value=True, box="desk")
+        for box, found in ({}, "the key is missing"), ({"box": "shelf"}, 'found the text "shelf"'):
+            error = arm.error("set_output", output=3, value=True, **box)
+            assert (error.kind, str(error)) == ("invalid", f"box: {found}, allowed is one of io, desk")
+        assert arm.loop.commands == [SetOutput(3, True, 1)]
 
 
 def test_objects_are_read_at_any_time_and_written_in_state_ready_only(arm: FakePlatform) -> None:

@@ -15,7 +15,7 @@ from rtcp.ipc.events import OverSpeed
 from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, RECORDS, records_for
 from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
 from rtcp.ipc.refusals import Malformed, PositionOutOfRange
-from rtcp.ipc.schema import PER_JOINT, arm_schema
+from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.states import DriveMode
 from tests.records import numbers
 
@@ -47,6 +47,17 @@ def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observe
     assert list(latest[0]["actual_position"]) == [0.1 * i for i in range(JOINTS)]
     assert list(latest[0]["sent_position"]) == [0.1 * i for i in range(4 * JOINTS, 5 * JOINTS)]
     assert list(latest[0]["statusword"]) == list(range(100, 100 + JOINTS))
+
+
+def test_an_observer_reads_any_schema_and_what_it_means(path: Path) -> None:
+    field = Field("kiln_zones", "float32", "K", "Of the kiln, lid first.", (3,), "kiln")
+    board = Blackboard(path, RecordSchema((SCHEMA["number"], field)), 500_000)
+    board.publish([1.0, 2.0, 3.0])
+    observer = Observer(path)
+    assert observer.schema["kiln_zones"] == field
+    assert (observer.latest() or [])[0]["kiln_zones"].tolist() == [1.0, 2.0, 3.0]
+    observer.close()
+    board.close()
 
 
 def test_before_the_first_cycle_there_is_no_record(observer: Observer) -> None:

@@ -14,7 +14,7 @@ from rtcp.telemetry.export import export
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recording_plot import Envelope, figure
 
-from .test_reading import csv, cycles, mcap
+from .test_reading import OTHER, csv, cycles, mcap, of_another_schema
 
 
 def test_mcap_of_a_span_has_the_records_numbers_times_topics_and_messages_of_the_original(tmp_path: Path) -> None:
@@ -99,6 +99,24 @@ def test_an_error_in_the_middle_leaves_nothing_half_written(tmp_path: Path, monk
     with pytest.raises(RecordingError, match="No space left on device"):
         export(Reader(path), tmp_path / "b.csv")
     assert [one.name for one in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_a_recording_of_another_schema_is_exported_and_drawn_with_its_units(tmp_path: Path) -> None:
+    path = of_another_schema(tmp_path / "a.mcap")
+    assert export(Reader(path), tmp_path / "b.csv") == export(Reader(path), tmp_path / "b.npz") == 1000
+    with open(tmp_path / "b.csv") as table:
+        assert (
+            table.readline()
+            == "Time,number,time_ns,state,kiln_kelvin,J1_pos,J2_pos,J1_kiln_zones,J2_kiln_zones,J3_kiln_zones\n"
+        )
+    again = read(tmp_path / "b.csv")
+    assert again.records["kiln_zones"][-1].tolist() == [1000.0, 2000.0, 3000.0]
+    with np.load(tmp_path / "b.npz") as found:
+        assert set(found) == {*OTHER.names, "seconds"}
+    drawn = figure(Reader(path))
+    assert [axes.get_ylabel() for axes in drawn.axes] == ["actual position\nrad"]
+    drawn = figure(Reader(path, ["kiln_*"]))
+    assert [axes.get_ylabel() for axes in drawn.axes] == ["kiln kelvin\nK", "kiln zones\nW"]
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from mcap.writer import Writer
 
 from rtcp.api.feed import Records
 from rtcp.config import default_config, load
-from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_type, write
-from rtcp.ipc.schema import PER_JOINT, arm_schema
+from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_messages, cycle_type, write
+from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.telemetry.channels import Channels, fields_of
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
@@ -57,6 +58,47 @@ def csv(path: Path, records: Records | None = None, signals: tuple[str, ...] = (
     writer.write(given, given)
     writer.close()
     return path
+
+
+OTHER = RecordSchema((
+    *(SCHEMA[name] for name in ("number", "time_ns", "state")),
+    Field("kiln_kelvin", "float32", "K", "Inside.", part="kiln"),
+    replace(SCHEMA["actual_position"], shape=(2,)), Field("kiln_zones", "float64", "W", "Heat.", (3,), "kiln"),
+))  # fmt: skip
+"""Of another version or platform: fields that nobody here knows, and few of those that are known."""
+
+
+def of_another_schema(path: Path) -> Path:
+    """A recording of 1000 such cycles without a configuration."""
+    rows = np.zeros(1000, cycle_type(OTHER))
+    rows["number"] = np.arange(1000) + 1
+    rows["time_ns"] = 7_000_000_000 + rows["number"] * PERIOD_NS
+    rows["kiln_kelvin"] = 300 + rows["number"]
+    rows["kiln_zones"] = rows["number"][:, None] * [1.0, 2.0, 3.0]
+    with open(path, "wb") as file:
+        writer = Writer(file)
+        writer.start()
+        kind = writer.register_schema("rtcp_msgs/msg/Cycle", "ros2msg", OTHER.definition())
+        channel = writer.register_channel("/cycle", "cdr", kind)
+        for row, message in zip(rows, cycle_messages(rows, rows.dtype), strict=True):
+            when = int(row["time_ns"]) + OFFSET_NS
+            writer.add_message(channel, when, message, when)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_a_recording_of_another_schema_is_read_with_all_that_it_has(tmp_path: Path) -> None:
+    path = of_another_schema(tmp_path / "a.mcap")
+    found, reader = read(path), Reader(path)
+    assert found.records.dtype.names == OTHER.names
+    assert found.records["kiln_zones"][-1].tolist() == [1000.0, 2000.0, 3000.0]
+    assert found.period_s == pytest.approx(500e-6)
+    assert len(list(reader)) >= 1
+    assert reader.schema == OTHER
+    with pytest.raises(
+        RecordingError, match="there is no signal wkc in it; it has number, time_ns, state, kiln_kelvin"
+    ):
+        read(path, ["wkc"])
 
 
 def test_a_recording_is_read_as_it_was_written(tmp_path: Path) -> None:
