@@ -228,7 +228,7 @@ class View:
             except HeldByAnother as held:
                 self._offer_to_take_over(held.holder)
             except EndedOnPurpose:
-                self.say("Stopped")
+                pass  # the header says that the arm has stopped
             except (RtcpError, OSError) as error:
                 self.warn(str(error))
             else:

@@ -3,7 +3,7 @@
 "use strict";
 window.rtcp = (() => {
   const STALE_MS = 500; // without a message for so long the page says so
-  const OLD_S = 0.1; // joint values older than this are marked
+  const OLD_S = 0.5; // joint values older than this are marked; a bar that comes and goes would move the buttons
   let socket = null, token = 0, heard = 0, state = {}, connected = false;
   const listeners = new Set(), pictures = new Set();
 
