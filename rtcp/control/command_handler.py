@@ -65,7 +65,7 @@ from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import read
 
 MOST_LIMIT_ROWS = 64
-"""Six joints and more boxes than an arm is configured with: all are checked in one cycle."""
+"""`MOST_AXES` joints and more boxes than an arm is configured with: all are checked in one cycle."""
 _LARGEST_OFFSET = 100.0
 _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})

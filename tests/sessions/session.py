@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from math import sqrt
 from random import Random
@@ -21,8 +21,10 @@ from rtcp.ipc.commands import (
     SetOutput,
     Shutdown,
 )
+from rtcp.ipc.message import PAYLOAD_SIZE
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.limits import Values
+from rtcp.motion.planning.plan import COLUMNS, KIND, POSITIONS, VELOCITIES
 from tests.sessions.actions import CONTROL_MODES, NONSENSE, SHARES, RandomActions
 from tests.sessions.driver import (
     FAULTS,
@@ -98,7 +100,7 @@ class Session(RandomActions):
             (4, self._change_mode),
             (2, lambda: self.send(SetOutput(self.or_odd(random.randrange(0, 18)), random.random() < 0.5))),
             (1, lambda: driver.send(random_command(random))),
-            (1, lambda: driver.send_raw(self._kind(), [self._number() for _ in range(14)])),
+            (1, lambda: driver.send_raw(self._kind(), [self._number() for _ in range(PAYLOAD_SIZE // 8)])),
             (1, lambda: driver.send(self._random_move(), lease=random.randrange(3))),
             (1, lambda: driver.fault(random.randrange(6), random.choice(FAULTS))),
             (2, lambda: driver.lose(random.choice((1, 1, 2, 5, 20, 60)), random.random() < 0.5)),
@@ -204,17 +206,17 @@ class Session(RandomActions):
         """A trajectory that nobody has planned: its pieces may be far too quick, or none at all."""
         random = self.random
         kind = random.choice((CUBIC, QUINTIC))
-        rows = [[0.0, *self.commanded, *[0.0] * 12, kind]] if random.random() < 0.5 else []
+        rows = [_waypoint(0.0, self.commanded, kind)] if random.random() < 0.5 else []
         for t, q in self.waypoints((0.1, 0.3, 0.3, 1.0), 8):
             speed = [random.uniform(-0.3, 0.3) if random.random() < 0.5 else 0.0 for _ in q]
-            rows.append([t, *q, *speed, *[0.0] * 6, kind])
-        rows[-1][7:13] = [0.0] * 6
+            rows.append(_waypoint(t, q, kind, speed))
+        rows[-1][VELOCITIES : VELOCITIES + 6] = [0.0] * 6
         self._run(RunTrajectory, rows)
 
     def _run(self, kind: type[RunTrajectory] | type[RunLines], rows: list[list[float]]) -> None:
         random = self.random
         if random.random() < 0.1:
-            rows[random.randrange(len(rows))][random.randrange(20)] = random.choice(NONSENSE)
+            rows[random.randrange(len(rows))][random.randrange(COLUMNS)] = random.choice(NONSENSE)
         slot = self.driver.simulation.observer.write_plan(rows)
         self.send(kind(self.or_odd(slot), self.or_odd(len(rows))))
 
@@ -229,7 +231,7 @@ class Session(RandomActions):
         else:
             return
         took = 0.1 + max(abs(b - a) for a, b in zip(here, there, strict=True)) / self.random.choice((0.1, 0.25))
-        rows = [[t, *q, *[0.0] * 12, QUINTIC] for t, q in ((0.0, here), (took, there))]
+        rows = [_waypoint(t, q, QUINTIC) for t, q in ((0.0, here), (took, there))]
         slot = self.driver.simulation.observer.write_plan(rows)
         if self.send(RunTrajectory(slot, len(rows))):
             self.seconds(0.5 * took, took)
@@ -249,7 +251,8 @@ class Session(RandomActions):
             length = sqrt(sum((b - a) ** 2 for a, b in zip(at, to, strict=True)))
             speed = random.choice((0.05, 0.1, 0.25, 0.5)) / max(length, 1e-3)
             took = 2.0 / speed
-            rows.append([*at, *turn, *to, *turn, speed, 4 * speed, 40 * speed, length, took, LINE])
+            piece = [*at, *turn, *to, *turn, speed, 4 * speed, 40 * speed, length, took]
+            rows.append([*piece, *[0.0] * (KIND - len(piece)), LINE])
             at = to
         self._run(RunLines, rows)
 
@@ -343,6 +346,14 @@ def run_session(seed: int, config: ArmConfig | None = None) -> Outcome:
     if session.driver.violations:
         outcome.failures.append((seed, [*session.driver.violations[:4], *session.driver.log[-12:]]))
     return outcome
+
+
+def _waypoint(t: float, q: list[float], kind: float, speed: Sequence[float] = ()) -> list[float]:
+    row = [0.0] * COLUMNS
+    row[0], row[KIND] = t, kind
+    row[POSITIONS : POSITIONS + len(q)] = q
+    row[VELOCITIES : VELOCITIES + len(speed)] = speed
+    return row
 
 
 def _quaternion(rotation: object) -> list[float]:

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rtcp.ipc.states import State
+from rtcp.ipc.commands import Halt, SetControlMode
+from rtcp.ipc.states import ControlMode, State
 from tests.samples import SLOW
 from tests.sessions.driver import KINDS
 from tests.sessions.session import Outcome, Session, run_session
@@ -33,6 +34,25 @@ def test_the_sessions_visit_every_state_and_send_every_command() -> None:
     assert set(State.__members__) - set(total.states) <= {"OFF", "HOMING"}
     given = set(total.taken) | set(total.refused)
     assert {command.name for command in KINDS} - given <= {"set_zero", "home"}
+
+
+def test_plans_of_a_session_are_taken_and_move_the_arm() -> None:
+    session = Session(Random(3))
+    driver = session.driver
+    try:
+        driver.enable()
+        for mode, begin in (ControlMode.JOINT, session.trajectory), (ControlMode.CARTESIAN, session.line):
+            driver.send(SetControlMode(mode))
+            for _ in range(20):
+                begin()
+                if driver.state is State.MOVING:
+                    break
+                driver.enable()
+            driver.send(Halt())
+            driver.wait(1000)
+        assert {"run_trajectory", "run_lines"} <= set(driver.taken)
+    finally:
+        driver.close()
 
 
 def test_a_session_is_the_same_each_time_it_runs() -> None:

@@ -51,7 +51,7 @@ def plan_trajectory(
         points: at least one, at most `MOST_POINTS`, times rising by `SHORTEST_S` at least.
         limits: position, velocity and acceleration of every joint, kept over the whole of each piece: the extremes of
             its polynomials are looked at, no samples.
-        q_now: where the arm is commanded, rad, shape (n,), n <= 6.
+        q_now: where the arm is commanded, rad, shape (n,).
         names: of the joints, for the sentences.
         zone_at: looked at every `ZONE_STEP_RAD` of any joint's way.
 
