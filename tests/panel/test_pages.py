@@ -314,7 +314,7 @@ def test_leaving_a_page_that_waits_for_a_command_prints_nothing(
             page.get_by_role("link", name="Arm").click()
             expect(page.get_by_role("heading", name="Arm", exact=True)).to_be_visible()
             children = psutil.Process(process.pid).children
-            until(lambda: not any("rtcp.cli" in one.cmdline() for one in children()), "the command has ended")
+            until(lambda: not any("rtcp.cli" in one.cmdline() for one in children()), "its end", 60.0)
             page.get_by_role("link", name="Start").click()
             expect(page.get_by_role("heading", name="Machine")).to_be_visible()
 
