@@ -44,6 +44,8 @@ class HasBox(Protocol):
         """Name of the box; None: the only one."""
 
 
+PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
+"""Parts of the cycle that are no devices: their fields have names of their own."""
 VIRTUAL = "virtual"
 """Name of the bus that is a segment in software."""
 JOINTS = 6
@@ -165,6 +167,12 @@ class DeviceDescription:
     """SYNC0 shift, us; less than one cycle in either direction."""
     watchdog_ms: Annotated[float, Gt(0), Le(6000)] = 100.0
     """Process-data (sync manager) watchdog, ms: without outputs for this time the device stops."""
+
+    @property
+    def is_box(self) -> bool:
+        """Whether inputs and outputs with a function may hang on it: it maps channels of these names."""
+        mapped = [{entry.name for pdo in pdos for entry in pdo.channels} for pdos in (self.rpdo, self.tpdo)]
+        return self.kind == "io" or (self.kind != "cia402" and "outputs" in mapped[0] and "inputs" in mapped[1])
 
     def wire_range(self, channel: str) -> tuple[float, float]:
         """Return the range of a channel to the device, SI; infinite where it is a float or does not exist."""
@@ -611,7 +619,7 @@ class ArmConfig(ArmSettings):
     @property
     def boxes(self) -> tuple[str, ...]:
         """Names of the IO boxes, in the order of the cable."""
-        return tuple(slave.name for slave in self.slaves if slave.device.kind == "io")
+        return tuple(slave.name for slave in self.slaves if slave.device.is_box)
 
     def box_of(self, user: HasBox | None) -> str:
         """Return the IO box that an input or output with a function hangs on; empty: there is none."""

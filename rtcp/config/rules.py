@@ -15,6 +15,7 @@ from rtcp.config.model import (
     BITS,
     MODE_CHANNELS,
     MOST_AXES,
+    PLATFORM_PARTS,
     VIRTUAL,
     ArmConfig,
     ArmFile,
@@ -236,7 +237,10 @@ def axes_of(arm: ArmFile | ArmConfig) -> Iterator[tuple[KeyPath, Joint]]:
 
 @rule(ArmFile, "slaves")
 def _slave_names(arm: ArmFile) -> Iterator[Finding]:
-    return _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+    yield from _repeated(((("slaves", i, "name"), slave.name) for i, slave in enumerate(arm.slaves)), "name")
+    for i, slave in enumerate(arm.slaves):
+        if slave.name in PLATFORM_PARTS:
+            yield ("slaves", i, "name"), f'found the text "{slave.name}", the name of a part of the platform'
 
 
 @rule(ArmFile, "joints", "gripper")
@@ -355,10 +359,10 @@ def terminal_findings(arm: ArmFile, devices: Mapping[str, DeviceDescription]) ->
     found = [devices.get(slave.device) for slave in arm.slaves]
     if None in found:
         return
-    boxes = [slave.name for slave in arm.slaves if devices[slave.device].kind == "io"]
+    boxes = [slave.name for slave in arm.slaves if devices[slave.device].is_box]
     for kind, terminals in (("input", _inputs(arm)), ("output", _outputs(arm))):
         for where, user, places in terminals:
-            if not boxes and all(device is not None and device.kind == "cia402" for device in found):
+            if not boxes:
                 for place, number in places:
                     yield place, f"found {kind} {number}, but no slave is of kind io; leave it out for such an arm"
             elif user.box is not None and user.box not in boxes:

@@ -264,9 +264,9 @@ class CommandHandler:
         boxes, output = self._context.boxes, command.output
         if not boxes:
             return NoOutputs()
-        if not 0 <= command.box < len(boxes):
+        _, box = boxes[command.box] if 0 <= command.box < len(boxes) else (0, None)
+        if box is None:
             return UnknownBox(command.box + 1, len(boxes))
-        _, box = boxes[command.box]
         if not 1 <= output <= box.output_count:
             return UnknownOutput(output, box.output_count)
         if (box.name, output) in self._operator.reserved:

@@ -68,8 +68,9 @@ class Context(PartContext):
         self.operator = operator
         self.parts: list[Part] = [arm, *([] if arm.gripper is None else [arm.gripper]), operator, *devices]
         """The parts of the cycle; the operator's outputs are written before its boxes encode them."""
-        self.boxes = [(one.slot + 1, one.driver) for one in devices if isinstance(one.driver, IoBox)]
-        """Position on the cable and driver of each IO box, in the order of the cable."""
+        boxes = [one for one in devices if one.name in config.boxes]
+        self.boxes = [(one.slot + 1, one.driver if isinstance(one.driver, IoBox) else None) for one in boxes]
+        """Position on the cable and driver of each of the configuration's boxes; None: its driver is no IO box's."""
         self.blackboard = blackboard
         self.service = service
         self.supervision = Supervision(config, arm.limits)
@@ -135,7 +136,7 @@ class Context(PartContext):
     def clear_lost_boxes(self) -> None:
         """Clear the outputs of each box that is not in OP; where it was the first slave lost, until the reset."""
         for position, box in self.boxes:
-            if self.service.lost_slave == position or not self.blackboard.in_op(position):
+            if box is not None and (self.service.lost_slave == position or not self.blackboard.in_op(position)):
                 self.operator.clear_outputs(box)
 
     def make_safe(self) -> None:

@@ -74,7 +74,7 @@ class Cycle:
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
     ) -> None:
-        devices = make_devices(config)
+        self.devices = devices = make_devices(config)
         self.arm = Arm(config, make_drives(config), make_gripper(config), blackboard.plan)
         self.operator = Operator(config, {one.name: one.driver for one in devices if isinstance(one.driver, IoBox)})
         context = Context(config, self.arm, self.operator, devices, blackboard, service, discipline)

@@ -142,10 +142,7 @@ class StateMachine:
                 self._handle(event)
         if ctx.state in _SLAVES_RETURN:
             ctx.clear_lost_boxes()
-        if ctx.reported is not None:
-            if self.fault != ctx.reported.number:
-                ctx.publish(ctx.reported)  # of a state that no fault ends: it is in one already
-            ctx.reported = None
+        ctx.drop_reported(self.fault)
 
     def change(self, cause: Cause, lease: int | None = None) -> None:
         """Change to the state that a command, an event or a signal leads to; an event is published.

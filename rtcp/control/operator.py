@@ -8,6 +8,7 @@ from typing import Any
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.part import Part, PartContext
+from rtcp.devices.driver import DeviceError
 from rtcp.devices.io_box import Inputs, IoBox, JoystickInput, Outputs
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
@@ -30,6 +31,9 @@ class Operator(Part):
     Args:
         config: which they are.
         boxes: the IO boxes by name; none: nothing is pressed, nothing is forbidden and there is no joystick.
+
+    Raises:
+        DeviceError: an input or output with a function hangs on no IO box: it would be ignored.
     """
 
     def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox]) -> None:
@@ -46,6 +50,12 @@ class Operator(Part):
         self._stick_box = boxes.get(config.box_of(inputs.joystick))
         self._lamp_box = boxes.get(config.box_of(outputs))
         self._grip_box = boxes.get(config.box_of(gripper))
+        output = None if gripper is None or gripper.output is None else gripper
+        users = (inputs.emergency_stop, inputs.enabling_switch, inputs.arm_toggle, inputs.joystick, output)
+        for user in users:
+            if user is not None and config.box_of(user) not in boxes:
+                box = config.box_of(user) or "none of the slaves"
+                raise DeviceError(f"{type(user).__name__} needs an IO box: {box} is none, or has no driver of one")
         names = [slave.name for slave in config.slaves]
         self.stop_position = 0 if self._stop_box is None else 1 + names.index(self._stop_box.name)
         """Position on the cable of the box with the emergency stop; 0: there is no box."""

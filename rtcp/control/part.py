@@ -43,17 +43,31 @@ class PartContext:
         """Whether all drives are in Operation Enabled."""
         self.reported: Event | None = None
         """A fault that a part has reported; the machine takes it in the next cycle."""
+        self._dropped = 0
 
     def publish(self, event: Event) -> None:
         """Report an event that changes no state."""
         raise NotImplementedError
 
     def report(self, event: Event) -> None:
-        """Report an event of a part; one that is a fault stops the arm in the next cycle."""
-        if event.is_fault:
+        """Report an event of a part; one that is a fault stops the arm in the next cycle, the hardest of several."""
+        if not event.is_fault:
+            self.publish(event)
+        elif self.reported is None:
+            self.reported = event
+        elif event.is_emergency and not self.reported.is_emergency:
+            self.publish(self.reported)
             self.reported = event
         else:
             self.publish(event)
+
+    def drop_reported(self, fault: int) -> None:
+        """Forget what was reported and ended no state; publish it once, unless it is of the present `fault`'s kind."""
+        event, self.reported = self.reported, None
+        number = 0 if event is None else event.number
+        if event is not None and number not in (fault, self._dropped):
+            self.publish(event)
+        self._dropped = number
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)
@@ -107,6 +121,7 @@ class Device(Part):
         super().__init__(driver.name, [device_field(driver.name, one) for one in driver.fields()], driver.commands)
         self.slot = slot
         self.driver = driver
+        self._stays_safe = False
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of the slave."""
@@ -121,6 +136,10 @@ class Device(Part):
         event = self.driver.update(context.state, context.now_ns)
         if event is not None:
             context.report(event)
+        if self._stays_safe:
+            # From the fault until the reset is done, whatever the driver does meanwhile.
+            self._stays_safe = context.state is not State.READY
+            self.driver.safe()
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the slave."""
@@ -131,7 +150,8 @@ class Device(Part):
         self.driver.publish(values, self.at)
 
     def safe(self) -> None:
-        """Set the driver's outputs to their safe state."""
+        """Set the driver's outputs to their safe state until the machine is ready again."""
+        self._stays_safe = True
         self.driver.safe()
 
 

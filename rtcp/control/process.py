@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,6 +25,7 @@ from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
+from rtcp.control.part import Device
 from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, TargetState
 from rtcp.devices.driver import DeviceError, make_codec
 from rtcp.fieldbus.bus import ProcessData
@@ -165,7 +167,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         cycle.run()
     except BaseException:
         # A defect in the cycle: the drives come to rest before the bus goes away.
-        stop_blindly(data, config, cycle.arm)
+        stop_blindly(data, config, cycle.arm, cycle.devices)
         raise
     else:
         if service.refused:
@@ -176,11 +178,15 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         scheduling.release(realtime)
 
 
-def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm) -> None:
+def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm, devices: Sequence[Device] = ()) -> None:
     """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
 
     Nothing else of the cycle is needed, and what raises for one drive or one frame keeps no other from being told.
     """
+    for device in devices:
+        with contextlib.suppress(Exception):
+            device.safe()
+            device.encode(data)
     period_s = config.cycle.period_us * 1e-6
     drives = arm.pairs if arm.gripper is None else [*arm.pairs, (arm.gripper.slot, arm.gripper.drive)]
     ramp_cycles = math.ceil(quick_stop_s(config) / period_s)

@@ -128,7 +128,7 @@ class Starting(MachineState):
             # Frames are not whole yet: cycles lost until all slaves are in OP do not count.
             ctx.wkc_error_count = 0
             return None
-        if ctx.good:
+        if ctx.good and ctx.reported is None:
             return Ready()
         fault = ctx.bus_fault()
         if fault is not None:
@@ -617,7 +617,7 @@ class FaultState(MachineState):
             reaction.remove_torque(ctx)
             return
         assert isinstance(cause, Event)
-        hard = ctx.reactions[type(cause)] is StopReaction.TORQUE_OFF or (
+        hard = ctx.reactions.get(type(cause)) is StopReaction.TORQUE_OFF or (
             before is State.DISABLING and cause is ctx.pending
         )
         # Who commanded no torque is not left with an arm that holds, and a reset that fails does not restore it.
@@ -723,6 +723,8 @@ class Resetting(MachineState):
     def update(self, ctx: Context) -> Event | Signal | None:
         """Reset what is back; give up after a while."""
         arm = ctx.arm
+        if ctx.reported is not None:
+            return ctx.reported
         if not (ctx.good and ctx.service.all_op and ctx.clock_locked):
             self._reaction.update(ctx)
             return self._failure(ctx)

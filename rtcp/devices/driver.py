@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import isnan
 from typing import Any, ClassVar
 
 from mypy_extensions import mypyc_attr
@@ -72,6 +73,7 @@ class Driver:
         self.codec_in, self.codec_out = make_codec(self.tpdo), make_codec(self.rpdo)
         self.values: dict[str, float] = {channel.name: 0.0 for channel in self.tpdo.channels if channel.index}
         self.targets: dict[str, float] = {channel.name: 0.0 for channel in self.rpdo.channels if channel.index}
+        self._input_names, self._output_names = tuple(self.values), tuple(self.targets)
 
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle (`input_bytes` long)."""
@@ -113,11 +115,11 @@ class Driver:
 
     def publish(self, values: list[Any], at: int) -> None:
         """Write the values of `fields` into the record, from index `at` on."""
-        for value in self.values.values():
-            values[at] = value
+        for name in self._input_names:
+            values[at] = self.values[name]
             at += 1
-        for value in self.targets.values():
-            values[at] = value
+        for name in self._output_names:
+            values[at] = self.targets[name]
             at += 1
 
     def encode(self) -> bytes:
@@ -126,7 +128,12 @@ class Driver:
 
     def _counts_of(self, channel: Channel) -> Number:
         counts = self.targets[channel.name] / channel.factor if channel.index else 0
-        return counts if channel.type.startswith("float") else round(counts)
+        if isnan(counts):
+            return 0  # what is no number is no reason to end the cycle
+        if channel.type.startswith("float"):
+            return counts
+        low, high = (0, 1) if channel.type == "bool" else integer_range(channel)
+        return round(min(max(counts, low), high))
 
 
 def make_driver(slave: SlaveConfig, period_s: float) -> Driver:

@@ -54,10 +54,11 @@ class IoBox(Driver):
     def fields(self) -> Sequence[Field]:
         """Return inputs, outputs and, where there is one, the counter."""
         made = [
-            Field("inputs", "uint32", "", "Levels of the inputs, bit 0 is input 1."),
-            Field("outputs", "uint32", "", "Levels of the outputs, bit 0 is output 1."),
+            Field("inputs", _type(self.tpdo, "inputs"), "", "Levels of the inputs, bit 0 is input 1."),
+            Field("outputs", _type(self.rpdo, "outputs"), "", "Levels of the outputs, bit 0 is output 1."),
         ]
-        return made if self._counter is None else [*made, Field("counter", "int32", "", "Counts of the encoder.")]
+        counted = Field("counter", _type(self.tpdo, "counter"), "", "Counts of the encoder.")
+        return made if self._counter is None else [*made, counted]
 
     def publish(self, values: list[Any], at: int) -> None:
         """Write them into the record."""
@@ -81,6 +82,11 @@ class IoBox(Driver):
             raise DeviceError(f"{self.name} has no output {number}; it has 1 to {self.output_count}")
         bit = 1 << number - 1
         self.outputs = self.outputs | bit if value else self.outputs & ~bit
+
+
+def _type(image: ImageLayout, name: str) -> str:
+    channel = image.find(name)
+    return "int32" if channel is None else channel.type
 
 
 def _field(box: Driver, image: ImageLayout, name: str) -> tuple[struct.Struct, int]:

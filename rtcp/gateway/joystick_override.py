@@ -41,7 +41,7 @@ class JoystickOverride:
         self._actions = actions
         self._config = config
         self._bus = bus
-        self._boxes = {slave.name: at for at, slave in enumerate(config.slaves, 1) if slave.device.kind == "io"}
+        self._boxes = {slave.name: at for at, slave in enumerate(config.slaves, 1) if slave.device.is_box}
         self._owner: Caller | None = None
         self._until = 0.0
         self._written: dict[tuple[str, int], int] = {}
@@ -96,17 +96,24 @@ class JoystickOverride:
     async def _write(self, inputs: Mapping[str, tuple[int, int]]) -> None:
         async with self._writing:
             repeats = time.monotonic() - self._repeated > _REPEAT_S
-            for box in self._boxes:
+            refused: RtcpError | None = None
+            # What is released first: a box that does not answer keeps no other one's stick deflected.
+            for box in sorted(self._boxes, key=lambda box: inputs.get(box, (0, 0))[0] != 0):
                 mask, levels = inputs.get(box, (0, 0))
-                if mask and (repeats or not self._written.get((box, MASK))):
-                    await self._write_object(box, HOLD, _BOX_HOLD_MS)
-                    self._repeated = time.monotonic()
-                # Levels first, so that no input takes one that nobody asked for; but none is released late.
-                for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
-                    if self._written.get((box, subindex)) != value:
-                        self._written.pop((box, subindex), None)
-                        await self._write_object(box, subindex, value)
-                        self._written[box, subindex] = value
+                try:
+                    if mask and (repeats or not self._written.get((box, MASK))):
+                        await self._write_object(box, HOLD, _BOX_HOLD_MS)
+                        self._repeated = time.monotonic()
+                    # Levels first, so that no input takes one that nobody asked for; but none is released late.
+                    for subindex, value in ((LEVELS, levels), (MASK, mask)) if mask else ((MASK, mask),):
+                        if self._written.get((box, subindex)) != value:
+                            self._written.pop((box, subindex), None)
+                            await self._write_object(box, subindex, value)
+                            self._written[box, subindex] = value
+                except RtcpError as error:
+                    refused = error
+            if refused is not None:
+                raise refused
 
     async def _write_object(self, box: str, subindex: int, value: int) -> None:
         request = {"slave": self._boxes[box], "index": OBJECT, "subindex": subindex}

@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from kinematics.forward import frames
 from kinematics.jacobian import singularity_distances
+from rtcp.config.model import PLATFORM_PARTS
 from rtcp.ipc.events import JOYSTICK_MODES, ProcessDataLost, ResetDone
 from rtcp.ipc.names import SINGULARITIES, Names
 from rtcp.ipc.observer import EventRecord, Observer
@@ -41,8 +42,6 @@ _MESSAGES = 50
 _SHOWN = 10
 """The last so many of them are shown."""
 _SILENT_S = 1.0
-_PLATFORM_PARTS = frozenset({"cycle", "arm", "gripper", "operator"})
-"""Parts that the status shows in words of their own; the others are devices."""
 _SECOND_NS = 1_000_000_000
 _UNDER_WAY = (int(State.MOVING), int(State.STOPPING))
 _FIGURES = {"wakeup": "wakeup_ns", "exchange": "exchange_ns", "compute": "compute_ns", "offset": "dc_offset_ns",
@@ -288,7 +287,7 @@ class StatusSnapshot:
         """Return value and unit of what each slave that is no drive publishes, by slave and field."""
         found: dict[str, dict[str, dict[str, Any]]] = {name: {} for name in self._session.config.boxes}
         for field in self._observer.schema.fields:
-            if field.part in _PLATFORM_PARTS:
+            if field.part in PLATFORM_PARTS:
                 continue
             value = record[field.name].tolist()
             numbers = value if field.shape else [value]

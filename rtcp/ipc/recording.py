@@ -36,7 +36,7 @@ import rtcp
 from rtcp.config.model import MOST_AXES
 from rtcp.config.zero import state_directory
 from rtcp.ipc.observer import numpy_fields
-from rtcp.ipc.schema import RecordSchema
+from rtcp.ipc.schema import RecordSchema, arm_schema
 
 FORMAT = 2
 KEPT = 100
@@ -452,6 +452,16 @@ class ChunkDecoder:
             schema = RecordSchema.from_definition(self._schemas[channel.schema_id])
             if lacking := {"number", "time_ns"} - set(schema.names):
                 raise ValueError(f"its cycles lack {', '.join(sorted(lacking))}")
+            known = arm_schema(max(schema.joints, 1))
+            for field in schema.fields:
+                if field.name in known.names:
+                    wanted = known[field.name]
+                    if (field.type, field.shape) != (wanted.type, wanted.shape):
+                        raise ValueError(
+                            f"{field.name} is {field.type} {field.shape}, not {wanted.type} {wanted.shape}"
+                        )
+            if self.cycle_channel >= 0 and schema != self.schema:
+                raise ValueError("it has cycles of two kinds")
             self.schema, self.kind, self.cycle_channel = schema, cycle_type(schema), channel.id
 
 

@@ -50,11 +50,12 @@ class Field:
             ("its name is not of lower case letters, digits and underscores", not _NAME.fullmatch(self.name)),
             (f"its type {self.type} is none of {', '.join(CODES)}", self.type not in CODES),
             (f"its shape is {self.shape}", len(self.shape) > 1 or not 0 < self.count <= MOST_NUMBERS),
-            ("unit, part or description breaks its line", any(one in self.unit + self.part for one in ",:\n")),
-            ("its description breaks its line", "\n" in self.description),
+            (f"its unit {self.unit!r} has a comma or a colon", any(one in self.unit for one in ",:")),
+            (f"its part {self.part!r} has a comma or a colon", any(one in self.part for one in ",:")),
+            ("its texts are not of one line", not (self.unit + self.part + self.description).isprintable()),
         ):
             if bad:
-                raise SchemaError(f"field {self.name!r}: {problem}")
+                raise SchemaError(f"field {self.name!r} of {self.part or 'a driver'}: {problem}")
 
     @property
     def count(self) -> int:
@@ -151,8 +152,10 @@ class RecordSchema:
             ]  # fmt: skip
         except SchemaError:
             raise
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             raise SchemaError(f"no schema: {type(error).__name__} {error}") from error
+        if not fields or (fields[0].name, fields[0].type, fields[0].shape) != ("number", "uint64", ()):
+            raise SchemaError("no schema of a record: its first field is not `number`, uint64")
         return cls(tuple(fields))
 
     def definition(self) -> bytes:

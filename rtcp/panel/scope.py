@@ -141,12 +141,13 @@ def _column(records: Records, signal: str) -> npt.NDArray[Any]:
         column: npt.NDArray[Any] = records[name][:, at]
         return column
     if name == "inputs":
-        # Any box: a number that changes whenever one of them does.
-        boxes = [records[one].astype(np.int64) for one in records.dtype.names or () if one.endswith("_inputs")]
-        mixed: npt.NDArray[Any] = sum(
-            (box << 16 * at for at, box in enumerate(boxes)), np.zeros(len(records), np.int64)
-        )
-        return mixed
+        # Any box: a number, exact in float32, that changes whenever one of them does.
+        mixed = np.zeros(len(records), np.uint64)
+        boxes = [one for one in records.dtype.names or () if one.endswith("_inputs") and records[one].ndim == 1]
+        for at, one in enumerate(boxes):
+            mixed += records[one].astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15 + 2 * at)
+        shown: npt.NDArray[Any] = mixed >> np.uint64(40)
+        return shown
     if name.endswith("_us"):
         in_us: npt.NDArray[Any] = records[f"{name[:-3]}_ns"] / 1e3
         return in_us

@@ -10,7 +10,7 @@ from time import monotonic_ns
 from typing import NamedTuple
 
 from rtcp.config import default_config, load
-from rtcp.config.model import ArmConfig, InputConfig
+from rtcp.config.model import ArmConfig, InputConfig, InputsConfig, OutputsConfig
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, record_schema
 from rtcp.fieldbus.al_state import AlState
@@ -193,7 +193,11 @@ class LoopRig:
         period_ns = round(PERIOD_S * 1e9)
         if not with_box:
             config = replace(
-                config, slaves=(replace(config.slaves[0], device=config.slaves[1].device), *config.slaves[1:])
+                config,
+                slaves=(replace(config.slaves[0], device=config.slaves[1].device), *config.slaves[1:]),
+                inputs=InputsConfig(),
+                outputs=OutputsConfig(),
+                gripper=None,
             )
         self._own: list[Blackboard | Observer] = []
         if board.schema != (schema := record_schema(config)):

@@ -146,7 +146,7 @@ class TrajectoryGuard:
         wanted = target.position
         if wanted is not state.commanded:
             self._rests = False
-        elif self._rests:
+        elif self._rests and not any(target.velocity):
             return GuardResult.PASS  # a controller that holds hands back the state itself
         self.held = held = self._bound(state, wanted)
         position, mean, last, dt = self._position, self._next, self._mean, self._dt

@@ -95,7 +95,7 @@ class CycleExperiment(Experiment):
     def _edges(self, setup: Setup, output: int) -> Array:
         """Return when the output changed, ns of the IO box's own clock."""
         arm = setup.arm
-        slave = next(at for at, one in enumerate(arm.slaves, 1) if one.device.kind == "io")
+        slave = next(at for at, one in enumerate(arm.slaves, 1) if one.device.is_box)
         stamps: list[int] = []
         control = read_session(runtime_directory()).segment_control
         assert control is not None

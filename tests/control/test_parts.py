@@ -1,0 +1,113 @@
+"""What holds for every part of the cycle: the faults that it reports, outputs that stay safe, inputs nobody ignores."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
+from rtcp.control.operator import Operator
+from rtcp.control.part import Device, PartContext
+from rtcp.devices.driver import DeviceError, Driver
+from rtcp.ipc.commands import Reset
+from rtcp.ipc.events import Event, LeftRange, OverSpeed, SlaveLost
+from rtcp.ipc.states import State
+
+from .rig import CONFIG, LoopRig
+
+HEATER = SlaveConfig(
+    "heater",
+    DeviceDescription(
+        "Heater", "heater", 1, 2, (Pdo(0x1600, (PdoEntry(0x7000, 1, "int16", "power", unit="W"),)),),
+        (Pdo(0x1A00, (PdoEntry(0x6000, 1, "int16", "power", unit="W"),)),),
+    ),
+)  # fmt: skip
+
+
+class Regulator(Driver):
+    """Switches its output on in every cycle, whatever was said."""
+
+    def update(self, state: State, now_ns: int) -> Event | None:
+        self.targets["power"] = 7.0
+        return None
+
+
+class Heard(PartContext):
+    """A context that keeps what is published."""
+
+    def __init__(self) -> None:
+        super().__init__(0.001)
+        self.published: list[Event] = []
+
+    def publish(self, event: Event) -> None:
+        self.published.append(event)
+
+
+class Image:
+    """The outputs of the slave."""
+
+    sent = b""
+
+    def set_output(self, slot: int, data: bytes) -> None:
+        self.sent = data
+
+
+def test_outputs_stay_safe_until_the_machine_is_ready_again_whatever_the_driver_does() -> None:
+    device, context, image = Device(0, Regulator(HEATER, 0.001)), Heard(), Image()
+
+    def cycle(state: State) -> int:
+        context.state = state
+        device.update(context)
+        device.encode(image)  # type: ignore[arg-type]
+        return int.from_bytes(image.sent, "little")
+
+    assert cycle(State.HOLDING) == 7
+    device.safe()
+    assert [cycle(state) for state in (State.FAULT, State.RESETTING)] == [0, 0]
+    cycle(State.READY)
+    assert cycle(State.READY) == 7
+
+
+@pytest.mark.parametrize(("power", "sent"), [(float("nan"), 0), (1e9, 0x7FFF), (float("-inf"), 0x8000)])
+def test_a_target_that_its_field_cannot_hold_is_cut_and_ends_no_cycle(power: float, sent: int) -> None:
+    driver = Driver(HEATER, 0.001)
+    driver.targets["power"] = power
+    assert int.from_bytes(driver.encode(), "little") == sent
+
+
+def test_a_value_that_a_driver_adds_is_not_in_the_record_and_moves_nothing() -> None:
+    driver = Driver(HEATER, 0.001)
+    driver.values["mean"] = 1.0
+    values: list[Any] = [0, 0, 5]
+    driver.publish(values, 0)
+    assert [field.name for field in driver.fields()] == ["power", "power_sent"]
+    assert values == [0.0, 0.0, 5]
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_several_faults_in_a_cycle_the_hardest_is_taken_and_the_other_published(first: int) -> None:
+    context, faults = Heard(), [LeftRange(0, 1.0), OverSpeed(0, 2.0, 1.0)]
+    for fault in (faults[first], faults[1 - first]):
+        context.report(fault)
+    assert context.reported == faults[1]
+    assert context.published == [faults[0]]
+
+
+def test_a_fault_that_is_reported_on_the_way_out_of_one_keeps_the_machine_in_it(rig: LoopRig) -> None:
+    rig.bring_to(State.FAULT)
+    rig.do(Reset())
+    while rig.state is State.RESETTING:
+        rig.context.report(SlaveLost(3))
+        rig.cycle()
+    assert rig.state is State.FAULT
+
+
+def test_an_emergency_stop_that_hangs_on_no_box_is_refused_and_never_ignored() -> None:
+    assert CONFIG.inputs.emergency_stop is not None
+    with pytest.raises(DeviceError, match="EmergencyStopConfig needs an IO box"):
+        Operator(CONFIG, {})
+    elsewhere = replace(CONFIG.inputs.emergency_stop, box="drive1")
+    with pytest.raises(DeviceError, match="drive1 is none"):
+        Operator(replace(CONFIG, inputs=replace(CONFIG.inputs, emergency_stop=elsewhere)), {})
