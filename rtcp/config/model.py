@@ -413,7 +413,7 @@ class InputConfig:
     """An input terminal of the IO box with a meaning."""
 
     number: Terminal
-    """Input terminal; no terminal is used twice."""
+    """Input terminal; none of a box is used twice."""
     active: Level = "high"
     """Active level."""
     debounce_ms: Milliseconds = 5.0
@@ -472,7 +472,7 @@ class OutputsConfig:
     """Outputs with a meaning; one that is left out does not exist."""
 
     state_lamp: Terminal | None = None
-    """Output terminal: on while drives have torque; no terminal is used twice."""
+    """Output terminal: on while drives have torque; none of a box is used twice."""
     motion_lamp: Terminal | None = None
     """Output terminal: on while the arm moves."""
     heartbeat: Terminal | None = None

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from rtcp.config.find import load_messages
 from rtcp.gateway.black_box import BlackBox
 from rtcp.gateway.command_channel import Caller, Json
 from rtcp.gateway.methods import Methods
@@ -190,6 +191,7 @@ class Gateway:
         session = read_session(directory)
         self._observer = Observer(blackboard_file(directory))
         started = read_json(directory / "started.json", dict)
+        load_messages()  # before anyone asks which events are faults
         self._snapshot = StatusSnapshot(self._observer, session, started)
         self._snapshot.follow()  # what an earlier gateway has logged, with its time, is not logged again
         self._box = BlackBox(self._observer, session, faults_directory(), self._snapshot.note)

@@ -3,7 +3,6 @@ run."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -16,37 +15,17 @@ from typing import Any
 
 import pytest
 
+from .conftest import EXAMPLE, add_thermometer
+
 HERE = Path(__file__).resolve().parent
-EXAMPLE = HERE / "example"
 REPOSITORY = HERE.parents[1]
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A directory with the example package, installed by pip."""
-    directory = tmp_path_factory.mktemp("example")
-    shutil.copytree(EXAMPLE, directory / "source", ignore=shutil.ignore_patterns("__pycache__"))
-    target = directory / "installed"
-    command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target)]
-    if importlib.util.find_spec("hatchling"):
-        command.append("--no-build-isolation")
-    subprocess.run([*command, str(directory / "source")], check=True)
-    return target
-
-
-@pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The default arm with a thermometer behind its last drive."""
     directory = tmp_path_factory.mktemp("config")
     shutil.copytree(REPOSITORY / "config", directory, dirs_exist_ok=True)
-    shutil.copy(EXAMPLE / "thermometer.yaml", directory / "devices")
-    arm, segment = directory / "assistive_arm.yaml", directory / "segment.yaml"
-    last = "  - {name: drive6, device: cubemars-orh}\n"
-    assert last in arm.read_text()
-    arm.write_text(arm.read_text().replace(last, last + "  - {name: thermometer, device: thermometer}\n"))
-    with segment.open("a") as file:
-        file.write("  - {model: example-thermometer, options: {heating: 10}}\n")
-    return arm
+    return add_thermometer(directory)
 
 
 @pytest.fixture(scope="module")
