@@ -83,6 +83,7 @@ class CommandHandler:
         self._machine = machine
         self._context = machine.context
         self._arm = machine.context.arm
+        self._joints = machine.context.joints
         self._operator = machine.context.operator
         self._blackboard = blackboard
         self._handlers: dict[type[Command], Callable[[Any, int], Refusal | None]] = {
@@ -166,8 +167,7 @@ class CommandHandler:
         return refusal
 
     def _halt(self, command: Halt, lease: int) -> Refusal | None:
-        if self._arm.gripper is not None:
-            self._arm.gripper.stop()
+        self._joints.stop_others()
         if self._machine.state is State.HOMING:
             self._context.homing.stop()
         else:
@@ -177,19 +177,19 @@ class CommandHandler:
     # -- torque ---------------------------------------------------------------------------------------------------
 
     def _enable(self, command: Enable, lease: int) -> Refusal | None:
-        arm = self._arm
+        joints = self._joints
         if self._operator.emergency_stop:
             return EmergencyStopPressed()
         if not self._context.service.all_op:
             return NotInOp()
         if not self._context.clock_locked:
             return ClockNotLocked()
-        axis = arm.first_moving()
+        axis = joints.first_moving()
         if axis >= 0:
-            return NotAtStandstill(axis, arm.all_drives[axis].velocity)
-        axis = arm.first_outside()
+            return NotAtStandstill(axis, joints.drives[axis].velocity)
+        axis = joints.first_outside()
         if axis >= 0:
-            return JointOutsideRange(axis, arm.all_drives[axis].position)
+            return JointOutsideRange(axis, joints.drives[axis].position)
         self._machine.change(command)
         return None
 
@@ -250,13 +250,13 @@ class CommandHandler:
         if refusal is not None:
             return refusal
         limits = arm.limits
-        if arm.first_with_torque() >= 0:
+        if self._joints.first_with_torque() >= 0:
             for axis, held in enumerate(arm.state.actual_torque):
                 most = new.torque[axis]
                 if most < limits.torque[axis] and abs(held) > most:
                     return TorqueLimitTooLow(axis, abs(held), most)
         limits.apply(new)
-        arm.limits_changed()
+        arm.output_limiter.take(limits)
         self._blackboard.event(LimitsChanged())
         return None
 
@@ -277,7 +277,7 @@ class CommandHandler:
     def _move_gripper(self, command: MoveGripper, lease: int) -> Refusal | None:
         if self._operator.emergency_stop:
             return EmergencyStopPressed()
-        gripper = self._arm.gripper
+        gripper = self._context.gripper
         if gripper is not None:
             if not self._operator.permitted:
                 return NotPermitted()
@@ -291,14 +291,14 @@ class CommandHandler:
         return None
 
     def _set_zero(self, command: SetZero, lease: int) -> Refusal | None:
-        arm, axis = self._arm, command.axis
-        if not 0 <= axis < len(arm.all_drives):
-            return UnknownAxis(axis, len(arm.all_drives) - 1)
+        arm, drives, axis = self._arm, self._joints.drives, command.axis
+        if not 0 <= axis < len(drives):
+            return UnknownAxis(axis, len(drives) - 1)
         if not abs(command.offset) <= _LARGEST_OFFSET:
             return OffsetOutOfRange(axis, command.offset, _LARGEST_OFFSET)
-        if arm.first_with_torque() >= 0:
+        if self._joints.first_with_torque() >= 0:
             return TorquePresent()
-        drive = arm.all_drives[axis]
+        drive = drives[axis]
         drive.zero = command.offset
         if axis < len(arm.drives):
             # It was decoded by now: the record of this cycle counts from the new zero, as its targets do.

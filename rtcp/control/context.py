@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
+from rtcp.control.gripper import DrivenGripper
 from rtcp.control.homing import HomingSequence
+from rtcp.control.joint_group import Joints
 from rtcp.control.operator import Operator
 from rtcp.control.part import Device, Part, PartContext
 from rtcp.devices.cia402 import DriveState
@@ -32,7 +34,6 @@ from rtcp.ipc.events import (
 )
 from rtcp.ipc.states import DriveMode, State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
-from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
 
@@ -44,7 +45,8 @@ class Context(PartContext):
 
     Args:
         config: timeouts, how many cycles may be lost, and the stop reactions.
-        arm: the joints.
+        arm: its joints.
+        gripper: one with a drive of its own, or None.
         operator: the inputs and outputs with a function.
         devices: the slaves that are no drives.
         blackboard: where events go, and where the lease is.
@@ -56,6 +58,7 @@ class Context(PartContext):
         self,
         config: ArmConfig,
         arm: Arm,
+        gripper: DrivenGripper | None,
         operator: Operator,
         devices: Sequence[Device],
         blackboard: Blackboard,
@@ -65,16 +68,17 @@ class Context(PartContext):
         super().__init__(config.cycle.period_us * 1e-6)
         self.config = config
         self.arm = arm
+        self.gripper = gripper
+        self.joints = Joints(arm, [] if gripper is None else [gripper])
         self.operator = operator
-        self.parts: list[Part] = [arm, *([] if arm.gripper is None else [arm.gripper]), operator, *devices]
+        self.parts: list[Part] = [*self.joints.groups, operator, *devices]
         """The parts of the cycle; the operator's outputs are written before its boxes encode them."""
         boxes = [one for one in devices if one.name in config.boxes]
         self.boxes = [(one.slot + 1, one.driver if isinstance(one.driver, IoBox) else None) for one in boxes]
         """Position on the cable and driver of each of the configuration's boxes; None: its driver is no IO box's."""
         self.blackboard = blackboard
         self.service = service
-        self.supervision = Supervision(config, arm.limits)
-        self.homing = HomingSequence(arm, self.period_s)
+        self.homing = HomingSequence(arm, self.joints, self.period_s)
         self.reactions = reactions(config.stops)
         self._discipline = discipline
         self._lost_limit = config.bus.lost_cycles
@@ -181,14 +185,15 @@ class Context(PartContext):
     def drive_event(self, kind: type[DriveFault] | type[DriveLeftEnabled], axis: int) -> Event:
         """Return the event of a drive, whose error code is looked up; one that shows a fault is in fault."""
         self.service.explain_drive(axis)
-        drive = self.arm.all_drives[axis]
+        drive = self.joints.drives[axis]
         if drive.state in _IN_FAULT:
             kind = DriveFault
         return kind(axis, drive.statusword)
 
     def wrong_drive_mode(self, axis: int) -> Event:
         """Return the event of a drive that does not change its mode."""
-        return DriveModeTimeout(axis, self.arm.all_drives[axis].mode_display, DriveMode(self.arm.mode))
+        drive = self.joints.drives[axis]
+        return DriveModeTimeout(axis, drive.mode_display, DriveMode(drive.mode))
 
     # -- one cycle of an enabled arm ------------------------------------------------------------------------------
 
@@ -197,28 +202,28 @@ class Context(PartContext):
 
         Return what ends the state. Without a good cycle the setpoints stand still: the slaves missed the last ones.
         """
-        arm = self.arm
+        arm, joints = self.arm, self.joints
         event = self.bus_fault()
         if event is not None or not self.good:
             return event
-        axis = arm.first_not_enabled()
+        axis = joints.first_not_enabled()
         if axis >= 0:
             return self.drive_event(DriveLeftEnabled, axis)
-        event = arm.beyond_limits(self.supervision) or self._supervise_gripper()
+        event = joints.beyond_limits() or self._supervise_gripper()
         if event is not None:
             return event
-        result = arm.command()
+        result = joints.command()
         if result is GuardResult.PASS and arm.active.ended is None:
             return None
         return self._motion_end(result)
 
     def track_homing(self) -> Event | None:
         """Run the homing for a cycle, supervised as any motion; return what ends the state."""
-        arm, homing = self.arm, self.homing
+        joints, homing = self.joints, self.homing
         event = self.bus_fault()
         if event is not None or not self.good:
             return event
-        axis = arm.first_not_enabled()
+        axis = joints.first_not_enabled()
         if axis >= 0:
             return self.drive_event(DriveLeftEnabled, axis)
         event = self.permission_lost(self.lease)
@@ -227,25 +232,25 @@ class Context(PartContext):
                 return event
             homing.stop()
         homing.step()
-        event = arm.beyond_limits(self.supervision) or self._supervise_gripper()
+        event = joints.beyond_limits() or self._supervise_gripper()
         if event is not None:
             return event
         if homing.stuck:
             return self.wrong_drive_mode(homing.axis)
         if homing.still_moving:
-            return HomingStillMoving(homing.axis, arm.drives[homing.axis].velocity)
-        axis = arm.first_outside()
+            return HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity)
+        axis = joints.first_outside()
         if axis >= 0:
             # While the drive searches, and where it counts from a new zero.
-            return LeftRange(axis, arm.all_drives[axis].position)
-        if not homing.leaving and (box := arm.trajectory_guard.zone_at(arm.state.actual)) is not None:
+            return LeftRange(axis, joints.drives[axis].position)
+        if not homing.leaving and (box := self.arm.trajectory_guard.zone_at(self.arm.state.actual)) is not None:
             self.publish(HomingInBox(box))
             homing.stop()
         return None
 
     def _supervise_gripper(self) -> Event | None:
         """Stop a gripper that nobody commands any more; return what ends the state."""
-        gripper = self.arm.gripper
+        gripper = self.gripper
         if gripper is None or not gripper.motion.moving or gripper.motion.stops:
             return None
         event = self.permission_lost(gripper.lease)

@@ -75,9 +75,12 @@ class Cycle:
         now: Callable[[], int] = monotonic_ns,
     ) -> None:
         self.devices = devices = make_devices(config)
-        self.arm = Arm(config, make_drives(config), make_gripper(config), blackboard.plan)
-        self.operator = Operator(config, {one.name: one.driver for one in devices if isinstance(one.driver, IoBox)})
-        context = Context(config, self.arm, self.operator, devices, blackboard, service, discipline)
+        boxes = {one.name: one.driver for one in devices if isinstance(one.driver, IoBox)}
+        gripper = make_gripper(config)
+        self.arm = Arm(config, make_drives(config), blackboard.plan)
+        self.operator = Operator(config, boxes, gripper)
+        context = Context(config, self.arm, gripper, self.operator, devices, blackboard, service, discipline)
+        self.joints = context.joints
         self.machine = StateMachine(context)
         self.commands = CommandHandler(self.machine, blackboard)
         self.parts = context.parts

@@ -9,6 +9,7 @@ from __future__ import annotations
 from enum import Enum
 
 from rtcp.control.arm import Arm
+from rtcp.control.joint_group import Joints
 from rtcp.devices.cia402 import CSP, ENABLE_OPERATION, Cia402Drive
 from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
 
@@ -210,11 +211,13 @@ class HomingSequence:
 
     Args:
         arm: enabled, at rest, in CSP.
+        joints: all of the platform; those beside the arm's move on.
         period_s: the cycle, s.
     """
 
-    def __init__(self, arm: Arm, period_s: float) -> None:
+    def __init__(self, arm: Arm, joints: Joints, period_s: float) -> None:
         self._arm = arm
+        self._joints = joints
         self._homing = Homing(period_s)
         self.axis = 0
 
@@ -237,21 +240,20 @@ class HomingSequence:
         if arm.beyond_range(axis) > 0.0:
             low, high, position = arm.limits.low[axis], arm.limits.high[axis], arm.state.commanded
             position[axis] = min(max(position[axis], low), high)
-            arm.trajectory_guard.latch(arm.state)
+            arm.latch()
             arm.command()
-        return arm.first_returning() < 0
+        return arm.beyond_range(axis) <= 0.0
 
     def step(self) -> None:
         """Run a cycle; the setpoint of the joint is where its drive shows it, those of the others stand."""
         arm, axis, homing = self._arm, self.axis, self._homing
+        self._joints.command_others()
         if homing.ended:
             return
         homing.step()
         arm.state.commanded[axis] = homing.position
         arm.output_limiter.latch(axis, homing.position)
-        arm.trajectory_guard.latch(arm.state)
-        if arm.gripper is not None:
-            arm.gripper.command()
+        arm.latch()
 
     @property
     def under_way(self) -> bool:

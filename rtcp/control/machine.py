@@ -199,7 +199,7 @@ class StateMachine:
             return False
         # On its way to no torque it continues: who commanded none is not left with an arm that holds.
         disabling = ctx.state is State.DISABLING
-        return disabling or (Signal.STOP_FOR_CLOCK in self._active.leads_to and not ctx.arm.all_still)
+        return disabling or (Signal.STOP_FOR_CLOCK in self._active.leads_to and not ctx.joints.at_rest)
 
     def _target(self, cause: Cause) -> State | None:
         """Return where a cause leads from the active state; the reaction configured for an event may be harder."""

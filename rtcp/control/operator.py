@@ -7,6 +7,7 @@ from typing import Any
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.arm import Arm
+from rtcp.control.gripper import DrivenGripper
 from rtcp.control.part import Part, PartContext
 from rtcp.devices.driver import DeviceError
 from rtcp.devices.io_box import Inputs, IoBox, JoystickInput, Outputs
@@ -31,12 +32,13 @@ class Operator(Part):
     Args:
         config: which they are.
         boxes: the IO boxes by name; none: nothing is pressed, nothing is forbidden and there is no joystick.
+        driven: the gripper where it has a drive of its own.
 
     Raises:
         DeviceError: an input or output with a function hangs on no IO box: it would be ignored.
     """
 
-    def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox]) -> None:
+    def __init__(self, config: ArmConfig, boxes: Mapping[str, IoBox], driven: DrivenGripper | None) -> None:
         super().__init__("operator", OPERATOR_FIELDS)
         cycle_s = config.cycle.period_us * 1e-6
         inputs, outputs, gripper = config.inputs, config.outputs, config.gripper
@@ -44,6 +46,7 @@ class Operator(Part):
         self._outputs = Outputs(outputs, gripper)
         self._input = JoystickInput(inputs, cycle_s)
         self._joystick = Joystick(config.jog)
+        self._driven = driven
         self._stop_box = boxes.get(config.box_of(inputs.emergency_stop))
         self._switch_box = boxes.get(config.box_of(inputs.enabling_switch))
         self._toggle_box = boxes.get(config.box_of(inputs.arm_toggle))
@@ -163,7 +166,7 @@ class Operator(Part):
                 blackboard.event(UnknownJoystickCode(shown.code))
             self._code_reported = True
         if joystick.grip is not None:
-            self._grip_by_joystick(arm, blackboard, opens=joystick.grip)
+            self._grip_by_joystick(blackboard, opens=joystick.grip)
         jog.command(joystick.twist, in_tool_frame=joystick.frame == "tool")
         if jog.phase is Phase.HOLD and joystick.moves:
             jog.start()
@@ -172,10 +175,10 @@ class Operator(Part):
             return True
         return False
 
-    def _grip_by_joystick(self, arm: Arm, blackboard: Blackboard, opens: bool) -> None:
+    def _grip_by_joystick(self, blackboard: Blackboard, opens: bool) -> None:
         accepted = self.has_gripper
-        if arm.gripper is not None:
-            accepted = arm.gripper.grip(not opens)
+        if self._driven is not None:
+            accepted = self._driven.grip(not opens)
         elif accepted:
             self.grip(not opens)
         if accepted:

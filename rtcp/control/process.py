@@ -22,7 +22,6 @@ from typing import Any
 
 from kinematics.compiled import BUILD
 from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
-from rtcp.control.arm import Arm
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
 from rtcp.control.part import Device
@@ -156,7 +155,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         report.close()
 
     service.on_op = started
-    drives = {position_of(config, joint): drive for joint, drive in zip(config.axes, cycle.arm.all_drives, strict=True)}
+    drives = {position_of(config, joint): drive for joint, drive in zip(config.axes, cycle.joints.drives, strict=True)}
     service.temperature = lambda position: drives[position].temperature if position in drives else math.nan
     service.clock_followed = lambda: discipline is None or discipline.locked
     service.on_refused = cycle.shut_down
@@ -167,7 +166,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         cycle.run()
     except BaseException:
         # A defect in the cycle: the drives come to rest before the bus goes away.
-        stop_blindly(data, config, cycle.arm, cycle.devices)
+        stop_blindly(data, config, cycle.joints.pairs, cycle.devices)
         raise
     else:
         if service.refused:
@@ -178,7 +177,9 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
         scheduling.release(realtime)
 
 
-def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm, devices: Sequence[Device] = ()) -> None:
+def stop_blindly(
+    data: ProcessData, config: ArmConfig, drives: Sequence[tuple[int, Cia402Drive]], devices: Sequence[Device] = ()
+) -> None:
     """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
 
     Nothing else of the cycle is needed, and what raises for one drive or one frame keeps no other from being told.
@@ -188,7 +189,6 @@ def stop_blindly(data: ProcessData, config: ArmConfig, arm: Arm, devices: Sequen
             device.safe()
             device.encode(data)
     period_s = config.cycle.period_us * 1e-6
-    drives = arm.pairs if arm.gripper is None else [*arm.pairs, (arm.gripper.slot, arm.gripper.drive)]
     ramp_cycles = math.ceil(quick_stop_s(config) / period_s)
     due = time.monotonic()
     for goal, cycles in ((TargetState.QUICK_STOPPED, ramp_cycles), (TargetState.DISABLED, _DISABLE_CYCLES)):

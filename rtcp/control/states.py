@@ -37,7 +37,6 @@ from rtcp.ipc.events import (
     MotionEnded,
     MovedSinceFault,
     PermissionWithdrawn,
-    PositionJumped,
     ProcessDataLost,
     Ready,
     ResetDone,
@@ -115,15 +114,15 @@ class Starting(MachineState):
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Ask for OP once the clock is locked."""
-        service, arm = ctx.service, ctx.arm
+        service, joints = ctx.service, ctx.joints
         if service.lost_slave:
             # It fell before the first cycle in which all was well: nothing has moved yet that needs a reset.
             service.recover()
         if ctx.clock_locked:
             service.want_op()
-        arm.advance(TargetState.DISABLED)
+        joints.advance(TargetState.DISABLED)
         if ctx.good:
-            arm.track_actual()
+            joints.track_actual()
         if not service.all_op:
             # Frames are not whole yet: cycles lost until all slaves are in OP do not count.
             ctx.wkc_error_count = 0
@@ -155,15 +154,15 @@ class ReadyState(MachineState):
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Watch bus and drives."""
-        arm = ctx.arm
+        joints = ctx.joints
         event = ctx.bus_fault()
         if event is not None or not ctx.good:
             return event
-        axis = arm.first_in_fault()
+        axis = joints.first_in_fault()
         if axis >= 0:
             return ctx.drive_event(DriveFault, axis)
-        arm.advance(TargetState.DISABLED)
-        arm.track_actual()
+        joints.advance(TargetState.DISABLED)
+        joints.track_actual()
         return None
 
 
@@ -185,7 +184,7 @@ class Enabling(MachineState):
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Begin in CSP, where target = actual means standstill."""
         ctx.arm.set_mode(DriveMode.CSP)
-        ctx.arm.hold()
+        ctx.joints.hold()
         ctx.operator.require_neutral()
         self._false_cycles = 0
         """Cycles in a row in which a drive shows a position to which it cannot have turned."""
@@ -193,41 +192,41 @@ class Enabling(MachineState):
         """Drives that have been enabled, a bit each."""
         self._returning = False
         """All are enabled; joints outside their range return to it."""
-        self._reset_supervision(ctx)
+        ctx.joints.reset_supervision()
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Advance the drives by one step."""
-        arm = ctx.arm
+        joints = ctx.joints
         event = ctx.bus_fault()
         if event is not None or not ctx.good:
             return event
-        event = self._drive_problem(ctx) or self._jump(ctx) or arm.beyond_limits(ctx.supervision)
+        event = self._drive_problem(ctx) or self._jump(ctx) or joints.beyond_limits()
         if event is not None or self._false_cycles:
             # While a position is false the last targets are sent again.
             return event
-        arm.advance(TargetState.ENABLED)
-        arm.track_actual()
-        arm.command()
-        axis = arm.first_not_enabled()
-        wrong_mode = arm.first_in_another_mode() if axis < 0 else -1
-        if axis < 0 and wrong_mode < 0 and (arm.gripper is None or arm.gripper.enabled):
+        joints.advance(TargetState.ENABLED)
+        joints.track_actual()
+        joints.command()
+        axis = joints.first_not_enabled()
+        wrong_mode = joints.first_in_another_mode() if axis < 0 else -1
+        if axis < 0 and wrong_mode < 0:
             return self._all_enabled(ctx)
         if ctx.waited <= ctx.cycles(ctx.config.enable_timeout_s):
             return None
         if axis >= 0:
             ctx.service.explain_drive(axis)
-            return EnableTimeout(axis, arm.all_drives[axis].statusword)
-        return ctx.wrong_drive_mode(wrong_mode if wrong_mode >= 0 else len(arm.drives))
+            return EnableTimeout(axis, joints.drives[axis].statusword)
+        return ctx.wrong_drive_mode(wrong_mode)
 
     def _drive_problem(self, ctx: Context) -> Event | None:
-        arm = ctx.arm
-        axis = arm.first_outside()
+        joints = ctx.joints
+        axis = joints.first_outside()
         if axis >= 0:
-            return LeftRange(axis, arm.all_drives[axis].position)
-        axis = arm.first_in_fault()
+            return LeftRange(axis, joints.drives[axis].position)
+        axis = joints.first_in_fault()
         if axis >= 0:
             return ctx.drive_event(DriveFault, axis)
-        for axis, drive in enumerate(arm.all_drives):
+        for axis, drive in enumerate(joints.drives):
             if drive.state is DriveState.OPERATION_ENABLED:
                 self._were_enabled |= 1 << axis
             elif self._were_enabled >> axis & 1:
@@ -235,31 +234,23 @@ class Enabling(MachineState):
         return None
 
     def _jump(self, ctx: Context) -> Event | None:
-        arm = ctx.arm
-        axis = arm.first_off_target()
-        self._false_cycles = 0 if axis < 0 else self._false_cycles + 1
-        if self._false_cycles < ctx.config.supervision.cycles:
-            return None
-        return PositionJumped(axis, arm.all_drives[axis].position, arm.tracked_to(axis))
+        jump = ctx.joints.position_jump()
+        self._false_cycles = 0 if jump is None else self._false_cycles + 1
+        return None if self._false_cycles < ctx.config.supervision.cycles else jump
 
     def _all_enabled(self, ctx: Context) -> Event | None:
-        arm = ctx.arm
+        joints = ctx.joints
         if not self._returning:
             self._returning = True
-            for axis, fastest in enumerate(arm.limits.velocity):
-                beyond = arm.beyond_range(axis)
-                if beyond > self._REPORTED_RAD:
-                    ctx.publish(ReturningToRange(axis, beyond, min(BACK_RAD_S, fastest)))
-        if arm.first_returning() >= 0:
+            for group in joints.groups:
+                for i, fastest in enumerate(group.limits.velocity):
+                    beyond = group.beyond_range(i)
+                    if beyond > self._REPORTED_RAD:
+                        ctx.publish(ReturningToRange(group.first + i, beyond, min(BACK_RAD_S, fastest)))
+        if joints.first_returning() >= 0:
             return None
-        self._reset_supervision(ctx)
+        joints.reset_supervision()
         return Enabled()
-
-    @staticmethod
-    def _reset_supervision(ctx: Context) -> None:
-        ctx.supervision.reset()
-        if ctx.arm.gripper is not None:
-            ctx.arm.gripper.supervision.reset()
 
 
 class Holding(MachineState):
@@ -306,12 +297,12 @@ class Holding(MachineState):
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Hold, wait for a mode change, or start to move by the joystick."""
-        arm = ctx.arm
+        arm, joints = ctx.arm, ctx.joints
         event = ctx.track()
         if event is not None:
             return event
         if self.changing_mode:
-            axis = arm.first_in_another_mode()
+            axis = joints.first_in_another_mode()
             self.changing_mode = axis >= 0
             if axis >= 0 and ctx.cycle - self._since > ctx.cycles(self._MODE_S):
                 return ctx.wrong_drive_mode(axis)
@@ -371,19 +362,19 @@ class Stopping(MachineState):
         ctx.operator.require_neutral()
         if not isinstance(cause, MotionEnded):
             ctx.limited = ctx.limited and cause is Signal.STOP_FOR_CLOCK
-            ctx.arm.stop()
-        elif ctx.limited and ctx.arm.gripper is not None:
-            ctx.arm.gripper.stop()
+            ctx.joints.stop()
+        elif ctx.limited:
+            ctx.joints.stop_others()
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Decelerate; at standstill hold, or begin the fault that the stop was for."""
-        arm = ctx.arm
+        arm, joints = ctx.arm, ctx.joints
         event = ctx.track()
         if event is not None:
             return event
         if ctx.pending is not None:
-            return ctx.pending if arm.all_still else None
-        if not arm.still or arm.trajectory_guard.stopping:
+            return ctx.pending if joints.at_rest else None
+        if not arm.at_rest:
             return None
         arm.rest()
         return StoppedByLimit() if ctx.limited else Stopped()
@@ -430,19 +421,19 @@ class Disabling(MachineState):
 
     def enter(self, ctx: Context, cause: Cause, before: State) -> None:
         """Let the arm come to rest."""
-        ctx.arm.stop()
+        ctx.joints.stop()
         self._since = ctx.cycle
         self._commanded = 0
         """Cycles in which the drives were commanded to disable."""
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Stop, then disable."""
-        arm = ctx.arm
+        joints = ctx.joints
         if ctx.homing.under_way:
             ctx.homing.stop()
             self._since = ctx.cycle
             return ctx.track_homing()
-        if not arm.all_still:
+        if not joints.at_rest:
             # The time to disable begins when the arm stands.
             self._since = ctx.cycle
             return ctx.track()
@@ -450,15 +441,15 @@ class Disabling(MachineState):
         if fault is not None or not ctx.good:
             return fault
         ctx.all_enabled = False
-        arm.advance(TargetState.DISABLED)
-        arm.track_actual()
+        joints.advance(TargetState.DISABLED)
+        joints.track_actual()
         self._commanded += 1
-        axis = arm.first_with_torque()
+        axis = joints.first_with_torque()
         if axis < 0:
             return Disabled() if self._commanded > SETTLE_CYCLES else None
         if ctx.cycle - self._since > ctx.cycles(ctx.config.enable_timeout_s):
             ctx.service.explain_drive(axis)
-            return DisableTimeout(axis, arm.all_drives[axis].statusword)
+            return DisableTimeout(axis, joints.drives[axis].statusword)
         return None
 
 
@@ -497,7 +488,7 @@ class Standstill:
         self._cycles += 1
         if not ctx.good:
             self._lost += 1
-        stands = ctx.good and self._cycles > FIRST_CYCLES and ctx.arm.first_moving() < 0
+        stands = ctx.good and self._cycles > FIRST_CYCLES and ctx.joints.first_moving() < 0
         return stands or self.unobservable or self._cycles > self._stand_cycles
 
 
@@ -549,19 +540,19 @@ class FaultReaction:
         ctx.pending = None
         ctx.all_enabled = False
         ctx.homing.abandon()
-        ctx.arm.hold()
+        ctx.joints.hold()
         self.standstill.begin()
         self._unobservable = 0
 
     def update(self, ctx: Context) -> None:
         """Command the drives, whether or not frames return: slaves that hear must not keep their speed or torque."""
-        arm = ctx.arm
+        joints = ctx.joints
         at_rest = not self.torque_off and self.off_at_rest and self.standstill.reached(ctx)
         if not self.torque_off and (at_rest or self._estop_unobservable(ctx)):
             self.remove_torque(ctx)
-        arm.advance(TargetState.TORQUE_OFF if self.torque_off else TargetState.QUICK_STOPPED)
+        joints.advance(TargetState.TORQUE_OFF if self.torque_off else TargetState.QUICK_STOPPED)
         if ctx.good:
-            arm.track_actual()
+            joints.track_actual()
 
     def remove_torque(self, ctx: Context) -> None:
         """Remove the torque from now on."""
@@ -628,7 +619,7 @@ class FaultState(MachineState):
             torque_off=hard or (fails and reaction.torque_off),
             off_at_rest=before is State.DISABLING or (fails and reaction.off_at_rest),
         )
-        ctx.arm.advance(TargetState.TORQUE_OFF if reaction.torque_off else TargetState.QUICK_STOPPED)
+        ctx.joints.advance(TargetState.TORQUE_OFF if reaction.torque_off else TargetState.QUICK_STOPPED)
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Keep the drives stopped."""
@@ -669,13 +660,13 @@ class EmergencyStopState(MachineState):
         self._off = TargetState.TORQUE_OFF if hard else TargetState.DISABLED
         self._since = ctx.cycle
         self._parked = False
-        ctx.arm.advance(TargetState.TORQUE_OFF if hard else TargetState.QUICK_STOPPED)
+        ctx.joints.advance(TargetState.TORQUE_OFF if hard else TargetState.QUICK_STOPPED)
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Stop, remove the torque, then park the slaves."""
-        arm, reaction = ctx.arm, self._reaction
+        joints, reaction = ctx.joints, self._reaction
         if not reaction.torque_off:
-            arm.advance(TargetState.QUICK_STOPPED)
+            joints.advance(TargetState.QUICK_STOPPED)
             if reaction.standstill.reached(ctx):
                 if reaction.standstill.unobservable:
                     # The states of the drives are unknown: from each of them this removes the torque.
@@ -683,15 +674,15 @@ class EmergencyStopState(MachineState):
                 reaction.torque_off = True
                 self._since = ctx.cycle
         else:
-            arm.advance(self._off)
+            joints.advance(self._off)
             waited = ctx.cycle - self._since
-            off = ctx.good and waited > FIRST_CYCLES and arm.first_with_torque() < 0
+            off = ctx.good and waited > FIRST_CYCLES and joints.first_with_torque() < 0
             if not self._parked and (off or waited > ctx.cycles(self._OFF_S)):
                 self._parked = True
                 ctx.service.park()
                 ctx.publish(SlavesParked())
         if ctx.good:
-            arm.track_actual()
+            joints.track_actual()
         return None
 
 
@@ -722,16 +713,16 @@ class Resetting(MachineState):
 
     def update(self, ctx: Context) -> Event | Signal | None:
         """Reset what is back; give up after a while."""
-        arm = ctx.arm
+        joints = ctx.joints
         if ctx.reported is not None:
             return ctx.reported
         if not (ctx.good and ctx.service.all_op and ctx.clock_locked):
             self._reaction.update(ctx)
             return self._failure(ctx)
         # What still moves comes to rest first: its torque goes with the reset.
-        arm.advance(TargetState.RESET if arm.first_moving() < 0 else TargetState.QUICK_STOPPED)
-        arm.track_actual()
-        if arm.first_not_resting() < 0 and ctx.operator.button_known:
+        joints.advance(TargetState.RESET if joints.first_moving() < 0 else TargetState.QUICK_STOPPED)
+        joints.track_actual()
+        if joints.first_not_resting() < 0 and ctx.operator.button_known:
             return ResetDone()
         return self._failure(ctx)
 
@@ -740,15 +731,15 @@ class Resetting(MachineState):
         settling_s = 0.0 if button is None else button.debounce_ms * 1e-3
         if ctx.waited <= ctx.cycles(self._RESET_S + settling_s):
             return None
-        arm, all_op = ctx.arm, ctx.service.all_op
-        axis = arm.first_moving()
+        joints, all_op = ctx.joints, ctx.service.all_op
+        axis = joints.first_moving()
         if axis >= 0 and ctx.good and all_op:
-            return ResetWhileMoving(axis, arm.all_drives[axis].velocity)
-        axis = arm.first_not_resting()
+            return ResetWhileMoving(axis, joints.drives[axis].velocity)
+        axis = joints.first_not_resting()
         # Without the clock no drive was commanded to reset: that one is not at rest is not the reason.
         if axis >= 0 and all_op and ctx.clock_locked:
             ctx.service.explain_drive(axis)
-            return ResetTimeout(axis, arm.all_drives[axis].statusword)
+            return ResetTimeout(axis, joints.drives[axis].statusword)
         return ResetWithoutFrames() if all_op else ResetWithoutSlaves()
 
 
@@ -774,35 +765,35 @@ class Closing(MachineState):
         return Signal.CLOSED if self._is_done(ctx) else None
 
     def _is_done(self, ctx: Context) -> bool:
-        arm, lost_limit = ctx.arm, ctx.config.bus.lost_cycles
+        joints, lost_limit = ctx.joints, ctx.config.bus.lost_cycles
         self._cycles += 1
         if self._decelerates(ctx):
             return False
         if ctx.lost >= lost_limit:
             # Slaves that still listen stay in OP until the joints stand.
-            arm.advance(self._target if self._hard else _TARGETS[ctx.reactions[ProcessDataLost]])
+            joints.advance(self._target if self._hard else _TARGETS[ctx.reactions[ProcessDataLost]])
             return ctx.lost >= lost_limit + ceil(quick_stop_s(ctx.config) / ctx.period_s) + SETTLE_CYCLES
         if self._cycles > ctx.cycles(self._CLOSING_S):
             return True
         if not ctx.good:
             return False
         homing = ctx.homing
-        if homing.under_way and arm.first_not_enabled() < 0:
+        if homing.under_way and joints.first_not_enabled() < 0:
             homing.stop()
             homing.step()
             self._cycles = 0
             if homing.still_moving:
-                self._stop_hard(ctx, HomingStillMoving(homing.axis, arm.drives[homing.axis].velocity))
+                self._stop_hard(ctx, HomingStillMoving(homing.axis, joints.drives[homing.axis].velocity))
             return False
         return self._stop(ctx) and self._remove_torque(ctx)
 
     def _decelerates(self, ctx: Context) -> bool:
         """React to the emergency stop or a measurement beyond its limit; return whether the arm moves after it."""
-        arm = ctx.arm
-        if not self._hard and arm.first_with_torque() >= 0:
+        joints = ctx.joints
+        if not self._hard and joints.first_with_torque() >= 0:
             event: Event | None = None
-            if ctx.good and arm.first_not_enabled() < 0:
-                event = arm.beyond_limits(ctx.supervision)
+            if ctx.good and joints.first_not_enabled() < 0:
+                event = joints.beyond_limits()
             if event is None and ctx.operator.emergency_stop:
                 event = EmergencyStopActivated()
             if event is not None:
@@ -812,11 +803,11 @@ class Closing(MachineState):
         self._standstill.reached(ctx)
         if self._standstill.unobservable:
             self._target = TargetState.TORQUE_OFF
-        if arm.first_moving() < 0 or self._cycles > ctx.cycles(self._CLOSING_S):
+        if joints.first_moving() < 0 or self._cycles > ctx.cycles(self._CLOSING_S):
             return False
-        arm.advance(self._target)
+        joints.advance(self._target)
         if ctx.good:
-            arm.track_actual()
+            joints.track_actual()
         return True
 
     def _stop_hard(self, ctx: Context, event: Event) -> None:
@@ -825,25 +816,25 @@ class Closing(MachineState):
         self._cycles = 0
         self._standstill.begin()
         ctx.homing.abandon()
-        ctx.arm.hold()
+        ctx.joints.hold()
         ctx.publish(event)
 
     def _stop(self, ctx: Context) -> bool:
         """Bring the setpoints to rest; return whether they are, or the drives do not follow them anyway."""
-        arm = ctx.arm
-        arm.stop()
-        if arm.all_still or arm.first_not_enabled() >= 0:
+        joints = ctx.joints
+        joints.stop()
+        if joints.at_rest or joints.first_not_enabled() >= 0:
             return True
         self._cycles = 0
-        if arm.command() is GuardResult.STOPPED:
-            arm.rest()
+        if joints.command() is GuardResult.STOPPED:
+            ctx.arm.rest()
         return False
 
     def _remove_torque(self, ctx: Context) -> bool:
         # In a fault the drives decelerate by themselves: their torque goes when they stand.
-        arm = ctx.arm
-        ramping = arm.first_with_torque() >= 0 and arm.first_not_enabled() >= 0 and arm.first_moving() >= 0
-        arm.advance(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)
-        arm.track_actual()
+        joints = ctx.joints
+        ramping = joints.first_with_torque() >= 0 and joints.first_not_enabled() >= 0 and joints.first_moving() >= 0
+        joints.advance(TargetState.QUICK_STOPPED if ramping else TargetState.DISABLED)
+        joints.track_actual()
         self._commanded = 0 if ramping else self._commanded + 1
-        return self._commanded > SETTLE_CYCLES and arm.first_with_torque() < 0
+        return self._commanded > SETTLE_CYCLES and joints.first_with_torque() < 0

@@ -9,7 +9,7 @@ import numpy as np
 
 from rtcp.config.model import ConfigError, Joint
 from rtcp.config.zero import read_zeros, store_zero
-from rtcp.control.arm import WITH_TORQUE
+from rtcp.control.joint_group import WITH_TORQUE
 from rtcp.devices.cia402 import DriveState, state_of
 from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json

@@ -214,7 +214,7 @@ class LoopRig:
             board.slave(position, AlState.OP, 0)
         self.now_ns = monotonic_ns()
         self.loop = Cycle(config, self.data, board, self.service, self.discipline, lambda: self.now_ns)
-        self.arm, self.operator = self.loop.arm, self.loop.operator
+        self.arm, self.joints, self.operator = self.loop.arm, self.loop.joints, self.loop.operator
         self.box = next((box for _, box in self.loop.machine.context.boxes), None)
         self.machine, self.context = self.loop.machine, self.loop.machine.context
         self.names = Names(config)

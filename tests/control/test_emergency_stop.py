@@ -99,7 +99,7 @@ def test_still_pressed_when_the_parked_box_is_heard_again_it_is_an_emergency_sto
     assert rig.state is State.EMERGENCY_STOP
     assert State.READY not in {cycle.state for cycle in rig.log[at:]}
     assert rig.refused(rig.send(Enable()))
-    assert rig.arm.first_with_torque() == -1
+    assert rig.joints.first_with_torque() == -1
 
 
 def test_the_gripper_is_not_switched_while_it_is_pressed(rig: LoopRig) -> None:
@@ -175,7 +175,7 @@ def test_stopped_by_a_limit_the_arm_holds_and_moves_again_only_after_reset(rig: 
     held = [cycle.target for cycle in rig.log[-1].drives]
     rig.run(0.2)
     assert [said.target for said in rig.log[-1].drives] == held
-    assert rig.arm.first_not_enabled() == -1
+    assert rig.joints.first_not_enabled() == -1
     answer = rig.send(move_to(0.0, 0.0))
     assert isinstance(answer.refusal, WrongState)
     assert rig.refused(answer).endswith("`rtcp reset` first")
@@ -251,7 +251,7 @@ def test_disabling_ends_a_homing_before_the_torque_goes(rig: LoopRig, meanwhile:
     meanwhile(rig)
     rig.until(ends_in)
     rig.run(1.0)
-    assert rig.arm.first_with_torque() == -1 or ends_in is State.FAULT
+    assert rig.joints.first_with_torque() == -1 or ends_in is State.FAULT
     assert (TorqueRemoved in rig.kinds) is (ends_in is State.FAULT)
 
 

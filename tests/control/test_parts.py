@@ -107,7 +107,7 @@ def test_a_fault_that_is_reported_on_the_way_out_of_one_keeps_the_machine_in_it(
 def test_an_emergency_stop_that_hangs_on_no_box_is_refused_and_never_ignored() -> None:
     assert CONFIG.inputs.emergency_stop is not None
     with pytest.raises(DeviceError, match="EmergencyStopConfig needs an IO box"):
-        Operator(CONFIG, {})
+        Operator(CONFIG, {}, None)
     elsewhere = replace(CONFIG.inputs.emergency_stop, box="drive1")
     with pytest.raises(DeviceError, match="drive1 is none"):
-        Operator(replace(CONFIG, inputs=replace(CONFIG.inputs, emergency_stop=elsewhere)), {})
+        Operator(replace(CONFIG, inputs=replace(CONFIG.inputs, emergency_stop=elsewhere)), {}, None)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -69,7 +68,7 @@ def ramps_down_under_torque(watched: Watched) -> bool:
 @pytest.mark.parametrize("mode", [CSP, CSV, CST])
 def test_after_a_defect_joints_ramp_down_and_none_loses_its_torque_while_it_moves(rig: LoopRig, mode: int) -> None:
     watched = set_in_motion(rig, mode)
-    stop_blindly(rig.data, CONFIG, rig.arm)
+    stop_blindly(rig.data, CONFIG, rig.joints.pairs)
     assert ramps_down_under_torque(watched)
 
 
@@ -81,7 +80,7 @@ def test_a_defect_in_one_drive_keeps_neither_it_nor_the_others_from_ramping_down
     watched = set_in_motion(rig)
     slot, drive = rig.arm.pairs[axis]
     rig.arm.pairs[axis] = (slot, Defective(drive, step))  # type: ignore[assignment]
-    stop_blindly(rig.data, CONFIG, rig.arm)
+    stop_blindly(rig.data, CONFIG, rig.joints.pairs)
     assert ramps_down_under_torque(watched)
 
 
@@ -95,7 +94,7 @@ def test_a_frame_that_cannot_be_sent_is_followed_by_others(rig: LoopRig) -> None
         send()
 
     rig.data.send = sends  # type: ignore[method-assign]
-    stop_blindly(rig.data, CONFIG, rig.arm)
+    stop_blindly(rig.data, CONFIG, rig.joints.pairs)
     assert ramps_down_under_torque(watched)
 
 
@@ -129,8 +128,7 @@ def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_o
     slaves = (*CONFIG.slaves[:2], turned_round(CONFIG.slaves[2]))
     config = replace(CONFIG, slaves=slaves)
     data = Sent(config)
-    arm = SimpleNamespace(pairs=make_drives(config), gripper=None)
-    stop_blindly(data, config, arm)  # type: ignore[arg-type]
+    stop_blindly(data, config, make_drives(config))
     rest = layout(slaves[1].device.rpdo).bytes - 2
     ramp = [frame for frame in data.frames if struct.unpack_from("<H", frame[1])[0] == QUICK_STOP]
     assert len(ramp) * PERIOD_S >= RAMP_S
@@ -138,12 +136,3 @@ def test_the_controlword_of_a_drive_whose_driver_raises_is_at_its_place_in_its_o
     assert {frame[1] for frame in ramp} == {struct.pack("<H", QUICK_STOP) + bytes(rest)}
     assert {frame[2] for frame in ramp} == {bytes(rest) + struct.pack("<H", QUICK_STOP)}
     assert {word for frame in data.frames[len(ramp) :] for word in (*frame[1], *frame[2])} == {VOLTAGE_OFF}
-
-
-def test_the_grippers_drive_is_commanded_as_the_joints_are() -> None:
-    data = Sent(CONFIG)
-    joint, (slot, drive) = make_drives(CONFIG)
-    arm = SimpleNamespace(pairs=[joint], gripper=SimpleNamespace(slot=slot, drive=drive))
-    stop_blindly(data, CONFIG, arm)  # type: ignore[arg-type]
-    assert all(frame[slot] == frame[joint[0]] for frame in data.frames)
-    assert struct.unpack_from("<H", data.frames[0][slot])[0] == QUICK_STOP

@@ -140,7 +140,7 @@ def test_a_slot_or_a_count_that_is_none_is_refused(rig: LoopRig, slot: int, coun
 
 def standing_arm() -> Arm:
     """The arm of the default configuration, at rest away from its boxes."""
-    arm = Arm(load(default_config()), [], None, lambda slot: memoryview(b"").cast("d"))
+    arm = Arm(load(default_config()), [], lambda slot: memoryview(b"").cast("d"))
     arm.state.commanded[:] = [0.3, -0.5, 1.2, 0.2, 0.7, -0.4]
     arm.trajectory_guard.latch(arm.state)
     return arm

@@ -177,7 +177,7 @@ def test_the_arm_holds_its_place_through_every_change_of_mode(rig: LoopRig, posi
     for mode in (CSV, CST, CSP, CST, CSV, CSP):
         rig.do(SetDriveMode(DriveMode(mode)))
         rig.run(0.3)
-        assert rig.arm.first_in_another_mode() == -1
+        assert rig.joints.first_in_another_mode() == -1
     seen = [cycle.drives[0] for cycle in rig.log[before:]]
     assert len({said.target for said in seen}) == 1
     assert max(abs(said.position - round(position * COUNTS)) for said in seen) <= 50
@@ -345,7 +345,7 @@ def test_a_stop_comes_to_rest_far_before_the_target_and_holds(rig: LoopRig) -> N
     rig.run(0.1)
     assert rig.kinds[-1] is Stopped
     assert rig.arm.drives[0].position < 0.3
-    assert rig.arm.first_moving() == -1
+    assert rig.joints.first_moving() == -1
 
 
 def test_a_lease_of_another_commander_ends_the_move_too(rig: LoopRig) -> None:

@@ -114,7 +114,7 @@ def test_for_a_lost_clock_the_arm_comes_to_rest_under_its_limits_before_it_is_a_
     rig.until(State.FAULT)
     ramp = rig.log[at:-1]
     assert {said.controlword for cycle in ramp for said in cycle.drives} == {ENABLE_OPERATION}
-    assert rig.arm.first_moving() == -1
+    assert rig.joints.first_moving() == -1
     assert rig.kinds.count(ClockLost) == 1
     assert rig.machine.fault == ClockLost.number
     rig.run(0.2)

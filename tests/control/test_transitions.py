@@ -217,7 +217,7 @@ def test_an_event_leads_to_its_state(rig: LoopRig, event: str, state: State) -> 
         assert words <= {QUICK_STOP}
         assert rig.machine.fault == kind.number
     if goal is State.EMERGENCY_STOP:
-        rig.wait(lambda: rig.arm.first_with_torque() == -1, 2.5)
+        rig.wait(lambda: rig.joints.first_with_torque() == -1, 2.5)
 
 
 # -- what is derived from the table ---------------------------------------------------------------------------------

@@ -168,7 +168,7 @@ def test_the_emergency_stop_ends_a_jog_without_a_jump(arm: Arm) -> None:
     simulation.run(1.5)
     assert simulation.state is State.EMERGENCY_STOP
     assert max(map(abs, simulation.loop.arm.state.actual_velocity)) < 0.01
-    assert simulation.loop.arm.first_with_torque() == -1
+    assert simulation.loop.joints.first_with_torque() == -1
     simulation.run(0.2)
     assert {slave.state.name for slave in simulation.bus.read_states()} == {"PREOP"}
 
@@ -204,7 +204,7 @@ def test_the_emergency_stop_is_met_while_the_loop_closes(arm: Arm) -> None:
     simulation.run(0.05)
     assert {drive.controlword for drive in simulation.loop.arm.drives} == {0x0002}
     assert simulation.until(lambda: simulation.done, 5.0)
-    assert simulation.loop.arm.first_with_torque() == -1
+    assert simulation.loop.joints.first_with_torque() == -1
 
 
 def test_the_joystick_moves_the_arm_again_after_a_fault_that_came_while_it_did(arm: Arm) -> None:

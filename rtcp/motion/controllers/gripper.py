@@ -11,37 +11,30 @@ _FIRM_CYCLES = 5
 
 
 class GripperMotion:
-    """Setpoints of a gripper's joint: jerk-limited, one `update` a cycle.
+    """Setpoints of a gripper's joint, whose state the methods get: jerk-limited, one `update` a cycle.
 
     While it moves, a torque at the joint's limit against the motion for 5 cycles means that it holds something: the
     setpoint stays, a little inside of what is held. A drive pushes ever harder towards a setpoint that it cannot
     reach: for as long as the torque is beyond the limit the setpoint yields, under the joint's acceleration. Nothing
-    else ever ends in force: the drive's following error would be a fault.
+    else ever ends in force: the drive's following error would be a fault. The output limiter keeps what is sent inside
+    range and step.
 
-    Attributes: `position` (rad, the setpoint), `gripped` (it was stopped by what it holds).
+    Attributes: `gripped` (it was stopped by what it holds).
     """
 
     def __init__(self, joint: Joint, open_position: float, closed_position: float, period_s: float) -> None:
         """Make the motion of `joint`; positions in rad inside its range, the cycle in s."""
         self._motion = JointMotion(period_s, [joint.velocity], [joint.acceleration], [joint.jerk])
-        self._state = ArmState(1)
         self._period_s = period_s
         # A way that begins where the setpoint was cut takes the last cycle's mean acceleration, and errs by so much.
         self._speed = max(joint.velocity - 0.5 * joint.acceleration * period_s, 0.5 * joint.velocity)
-        self._step = joint.velocity * period_s
         self._firm_torque = joint.torque
         self._yielding = joint.acceleration * period_s * period_s
         self._direction = 0.0
-        self._low, self._high = joint.position.min, joint.position.max
         self._goals = {False: open_position, True: closed_position}
         self._firm = 0
         self._closing: bool | None = None
         self.gripped = False
-
-    @property
-    def position(self) -> float:
-        """The setpoint, rad."""
-        return self._state.commanded[0]
 
     @property
     def moving(self) -> bool:
@@ -53,64 +46,42 @@ class GripperMotion:
         """Whether it comes to rest on its way."""
         return self._motion.phase is Phase.STOP
 
-    def latch(self, position: float) -> None:
-        """Rest at `position`, rad, or at the end of the range that it is beyond: without torque it is where it is."""
-        state = self._state
-        state.commanded[0] = self.clamped(position)
+    def hold(self, state: ArmState) -> None:
+        """Rest at the setpoint from now on."""
         state.commanded_velocity[0] = state.commanded_acceleration[0] = 0.0
         self._motion.hold()
         self._firm = 0
-        self.gripped = False
 
-    def grip(self, close: bool) -> bool:
+    def grip(self, state: ArmState, close: bool) -> bool:
         """Go to where it is closed, or open, from whatever it does; return False where no way is found."""
         if close is self._closing and self._motion.phase is Phase.MOVE:
             return True
-        if not self._motion.move_to(self._state, [self._goals[close]], self._speed):
+        if not self._motion.move_to(state, [self._goals[close]], self._speed):
             return False
         self._closing = close
         self._firm = 0
         self.gripped = False
         return True
 
-    def stop(self) -> None:
+    def stop(self, state: ArmState) -> None:
         """Come to rest under its limits."""
-        state = self._state
-        if any(state.commanded_velocity) or any(state.commanded_acceleration):
-            self._motion.stop(state)
-        else:
-            # On a way that has not begun: the generator's stop does nothing at rest.
-            self._motion.hold()
+        self._motion.stop(state)
 
-    def update(self, torque: float) -> float:
-        """Return the setpoint of the next cycle, rad; `torque`: measured, Nm."""
-        state = self._state
-        before = state.commanded_velocity[0]
+    def update(self, state: ArmState) -> None:
+        """Move the setpoint on by one cycle."""
+        torque, before = state.actual_torque[0], state.commanded_velocity[0]
         # A drive pushes in the direction of its setpoint: what resists shows as torque in that direction.
         firm = self.moving and (torque if before > 0.0 else -torque) >= self._firm_torque
         self._firm = self._firm + 1 if firm else 0
         if self._firm >= _FIRM_CYCLES:
-            here = state.commanded[0]
-            self.latch(here)
+            self.hold(state)
             self.gripped = True
             self._direction = 1.0 if before > 0.0 else -1.0
-            return here
+            return
         if self.gripped and torque * self._direction > self._firm_torque:
             state.commanded[0] -= self._direction * self._yielding
         target = self._motion.update(state)
-        position = self._next(state.commanded[0], target.position[0])
         velocity = target.velocity[0]
-        state.commanded[0] = position
+        state.commanded[0] = target.position[0]
         state.commanded_velocity[0] = velocity
         state.commanded_acceleration[0] = (velocity - before) / self._period_s
-        return position
-
-    def clamped(self, position: float) -> float:
-        """Return what of the range, rad, is nearest to `position`."""
-        return min(max(position, self._low), self._high)
-
-    def _next(self, here: float, wanted: float) -> float:
-        """The last place before the drive: inside the range, no step beyond speed x cycle, never what is no number."""
-        low, high = max(self._low, here - self._step), min(self._high, here + self._step)
-        # A comparison with NaN is false.
-        return wanted if low <= wanted <= high else high if wanted > high else low if wanted < low else here

@@ -14,13 +14,17 @@ class Supervision:
     Args:
         config: factors, and how many cycles are too many.
         limits: of the joints; read every cycle.
+        first: axis number of the first joint.
     """
 
-    def __init__(self, config: ArmConfig, limits: Limits) -> None:
+    def __init__(self, config: ArmConfig, limits: Limits, first: int = 0) -> None:
         bounds, n = config.supervision, len(config.joints)
         self._limits = limits
+        self._first = first
         self._cycles = bounds.cycles
-        self._speed, self._torque, self._error = bounds.speed, bounds.torque, bounds.following_error
+        self._speed, self._torque = bounds.speed, bounds.torque
+        self.following_error = bounds.following_error
+        """Limit in force, rad; infinite while a gripper holds an object."""
         self._joints = range(n)
         self._counts = [[0] * n, [0] * n, [0] * n]
         self._counted = False
@@ -35,7 +39,8 @@ class Supervision:
 
     def check(self, state: ArmState) -> EmergencyStop | None:
         """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
-        limits, error, speed, torque, cycles = self._limits, self._error, self._speed, self._torque, self._cycles
+        limits, error, cycles = self._limits, self.following_error, self._cycles
+        speed, torque = self._speed, self._torque
         speeds, torques, errors = self._counts
         fastest, strongest = limits.velocity, limits.torque
         actual, commanded = state.actual, state.commanded
@@ -62,7 +67,7 @@ class Supervision:
                 speeds[i] += 1
                 counted = True
                 if speeds[i] >= cycles:
-                    return OverSpeed(i, value, bound)
+                    return OverSpeed(self._first + i, value, bound)
             bound = torque * strongest[i]
             value = actual_torque[i]
             if -bound <= value <= bound:
@@ -71,7 +76,7 @@ class Supervision:
                 torques[i] += 1
                 counted = True
                 if torques[i] >= cycles:
-                    return OverTorque(i, value, bound)
+                    return OverTorque(self._first + i, value, bound)
             value = actual[i] - commanded[i]
             if -error <= value <= error:
                 errors[i] = 0
@@ -79,6 +84,6 @@ class Supervision:
                 errors[i] += 1
                 counted = True
                 if errors[i] >= cycles:
-                    return FollowingError(i, value, error)
+                    return FollowingError(self._first + i, value, error)
         self._counted = counted
         return None

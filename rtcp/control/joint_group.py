@@ -1,0 +1,254 @@
+"""Joints that share their limits, supervision and output limiter: the arm is one group, a driven gripper another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rtcp.config.model import ArmConfig
+from rtcp.control.part import Part
+from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
+from rtcp.fieldbus.bus import ProcessData
+from rtcp.ipc.events import EmergencyStop, PositionJumped
+from rtcp.ipc.schema import Field
+from rtcp.motion.guards.output_limiter import OutputLimiter
+from rtcp.motion.guards.supervision import Supervision
+from rtcp.motion.guards.trajectory_guard import GuardResult
+from rtcp.motion.limits import Limits
+from rtcp.motion.state import ArmState
+
+WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
+RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
+"""Drive states without torque and without a fault."""
+_ENABLED = DriveState.OPERATION_ENABLED
+_HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
+"""Drive states with torque: the target stands."""
+_STILL_RAD_S = 0.01
+RANGE_MARGIN_RAD = 0.02
+"""So far outside its range a joint may stand and still be enabled, to return to the edge: an overshoot in CST must not
+leave an arm that no command can move."""
+TRACKED_RAD = 0.03
+"""No joint that stood turns so far between two frames: a position further away is not tracked while enabling. More than
+a joint may stand outside its range."""
+
+
+class JointGroup(Part):
+    """Drives with consecutive axis numbers. Its setpoints advance only in `command`, when the machine calls it.
+
+    Args:
+        name: of the part.
+        fields: of the record.
+        config: its `joints` are those of the group.
+        drives: one a joint, with the index of its slave.
+        first: axis number of the first joint.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        fields: Sequence[Field],
+        config: ArmConfig,
+        drives: Sequence[tuple[int, Cia402Drive]],
+        first: int = 0,
+    ) -> None:
+        super().__init__(name, fields)
+        self.first = first
+        self.period_s = config.cycle.period_us * 1e-6
+        self.pairs = list(drives)
+        self.drives = [drive for _, drive in drives]
+        self.state = ArmState(len(config.joints))
+        self.limits = Limits(config)
+        self.output_limiter = OutputLimiter(self.limits, self.period_s)
+        self.supervision = Supervision(config, self.limits, first)
+
+    def decode(self, data: ProcessData) -> None:
+        """Read the inputs of the drives."""
+        state = self.state
+        actual, speed, torque = state.actual, state.actual_velocity, state.actual_torque
+        for axis, (slot, drive) in enumerate(self.pairs):
+            drive.decode(data.input(slot))
+            actual[axis] = drive.position
+            speed[axis] = drive.velocity
+            torque[axis] = drive.torque
+
+    def encode(self, data: ProcessData) -> None:
+        """Write the outputs of the drives."""
+        for slot, drive in self.pairs:
+            data.set_output(slot, drive.encode())
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the setpoints stand still and no guard brakes: the torque may go."""
+        raise NotImplementedError
+
+    def command(self) -> GuardResult:
+        """Write the targets of this cycle; return the verdict of the trajectory guard, PASS without one."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Bring the setpoints to rest under the limits."""
+        raise NotImplementedError
+
+    def hold(self) -> None:
+        """Hold at the last setpoint, at rest from now on."""
+        raise NotImplementedError
+
+    def latch(self) -> None:
+        """Let the setpoints, moved by `track_actual`, be at rest."""
+        raise NotImplementedError
+
+    def track_actual(self) -> None:
+        """Let setpoints and targets follow the drives that have no torque.
+
+        The setpoint of a joint outside its range is the edge of it, so that every controller begins inside; from where
+        the joint is to there the output limiter moves its target, once the drive follows it.
+        """
+        commanded, latch, limits = self.state.commanded, self.output_limiter.latch, self.limits
+        for i, drive in enumerate(self.drives):
+            if drive.state not in _HOLDING:
+                low, high, here = limits.low[i], limits.high[i], drive.position
+                commanded[i] = high if here > high else low if here < low else here
+                drive.target_position = here
+                latch(i, here)
+        self.latch()
+
+    def beyond_range(self, i: int) -> float:
+        """Return how far beyond its range the target of a joint is, rad, or 0; `i` counts from the group's first."""
+        last, limits = self.output_limiter.sent[i], self.limits
+        return max(last - limits.high[i], limits.low[i] - last, 0.0)
+
+
+class Joints:
+    """All joints of a platform by axis number. A method `first_...` returns -1 where there is no such joint.
+
+    Args:
+        arm: its axes come first.
+        others: groups beside it, which move on while a joint of the arm homes.
+    """
+
+    def __init__(self, arm: JointGroup, others: Sequence[JointGroup]) -> None:
+        self.others = list(others)
+        self.groups = [arm, *others]
+        self.pairs = [pair for group in self.groups for pair in group.pairs]
+        """Index of its slave and driver of each drive."""
+        self.drives = [drive for _, drive in self.pairs]
+
+    def advance(self, target: TargetState) -> None:
+        """Command every drive one step towards `target`."""
+        for drive in self.drives:
+            drive.advance(target)
+
+    def track_actual(self) -> None:
+        """Let setpoints and targets follow the drives that have no torque."""
+        for group in self.groups:
+            group.track_actual()
+
+    def command(self) -> GuardResult:
+        """Write the targets of this cycle; return the verdict of the arm's trajectory guard."""
+        self.command_others()
+        return self.groups[0].command()
+
+    def command_others(self) -> None:
+        """Write the targets of this cycle of all joints beside the arm's."""
+        for group in self.others:
+            group.command()
+
+    def stop(self) -> None:
+        """Bring all setpoints to rest."""
+        self.groups[0].stop()
+        self.stop_others()
+
+    def stop_others(self) -> None:
+        """Bring the setpoints of all joints beside the arm's to rest."""
+        for group in self.others:
+            group.stop()
+
+    def hold(self) -> None:
+        """Hold at the last setpoints, at rest from now on."""
+        for group in self.groups:
+            group.hold()
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether all setpoints stand still and no guard brakes: the torque may go."""
+        return all(group.at_rest for group in self.groups)
+
+    def beyond_limits(self) -> EmergencyStop | None:
+        """Return what was measured beyond its limit for too long, or None."""
+        for group in self.groups:
+            event = group.supervision.check(group.state)
+            if event is not None:
+                return event
+        return None
+
+    def reset_supervision(self) -> None:
+        """Begin to count anew the cycles beyond a limit."""
+        for group in self.groups:
+            group.supervision.reset()
+
+    def first_not_enabled(self) -> int:
+        """Return the first joint whose drive is not enabled."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state is not _ENABLED:
+                return axis
+        return -1
+
+    def first_with_torque(self) -> int:
+        """Return the first joint whose drive gives torque: enabled, in a quick stop or reacting to a fault."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state in WITH_TORQUE:
+                return axis
+        return -1
+
+    def first_in_another_mode(self) -> int:
+        """Return the first joint whose drive does not show the commanded mode."""
+        for axis, drive in enumerate(self.drives):
+            if drive.mode_display != drive.mode:
+                return axis
+        return -1
+
+    def first_in_fault(self) -> int:
+        """Return the first joint whose drive is in fault."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state is DriveState.FAULT:
+                return axis
+        return -1
+
+    def first_moving(self) -> int:
+        """Return the first joint that does not stand still."""
+        for axis, drive in enumerate(self.drives):
+            if abs(drive.velocity) > _STILL_RAD_S:
+                return axis
+        return -1
+
+    def first_not_resting(self) -> int:
+        """Return the first joint whose drive is in fault or enabled."""
+        for axis, drive in enumerate(self.drives):
+            if drive.state not in RESTING:
+                return axis
+        return -1
+
+    def first_outside(self) -> int:
+        """Return the first joint that stands outside its range by more than may be enabled."""
+        for group in self.groups:
+            low, high = group.limits.low, group.limits.high
+            for i, drive in enumerate(group.drives):
+                if not low[i] - RANGE_MARGIN_RAD <= drive.position <= high[i] + RANGE_MARGIN_RAD:
+                    return group.first + i
+        return -1
+
+    def first_returning(self) -> int:
+        """Return the first joint whose target still returns to its range."""
+        for group in self.groups:
+            for i in range(len(group.drives)):
+                if group.beyond_range(i) > 0.0:
+                    return group.first + i
+        return -1
+
+    def position_jump(self) -> PositionJumped | None:
+        """Return the first joint that `track_actual` would move further than it can have turned, or None."""
+        for group in self.groups:
+            sent = group.output_limiter.sent
+            for i, drive in enumerate(group.drives):
+                if drive.state not in _HOLDING and not abs(drive.position - sent[i]) <= TRACKED_RAD:
+                    return PositionJumped(group.first + i, drive.position, sent[i])
+        return None
