@@ -61,7 +61,7 @@ def test_each_of_two_boxes_is_forced_and_released(tmp_path: Path) -> None:
         requests = [(one["slave"], one["subindex"], int(one["hex"][:2], 16)) for one in arm.loop.requests]
         io, desk = 1, 8
         assert [one for one in requests if one[1] != 3] == [
-            (io, 2, 62), (io, 1, 0xFF), (desk, 1, 0), (desk, 2, 1), (desk, 1, 1), (io, 1, 0), (desk, 1, 0),
+            (desk, 1, 0), (io, 2, 62), (io, 1, 0xFF), (desk, 2, 1), (desk, 1, 1), (io, 1, 0), (desk, 1, 0),
         ]  # fmt: skip
         assert [one[0] for one in requests if one[1] == 3] == [io, desk], "each is told when to release by itself"
 
