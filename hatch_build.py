@@ -29,7 +29,6 @@ COMPILED = (
     "rtcp/fieldbus/process_data.py",
     "rtcp/ipc/blackboard.py",
     "rtcp/ipc/layout.py",
-    "rtcp/launch/inprocess.py",
     "rtcp/realtime/discipline.py",
     "rtcp/virtual/al_state.py",
     "rtcp/virtual/distributed_clock.py",

@@ -22,7 +22,8 @@ from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
 from kinematics.jacobian import jacobian, joint_velocity
 from rtcp.config import default_config, load
-from rtcp.control.cycle import make_drives, make_others
+from rtcp.control.cycle import make_drives
+from rtcp.control.part import make_devices
 from rtcp.devices.cia402 import TargetState
 from rtcp.devices.io_box import IoBox
 from rtcp.motion.controllers.jog import ScaledTwist, TwistRamp
@@ -199,7 +200,7 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
 
 def devices(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
     drives = [drive for _, drive in make_drives(CONFIG)]
-    box = next(driver for _, driver in make_others(CONFIG) if isinstance(driver, IoBox))
+    box = next(one.driver for one in make_devices(CONFIG) if isinstance(one.driver, IoBox))
     discipline = Discipline(500_000, 250_000)
     targets = tuple(TargetState)
     planned = sent = 10**15

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from math import cos, pi
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def test_a_stream_leads_all_nine(arm: Simulation) -> None:
 
 def test_the_limits_of_the_ninth_are_narrowed(arm: Simulation) -> None:
     widest = Values.configured(arm.config)
-    narrow = rows(Values(widest.low, (*widest.high[:8], 0.1), *list(vars(widest).values())[2:]))
+    narrow = rows(replace(widest, high=(*widest.high[:8], 0.1)))
     accept(arm, SetLimits(arm.observer.write_plan(narrow), len(narrow)))
     assert arm.send(MoveJoints(TARGET, 0.3, True)).refusal == PositionOutOfRange(8, TARGET[8], 0.1)
     accept(arm, MoveJoints((*TARGET[:8], 0.09), 0.3, True))

@@ -12,7 +12,9 @@ ALL = InputsConfig(
 
 
 def read(switch, levels: int, cycles: int) -> bool:
-    switches = [switch] if isinstance(switch, Switch) else [getattr(switch, name) for name in Inputs.__slots__]
+    switches = (
+        [switch] if isinstance(switch, Switch) else [switch.arm_toggle, switch.enabling_switch, switch.emergency_stop]
+    )
     for _ in range(cycles):
         for one in switches:
             one.read(levels)

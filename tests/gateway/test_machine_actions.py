@@ -212,6 +212,7 @@ def test_a_zero_that_cannot_be_kept_in_the_file_is_taken_back_from_the_loop(arm:
     assert [command.offset for command in arm.loop.received(SetZero)] in ([], [0.0, 0.25, 0.0])
 
 
+@pytest.mark.interpreted
 def test_a_zero_whose_answer_does_not_come_is_taken_back_from_the_loop(
     arm: FakePlatform, monkeypatch: pytest.MonkeyPatch
 ) -> None:
