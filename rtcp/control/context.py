@@ -73,8 +73,11 @@ class Context(PartContext):
         self.operator = operator
         self.parts: list[Part] = [*self.joints.groups, operator, *devices]
         """The parts of the cycle; the operator's outputs are written before its boxes encode them."""
-        boxes = [one for one in devices if one.name in config.boxes]
-        self.boxes = [(one.slot + 1, one.driver if isinstance(one.driver, IoBox) else None) for one in boxes]
+        self.boxes = [
+            (device.slot + 1, device.driver if isinstance(device.driver, IoBox) else None)
+            for device in devices
+            if device.name in config.boxes
+        ]
         """Position on the cable and driver of each of the configuration's boxes; None: its driver is no IO box's."""
         self.blackboard = blackboard
         self.service = service

@@ -75,7 +75,7 @@ class Cycle:
         now: Callable[[], int] = monotonic_ns,
     ) -> None:
         self.devices = devices = make_devices(config)
-        boxes = {one.name: one.driver for one in devices if isinstance(one.driver, IoBox)}
+        boxes = {device.name: device.driver for device in devices if isinstance(device.driver, IoBox)}
         gripper = make_gripper(config)
         self.arm = Arm(config, make_drives(config), blackboard.plan)
         self.operator = Operator(config, boxes, gripper)
@@ -85,7 +85,7 @@ class Cycle:
         self.commands = CommandHandler(self.machine, blackboard)
         self.parts = context.parts
         self._context = context
-        self._stop_device = next((one for one in devices if one.slot + 1 == self.operator.stop_position), None)
+        self._stop_device = next((device for device in devices if device.slot + 1 == self.operator.stop_position), None)
         at = len(CYCLE_FIELDS) - 1
         for part in self.parts:
             part.at = at

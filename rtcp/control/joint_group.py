@@ -24,11 +24,11 @@ _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 """Drive states with torque: the target stands."""
 _STILL_RAD_S = 0.01
 RANGE_MARGIN_RAD = 0.02
-"""So far outside its range a joint may stand and still be enabled, to return to the edge: an overshoot in CST must not
-leave an arm that no command can move."""
+"""Largest distance from its range at which a joint is still enabled, to return to the edge: an overshoot in CST must
+not leave an arm that no command can move."""
 TRACKED_RAD = 0.03
-"""No joint that stood turns so far between two frames: a position further away is not tracked while enabling. More than
-a joint may stand outside its range."""
+"""Largest step of a joint without torque between two frames: a larger one is a jump, and enabling ends in a fault.
+Greater than `RANGE_MARGIN_RAD`."""
 
 
 class JointGroup(Part):

@@ -118,7 +118,7 @@ class Device(Part):
     """
 
     def __init__(self, slot: int, driver: Driver) -> None:
-        super().__init__(driver.name, [device_field(driver.name, one) for one in driver.fields()], driver.commands)
+        super().__init__(driver.name, [device_field(driver.name, field) for field in driver.fields()], driver.commands)
         self.slot = slot
         self.driver = driver
         self._stays_safe = False

@@ -245,10 +245,10 @@ class JoystickInput:
         self._debounce = round(joystick.debounce_ms * 1e-3 / cycle_s)
         self._byte_at = (min(numbers) - 1) // 8 * 8
         others = (config.arm_toggle, config.enabling_switch, config.emergency_stop)
-        found = [one for one in others if one is not None]
+        switches = [switch for switch in others if switch is not None]
         # What names no box hangs on the only one.
-        here = [one for one in found if one.box == joystick.box or None in (one.box, joystick.box)]
-        meant = sum(1 << one.number - 1 for one in here)
+        same_box = [switch for switch in switches if switch.box == joystick.box or None in (switch.box, joystick.box)]
+        meant = sum(1 << switch.number - 1 for switch in same_box)
         bytes_used = {(number - 1) // 8 for number in numbers}
         self._checked = sum(0xFF << 8 * byte for byte in bytes_used) & ~meant
 

@@ -181,29 +181,32 @@ class RecordSchema:
         return cls(tuple(fields))
 
 
-CYCLE_FIELDS = tuple(
-    Field(name, kind, unit, description, part="cycle")
-    for name, kind, unit, description in (
-        ("number", "uint64", "", "Number of the record, from 1."),
-        ("cycle", "uint64", "", "Number of the cycle, from 1."),
-        ("time_ns", "int64", "ns", "Wake-up, CLOCK_MONOTONIC."),
-        ("dc_time_ns", "int64", "ns", "System time of the reference clock."),
-        ("state", "uint8", "", "State of the machine (rtcp.ipc.states.State)."),
-        ("flags", "uint16", "", "Bits FLAG_... of rtcp.ipc.schema."),
-        ("wkc", "int16", "", "Working counter; -1 without an answer."),
-        ("wkc_expected", "int16", "", "Working counter with all slaves."),
-        ("missed", "uint32", "", "Ticks skipped since the start."),
-        ("lost", "uint32", "", "Cycles in a row without the expected working counter."),
-        ("wakeup_ns", "int32", "ns", "Wake-up after its tick."),
-        ("exchange_ns", "int32", "ns", "From the wake-up to the answer."),
-        ("compute_ns", "int32", "ns", "From the answer to the end of the cycle, of the cycle before."),
-        ("dc_offset_ns", "int32", "ns", "Phase of the cycle to the reference clock."),
-        ("dc_filtered_ns", "int32", "ns", "The same, filtered."),
-        ("fault", "uint32", "", "Number of the event that began the fault; 0 for none."),
-        ("limit", "uint32", "", "Number of the event by which a limit ended the last motion; 0 for none."),
-        ("enables", "uint32", "", "How often the arm was enabled."),
-        ("moves", "uint32", "", "How many motions have begun."),
-    )
+def _fields_of(part: str, *rows: tuple[str, str, str, str]) -> tuple[Field, ...]:
+    """Return fields of one number each: name, type, unit and description in a row."""
+    return tuple(Field(*row, part=part) for row in rows)
+
+
+CYCLE_FIELDS = _fields_of(
+    "cycle",
+    ("number", "uint64", "", "Number of the record, from 1."),
+    ("cycle", "uint64", "", "Number of the cycle, from 1."),
+    ("time_ns", "int64", "ns", "Wake-up, CLOCK_MONOTONIC."),
+    ("dc_time_ns", "int64", "ns", "System time of the reference clock."),
+    ("state", "uint8", "", "State of the machine (rtcp.ipc.states.State)."),
+    ("flags", "uint16", "", "Bits FLAG_... of rtcp.ipc.schema."),
+    ("wkc", "int16", "", "Working counter; -1 without an answer."),
+    ("wkc_expected", "int16", "", "Working counter with all slaves."),
+    ("missed", "uint32", "", "Ticks skipped since the start."),
+    ("lost", "uint32", "", "Cycles in a row without the expected working counter."),
+    ("wakeup_ns", "int32", "ns", "Wake-up after its tick."),
+    ("exchange_ns", "int32", "ns", "From the wake-up to the answer."),
+    ("compute_ns", "int32", "ns", "From the answer to the end of the cycle, of the cycle before."),
+    ("dc_offset_ns", "int32", "ns", "Phase of the cycle to the reference clock."),
+    ("dc_filtered_ns", "int32", "ns", "The same, filtered."),
+    ("fault", "uint32", "", "Number of the event that began the fault; 0 for none."),
+    ("limit", "uint32", "", "Number of the event by which a limit ended the last motion; 0 for none."),
+    ("enables", "uint32", "", "How often the arm was enabled."),
+    ("moves", "uint32", "", "How many motions have begun."),
 )
 """What every record has, whatever the platform consists of."""
 OPERATOR_FIELDS = (Field("joystick_mode", "uint8", "", "0 X-Y, 1 Z-yaw, 2 roll-pitch, 3 gripper.", part="operator"),)
@@ -234,15 +237,13 @@ def arm_fields(joints: int) -> tuple[Field, ...]:
     return (*ARM_MODES, *vectors)
 
 
-GRIPPER_FIELDS = tuple(
-    Field(f"gripper_{name}", kind, unit, description, part="gripper")
-    for name, kind, unit, description in (
-        ("actual_position", "float64", "rad", "Measured position at the drive's shaft."),
-        ("actual_velocity", "float64", "rad/s", "Measured velocity."),
-        ("actual_torque", "float64", "Nm", "Measured torque."),
-        ("sent_position", "float64", "rad", "Target position in the frame."),
-        ("statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
-    )
+GRIPPER_FIELDS = _fields_of(
+    "gripper",
+    ("gripper_actual_position", "float64", "rad", "Measured position at the drive's shaft."),
+    ("gripper_actual_velocity", "float64", "rad/s", "Measured velocity."),
+    ("gripper_actual_torque", "float64", "Nm", "Measured torque."),
+    ("gripper_sent_position", "float64", "rad", "Target position in the frame."),
+    ("gripper_statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
 )
 """Of a gripper with a drive of its own."""
 

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.alone, pytest.mark.browser]
 
 @pytest.fixture(scope="module", params=[4, 7])
 def platform(request: pytest.FixtureRequest) -> Iterator[Platform]:
-    """A platform of so many joints, enabled."""
+    """An enabled platform with the given number of joints."""
     made = Platform()
     try:
         made.be_patient(lost_ms=2000)
@@ -31,7 +31,7 @@ def platform(request: pytest.FixtureRequest) -> Iterator[Platform]:
 
 
 def without_geometry(platform: Platform, joints: int) -> None:
-    """Leave the geometry out of the platform's files, and let the arm have so many joints."""
+    """Remove the geometry from the platform's files, and set the number of joints."""
     yaml, directory = YAML(typ="safe"), platform.directory / "config"
     arm = yaml.load((directory / "assistive_arm.yaml").read_text())
     segment = yaml.load((directory / "segment.yaml").read_text())
