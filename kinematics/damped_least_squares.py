@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from math import atan2, hypot, inf, pi, sqrt, tau
 from operator import add, mul
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from kinematics.forward import frames
 from kinematics.jacobian import characteristic_length, gram, jacobian_columns, solve_positive
@@ -13,23 +13,23 @@ from kinematics.model import ArmModel
 from kinematics.pose import Pose, Rotation, Vector, as_floats, orthonormality_error, require_finite
 from kinematics.solution import Six, six
 
-TOLERANCE = 1e-9  # m and rad: a pose with smaller errors is reached
+TOLERANCE: Final = 1e-9  # m and rad: a pose with smaller errors is reached
 
-_STARTS = 24
-_ITERATIONS = 80  # of one start
-_FINE = 1e-24  # square of the scaled error at which a descent ends
+_STARTS: Final = 24
+_ITERATIONS: Final = 80  # of one start
+_FINE: Final = 1e-24  # square of the scaled error at which a descent ends
 _ROUGH, _FINAL = 1e-5, 1e-12  # relative gain in cost; three smaller ones in a row end a descent
-_EQUAL = 0.999  # ratio of two costs above which they count as equal
-_GOLDEN = 1.1127756842787055  # root of x^7 = x + 1: its powers fill six dimensions evenly (Roberts 2018)
+_EQUAL: Final = 0.999  # ratio of two costs above which they count as equal
+_GOLDEN: Final = 1.1127756842787055  # root of x^7 = x + 1: its powers fill six dimensions evenly (Roberts 2018)
 
 # Of `damped_least_squares`
-_STEPS = 7  # limit; two or three are usual, and on the edge of the workspace each halves the error
+_STEPS: Final = 7  # limit; two or three are usual, and on the edge of the workspace each halves the error
 _DAMPING, _RELAXATION, _LEAST_DAMPING = 1e-3, 1e-3, 1e-13
-_ENOUGH = 1e-28  # m^2 and rad^2: beside a singularity the error that remains is amplified
+_ENOUGH: Final = 1e-28  # m^2 and rad^2: beside a singularity the error that remains is amplified
 _REACHED = (5e-10) ** 2
-_HOPEFUL = 1e-4  # of the initial cost; give up when three steps do not reach it
+_HOPEFUL: Final = 1e-4  # of the initial cost; give up when three steps do not reach it
 
-_INVALID_ROTATION = 1e-10  # orthonormality error that prevents a solution from being confirmed
+_INVALID_ROTATION: Final = 1e-10  # orthonormality error that prevents a solution from being confirmed
 
 _Bounds: TypeAlias = Sequence[tuple[float, float]]
 _UNBOUNDED: _Bounds = ((-inf, inf),) * 6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, sin
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from kinematics.model import JOINTS, ArmModel
 from kinematics.pose import IDENTITY, Pose, as_floats, require_finite
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-_BLOCK = 2048  # configurations: the arrays of a block stay in a second-level cache of 1 MiB
+_BLOCK: Final = 2048  # configurations: the arrays of a block stay in a second-level cache of 1 MiB
 
 
 def forward(model: ArmModel, q: Sequence[float]) -> Pose:

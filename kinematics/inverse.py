@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf, remainder, sin, tau
-from typing import Literal
+from typing import Final, Literal
 
 from kinematics.damped_least_squares import (
     NumericResult,
@@ -21,9 +21,9 @@ from kinematics.spherical import ObliqueWrist, SphericalArm, has_spherical_wrist
 
 # A joint that moves by less than this, rad, and by less than this many times the tool's move, in m and rad, does not
 # jump.
-_NO_JUMP = 1e-4
-_JUMP_RATIO = 4.0
-_BESIDE = 1e-4  # |sin theta5| below which the round-off of joints 1 to 3 could make joint 4 jump
+_NO_JUMP: Final = 1e-4
+_JUMP_RATIO: Final = 4.0
+_BESIDE: Final = 1e-4  # |sin theta5| below which the round-off of joints 1 to 3 could make joint 4 jump
 
 Method = Literal["spherical wrist, parallel axes 2 and 3", "spherical wrist, general", "numeric"]
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from math import asin, atan2, fabs, hypot, sqrt
 from operator import mul
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from kinematics.forward import frames
 from kinematics.model import ArmModel
@@ -19,12 +19,12 @@ Row: TypeAlias = tuple[float, float, float, float, float, float]
 Rows: TypeAlias = tuple[Row, Row, Row, Row, Row, Row]
 _Matrix: TypeAlias = Sequence[Sequence[float]]
 
-THRESHOLD = 0.04  # smallest singular value below which `joint_velocity` damps
+THRESHOLD: Final = 0.04  # smallest singular value below which `joint_velocity` damps
 
 _TWIST = ("vx", "vy", "vz", "wx", "wy", "wz")
-_PARALLEL = 1e-9  # sine of the angle below which two axes count as parallel
-_ORTHOGONAL = 1e-30  # square of the cosine between two rows that count as orthogonal
-_SWEEPS = 30  # limit; one-sided Jacobi converges quadratically, in practice in six to eight sweeps
+_PARALLEL: Final = 1e-9  # sine of the angle below which two axes count as parallel
+_ORTHOGONAL: Final = 1e-30  # square of the cosine between two rows that count as orthogonal
+_SWEEPS: Final = 30  # limit; one-sided Jacobi converges quadratically, in practice in six to eight sweeps
 
 
 class SingularityDistances(NamedTuple):

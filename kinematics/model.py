@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 from kinematics.pose import IDENTITY, Pose, Vector, orthonormality_error, require_finite
 
-JOINTS = 6
+JOINTS: Final = 6
 
 # Sines and cosines below this count as zero: the cosine of pi / 2 is 6e-17 in doubles.
-_ROUND_OFF = 1e-15
+_ROUND_OFF: Final = 1e-15
 
 
 @dataclass(frozen=True)

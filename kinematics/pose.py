@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 Vector: TypeAlias = tuple[float, float, float]
 Rotation: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 
 # cos(ry) below which the two outer axes coincide: only rx + rz or rx - rz is then defined.
-_SINGULAR_COSINE = 1e-12
+_SINGULAR_COSINE: Final = 1e-12
 
 
 def as_floats(values: Sequence[float]) -> Sequence[float]:

@@ -14,15 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import atan2, cos, hypot, inf, pi, sin, sqrt, tau
+from typing import Final
 
 from kinematics.model import ArmModel
 from kinematics.pose import Rotation, Vector
 from kinematics.solution import BACK, CONFIRMED, DOWN, ELBOW, ON_EDGE, SHOULDER, SLACK, Angles
 
-_SAMPLES = 48
-_VALLEYS = 2
-_GOLDEN = 0.6180339887498949
-_GOLDEN_STEPS = 46  # of golden section, down to 1e-10 rad: a distance of 1e-6 m is then exact to 1e-8 of it
+_SAMPLES: Final = 48
+_VALLEYS: Final = 2
+_GOLDEN: Final = 0.6180339887498949
+_GOLDEN_STEPS: Final = 46  # of golden section, down to 1e-10 rad: a distance of 1e-6 m is then exact to 1e-8 of it
 
 
 class PlanarArm:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan, atan2, copysign, cos, hypot, pi, remainder, sin, sqrt, tau
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from kinematics.model import ArmModel
 from kinematics.pose import Rotation, Vector, applied, times, transposed, turned
@@ -29,17 +29,19 @@ Quadratic: TypeAlias = tuple[float, ...]
 
 # m, or a sine. A value of a1 or sin(alpha1) below SMALL brings roots of the quartic so close together that round-off
 # may hide them: the roots of the equation without it are then tried too. Below ZERO it counts as zero.
-_SMALL = 1e-4
-_ZERO = 1e-12
-_LOOSE = 10.0  # relative tolerance of those roots, in units of the value that is left out
-_SAME = 1e-7  # rad; nearer solutions are one, on a singularity
-_REGULAR = 1e-6  # largest determinant, in units of the size cubed, below which an arm moves in two directions only
-_FLAT = 1e-12  # determinant, in units of the size cubed, below which Newton's method has no step
-_NEWTON_STEPS = 20  # limit; near a double root each step only halves the error
-_ROOT_STEPS = 200  # limit; about ten are usual
+_SMALL: Final = 1e-4
+_ZERO: Final = 1e-12
+_LOOSE: Final = 10.0  # relative tolerance of those roots, in units of the value that is left out
+_SAME: Final = 1e-7  # rad; nearer solutions are one, on a singularity
+_REGULAR: Final = (
+    1e-6  # largest determinant, in units of the size cubed, below which an arm moves in two directions only
+)
+_FLAT: Final = 1e-12  # determinant, in units of the size cubed, below which Newton's method has no step
+_NEWTON_STEPS: Final = 20  # limit; near a double root each step only halves the error
+_ROOT_STEPS: Final = 200  # limit; about ten are usual
 # Relative to the largest factor: an extremum this near to zero counts as a root, since round-off may have removed it.
 # A false root is rejected by the check of the wrist centre.
-_NEARLY = 1e-7
+_NEARLY: Final = 1e-7
 
 
 class GeneralArm:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from collections.abc import Iterable, Sequence
 from math import ceil, pi, remainder, tau
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 from kinematics.model import ArmModel
 from kinematics.pose import Vector
@@ -105,8 +105,8 @@ Angles: TypeAlias = tuple[float, float, float, int, int]
 
 # m. A wrist centre nearer to an edge of the workspace than ON_EDGE is on it: the round-off of the pose decides. One
 # that is beyond it by less than SLACK is moved onto it; one nearer than SLACK to an axis leaves that joint free.
-ON_EDGE = 1e-14
-SLACK = 1e-10
+ON_EDGE: Final = 1e-14
+SLACK: Final = 1e-10
 
 CONFIRMED = (5e-10) ** 2  # m^2: largest squared error of the wrist centre of a solution
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan2, cos, hypot, pi, remainder, sin, sqrt, tau
+from typing import Final
 
 from kinematics.model import ArmModel
 from kinematics.pose import IDENTITY, Pose, Rotation, Vector, applied, times, transposed, turned
@@ -23,9 +24,9 @@ from kinematics.position_ik import PlanarArm
 from kinematics.position_ik_general import GeneralArm
 from kinematics.solution import BRANCHES, FLIP, SINGULARITIES, WRIST, Angles, AngleWrap, Solution, six
 
-_ZERO = 1e-12  # m: a shorter length counts as zero
-_PARALLEL = 1e-6  # sine of the angle below which two neighbouring axes count as parallel
-_EDGE = 1e-14  # rad: an orientation nearer to the edge of what an oblique wrist reaches is on it
+_ZERO: Final = 1e-12  # m: a shorter length counts as zero
+_PARALLEL: Final = 1e-6  # sine of the angle below which two neighbouring axes count as parallel
+_EDGE: Final = 1e-14  # rad: an orientation nearer to the edge of what an oblique wrist reaches is on it
 
 
 def has_spherical_wrist(model: ArmModel) -> bool:

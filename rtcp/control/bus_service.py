@@ -8,6 +8,8 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -78,6 +80,7 @@ class BusService(threading.Thread):
         self._asked = 0
         """What the cycle asked last, counted up: odd to park, even to recover."""
         self._done = 0
+        self._errors: deque[tuple[str, Exception]] = deque(maxlen=_MOST_COMPLAINTS)
         self._explain = [False] * len(joint_names)
         self._complaints = LogThrottle(blackboard.text, _MOST_COMPLAINTS, "failures of the bus")
         self._emergencies: dict[tuple[int, bool], LogThrottle] = {}
@@ -117,6 +120,10 @@ class BusService(threading.Thread):
         """Ask for the drive's error code to be read and put into words; several drives may fail at once."""
         self._explain[axis] = True
 
+    def explain_error(self, what: str, error: Exception) -> None:
+        """Ask for an exception that the cycle met to be put into words."""
+        self._errors.append((what, error))
+
     def finish(self) -> None:
         """End the thread and wait for it."""
         self._end.set()
@@ -142,6 +149,7 @@ class BusService(threading.Thread):
         while not self._end.wait(self._watch_s):
             turn += 1
             # Each part by itself: an error in one does not stop the others.
+            self._say_errors()
             for part in (self._watch, self._serve_sdo_requests, self._listen):
                 try:
                     part(turn)
@@ -151,6 +159,13 @@ class BusService(threading.Thread):
             self._publish_states(self._bus.read_states())
         except BusError as error:
             self._complain(error)
+
+    def _say_errors(self) -> None:
+        while self._errors:
+            what, error = self._errors.popleft()
+            frames = traceback.extract_tb(error.__traceback__)
+            where = f" ({frames[-1].filename}, line {frames[-1].lineno})" if frames else ""
+            self._blackboard.text(f"{what}: {type(error).__name__}: {error}{where}")
 
     def _complain(self, error: BusError) -> None:
         """Report what failed; a failure in every turn, as without the interface, is reported at most every 10 s."""

@@ -7,7 +7,7 @@ method here, found by the command's class.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
@@ -64,9 +64,9 @@ from rtcp.ipc.refusals import (
 from rtcp.ipc.states import ControlMode, DriveMode, State
 from rtcp.motion.limits import read
 
-MOST_LIMIT_ROWS = 64
+MOST_LIMIT_ROWS: Final = 64
 """`MOST_AXES` joints and more boxes than an arm is configured with: all are checked in one cycle."""
-_LARGEST_OFFSET = 100.0
+_LARGEST_OFFSET: Final = 100.0
 _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
 
@@ -255,8 +255,7 @@ class CommandHandler:
                 most = new.torque[axis]
                 if most < limits.torque[axis] and abs(held) > most:
                     return TorqueLimitTooLow(axis, abs(held), most)
-        limits.apply(new)
-        arm.output_limiter.take(limits)
+        arm.set_limits(new)
         self._blackboard.event(LimitsChanged())
         return None
 

@@ -129,6 +129,10 @@ class Context(PartContext):
         """Report an event that changes no state."""
         self.blackboard.event(event)
 
+    def explain(self, what: str, error: Exception) -> None:
+        """Let an exception be put into the log, not by this thread."""
+        self.service.explain_error(what, error)
+
     @property
     def clock_locked(self) -> bool:
         """Whether there is no reference clock, or the cycle is locked to it."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from time import monotonic_ns
-from typing import Any
+from typing import Any, Final
 
 from rtcp.config.model import ArmConfig, Joint
 from rtcp.control.arm import Arm
@@ -45,8 +45,8 @@ from rtcp.realtime.scheduling import Sleeper
 
 _LARGEST_COUNTER = 0x7FFF
 """A damaged frame may bring a larger working counter than any segment has."""
-_LONGEST_NS = 2_000_000_000
-_TRANSIT_DIVISOR = 20
+_LONGEST_NS: Final = 2_000_000_000
+_TRANSIT_DIVISOR: Final = 20
 """A frame is on its way for this part of the period at most."""
 
 

@@ -7,13 +7,14 @@ the start-up SDOs of its description. Afterwards it counts from its home; the jo
 from __future__ import annotations
 
 from enum import Enum
+from typing import Final
 
 from rtcp.control.arm import Arm
 from rtcp.control.joint_group import Joints
 from rtcp.devices.cia402 import CSP, ENABLE_OPERATION, Cia402Drive
 from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
 
-HOMING = 6
+HOMING: Final = 6
 """Mode of operation (CiA 402-2, object 0x6060)."""
 START = ENABLE_OPERATION | 0x10
 """Controlword with the start bit; taking the bit away interrupts (CiA 402-2, homing mode)."""
@@ -63,11 +64,11 @@ class HomingPhase(Enum):
 ENDED = frozenset({HomingPhase.HOMED, HomingPhase.FAILED, HomingPhase.STOPPED, HomingPhase.STUCK, HomingPhase.RUNNING})
 
 _P = HomingPhase
-_MODE_S = 1.0
-_REST_S = 3.0
-_LONGEST_S = 60.0
-_STILL_RAD_S = 0.01
-_TOLD_CYCLES = 10
+_MODE_S: Final = 1.0
+_REST_S: Final = 3.0
+_LONGEST_S: Final = 60.0
+_STILL_RAD_S: Final = 0.01
+_TOLD_CYCLES: Final = 10
 """Cycles for which the statusword may still show the end of an earlier homing: it lags behind the controlword."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.part import Part
@@ -13,7 +14,7 @@ from rtcp.ipc.schema import Field
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult
-from rtcp.motion.limits import Limits
+from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState
 
 WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
@@ -22,11 +23,11 @@ RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_O
 _ENABLED = DriveState.OPERATION_ENABLED
 _HOLDING = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 """Drive states with torque: the target stands."""
-_STILL_RAD_S = 0.01
-RANGE_MARGIN_RAD = 0.02
+_STILL_RAD_S: Final = 0.01
+RANGE_MARGIN_RAD: Final = 0.02
 """Largest distance from its range at which a joint is still enabled, to return to the edge: an overshoot in CST must
 not leave an arm that no command can move."""
-TRACKED_RAD = 0.03
+TRACKED_RAD: Final = 0.03
 """Largest step of a joint without torque between two frames: a larger one is a jump, and enabling ends in a fault.
 Greater than `RANGE_MARGIN_RAD`."""
 
@@ -74,6 +75,12 @@ class JointGroup(Part):
         """Write the outputs of the drives."""
         for slot, drive in self.pairs:
             data.set_output(slot, drive.encode())
+
+    def set_limits(self, new: Values) -> None:
+        """Put other limits into force."""
+        self.limits.apply(new)
+        self.output_limiter.take(self.limits)
+        self.supervision.take(self.limits)
 
     @property
     def at_rest(self) -> bool:

@@ -17,8 +17,8 @@ from rtcp.devices.cia402 import Cia402Drive
 from rtcp.devices.driver import Driver, make_driver
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command
-from rtcp.ipc.events import Event
-from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.events import DriverFailed, Event, MotionEnded
+from rtcp.ipc.refusals import DriverRaised, Refusal
 from rtcp.ipc.schema import Field, device_field
 from rtcp.ipc.states import State
 
@@ -47,6 +47,10 @@ class PartContext:
 
     def publish(self, event: Event) -> None:
         """Report an event that changes no state."""
+        raise NotImplementedError
+
+    def explain(self, what: str, error: Exception) -> None:
+        """Let an exception be put into the log, not by this thread."""
         raise NotImplementedError
 
     def report(self, event: Event) -> None:
@@ -112,6 +116,9 @@ class Part:
 class Device(Part):
     """A slave that is no drive: its driver, which a package may have brought.
 
+    A driver that raises is a fault of that slave, and no end of the cycle: it is asked no more and its outputs are 0
+    until the machine is ready again.
+
     Args:
         slot: index of the slave.
         driver: of the slave's kind.
@@ -122,37 +129,79 @@ class Device(Part):
         self.slot = slot
         self.driver = driver
         self._stays_safe = False
+        self._failed = False
+        self._error: Exception | None = None
+        self._zeros = bytes(driver.output_bytes)
+
+    def _fail(self, error: Exception) -> None:
+        self._failed, self._error = True, error
 
     def decode(self, data: ProcessData) -> None:
         """Read the inputs of the slave."""
-        self.driver.decode(data.input(self.slot))
+        try:
+            if not self._failed:
+                self.driver.decode(data.input(self.slot))
+        except Exception as error:
+            self._fail(error)
 
     def accept(self, command: Command, lease: int) -> Refusal | None:
         """Let the driver carry out the command."""
-        return self.driver.accept(command)
+        try:
+            return DriverRaised(self.slot + 1) if self._failed else self.driver.accept(command)
+        except Exception as error:
+            self._fail(error)
+            return DriverRaised(self.slot + 1)
 
     def update(self, context: PartContext) -> None:
         """Let the driver do its cycle."""
-        event = self.driver.update(context.state, context.now_ns)
-        if event is not None:
-            context.report(event)
-        if self._stays_safe:
-            # From the fault until the reset is done, whatever the driver does meanwhile.
-            self._stays_safe = context.state is not State.READY
-            self.driver.safe()
+        event = None
+        try:
+            if not self._failed:
+                event = self.driver.update(context.state, context.now_ns)
+                if isinstance(event, MotionEnded):
+                    raise TypeError(f"a driver ends no motion: {event.name}")
+            if self._stays_safe:
+                # From the fault until the reset is done, whatever the driver does meanwhile.
+                self._stays_safe = context.state is not State.READY
+                self._failed = self._failed and self._stays_safe
+                if not self._failed:
+                    self.driver.safe()
+        except Exception as error:
+            self._fail(error)
+        else:
+            if event is not None:
+                context.report(event)
+        if self._error is not None:
+            context.explain(f"driver of slave {self.name}", self._error)
+            self._error = None
+        if self._failed and not self._stays_safe:
+            context.report(DriverFailed(self.slot + 1))
 
     def encode(self, data: ProcessData) -> None:
         """Write the outputs of the slave."""
-        data.set_output(self.slot, self.driver.encode())
+        outputs = self._zeros
+        try:
+            if not self._failed:
+                outputs = self.driver.encode()
+        except Exception as error:
+            self._fail(error)
+        data.set_output(self.slot, outputs)
 
     def publish(self, values: list[Any]) -> None:
         """Write what the driver shows."""
-        self.driver.publish(values, self.at)
+        try:
+            if not self._failed:
+                self.driver.publish(values, self.at)
+        except Exception as error:
+            self._fail(error)
 
     def safe(self) -> None:
         """Set the driver's outputs to their safe state until the machine is ready again."""
         self._stays_safe = True
-        self.driver.safe()
+        try:
+            self.driver.safe()
+        except Exception as error:
+            self._fail(error)
 
 
 def make_devices(config: ArmConfig) -> list[Device]:

@@ -31,7 +31,7 @@ from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.errors import BusError
 from rtcp.fieldbus.pdo import layout
 from rtcp.fieldbus.soem import SoemBus
-from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import SchemaError
 from rtcp.ipc.session import EXIT_INCOMPLETE, Session, SessionError, read_session, write_exit_report
@@ -93,7 +93,7 @@ def main() -> int:
     try:
         bus.open()
         _work(bus, session, given.directory, report)
-    except (BusError, DeviceError, ConfigError, SchemaError) as error:
+    except (BusError, DeviceError, ConfigError, SchemaError, BlackboardTooLarge) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
         sys.stderr.write("\n".join(sentences) + "\n")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from enum import Enum
 from math import ceil, nan
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from rtcp.control.context import Context
 from rtcp.devices.cia402 import DriveState, TargetState
@@ -69,9 +69,9 @@ class Signal(Enum):
 
 Cause = Message | Signal
 
-FIRST_CYCLES = 10
+FIRST_CYCLES: Final = 10
 """What a drive shows is older than what it was told: so many cycles pass before standstill counts."""
-SETTLE_CYCLES = 5
+SETTLE_CYCLES: Final = 5
 """The same, before a drive counts as disabled."""
 
 _TARGETS = {

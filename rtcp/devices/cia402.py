@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from enum import Enum
+from typing import Final
 
 from rtcp.config.model import MODE_CHANNELS, ArmConfig, Joint, SlaveConfig
 from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
@@ -93,7 +94,7 @@ _STATE_OF = tuple(
     next((state for (mask, value), state in STATES.items() if word & mask == value), DriveState.UNKNOWN)
     for word in range(0x80)
 )
-_RESET_HOLD = 5
+_RESET_HOLD: Final = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
@@ -101,7 +102,7 @@ CSP, CSV, CST = 8, 9, 10
 """Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
 _WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
-_WINDOW_S = 0.02
+_WINDOW_S: Final = 0.02
 """Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
 _ENABLED = DriveState.OPERATION_ENABLED
 
@@ -154,6 +155,7 @@ class Cia402Drive(Driver):
         (self._temperature_slot,) = _slots(self.tpdo, ("temperature",))
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
         self._fields: list[int] = [0] * len(self.rpdo.channels)
+        self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
         self.position = self.velocity = self.torque = 0.0
         self.temperature = math.nan
         self.statusword = self.mode_display = 0
@@ -163,7 +165,8 @@ class Cia402Drive(Driver):
         self.speed_limit = speed_limit
         self._zero = zero
         self.target_position = self.target_velocity = self.target_torque = 0.0
-        self._sent_mode, self._sent_word, self._followed = 0, -1, False
+        self._sent_mode, self._sent_word, self._changed = 0, -1, True
+        """What the outputs but the position were filled in for; and whether the drive has shown something else."""
         self._was_enabled = False
         self._reset_calls = 0
         self._past: list[float] = []
@@ -195,12 +198,16 @@ class Cia402Drive(Driver):
         if word != self.statusword:
             self.statusword = word
             self.state = _STATE_OF[word & STATE_BITS]
+            self._changed = True
         shown = values[position] * by_position
         self.position = here = shown - self._zero
         self.velocity = values[velocity] * by_velocity if velocity >= 0 else self._measured_velocity(shown)
         if torque >= 0:
             self.torque = values[torque] * by_torque
-        self.mode_display = values[mode]
+        display: int = values[mode]
+        if display != self.mode_display:
+            self.mode_display = display
+            self._changed = True
         if self._temperature_slot >= 0:
             self.temperature = values[self._temperature_slot] * self.tpdo.channels[self._temperature_slot].factor
         if self.controlword not in (ENABLE_OPERATION, QUICK_STOP):
@@ -249,14 +256,13 @@ class Cia402Drive(Driver):
         limit for a target velocity, and run. A torque means nothing in CSP and CSV, and is there when CST begins.
         A target that is no finite number leaves its field as it was; one out of the field's range is cut to it.
         """
-        fields, word, commanded, at = self._fields, self.controlword, self.mode, self._out[1]
-        counts = (self.target_position + self._zero) * self._scales[0]
-        low, high = self._limits[0]
+        fields, at, word, commanded = self._fields, self._position_slot, self.controlword, self.mode
+        counts = (self.target_position + self._zero) * self._scale
+        low, high = self._range
         fields[at] = round(counts) if low <= counts <= high else self._counts(counts, 0, fields[at])
-        follows = self.state is _ENABLED and self.mode_display == commanded
         # In CSP nothing but the position changes while the drive follows it.
-        if commanded != CSP or commanded != self._sent_mode or word != self._sent_word or follows is not self._followed:
-            self._sent_mode, self._sent_word, self._followed = commanded, word, follows
+        if commanded != CSP or self._changed or commanded != self._sent_mode or word != self._sent_word:
+            self._sent_mode, self._sent_word, self._changed = commanded, word, False
             self._fill(fields, word, commanded)
         return self._pack(*fields)
 

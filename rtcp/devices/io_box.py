@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from rtcp.config.model import GripperConfig, InputConfig, InputsConfig, OutputsConfig, SlaveConfig
 from rtcp.devices.driver import DeviceError, Driver
@@ -210,7 +210,7 @@ def _mask(number: int | None) -> int:
     return 0 if number is None else 1 << number - 1
 
 
-RESTLESS = 4
+RESTLESS: Final = 4
 """After so many times the debounce without rest the lines are no code."""
 
 

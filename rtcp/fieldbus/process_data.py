@@ -11,11 +11,11 @@ import ctypes
 import socket
 import time
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Final
 
 from rtcp.fieldbus.registers import DatagramCommand, build_frame, open_socket
 
-_LARGEST_FRAME_DATA = 1466
+_LARGEST_FRAME_DATA: Final = 1466
 """Bytes of process data that fit one frame beside the clock's datagram (SOEM: EC_MAXLRWDATA - EC_FIRSTDCDATAGRAM)."""
 
 
@@ -110,7 +110,7 @@ class SoemProcessData:
 
 
 _INDEX = 0xF0
-_NUMBER_AT = 26
+_NUMBER_AT: Final = 26
 # PyDLL keeps the interpreter's lock: the cycle must not have to win it back from another thread after each poll.
 _libc = ctypes.PyDLL(None)
 _DONTWAIT = int(socket.MSG_DONTWAIT)

@@ -14,6 +14,7 @@ import threading
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Final
 
 from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.commands import COMMANDS as COMMAND_KINDS
@@ -64,9 +65,13 @@ from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import Malformed, Refusal
 from rtcp.ipc.schema import RecordSchema, SchemaError
 
-_HOTTEST = 1e6
+_HOTTEST: Final = 1e6
 _U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
+
+
+class BlackboardTooLarge(Exception):
+    """There is no room for the blackboard: the message says where, and how much is wanted."""
 
 
 class Blackboard:
@@ -79,6 +84,7 @@ class Blackboard:
 
     Raises:
         SchemaError: the schema is longer than its place.
+        BlackboardTooLarge: its file system has too little room.
     """
 
     def __init__(self, path: Path, schema: RecordSchema, period_ns: int) -> None:
@@ -93,8 +99,13 @@ class Blackboard:
         fresh.unlink(missing_ok=True)
         descriptor = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o600)
         try:
-            os.ftruncate(descriptor, size)
+            # All of it now: a page that cannot be had later would end the process in the cycle.
+            os.posix_fallocate(descriptor, 0, size)
             self._map = mmap.mmap(descriptor, size)
+        except OSError as error:
+            fresh.unlink()
+            wanted = f"{size / 1e6:.1f} MB ({records} cycle records of {schema.size} bytes)"
+            raise BlackboardTooLarge(f"{path}: {wanted} cannot be had: {error.strerror}") from error
         finally:
             os.close(descriptor)
         HEADER.pack_into(

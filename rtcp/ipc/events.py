@@ -274,6 +274,14 @@ class ResetWhileMoving(FaultEvent, number=22):
     velocity: float
 
 
+class DriverFailed(FaultEvent, number=113):
+    """the driver of slave {slave} ({slave_name}) raised an error, which the log names: its outputs are 0, {reaction};
+    then `rtcp reset`"""
+
+    slave: int
+    """Position on the cable, from 1."""
+
+
 class GeneratorFailed(FaultEvent, number=7):
     """the trajectory generator refused its input: {reaction}; then `rtcp reset`"""
 

@@ -23,6 +23,7 @@ import mmap
 import struct
 import threading
 from collections.abc import Sequence
+from typing import Final
 
 from rtcp.config.model import MOST_AXES
 from rtcp.ipc.message import PAYLOAD_SIZE
@@ -31,42 +32,42 @@ MAGIC = 0x5254_4350_0000_0008
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, length of the schema, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
-LEASE_ID_AT = 128
+LEASE_ID_AT: Final = 128
 """0: free. Written last when the lease is taken."""
-LEASE_RENEWED_AT = 136
+LEASE_RENEWED_AT: Final = 136
 """CLOCK_MONOTONIC, ns"""
-LEASE_DURATION_AT = 144
+LEASE_DURATION_AT: Final = 144
 """ns"""
-LEASE_HOLDER_AT = 152
-LEASE_HOLDER_SIZE = 64
+LEASE_HOLDER_AT: Final = 152
+LEASE_HOLDER_SIZE: Final = 64
 
-COMMAND_HEAD_AT = 256
-COMMAND_TAKEN_AT = 264
-ANSWER_NUMBER_AT = 272
+COMMAND_HEAD_AT: Final = 256
+COMMAND_TAKEN_AT: Final = 264
+ANSWER_NUMBER_AT: Final = 272
 """Number of the command that the answer belongs to; written last."""
-ANSWER_AT = 768
+ANSWER_AT: Final = 768
 ANSWER = struct.Struct("<Q")
 """number of the refusal's kind (0: accepted); its fields follow (`rtcp.ipc.message`)"""
 
-RECORDS_HEAD_AT = 384
-EVENTS_HEAD_AT = 392
-TEXTS_HEAD_AT = 400
+RECORDS_HEAD_AT: Final = 384
+EVENTS_HEAD_AT: Final = 392
+TEXTS_HEAD_AT: Final = 400
 
-PLAN_IN_USE_AT = 408
+PLAN_IN_USE_AT: Final = 408
 """Slot of the plan that the loop reads from, plus 1; 0: none."""
 
-SERVICE_STATE_AT = 512
+SERVICE_STATE_AT: Final = 512
 """0 idle, 1 asked, 2 answered"""
-SERVICE_LENGTH_AT = 520
-SERVICE_TEXT_AT = 16384
-SERVICE_TEXT_SIZE = 8192
+SERVICE_LENGTH_AT: Final = 520
+SERVICE_TEXT_AT: Final = 16384
+SERVICE_TEXT_SIZE: Final = 8192
 
-SLAVES_AT = 1024
+SLAVES_AT: Final = 1024
 """A word a slave: AL status (state, error bit; 0: no answer), AL status code << 16."""
-SLAVES_MAX = 256
+SLAVES_MAX: Final = 256
 
 HEALTH_AT = SLAVES_AT + SLAVES_MAX * 8
-PORTS = 4
+PORTS: Final = 4
 HEALTH_SIZE = 8 * (1 + PORTS)
 """A word of a slave: how often it left OP | how often it came back << 16 | its temperature << 32 (C, a float; not a
 number: none is known); then one for each of its ports: damaged frames that came in there | damaged frames forwarded
@@ -76,24 +77,24 @@ TEMPERATURE = struct.Struct("<f")
 TEXTS_AT = SERVICE_TEXT_AT + SERVICE_TEXT_SIZE
 TEXT = struct.Struct("<QqHH500s")
 """number, CLOCK_REALTIME ns, length, whether it is a problem, UTF-8 text"""
-TEXTS = 64
+TEXTS: Final = 64
 
 EVENTS_AT = TEXTS_AT + TEXTS * TEXT.size
 EVENT = struct.Struct("<QqqQ")
 """number, CLOCK_REALTIME ns, CLOCK_MONOTONIC ns, number of the event's kind; its fields follow (`rtcp.ipc.message`)"""
 EVENT_SIZE = EVENT.size + PAYLOAD_SIZE
-EVENTS = 256
+EVENTS: Final = 256
 
 COMMANDS_AT = EVENTS_AT + EVENTS * EVENT_SIZE
 COMMAND = struct.Struct("<QQQ")
 """number, lease id, number of the command's kind; its fields follow (`rtcp.ipc.message`)"""
 COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
-COMMANDS = 64
+COMMANDS: Final = 64
 
 PLAN_ROWS, PLAN_COLUMNS = 4096, 2 + 3 * MOST_AXES
 """A plan: rows of doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
-PLANS = 2
+PLANS: Final = 2
 """Two places: one is written while the plan in the other runs."""
 PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND_SIZE + 4095) & ~4095
 
@@ -104,7 +105,7 @@ SCHEMA_SIZE = 1 << 18
 RECORDS_AT = (SCHEMA_AT + SCHEMA_SIZE + 4095) & ~4095
 RECORDS = 1 << 15
 """The ring of a cycle of 366 us and longer; a shorter one has a longer ring, see `records_for`."""
-RING_S = 12.0
+RING_S: Final = 12.0
 """Seconds that every ring holds: those that are written down before a fault, and until they have been read."""
 
 

@@ -346,3 +346,10 @@ class TorqueLimitTooLow(Refusal):
     axis: int
     held: float
     limit: float
+
+
+class DriverRaised(Refusal):
+    """the driver of slave {slave} ({slave_name}) raised an error, which the log names"""
+
+    slave: int
+    """Position on the cable, from 1."""

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import exp
-from typing import Protocol
+from typing import Final, Protocol
 
 from rtcp.config.model import Joint
 from rtcp.ipc.states import DriveMode
 
-_FADE_S = 0.3
+_FADE_S: Final = 0.3
 """Time constant with which the drive's own following error gives way to the position loop closed here."""
 
 

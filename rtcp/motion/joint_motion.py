@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import Final
 
 from ruckig import (
     ControlInterface,
@@ -22,12 +23,12 @@ from ruckig import (
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-LONGEST_S = 600.0
+LONGEST_S: Final = 600.0
 """A move that would take longer is refused: ruckig's own arithmetic ends at about 7600 s."""
 # ruckig finds no solution where a distance is exactly a border between two profiles, as 2 a^3 / j^2: with a little more
 # jerk it is not on the border any more. With less of it a joint at its speed limit would pass that.
 _JERK_SCALES = (1.0, 1.0 + 1e-4, 1.0 + 1e-3, 1.0 - 1e-2)
-_SLACK = 1e-6
+_SLACK: Final = 1e-6
 """Beyond a range, rad, that is a rounding."""
 _INSIDE = 1.0 - 1e-6
 """What the guards have cut may lie a rounding beyond a limit, where ruckig accepts no state."""

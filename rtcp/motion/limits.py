@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.ipc.refusals import ImpossibleLimit, LimitsExcludeJoint, LimitWidened, Refusal
 from rtcp.motion.planning.plan import COLUMNS
 
-LEAST_PART = 1e-3
+LEAST_PART: Final = 1e-3
 """Of a configured speed, acceleration, jerk or torque: less of it is no limit, but an arm that does not move."""
 
 Corners: TypeAlias = tuple[float, float, float, float, float, float]

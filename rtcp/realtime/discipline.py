@@ -14,26 +14,28 @@ grid to the configured phase between two SYNC0, before any drive is in OP), *tra
 
 from __future__ import annotations
 
+from typing import Final
+
 from mypy_extensions import mypyc_attr
 
-MEASURE_CYCLES = 100
-LOCK_CYCLES = 200
-LOCK_WITHIN_NS = 10_000.0
-UNLOCK_BEYOND_NS = 50_000.0
-_RESIDUAL_BOUND_NS = 20_000.0
-_PHASE_GAIN = 0.02
+MEASURE_CYCLES: Final = 100
+LOCK_CYCLES: Final = 200
+LOCK_WITHIN_NS: Final = 10_000.0
+UNLOCK_BEYOND_NS: Final = 50_000.0
+_RESIDUAL_BOUND_NS: Final = 20_000.0
+_PHASE_GAIN: Final = 0.02
 # Critically damped for that phase gain.
 _RATE_GAIN = _PHASE_GAIN * _PHASE_GAIN / 4
-_SHOWN_GAIN = 1 / 32
-_LATE_BEYOND_NS = 50_000.0
-UNHEARD_CYCLES = 200
+_SHOWN_GAIN: Final = 1 / 32
+_LATE_BEYOND_NS: Final = 50_000.0
+UNHEARD_CYCLES: Final = 200
 """Frames in a row with the same reference time that the holdover bridges at the last rate; then the lock is lost."""
-_LATE_MORE = 150
+_LATE_MORE: Final = 150
 """Excess of late frames over those in time, above which they are the clock's. A host that takes the CPU away in bursts
 of tens of frames, fewer than half of all, does not reach it; it reaches 40."""
-_LATE_MOST = 200
+_LATE_MOST: Final = 200
 """Limit of that count: where most frames are late all late ones are used, not one ignored for each in time."""
-_RATE_BOUND = 500e-6
+_RATE_BOUND: Final = 500e-6
 """No two oscillators differ by more; keeps a jump of the reference from winding up the rate."""
 
 

@@ -11,8 +11,9 @@ from rtcp.config.model import DeviceDescription, Pdo, PdoEntry, SlaveConfig
 from rtcp.control.operator import Operator
 from rtcp.control.part import Device, PartContext
 from rtcp.devices.driver import DeviceError, Driver
-from rtcp.ipc.commands import Reset
-from rtcp.ipc.events import Event, LeftRange, OverSpeed, SlaveLost
+from rtcp.ipc.commands import Command, Reset
+from rtcp.ipc.events import DriverFailed, Event, LeftRange, OverSpeed, SlaveLost
+from rtcp.ipc.refusals import DriverRaised, Refusal
 from rtcp.ipc.states import State
 
 from .rig import CONFIG, LoopRig
@@ -41,17 +42,57 @@ def heard() -> Any:
         def __init__(self) -> None:
             super().__init__(0.001)
             self.published: list[Event] = []
+            self.explained: list[tuple[str, str]] = []
 
         def publish(self, event: Event) -> None:
             self.published.append(event)
 
+        def explain(self, what: str, error: Exception) -> None:
+            self.explained.append((what, str(error)))
+
     return Heard()
 
 
+class Raising(Driver):
+    """Raises in the method that is named last."""
+
+    method = ""
+
+    def raise_in(self, method: str) -> None:
+        if method == self.method:
+            raise ZeroDivisionError(method)
+
+    def decode(self, data: bytes) -> None:
+        self.raise_in("decode")
+
+    def accept(self, command: Command) -> Refusal | None:
+        self.raise_in("accept")
+        return None
+
+    def update(self, state: State, now_ns: int) -> Event | None:
+        self.targets["power"] = 7.0
+        self.raise_in("update")
+        return None
+
+    def safe(self) -> None:
+        super().safe()
+        self.raise_in("safe")
+
+    def encode(self) -> bytes:
+        self.raise_in("encode")
+        return super().encode()
+
+    def publish(self, values: list[Any], at: int) -> None:
+        self.raise_in("publish")
+
+
 class Image:
-    """The outputs of the slave."""
+    """The inputs and outputs of the slave."""
 
     sent = b""
+
+    def input(self, slot: int) -> bytes:
+        return bytes(2)
 
     def set_output(self, slot: int, data: bytes) -> None:
         self.sent = data
@@ -68,6 +109,37 @@ def test_outputs_stay_safe_until_the_machine_is_ready_again_whatever_the_driver_
         return int.from_bytes(image.sent, "little")
 
     assert cycle(State.HOLDING) == 7
+    device.safe()
+    assert [cycle(state) for state in (State.FAULT, State.RESETTING)] == [0, 0]
+    cycle(State.READY)
+    assert cycle(State.READY) == 7
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("method", ["decode", "accept", "update", "safe", "encode", "publish"])
+def test_a_driver_that_raises_is_a_fault_with_outputs_of_zero_and_is_tried_again_after_the_reset(method: str) -> None:
+    driver, context, image = Raising(HEATER, 0.001), heard(), Image()
+    device = Device(0, driver)
+
+    def cycle(state: State) -> int:
+        context.state = state
+        device.decode(image)  # type: ignore[arg-type]
+        device.update(context)
+        device.encode(image)  # type: ignore[arg-type]
+        device.publish([0, 0])
+        return int.from_bytes(image.sent, "little")
+
+    assert cycle(State.HOLDING) == 7
+    driver.method = method
+    assert device.accept(Reset(), 0) == (DriverRaised(1) if method == "accept" else None)
+    if method == "safe":
+        device.safe()
+    assert [cycle(State.HOLDING) for _ in range(3)][1:] == [0, 0]
+    assert context.explained == [("driver of slave heater", method)]
+    assert device.accept(Reset(), 0) == DriverRaised(1)
+    # Called by the machine on a fault, which is then the one that counts.
+    assert context.reported == (None if method == "safe" else DriverFailed(1))
+    driver.method = ""
     device.safe()
     assert [cycle(state) for state in (State.FAULT, State.RESETTING)] == [0, 0]
     cycle(State.READY)

@@ -12,7 +12,7 @@ from rtcp.config import default_config, load
 from rtcp.control.arm import Arm
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Disable, SetLimits
-from rtcp.ipc.events import LimitsChanged
+from rtcp.ipc.events import LimitsChanged, OverSpeed
 from rtcp.ipc.observer import Answer, Observer
 from rtcp.ipc.refusals import (
     ImpossibleLimit,
@@ -27,6 +27,7 @@ from rtcp.ipc.refusals import (
 )
 from rtcp.ipc.states import State
 from rtcp.motion.limits import Values, rows
+from rtcp.motion.state import ArmState
 
 from .rig import CONFIG, COUNTS, PERIOD_S, LoopRig, move_to
 
@@ -92,6 +93,15 @@ def test_the_last_clamp_before_the_drives_keeps_to_them_too(rig: LoopRig) -> Non
     drive.target_position = before + 1.0
     rig.arm.output_limiter.check(rig.arm.drives)
     assert drive.target_position == pytest.approx(before + 0.1 * PERIOD_S, rel=1e-4)
+
+
+def test_what_is_measured_is_compared_with_them_too(rig: LoopRig) -> None:
+    rig.hold()
+    give(rig, of_first("velocity", 0.1))
+    watched = ArmState(len(CONFIG.joints))
+    watched.actual_velocity[0] = CONFIG.supervision.speed * 0.1 + 0.01
+    seen = [rig.arm.supervision.check(watched) for _ in range(CONFIG.supervision.cycles)]
+    assert seen[-1] == OverSpeed(0, watched.actual_velocity[0], CONFIG.supervision.speed * 0.1)
 
 
 def test_a_move_under_way_that_leads_beyond_the_new_limit_is_stopped_before_it(rig: LoopRig) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import resource
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from rtcp.ipc.blackboard import Blackboard
+from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
 from rtcp.ipc.commands import Enable, MoveJoints, SetDriveMode
 from rtcp.ipc.events import OverSpeed
 from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, RECORDS, records_for
@@ -226,3 +227,16 @@ def test_a_file_that_is_no_blackboard_is_refused(tmp_path: Path) -> None:
     (tmp_path / "zeros").write_bytes(bytes(1 << 22))
     with pytest.raises(BlackboardError, match="not of this version"):
         Observer(tmp_path / "zeros")
+
+
+def test_a_ring_without_room_is_refused_before_the_cycle_and_leaves_nothing(path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, limits[1]))
+    try:
+        with pytest.raises(
+            BlackboardTooLarge, match=r"[0-9.]+ MB \([0-9]+ cycle records of [0-9]+ bytes\) cannot be had"
+        ):
+            Blackboard(path, arm_schema(6), 500_000)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(path.parent.glob(path.name + "*"))

@@ -93,6 +93,7 @@ def test_the_limits_that_are_in_force_are_those_that_count() -> None:
     seen = Seen()
     assert seen.look(OverSpeed, *[1.0] * CYCLES)[-1] is None
     seen.limits.velocity[1] = 0.5
+    seen.watch.take(seen.limits)
     assert seen.look(OverSpeed, *[1.0] * CYCLES)[-1] == OverSpeed(1, 1.0, 0.75)
 
 

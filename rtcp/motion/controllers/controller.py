@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from math import isfinite
-from typing import ClassVar
+from typing import ClassVar, Final
 
 from mypy_extensions import mypyc_attr
 
@@ -27,7 +27,7 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 ENTRY_POINTS = "rtcp.controllers"
-LONGEST_HOLD_S = 1.0
+LONGEST_HOLD_S: Final = 1.0
 """A velocity, a torque or a jog counts for at most this long, s; then it must be commanded again."""
 
 

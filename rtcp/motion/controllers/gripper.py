@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from rtcp.config.model import Joint
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.state import ArmState, Phase
 
-_FIRM_CYCLES = 5
+_FIRM_CYCLES: Final = 5
 """So many cycles in a row at the torque limit are a grip, and no friction when it starts."""
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import Final
 
 from kinematics.forward import frames
 from kinematics.jacobian import jacobian_columns
@@ -31,16 +32,16 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
 FOREVER_NS = 1 << 62
-_FULL = 0.98
+_FULL: Final = 0.98
 """Share of the joints' speeds and accelerations that jogging uses: the guard never has to cut."""
-_LAST_RAD = 1e-6
-_BRAKING = 0.7
+_LAST_RAD: Final = 1e-6
+_BRAKING: Final = 0.7
 """Share of the Cartesian acceleration with which the tool slows before a box."""
-_BACK_1_S = 100.0
+_BACK_1_S: Final = 100.0
 """How fast the tool returns to its line, 1/s."""
-_OFF_LINE_M = 2e-4
+_OFF_LINE_M: Final = 2e-4
 """Further away than this the line begins anew."""
-_AT_REST = 2e-3
+_AT_REST: Final = 2e-3
 """m/s, rad/s: a slower motion counts as rest."""
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import Final
 
 from kinematics.pose import Pose
 from rtcp.ipc.schema import HELD_BOX_AT, HELD_RANGE_AT, HELD_SHOULDER
@@ -16,16 +17,16 @@ from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.guards.zones import ELBOW, INNER_BOX, TOOL, Clearance
 from rtcp.motion.limits import Limits
 
-STANDOFF_M = 0.008
+STANDOFF_M: Final = 0.008
 """The points of the arm come so near to a box; what the guard's own stop needs beside it is less."""
-_GUARD_M = 0.003
-JOINT_MARGIN_RAD = 2e-4
-_BRAKES = 0.5
+_GUARD_M: Final = 0.003
+JOINT_MARGIN_RAD: Final = 2e-4
+_BRAKES: Final = 0.5
 """Part of a joint's acceleration that its braking envelope uses: the rest is for following the path."""
-_WITHIN_M = 0.13
-_FASTEST_POINT_M_S = 2.0
-_PASSES = 6
-_TOLERANCE = 1e-9
+_WITHIN_M: Final = 0.13
+_FASTEST_POINT_M_S: Final = 2.0
+_PASSES: Final = 6
+_TOLERANCE: Final = 1e-9
 
 
 class JogBounds:

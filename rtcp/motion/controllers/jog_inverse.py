@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import asin, atan2, pi, sqrt
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from kinematics.jacobian import characteristic_length
 from kinematics.model import ArmModel
@@ -21,17 +21,17 @@ from rtcp.motion.limits import Limits
 Row: TypeAlias = tuple[float, float, float, float, float, float]
 _Triple: TypeAlias = tuple[float, float, float]
 SHOULDER, ELBOW, WRIST = 0, 1, 2
-SHOULDER_M = 0.001
-SINE = 0.002
+SHOULDER_M: Final = 0.001
+SINE: Final = 0.002
 """Nearer to a singularity than this its joint is locked: m of the wrist centre, sine of the bend."""
 _ZERO: _Triple = (0.0, 0.0, 0.0)
-_FAR = 1e9
-_INWARD_M_S = 1e-3
+_FAR: Final = 1e9
+_INWARD_M_S: Final = 1e-3
 """An elbow that is stretched bends where the tool is wanted to come inwards faster than this."""
-_STRAIGHT_RAD = 1e-9
-_BENDING = 0.4
+_STRAIGHT_RAD: Final = 1e-9
+_BENDING: Final = 0.4
 """Part of the joints' speeds with which it bends."""
-_LOST = 1e-3
+_LOST: Final = 1e-3
 
 
 class JogInverse:

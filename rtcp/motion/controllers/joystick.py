@@ -10,12 +10,12 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Final, Protocol
 
 from rtcp.config.model import JogConfig
 
-GRIPPER = 3
-MODES = 4
+GRIPPER: Final = 3
+MODES: Final = 4
 # (direction 0 to 5, sign) of forward and of left, in the modes that move the tool.
 _DIRECTIONS = (((0, 1.0), (1, 1.0)), ((2, -1.0), (5, 1.0)), ((3, 1.0), (4, 1.0)))
 

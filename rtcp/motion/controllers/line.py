@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import asin, atan2, hypot, sqrt
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError
 
@@ -30,16 +30,16 @@ from rtcp.motion.planning.interpolation import quaternion, rotation, turn_betwee
 from rtcp.motion.planning.plan import damaged_line, read_row
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-LINES_MOST = 256
+LINES_MOST: Final = 256
 """Straight pieces of a plan."""
 AT_START_M, AT_START_RAD = 1e-3, 2e-3
 """The first piece begins at most this far from where the tool is commanded; the difference fades out."""
-_STILL_RAD_S = 1e-6
-_EXACT = 1e-9
-_LOOK_S = 0.004
-_BETWEEN_SAMPLES = 0.95
+_STILL_RAD_S: Final = 1e-6
+_EXACT: Final = 1e-9
+_LOOK_S: Final = 0.004
+_BETWEEN_SAMPLES: Final = 0.95
 """Share of the distance that is kept from a singularity: a plan was checked every 2 mm."""
-_FADED = 0.25
+_FADED: Final = 0.25
 """The difference at the start fades out over this fraction of the first piece."""
 
 

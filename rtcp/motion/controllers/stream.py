@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import isfinite
+from typing import Final
 
 from ruckig import InputParameter, Ruckig, Trajectory
 
@@ -14,22 +15,22 @@ from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-TIMEOUT_S = 0.2
+TIMEOUT_S: Final = 0.2
 """A stream that is silent for this long has ended."""
-_LOOK_AHEAD_S = 0.2
+_LOOK_AHEAD_S: Final = 0.2
 """Longest time ahead at which a target is met, s."""
-_LATE = 2.5
+_LATE: Final = 2.5
 """A target is missing this many intervals after the last one; until then the speed is kept."""
 _INSIDE = 1.0 - 1e-6
-_SHARE = 0.2
+_SHARE: Final = 0.2
 """Weight of a new interval in the mean."""
-_OVER_S = 0.01
+_OVER_S: Final = 0.01
 """Shortest time over which a target's speed is estimated, s: an encoder's steps and noise average out."""
-_AT_LEAST_S = 0.01
+_AT_LEAST_S: Final = 0.01
 """Shortest time to meet a target, s: in less, a rounding error could only be corrected by a detour."""
-_LONGER = 1.05
+_LONGER: Final = 1.05
 """Factor on the shortest time: with no time to spare, rounding can leave no solution."""
-_DRIFT = 1e-4
+_DRIFT: Final = 1e-4
 """The sender's clock may be slower than ours by this fraction."""
 _TIMEOUT_NS = round(TIMEOUT_S * 1e9)
 

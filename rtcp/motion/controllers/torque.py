@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
+from typing import Final
 
 from kinematics.gravity import gravity_torques
 from rtcp.ipc.commands import ApplyTorque, Command
@@ -13,17 +14,17 @@ from rtcp.ipc.states import ControlMode
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-_RATE_S = 0.1
+_RATE_S: Final = 0.1
 """A torque goes from 0 to the joint's largest in no less."""
-_FADE = 0.3
+_FADE: Final = 0.3
 """Torque fades out over the last part of the speed that a joint may have in its direction."""
 _FREE = 1.0 - _FADE
-_STILL_RAD_S = 0.01
-_AHEAD_RAD_S = 0.1
+_STILL_RAD_S: Final = 0.01
+_AHEAD_RAD_S: Final = 0.1
 """Torque fades out by where the arm is so much faster than its setpoint; twice as much is damped."""
-_CATCH_UP = 20.0
+_CATCH_UP: Final = 20.0
 """1/s: how fast the setpoint goes to where the arm is, on the last bit of the way."""
-_MARGIN_RAD = 0.02
+_MARGIN_RAD: Final = 0.02
 """So far inside its range a joint is brought to rest; beyond, a spring of its `cst_stiffness` pushes it back."""
 
 

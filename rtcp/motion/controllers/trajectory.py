@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from ruckig import InputParameter, Ruckig, Trajectory
 
@@ -32,20 +32,20 @@ from rtcp.motion.planning.plan import (
 )
 from rtcp.motion.state import ArmState, Phase, Setpoint
 
-AT_START_RAD = 1e-3
+AT_START_RAD: Final = 1e-3
 """A plan with a waypoint at time 0 begins at most this far from what is commanded; the difference fades out."""
-AT_START_RAD_S = 1e-2
+AT_START_RAD_S: Final = 1e-2
 """And with a velocity that differs at most this much."""
-_FADE_S = 0.5
-_EXACT = 1e-12
-_AT_ONCE_S = 1e-9
-_SLACK = 1e-6
+_FADE_S: Final = 0.5
+_EXACT: Final = 1e-12
+_AT_ONCE_S: Final = 1e-9
+_SLACK: Final = 1e-6
 _INSIDE = 1.0 - 1e-9
-_MOST_RATE = 50.0
-_MOST_JERK = 2000.0
+_MOST_RATE: Final = 50.0
+_MOST_JERK: Final = 2000.0
 """1/s and 1/s^2: bounds of how fast the path's time stops where no joint moves."""
-_STILL = 1e-9
-_OF_LIMIT = 0.99
+_STILL: Final = 1e-9
+_OF_LIMIT: Final = 0.99
 """Share of a joint's acceleration that a slowdown uses, so that what is between two cycles keeps to it too."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Final
 
 from ruckig import ControlInterface, InputParameter, OutputParameter, Result, Ruckig, RuckigError, Synchronization
 
@@ -17,10 +18,10 @@ from rtcp.motion.state import ArmState, Phase, Setpoint
 
 _POSITION, _VELOCITY = ControlInterface.Position, ControlInterface.Velocity
 _HALT = [0.0, 0.0, 0.0, 0.0]
-_EARLY = 1.5
-_NEAR_RAD = 0.02
+_EARLY: Final = 1.5
+_NEAR_RAD: Final = 0.02
 """A joint heads for the edge of its range when it is this much nearer than it takes to stop."""
-_SLOWEST_RAD_S = 1e-5
+_SLOWEST_RAD_S: Final = 1e-5
 
 
 class VelocityController(Controller):

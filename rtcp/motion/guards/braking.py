@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf, sqrt
+from typing import Final
 
 from kinematics.forward import frames
 from kinematics.pose import Pose
 from rtcp.motion.guards.zones import INNER_BOX, Gap, Zones, inside, outside
 from rtcp.motion.limits import Corners
 
-_MOST_SAMPLES = 16
+_MOST_SAMPLES: Final = 16
 """A way that needs more, beside a box at full speed, counts as touching it: a cycle has no time for all of them."""
-_ROUNDING_M = 1e-12
-_INSIDE_SAMPLES = 8
+_ROUNDING_M: Final = 1e-12
+_INSIDE_SAMPLES: Final = 8
 
 
 def fastest_stoppable(stopping_distance: float, u: float, dt: float) -> float:
@@ -42,8 +43,10 @@ def travel(
     step = stop = 0.0
     for i, w in enumerate(mean):
         if w:
-            step += (w if w > 0.0 else -w) * reach[i]
-            stop += w * w / acceleration[i] * reach[i]
+            speed = w if w > 0.0 else -w
+            swept = speed * reach[i]
+            step += swept
+            stop += swept * speed / acceleration[i]
     step *= dt
     return step, step + 0.5 * stop
 

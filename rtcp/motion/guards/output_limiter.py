@@ -9,13 +9,14 @@ led back into it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import copysign
+from math import copysign, isnan
+from typing import Final
 
 from rtcp.motion.drive_writers import Commanded
 from rtcp.motion.guards.braking import fastest_stoppable
 from rtcp.motion.limits import Limits
 
-BACK_RAD_S = 0.05
+BACK_RAD_S: Final = 0.05
 """A joint that stands beyond its range is led back to the edge no faster: nobody has asked it to move. At a reach of
 1.3 m it is 65 mm/s, below the 250 mm/s of reduced speed (ISO 10218-1)."""
 
@@ -56,21 +57,14 @@ class OutputLimiter:
         fastest, strongest, velocity = self._speed, self._torque, self._velocity
         held = 0
         for i, drive in enumerate(drives):
-            wanted = drive.target_position
-            before = sent[i]
-            lowest, highest = lows[i], highs[i]
-            if lowest <= before <= highest:
-                step = steps[i]
-                low, high = before - step, before + step
-                low = low if low > lowest else lowest
-                high = high if high < highest else highest
-            else:
-                low = high = self._led_back(i)
-            # A comparison with NaN is false: what is no number fails the first test and the target stays.
-            if not (low <= wanted <= high):
-                held |= 1 << i
-                wanted = high if wanted > high else low if wanted < low else min(max(before, low), high)
-            sent[i] = drive.target_position = wanted
+            wanted, before, lowest, highest, step = drive.target_position, sent[i], lows[i], highs[i], steps[i]
+            # A comparison with NaN is false: what is no number fails it, and the target stays.
+            if not (lowest <= wanted <= highest and lowest <= before <= highest and -step <= wanted - before <= step):
+                allowed = self._allowed(i, wanted)
+                if allowed != wanted:
+                    held |= 1 << i
+                    drive.target_position = wanted = allowed
+            sent[i] = wanted
             speed = drive.target_velocity
             if speed == 0.0 == drive.target_torque and velocity[i] == 0.0:
                 continue  # as in CSP: zero is inside every bound, and changes nothing
@@ -103,6 +97,16 @@ class OutputLimiter:
             velocity[i] = drive.target_velocity = speed
             drive.target_torque = torque
         self.held = held
+
+    def _allowed(self, i: int, wanted: float) -> float:
+        """Return the allowed target, rad, that is nearest to `wanted`; the last one where that is no number."""
+        before, lowest, highest = self.sent[i], self._low[i], self._high[i]
+        if not lowest <= before <= highest:
+            return self._led_back(i)
+        if isnan(wanted):
+            return before
+        step = self._step[i]
+        return min(max(wanted, lowest, before - step), highest, before + step)
 
     def _led_back(self, i: int) -> float:
         """Return the next target, rad, of a joint whose last lay outside its range: nearer to the edge, gently.

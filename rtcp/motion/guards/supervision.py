@@ -13,22 +13,27 @@ class Supervision:
 
     Args:
         config: factors, and how many cycles are too many.
-        limits: of the joints; read every cycle.
+        limits: of the joints.
         first: axis number of the first joint.
     """
 
     def __init__(self, config: ArmConfig, limits: Limits, first: int = 0) -> None:
         bounds, n = config.supervision, len(config.joints)
-        self._limits = limits
         self._first = first
         self._cycles = bounds.cycles
         self._speed, self._torque = bounds.speed, bounds.torque
         self.following_error = bounds.following_error
         """Limit in force, rad; infinite while a gripper holds an object."""
+        self.take(limits)
         self._joints = range(n)
         self._counts = [[0] * n, [0] * n, [0] * n]
         self._counted = False
         """Whether a count is not 0."""
+
+    def take(self, limits: Limits) -> None:
+        """Check against other limits from now on."""
+        self._fastest = [self._speed * velocity for velocity in limits.velocity]
+        self._strongest = [self._torque * torque for torque in limits.torque]
 
     def reset(self) -> None:
         """Begin to count anew."""
@@ -39,18 +44,16 @@ class Supervision:
 
     def check(self, state: ArmState) -> EmergencyStop | None:
         """Check the measurements of a cycle; return what was beyond its limit for too long, or None."""
-        limits, error, cycles = self._limits, self.following_error, self._cycles
-        speed, torque = self._speed, self._torque
+        error, cycles, fastest, strongest = self.following_error, self._cycles, self._fastest, self._strongest
         speeds, torques, errors = self._counts
-        fastest, strongest = limits.velocity, limits.torque
         actual, commanded = state.actual, state.commanded
         actual_velocity, actual_torque = state.actual_velocity, state.actual_torque
         if not self._counted:
             for i in self._joints:
                 # What is no number is inside nothing.
                 if not (
-                    -speed * fastest[i] <= actual_velocity[i] <= speed * fastest[i]
-                    and -torque * strongest[i] <= actual_torque[i] <= torque * strongest[i]
+                    -fastest[i] <= actual_velocity[i] <= fastest[i]
+                    and -strongest[i] <= actual_torque[i] <= strongest[i]
                     and -error <= actual[i] - commanded[i] <= error
                 ):
                     self._counted = True
@@ -59,7 +62,7 @@ class Supervision:
                 return None
         counted = False
         for i in self._joints:
-            bound = speed * fastest[i]
+            bound = fastest[i]
             value = actual_velocity[i]
             if -bound <= value <= bound:
                 speeds[i] = 0
@@ -68,7 +71,7 @@ class Supervision:
                 counted = True
                 if speeds[i] >= cycles:
                     return OverSpeed(self._first + i, value, bound)
-            bound = torque * strongest[i]
+            bound = strongest[i]
             value = actual_torque[i]
             if -bound <= value <= bound:
                 torques[i] = 0

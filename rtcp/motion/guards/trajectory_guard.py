@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from enum import IntEnum
 from math import inf, isfinite
+from typing import Final
 
 from kinematics.forward import frames
 from kinematics.pose import Pose
@@ -23,12 +24,12 @@ from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
 
-# So much beyond a limit is the generators' own arithmetic: of the range; as part of the speed, and of its change in a
+# So much beyond a limit is the generators' own arithmetic: of the range; times the speed, and times its change in a
 # cycle; and of a change that a limit demands.
-_ROUNDING_RAD = 1e-7
-_ROUNDING_SPEED = 5e-7
-_ROUNDING_CHANGE = 5e-5
-_ROUNDING_RAD_S = 1e-10
+_ROUNDING_RAD: Final = 1e-7
+_SPEED: Final = 1.0 + 5e-7
+_CHANGE: Final = 1.0 + 5e-5
+_ROUNDING_RAD_S: Final = 1e-10
 
 
 class GuardResult(IntEnum):
@@ -163,15 +164,14 @@ class TrajectoryGuard:
         here, speeds, rates, most = state.commanded, target.velocity, self._limits.acceleration, self._limits.velocity
         velocity, acceleration = state.commanded_velocity, state.commanded_acceleration
         for i in self._joints:
-            w, speed, rate, fastest = mean[i], speeds[i], rates[i], most[i] * (1.0 + _ROUNDING_SPEED)
-            u = rate * dt * (1.0 + _ROUNDING_CHANGE)
-            if not (w - u <= speed <= w + u and -fastest <= speed <= fastest) or held >> i & 1:
+            w, speed, rate = mean[i], speeds[i], rates[i]
+            u, fastest = rate * dt * _CHANGE, most[i] * _SPEED
+            if held >> i & 1 or not (-u <= speed - w <= u and -fastest <= speed <= fastest):
                 speed = w
             change = (speed - velocity[i]) / dt
             acceleration[i] = rate if change > rate else -rate if change < -rate else change
             velocity[i] = speed
-            here[i] = wanted[i]
-            last[i] = w
+        here[:], last[:] = wanted, mean
         if held:
             return GuardResult.CLAMPED
         self._rests = wanted is here and not (any(last) or any(velocity) or any(acceleration))
@@ -183,22 +183,20 @@ class TrajectoryGuard:
         lows, highs, most, rates = limits.low, limits.high, limits.velocity, limits.acceleration
         held = 0
         for i in self._joints:
-            q, v, rate, fastest = here[i], last[i], rates[i], most[i]
+            q, v, rate = here[i], last[i], rates[i]
             u = rate * dt
             w = (wanted[i] - q) / dt
-            stopping_distance = (highs[i] - q if w > 0.0 else q - lows[i]) + _ROUNDING_RAD
-            speed, before = (w, v) if w > 0.0 else (-w, -v)
-            slack = u * _ROUNDING_CHANGE
+            if w > 0.0:
+                speed, slower, room = w, v - w, highs[i] - q + _ROUNDING_RAD
+            else:
+                speed, slower, room = -w, w - v, q - lows[i] + _ROUNDING_RAD
             # No joint slows down faster than it may: what is beyond a limit comes back at that rate.
-            slowed = before - u
-            if (
-                slowed - slack <= speed <= before + u + slack
-                and (speed <= fastest * (1.0 + _ROUNDING_SPEED) or speed <= slowed + _ROUNDING_RAD_S)
-                and (
-                    speed * (dt + 0.5 * speed / rate) <= stopping_distance
-                    or speed <= fastest_stoppable(stopping_distance, u, dt)
-                    or speed <= slowed + _ROUNDING_RAD_S
+            if (-u * _CHANGE <= slower <= u * _CHANGE) and (
+                (
+                    speed <= most[i] * _SPEED
+                    and (speed * (dt + 0.5 * speed / rate) <= room or speed <= fastest_stoppable(room, u, dt))
                 )
+                or slower >= u - _ROUNDING_RAD_S
             ):
                 allowed[i] = w
                 continue

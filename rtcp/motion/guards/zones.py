@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import hypot, sqrt
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
@@ -16,7 +16,7 @@ from rtcp.motion.limits import Corners
 ELBOW, WRIST, TOOL = 2, 4, 6
 """Places in `frames` of the points that are watched: the origins of frames 3 and 5, and the tool."""
 POINTS = (TOOL, WRIST, ELBOW)
-INNER_BOX = -1
+INNER_BOX: Final = -1
 """Number of the box that the tool stays inside; the keep-out boxes are numbered from 0."""
 
 

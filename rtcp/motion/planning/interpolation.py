@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from math import atan2, comb, copysign, cos, fabs, hypot, sin, sqrt
-from typing import TypeAlias
+from typing import Final, TypeAlias
 
 from kinematics.pose import Rotation, Vector, times
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Coefficients: TypeAlias = tuple[float, float, float, float, float, float]
-_NO_TURN = 1e-12
-_NEARLY = 1e-15
+_NO_TURN: Final = 1e-12
+_NEARLY: Final = 1e-15
 """A root is known so closely, as a fraction of the piece."""
 
 

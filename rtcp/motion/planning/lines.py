@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil, hypot, inf, isfinite, sqrt
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ruckig import InputParameter, Ruckig, RuckigError, Trajectory
 
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
 
 SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
 """A line is looked at whenever the tool has moved or turned so far."""
-_JUMP_RAD = 0.3
+_JUMP_RAD: Final = 0.3
 """A joint that moves by more between two samples changes its branch, or is at a singularity."""
 _UNUSED = (0.0,) * (KIND - 19)
 _NO_WAY_M, _NO_WAY_RAD = 1e-6, 1e-6
-_OF_LIMIT = 0.95
+_OF_LIMIT: Final = 0.95
 """Of a joint's limits a line uses so much: between the samples they hold too."""
-_SAME_RAD = 1e-3
+_SAME_RAD: Final = 1e-3
 
 
 @dataclass(frozen=True)

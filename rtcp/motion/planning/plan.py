@@ -25,6 +25,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
+from typing import Final
 
 from rtcp.config.model import MOST_AXES
 from rtcp.ipc.layout import PLAN_COLUMNS
@@ -33,11 +34,11 @@ COLUMNS = PLAN_COLUMNS
 POSITIONS, VELOCITIES, ACCELERATIONS = 1, 1 + MOST_AXES, 1 + 2 * MOST_AXES
 KIND = COLUMNS - 1
 CUBIC, QUINTIC, LINE = 3.0, 5.0, 1.0
-LONGEST_S = 86_400.0
+LONGEST_S: Final = 86_400.0
 """Longest duration of a plan."""
-_UNIT = 1e-6
-_FASTEST = 1e9
-_LONGEST_M = 1e3
+_UNIT: Final = 1e-6
+_FASTEST: Final = 1e9
+_LONGEST_M: Final = 1e3
 
 
 ZoneAt = Callable[[Sequence[float]], "str | None"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Final
 
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel
@@ -15,7 +16,7 @@ from rtcp.motion.planning.interpolation import cubic, quintic, rotation, turn_be
 from rtcp.motion.planning.plan import ACCELERATIONS, CUBIC, KIND, LINE, POSITIONS, VELOCITIES, Plan
 from rtcp.motion.state import ArmState
 
-SAMPLES = 60
+SAMPLES: Final = 60
 """Configurations of a preview at least, where the motion has an extent."""
 
 JointPath = list[tuple[float, ...]]

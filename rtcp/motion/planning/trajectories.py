@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from math import ceil, isfinite
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from rtcp.config.model import MOST_AXES, MOST_POINTS, Point
 from rtcp.motion.controllers.trajectory import AT_START_RAD, Approach
@@ -24,13 +24,13 @@ from rtcp.motion.planning.plan import CUBIC, LONGEST_S, QUINTIC, Plan, PlanRefus
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
-SHORTEST_S = 1e-3
+SHORTEST_S: Final = 1e-3
 """Between two points there is at least so much time."""
-ZONE_STEP_RAD = 0.01
+ZONE_STEP_RAD: Final = 0.01
 """Zones are looked at whenever a joint has moved so far."""
-_ROUNDING = 1e-9
-_STILL = 1e-9
-_AT_ONCE_S = 1e-12
+_ROUNDING: Final = 1e-9
+_STILL: Final = 1e-9
+_AT_ONCE_S: Final = 1e-12
 
 
 def plan_trajectory(
