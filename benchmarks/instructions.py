@@ -28,7 +28,10 @@ from kinematics.compiled import BUILD
 
 CYCLES = 1000
 _WARM_UP = 100
-_MARK = "#include <valgrind/callgrind.h>\nvoid mark(void) { CALLGRIND_START_INSTRUMENTATION; }\n"
+_MARKS = """#include <valgrind/callgrind.h>
+void start(void) { CALLGRIND_START_INSTRUMENTATION; }
+void stop(void) { CALLGRIND_STOP_INSTRUMENTATION; }
+"""
 _COUNT_PER_RAD = 1e4
 
 
@@ -60,32 +63,34 @@ def probe(cycles: int) -> None:
 
 
 def run_counted(name: str, library: str) -> None:
-    """Warm up, switch counting on, run the cycles and end at once: what counts is between."""
-    mark = ctypes.CDLL(library).mark
+    """Warm up, switch counting on, run the cycles and switch it off."""
+    marks = ctypes.CDLL(library)
     if name == "probe":
         probe(_WARM_UP)
-        mark()
+        marks.start()
         probe(CYCLES)
-        os._exit(0)
+        marks.stop()
+        return
     with activity("hold" if name == "bus" else name) as running:
         for _ in range(_WARM_UP):
             running.step()
         gc.collect()
         gc.disable()
         if name != "bus":
-            mark()
+            marks.start()
             for _ in range(CYCLES):
                 running.step()
-            os._exit(0)
+            marks.stop()
+            return
         simulation = running.simulation
         data, now_ns = simulation.data, simulation.now_ns
-        mark()
+        marks.start()
         for _ in range(CYCLES):
             now_ns += round(PERIOD_US * 1000)
             simulation.bus.advance_to(now_ns)
             data.send()
             data.receive()
-        os._exit(0)
+        marks.stop()
 
 
 def thousands(name: str, source: bool, library: Path) -> float:
@@ -116,13 +121,14 @@ def main() -> int:
     given = parser.parse_args()
     if given.worker:
         run_counted(given.worker, given.library)
+        return 0
     if unknown := set(given.activities) - set(ACTIVITIES):
         parser.error(f"found {', '.join(unknown)}, allowed are {', '.join(ACTIVITIES)}")
     try:
         with tempfile.TemporaryDirectory() as folder:
             library = Path(folder) / "mark.so"
             compiler = ["cc", "-O1", "-shared", "-fPIC", "-x", "c", "-", "-o", str(library)]
-            subprocess.run(compiler, input=_MARK, text=True, check=True)
+            subprocess.run(compiler, input=_MARKS, text=True, check=True)
             least = thousands("probe", True, library)
             print(f"probe {least:.0f} thousand instructions", flush=True)
             ways = ["source"] if given.source or not BUILD.is_used else ["source", "compiled"]

@@ -21,6 +21,7 @@ from rtcp.ipc.events import (
     DriveFault,
     DriveLeftEnabled,
     DriveModeTimeout,
+    DriverFailed,
     EmergencyStopActivated,
     EnableTimeout,
     Event,
@@ -148,8 +149,13 @@ def position_jumps(rig: LoopRig) -> None:
     rig.data.input = lambda slot: false(slot) if slot == 2 else sound(slot)  # type: ignore[method-assign]
 
 
-def position_is_true(rig: LoopRig) -> None:
+def inputs_are_true(rig: LoopRig) -> None:
     del rig.data.input
+
+
+def box_cannot_be_read(rig: LoopRig) -> None:
+    sound = rig.set_in_motion().data.input
+    rig.data.input = lambda slot: sound(slot) if slot else b""  # type: ignore[method-assign]
 
 
 def generator_fails(rig: LoopRig) -> None:
@@ -201,7 +207,9 @@ FAULTS = (
          joint_out_of_range, joint_turned_by_hand(1.9)),
     Case("position jumps while enabling", PositionJumped, 1,
          ("joint2", "jumped from 0 to 0.1 rad", "5 cycles (supervision in assistive_arm.yaml)", "`rtcp reset`"),
-         position_jumps, position_is_true),
+         position_jumps, inputs_are_true),
+    Case("driver raises", DriverFailed, 1, ("slave 1 (io)", "raised an error", "outputs are 0", "`rtcp reset`"),
+         box_cannot_be_read, inputs_are_true),
     Case("trajectory generator fails", GeneratorFailed, -1, ("trajectory generator", "`rtcp reset`"),
          generator_fails, generator_works),
 )  # fmt: skip
