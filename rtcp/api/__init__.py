@@ -16,7 +16,8 @@ from rtcp.api.results import (
     Zero,
 )
 from rtcp.api.robot import Robot, connect
-from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
+from rtcp.api.stream import Stream
+from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, Replaced, RtcpError, TimedOut
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -42,10 +43,12 @@ __all__ = [
     "RecordSchema",
     "RecorderStatus",
     "Refused",
+    "Replaced",
     "Robot",
     "RtcpError",
     "State",
     "Status",
+    "Stream",
     "Streamed",
     "TimedOut",
     "Zero",

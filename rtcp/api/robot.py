@@ -27,6 +27,7 @@ from rtcp.api.results import (
     Zero,
     result,
 )
+from rtcp.api.stream import Stream
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
@@ -192,6 +193,7 @@ class Methods:
         speed: float | None = None,
         synchronized: bool = True,
         progress: OnProgress | None = None,
+        replace: bool = False,
     ) -> Call[Arrival]:
         """Move to joint positions and return when the arm is there.
 
@@ -200,12 +202,15 @@ class Methods:
             speed: of the fastest joint, rad/s; None: its limit.
             synchronized: all joints arrive together; else each as soon as it can.
             progress: called about ten times a second meanwhile.
+            replace: a motion of this connection that is under way (`AsyncRobot`) goes over into this one without a
+                stop, under the limits; where this one is refused, that goes on.
 
         Raises:
             Refused: a target outside the limits, the wrong state, another commander.
             Faulted: it ended before it arrived.
+            Replaced: another motion took its place.
         """
-        params = {"q": list(q), "speed": speed, "synchronized": synchronized}
+        params = {"q": list(q), "speed": speed, "synchronized": synchronized, "replace": replace}
         return Call("move_joints", params, _arrival, progress)
 
     @Method
@@ -248,13 +253,18 @@ class Methods:
 
     @Method
     def run_trajectory(
-        self, points: Sequence[Mapping[str, Any]], approach: bool = False, progress: OnProgress | None = None
+        self,
+        points: Sequence[Mapping[str, Any]],
+        approach: bool = False,
+        progress: OnProgress | None = None,
+        replace: bool = False,
     ) -> Call[Arrival]:
         """Run a trajectory through points `{"t": s, "q": [rad]}`; `approach`: the joints first move to the first point.
 
-        A point may also have velocities `v` and accelerations `a`.
+        A point may also have velocities `v` and accelerations `a`. With `replace` as `move_joints`: a first point at
+        time 0 is left out while the arm moves, and what follows is as much later as the way to the next one demands.
         """
-        params = {"points": [dict(point) for point in points], "approach": approach}
+        params = {"points": [dict(point) for point in points], "approach": approach, "replace": replace}
         return Call("run_trajectory", params, _arrival, progress)
 
     @Method
@@ -356,6 +366,15 @@ class Methods:
     def stream(self, q: Sequence[float], t: float) -> Call[Streamed]:
         """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
         return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)
+
+    @Method
+    def open_stream(self) -> Call[Stream]:
+        """Begin a stream of setpoints, sent without waiting for answers: 1 kHz and more; leave its block to end it.
+
+        Raises:
+            Refused: what would refuse any motion.
+        """
+        return Call("open_stream", {}, Stream.from_json)
 
     # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
 

@@ -285,9 +285,18 @@ class Methods:
 
     @method()
     async def move_joints(
-        self, caller: Caller, q: Numbers, speed: float | None = None, synchronized: bool = True
+        self,
+        caller: Caller,
+        q: Numbers,
+        speed: float | None = None,
+        synchronized: bool = True,
+        replace: bool = False,
     ) -> Json:
-        """Move to joint positions, rad, at most at `speed`, rad/s. Returns `positions` and the largest `error`, rad."""
+        """Move to joint positions, rad, at most at `speed`, rad/s. Returns `positions` and the largest `error`, rad.
+
+        With `replace` it waits for no other request of its connection: a motion of that goes over into this one without
+        a stop, and ends with the error kind `replaced`.
+        """
         return await self._motion.move_joints(caller, q, speed, synchronized)
 
     @method()
@@ -335,8 +344,14 @@ class Methods:
         return await self._motion.run_file(caller, file, approach)
 
     @method()
-    async def run_trajectory(self, caller: Caller, points: tuple[Point, ...], approach: bool = False) -> Json:
-        """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`."""
+    async def run_trajectory(
+        self, caller: Caller, points: tuple[Point, ...], approach: bool = False, replace: bool = False
+    ) -> Json:
+        """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`.
+
+        With `replace` as `move_joints`; a first point at time 0 is left out where the arm moves, and the others come as
+        much later as the way to the next one lasts longer than its time.
+        """
         return await self._motion.run_trajectory(caller, points, approach)
 
     @method()
@@ -345,6 +360,15 @@ class Methods:
     ) -> Json:
         """Run straight lines to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s."""
         return await self._motion.run_path(caller, stops, speed, approach)
+
+    @method(streams=True)
+    async def open_stream(self, caller: Caller) -> Json:
+        """Begin a stream of setpoints through shared memory. Returns what `rtcp.Stream` needs for it.
+
+        That is `stream`, its number, `lease`, which its sender renews, `since`, the last event before it, and the
+        runtime `directory`.
+        """
+        return {**await self._streaming.open(caller), "directory": str(self._directory)}
 
     @method(streams=True)
     async def jog(

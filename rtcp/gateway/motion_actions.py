@@ -95,11 +95,11 @@ class Planner:
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused)) from None
 
-    def trajectory(self, points: Sequence[Point], q_now: Sequence[float]) -> Plan:
-        """Return the plan of a trajectory that begins at `q_now`."""
+    def trajectory(self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False) -> Plan:
+        """Return the plan of a trajectory that begins at `q_now`; or, `moving`, on the way there."""
         names = [joint.name for joint in self._config.joints]
         try:
-            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
+            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
@@ -158,6 +158,8 @@ class MotionActions:
         self._count = len(channel.config.joints)
         self.goal: Sequence[float] | None = None
         """Joint positions to which the call under way moves, rad, until it returns; None: none, or a package's own."""
+        self._motion: object = None
+        """The motion that the loop accepted last."""
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
@@ -186,9 +188,10 @@ class MotionActions:
     async def run_trajectory(self, caller: Caller, points: Sequence[Point], approach: bool) -> Json:
         """Run a trajectory; with `approach` the joints first move to its first point."""
         async with self._channel.lease(caller) as lease:
+            moving = self._channel.state is State.MOVING and not approach
             begin = self._joints(points[0].q) if approach and points else self._start()
             # Before the approach: of a trajectory that is refused nothing moves.
-            plan = await asyncio.to_thread(self._planner.trajectory, points, begin)
+            plan = await asyncio.to_thread(self._planner.trajectory, points, begin, moving)
             slot = self._write(plan)
             if approach:
                 await self._move(lease, begin, None, True)
@@ -284,7 +287,7 @@ class MotionActions:
     def _start(self) -> list[float]:
         """Return where a plan begins."""
         # What is refused anyway is refused by the loop: then the plan only has to begin somewhere.
-        is_commanded = self._channel.state is State.HOLDING
+        is_commanded = self._channel.state in (State.HOLDING, State.MOVING)
         return self._channel.joints("commanded_position" if is_commanded else "actual_position")
 
     async def _move(self, lease: int, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
@@ -324,11 +327,15 @@ class MotionActions:
         channel = self._channel
         since = channel.observer.last_event
         at_rest = channel.reaching(State.HOLDING, IN_MOTION, what, since)
-        rested = False
+        began = rested = False
+        motion = object()
 
         def outcome() -> T | None:
-            nonlocal rested
-            self.goal = goal  # only once the loop has accepted it
+            nonlocal began, rested
+            if not began:  # only once the loop has accepted it
+                began, self._motion, self.goal = True, motion, goal
+            if self._motion is not motion:
+                raise RtcpError("replaced", f"{what} was replaced by another motion")
             if not rested:
                 if at_rest() is None:
                     return None
@@ -340,7 +347,8 @@ class MotionActions:
         try:
             return await channel.run(lease, command, outcome, timeout_s, what)
         finally:
-            self.goal = None
+            if self._motion is motion:
+                self.goal = None
 
     def _arrival(self, q: Sequence[float], same_rad: float, what: str) -> Callable[[], Json | None]:
         """Return an outcome: where the arm is, once the following error has died away."""

@@ -116,7 +116,7 @@ class _Connection:
 
     async def _answer(self, number: jsonrpc.RequestId, method: str, params: Json) -> None:
         caller = Caller(self._name, self._number, lambda progress: self._report(number, progress), self._is_stalled)
-        at_once = self._methods.table[method].at_once
+        at_once = self._methods.table[method].at_once or params.get("replace") is True
         try:
             async with contextlib.AsyncExitStack() as turn:
                 if not at_once:

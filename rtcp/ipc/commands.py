@@ -173,6 +173,14 @@ class StreamPosition(MotionCommand):
     """Clock of the sender, s."""
 
 
+class OpenStream(MotionCommand):
+    """Begin a stream whose setpoints come through shared memory (`rtcp.Stream`)."""
+
+    renewed = True
+    stream: int
+    """Its number, not 0."""
+
+
 class Jog(MotionCommand):
     """Move the tool with velocities along and about the axes of a frame, or the joints, for `hold_s`."""
 

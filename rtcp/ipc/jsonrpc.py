@@ -22,6 +22,7 @@ CODES = {
     "refused": -32000,
     "fault": -32001,
     "timeout": -32002,
+    "replaced": -32003,
     "invalid": INVALID_PARAMS,
     "internal": INTERNAL_ERROR,
 }

@@ -53,7 +53,13 @@ from rtcp.ipc.layout import (
     SERVICE_STATE_AT,
     SERVICE_TEXT_AT,
     SERVICE_TEXT_SIZE,
+    SETPOINT,
+    SETPOINT_HEAD_AT,
+    SETPOINT_TAKEN_AT,
+    SETPOINTS,
+    SETPOINTS_AT,
     SLAVES_AT,
+    STREAM_AT,
     TEMPERATURE,
     TEXT,
     TEXTS,
@@ -360,6 +366,41 @@ class Observer:
         self._words.fence()
         self._words[COMMAND_HEAD_AT] = number
         return number
+
+    def setpoint(self, stream: int, bits: int, stamp_s: float, numbers: Sequence[float]) -> bool:
+        """Put a setpoint into its ring; return False where the stream has ended. The stream's owner is the only writer.
+
+        Args:
+            stream: its number.
+            bits: `SETPOINT_...` of `rtcp.ipc.layout`.
+            stamp_s: time stamp of the sender, s.
+            numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
+
+        Raises:
+            BlackboardError: the ring is full: the loop hangs.
+            struct.error: what is no number.
+        """
+        words = self._words
+        if words[STREAM_AT] != stream:
+            return False
+        number = words[SETPOINT_HEAD_AT] + 1
+        if number - words[SETPOINT_TAKEN_AT] > SETPOINTS:
+            raise BlackboardError("the loop takes no setpoints: its process hangs or is gone")
+        at = SETPOINTS_AT + (number % SETPOINTS) * SETPOINT.size
+        SETPOINT.pack_into(self._map, at, number, stream, bits, stamp_s, *numbers)
+        words.fence()
+        words[SETPOINT_HEAD_AT] = number
+        return True
+
+    @property
+    def open_stream(self) -> int:
+        """Number of the stream whose setpoints the loop follows; 0: none."""
+        return self._words[STREAM_AT]
+
+    @property
+    def setpoints_taken(self) -> int:
+        """How many setpoints the loop has taken since the start."""
+        return self._words[SETPOINT_TAKEN_AT]
 
     def write_plan(self, rows: Sequence[Sequence[float]]) -> int:
         """Write a plan, rows of up to 20 numbers, for a command that names the slot which is returned.

@@ -40,6 +40,7 @@ def plan_trajectory(
     *,
     names: Sequence[str] = (),
     zone_at: ZoneAt | None = None,
+    moving: bool = False,
 ) -> Plan:
     """Return the plan of a trajectory for `TrajectoryController`.
 
@@ -54,6 +55,8 @@ def plan_trajectory(
         q_now: where the arm is commanded, rad, shape (n,).
         names: of the joints, for the sentences.
         zone_at: looked at every `ZONE_STEP_RAD` of any joint's way.
+        moving: it replaces a motion, which has passed `q_now` when it begins: a first point at time 0 with others
+            behind it is left out, and only the loop knows the way to the next.
 
     Raises:
         PlanRefused: with the point, the joint, what was found and what is allowed.
@@ -61,12 +64,14 @@ def plan_trajectory(
     joints = len(q_now)
     names = list(names) or [f"joint{i + 1}" for i in range(joints)]
     _check_points(points, names)
+    if moving and len(points) > 1 and points[0].t <= _AT_ONCE_S:
+        points = points[1:]
     waypoints = _waypoints(points, q_now)
     first, last = waypoints[0], waypoints[-1]
     _check_ends(first, last, len(points), q_now, names)
     for number, waypoint in enumerate(waypoints, 1):
         _check_waypoint(waypoint, f"point {number}", limits, names)
-    if first.t > _AT_ONCE_S:
+    if first.t > _AT_ONCE_S and not moving:
         _check_approach(first, limits, q_now, names, zone_at)
     for number, (before, after) in enumerate(pairwise(waypoints), 1):
         _check_piece(before, after, f"between points {number} and {number + 1}", limits, names, zone_at)
