@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from rtcp.api.results import (
     Arrival,
+    Buffered,
     EventRecord,
     GripperRest,
+    JointLimits,
     Preview,
     Progress,
     RecorderStatus,
@@ -16,18 +18,20 @@ from rtcp.api.results import (
     Zero,
 )
 from rtcp.api.robot import Robot, connect
-from rtcp.api.stream import Stream
 from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, Replaced, RtcpError, TimedOut
+from rtcp.ipc.robot_status import RobotStatus
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
     from rtcp.api.feed import Feed
+    from rtcp.api.stream import Stream
 
 __all__ = [
     "Arrival",
     "AsyncRobot",
+    "Buffered",
     "ConnectionLost",
     "ControlMode",
     "DriveMode",
@@ -37,6 +41,7 @@ __all__ = [
     "GripperRest",
     "Invalid",
     "JogFrame",
+    "JointLimits",
     "NotRunning",
     "Preview",
     "Progress",
@@ -45,6 +50,7 @@ __all__ = [
     "Refused",
     "Replaced",
     "Robot",
+    "RobotStatus",
     "RtcpError",
     "State",
     "Status",
@@ -67,6 +73,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api.feed import Feed
 
         return Feed
+    if name == "Stream":
+        from rtcp.api.stream import Stream
+
+        return Stream
     raise AttributeError(f"module 'rtcp.api' has no attribute {name!r}")
 
 

@@ -133,6 +133,11 @@ class CommandChannel:
             "positions": self.joints("actual_position"),
         }
 
+    def ahead_s(self) -> float:
+        """Return how long the motion under way still lasts, s."""
+        record = self.record()
+        return float(record["duration_s"]) - float(record["elapsed_s"])
+
     def check_loop(self) -> None:
         """Raise RtcpError where the loop has ended."""
         if not self.snapshot.loop_lives:
@@ -349,9 +354,12 @@ class StreamingCommands:
 
     async def rest(self, caller: Caller) -> None:
         """End what this connection moves and wait until the arm rests: another command follows."""
-        if caller.connection not in self._leases:
-            return
-        self.end(caller.connection)
+        if caller.connection in self._leases:
+            self.end(caller.connection)
+            await self.wait_for_rest()
+
+    async def wait_for_rest(self) -> None:
+        """Wait until the arm rests, after its commander has let go."""
         channel = self._channel
 
         def rested() -> bool | None:

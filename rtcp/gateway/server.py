@@ -45,6 +45,8 @@ _REPEAT_LOG_S = 10.0
 """Between two lines of the log on the same defect."""
 _MOST_PENDING = 256
 """Requests of one connection that wait for their answers."""
+_MOST_UNREAD = 1 << 16
+"""Bytes of answers that wait for a client; with more, it is told of no progress."""
 _SEND_BUFFER = 4096
 """Bytes, before doubling by the kernel: a client that does not read is noticed after about ten progress reports."""
 _LINGER_S = 1.0
@@ -146,7 +148,7 @@ class _Connection:
             self._unread_since = None
         elif self._unread_since is None:
             self._unread_since = time.monotonic()
-        if self._unread() < jsonrpc.LINE_LIMIT:
+        if self._unread() < _MOST_UNREAD:
             self._send({"method": "progress", "params": {"request": number, **progress}})
 
     def _unread(self) -> int:

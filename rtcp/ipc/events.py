@@ -396,6 +396,12 @@ class StreamEnded(MotionEnded, number=101):
     by_limit = False
 
 
+class OutOfPoints(MotionEnded, number=117):
+    """the open trajectory came to its last point and no more had been appended: controlled stop"""
+
+    by_limit = False
+
+
 class SetpointOutOfRange(MotionEnded, number=114):
     """{joint}: the stream's setpoint of {value:.6g} rad is outside its range, beyond {limit:g} rad: controlled stop,
     the stream has ended"""

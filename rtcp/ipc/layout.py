@@ -18,7 +18,6 @@ Nothing here imports numpy: its threads would keep the loop's process from joini
 
 from __future__ import annotations
 
-import array
 import math
 import mmap
 import struct
@@ -106,6 +105,7 @@ SETPOINT_HAS_VELOCITY, SETPOINT_HAS_ACCELERATION, SETPOINT_ENDS = 1, 2, 4
 
 PLAN_ROWS, PLAN_COLUMNS = 4096, 2 + 3 * MOST_AXES
 """A plan: rows of doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
+_ROW = struct.Struct(f"<{PLAN_COLUMNS}d")
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS: Final = 2
 """Two places: one is written while the plan in the other runs."""
@@ -181,15 +181,16 @@ def write_plan(memory: mmap.mmap, words: AtomicWords, rows: Sequence[Sequence[fl
     Raises:
         PlanTooLong: with the number of rows and how many fit.
     """
+    slot = 0 if words[PLAN_IN_USE_AT] != 1 else PLANS - 1
+    write_rows(memory, words, slot, 0, rows)
+    return slot
+
+
+def write_rows(memory: mmap.mmap, words: AtomicWords, slot: int, first: int, rows: Sequence[Sequence[float]]) -> None:
+    """Write rows of a plan from number `first` on; a slot is a ring of them. Raises PlanTooLong as `write_plan`."""
     if len(rows) > PLAN_ROWS:
         raise PlanTooLong(f"the plan has {len(rows)} rows, at most {PLAN_ROWS} fit: give fewer points")
-    flat = array.array("d")
-    for row in rows:
-        flat.extend(row)
-        flat.extend([0.0] * (PLAN_COLUMNS - len(row)))
-    slot = 0 if words[PLAN_IN_USE_AT] != 1 else PLANS - 1
-    at = PLANS_AT + slot * PLAN_SIZE
-    encoded = flat.tobytes()
-    memory[at : at + len(encoded)] = encoded
+    for number, row in enumerate(rows, first):
+        at = PLANS_AT + slot * PLAN_SIZE + number % PLAN_ROWS * PLAN_COLUMNS * 8
+        _ROW.pack_into(memory, at, *row, *[0.0] * (PLAN_COLUMNS - len(row)))
     words.fence()
-    return slot

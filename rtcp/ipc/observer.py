@@ -69,6 +69,7 @@ from rtcp.ipc.layout import (
     file_size,
     records_for,
     write_plan,
+    write_rows,
 )
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import REFUSALS, Refusal
@@ -409,6 +410,10 @@ class Observer:
             PlanTooLong: where it does not fit.
         """
         return write_plan(self._map, self._words, rows)
+
+    def extend_plan(self, slot: int, first: int, rows: Sequence[Sequence[float]]) -> None:
+        """Write more rows of the open plan in a slot, from number `first` on; raises PlanTooLong."""
+        write_rows(self._map, self._words, slot, first, rows)
 
     def answer(self, number: int) -> Answer | None:
         """Return the loop's answer to the command `number`, or None while there is none."""
