@@ -38,6 +38,7 @@ _UNDER_WAY = 4
 """Commands that wait for their answers."""
 _REFUSED = 10
 """Commands of a stream that may be refused: a host that stalls makes some come too late."""
+_MOST_BY_SOCKET_HZ = 1000.0
 _REST_S = 10.0
 _SPARE = 4.0
 """Limits beside what the sine needs: with less the way to each target, and not the platform, takes the time."""
@@ -86,11 +87,13 @@ def behind(feedback: Sine, command: Sine) -> tuple[float, float]:
 
 @contextmanager
 def _by_api(robot: Robot) -> Iterator[Send]:
-    def send(q: Sequence[float]) -> bool:
-        robot.stream(q, time.monotonic())
-        return True
+    with robot.open_stream() as stream:
 
-    yield send
+        def send(q: Sequence[float]) -> bool:
+            stream.send(q)
+            return True
+
+        yield send
 
 
 class _Answers(threading.Thread):
@@ -151,7 +154,7 @@ class LatencyExperiment(Experiment):
     name = "latency"
     title = "Latency of streamed joint commands"
 
-    def __init__(self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0), periods: int = 6) -> None:
+    def __init__(self, rates_hz: Sequence[float] = (30.0, 250.0, 1000.0, 2000.0), periods: int = 6) -> None:
         self._rates_hz = rates_hz
         self._periods = periods
         self._drive_us: Array = np.empty(0)
@@ -170,8 +173,11 @@ class LatencyExperiment(Experiment):
         with setup.platform() as robot:
             for way in WAYS:
                 for rate in self._rates_hz:
+                    if way == "socket" and rate > _MOST_BY_SOCKET_HZ:
+                        continue  # each command is a line of JSON, and answered
                     rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
             rows += self._parts(setup, robot)
+            rows += self._to_frame(robot)
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
@@ -205,7 +211,7 @@ class LatencyExperiment(Experiment):
         latency, error = behind(sines["actual"], command)
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
-        aim = (0.0, AIM_CYCLES) if rate == 1000.0 else ()
+        aim = (0.0, AIM_CYCLES) if rate >= 1000.0 else ()
         self._drive_us = 1e6 * _behind_each(*series["sent"], *series["actual"], first, last)
         self._draw(setup, name, label, {one: (t - begun, y) for one, (t, y) in series.items()})
         setup.report(
@@ -255,6 +261,30 @@ class LatencyExperiment(Experiment):
         return [
             Row(f"{name}: p{p}", "us", float(np.percentile(values, p)))
             for name, values in parts.items()
+            for p in (50, 99)
+        ]
+
+    @staticmethod
+    def _to_frame(robot: Robot) -> list[Row]:
+        """Measure how long setpoints of an open stream take from `send` until the frame has left, in cycles."""
+        observer = Observer(blackboard_file(runtime_directory()))
+        base = list(robot.status().positions)
+        sent_at, instants, begun = [], [], observer.head
+        with contextlib.closing(observer), robot.open_stream() as stream:
+            for _ in range(_PROBES):
+                number = observer.setpoints_taken + 1
+                sent_at.append(time.monotonic_ns())
+                stream.send(base)
+                instants.append(_spin_until(number, lambda: observer.setpoints_taken))
+                time.sleep(_PROBE_INTERVAL_S)
+            records, _ = observer.since(begun)
+            period_ns = observer.period_ns
+        _wait_until_it_rests(robot)
+        at = np.searchsorted(records["time_ns"], instants)
+        known = at < len(records)
+        cycles = (records["time_ns"][at[known]] - np.array(sent_at)[known]) / period_ns
+        return [
+            Row(f"Python API: command to frame, p{p}", "cycles", float(np.percentile(cycles, p)), None, 0.0, AIM_CYCLES)
             for p in (50, 99)
         ]
 
