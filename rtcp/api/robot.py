@@ -113,12 +113,6 @@ def _joint_limits(answer: Json) -> tuple[JointLimits, ...]:
     return tuple(JointLimits(name, *(limits[key][i] for key in keys)) for i, name in enumerate(answer["joint_names"]))
 
 
-def _stream(answer: Json) -> Stream:
-    from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
-
-    return Stream.from_json(answer)
-
-
 def _recordings(answer: Json) -> list[RecorderStatus]:
     return [result(RecorderStatus, one) for one in answer["recordings"]]
 
@@ -448,7 +442,9 @@ class Methods:
         Raises:
             Refused: what would refuse any motion.
         """
-        return Call("open_stream", {}, _stream)
+        from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
+
+        return Call("open_stream", {}, Stream.from_json)
 
     # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
 

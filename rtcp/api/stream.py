@@ -18,7 +18,7 @@ from rtcp.ipc.observer import BlackboardError, Observer
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.session import read_session
 
-_ENDS = (MotionEnded, LeaseExpired, PermissionWithdrawn, Stopped)
+_ENDS = (MotionEnded, LeaseExpired, PermissionWithdrawn)
 _NOTHING = (0.0,) * (3 * MOST_AXES)
 
 
@@ -121,7 +121,12 @@ class Stream:
         """Return the error for what has ended the stream."""
         found: Event | None = None
         for event in (record.event for record in self._observer.events_since(self._since)):
-            if isinstance(event, _ENDS) or type(event) in self._names.faults:
+            # That the arm has stopped says why only where nothing else does.
+            if (
+                isinstance(event, _ENDS)
+                or type(event) in self._names.faults
+                or (found is None and type(event) is Stopped)
+            ):
                 found = event
         if found is None:
             return RtcpError("fault", "the stream has ended")

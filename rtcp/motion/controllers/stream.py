@@ -200,7 +200,7 @@ class StreamController(Controller):
     def advance(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle."""
         target = self.setpoint
-        if state.now_ns - self._came_ns > _TIMEOUT_NS:
+        if state.now_ns - self._came_ns > _TIMEOUT_NS and not self._first:
             return self.give_up(state, StreamEnded())
         if self._fresh:
             self._fresh = False
