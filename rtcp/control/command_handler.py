@@ -6,6 +6,7 @@ method here, found by the command's class.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -114,7 +115,12 @@ class CommandHandler:
     def handle(self) -> None:
         """Carry out the next command and answer it; called only when one waits."""
         number, lease, command = self._blackboard.take_command()
-        self._blackboard.answer(number, self._refusal(command, lease))
+        refusal = self._refusal(command, lease)
+        try:
+            self._blackboard.answer(number, refusal)
+        except struct.error:
+            # A field of the command is so large that the refusal, which counts on from it, cannot hold it.
+            self._blackboard.answer(number, Malformed(command.number))
 
     def take_setpoints(self) -> None:
         """Follow the setpoints that wait; those of a stream that is not open any more are dropped."""

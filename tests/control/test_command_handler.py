@@ -83,6 +83,13 @@ def test_only_what_makes_the_arm_safer_needs_no_lease() -> None:
     assert {kind for kind in own if kind.needs_lease} == tried | {ExtendTrajectory}
 
 
+def test_a_number_that_no_refusal_can_hold_is_malformed_and_ends_nothing(rig: LoopRig) -> None:
+    rig.hold()
+    assert rig.send(SetOutput(1, True, (1 << 63) - 1)).refusal == Malformed(SetOutput.number)
+    rig.run(0.1)
+    assert rig.state is State.HOLDING
+
+
 @pytest.mark.parametrize("state", WITH_LEASE, ids=name_of)
 def test_a_command_without_its_lease_is_refused_and_changes_nothing(rig: LoopRig, state: State) -> None:
     rig.bring_to(state)
