@@ -21,8 +21,12 @@ def _ros(
         float, typer.Option("--rate", min=1.0, max=10_000.0, help="Joint states a second, at most one a cycle.")
     ] = 100.0,
     name: Annotated[str, option("--name", "NAME", "Of the node.")] = "rtcp",
+    enable: Annotated[
+        bool, option("--auto-enable", "A motion enables the drives, but not after a stop, a fault or robot_disable.")
+    ] = False,
+    partial: Annotated[bool, option("--partial", "Joints that a trajectory does not name hold.")] = False,
 ) -> None:
-    """Show the running platform to ROS 1, until Ctrl-C (docs/ros.md); waits for the master and the platform."""
+    """Run the arm as a ROS 1 node, until Ctrl-C (docs/ros.md); waits for the master and the platform."""
     from rtcp.ros import ros1_messages
 
     try:
@@ -30,6 +34,7 @@ def _ros(
     except ros1_messages.RosMissing as error:
         raise CommandError(str(error)) from None
     from rtcp.ros import ros1
+    from rtcp.ros.commands import CommandOptions
 
     for argument in remappings or ():
         if ":=" not in argument:
@@ -37,6 +42,6 @@ def _ros(
     try:
         with signals_raise():
             report(f"node {name}: Ctrl-C ends it")
-            ros1.run(ros1.NodeOptions(name, rate, remappings or ()))
+            ros1.run(ros1.NodeOptions(name, rate, remappings or (), CommandOptions(enable, partial)))
     except KeyboardInterrupt:
         raise typer.Exit(ExitCode.DONE) from None  # the normal end of a node

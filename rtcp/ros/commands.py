@@ -314,6 +314,7 @@ class Commander:
     async def _connected(self) -> Arm:
         async with self._connecting:
             if self._arm is None:
+                await self._closing.aclose()  # a connection that was lost
                 self._arm = await self._closing.enter_async_context(self._connect())
             return self._arm
 

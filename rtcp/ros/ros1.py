@@ -1,29 +1,51 @@
-"""ROS 1: the node on rospy, a thin skin on `rtcp.ros.state`. The only file that imports ROS; call
-`ros1_messages.make_importable` first."""
+"""ROS 1: the node on rospy, a thin skin on `rtcp.ros.state` and `rtcp.ros.commands`.
+
+The only file that imports ROS; `ros1_messages.make_importable` goes before.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import http.client
 import os
 import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import AsyncIterator, Coroutine, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
+import actionlib
 import rosgraph
 import rospy
-from control_msgs.msg import FollowJointTrajectoryFeedback
+from control_msgs.msg import FollowJointTrajectoryAction, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from industrial_msgs.msg import RobotStatus as RobotStatusMessage
+from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
 from sensor_msgs.msg import JointState
-from trajectory_msgs.msg import JointTrajectoryPoint
+from std_srvs.srv import Trigger, TriggerResponse
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from kinematics.urdf import to_urdf
+from rtcp.api import RtcpError
+from rtcp.api.async_robot import connect_async
 from rtcp.config.model import ArmConfig
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher
+from rtcp.ros.commands import (
+    Arm,
+    Commander,
+    CommandOptions,
+    FollowCode,
+    StoppingArm,
+    Tolerance,
+    Tolerances,
+    Trajectory,
+    TrajectoryPoint,
+)
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+
+T = TypeVar("T")
 
 _TURN_S = 0.005
 _MASTER_S = 1.0
@@ -40,6 +62,7 @@ class NodeOptions:
     """Of joint_states and feedback_states."""
     arguments: Sequence[str] = ()
     """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
+    commands: CommandOptions = field(default_factory=CommandOptions)
 
 
 def run(options: NodeOptions) -> None:
@@ -51,12 +74,15 @@ def run(options: NodeOptions) -> None:
     rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
-    publisher = StatePublisher(Publications(), rate_hz=options.rate_hz, name=rospy.get_name())
+    commands = Commands(options.commands)
+    publisher = StatePublisher(Publications(commands), rate_hz=options.rate_hz, name=rospy.get_name())
     try:
-        while watch.is_alive():
+        # Not in the middle of a motion, which the end of its connection would stop.
+        while watch.is_alive() or commands.commander.is_moving:
             publisher.step(_TURN_S)
     finally:
         publisher.close()
+        commands.close()
         if watch.is_alive():
             rospy.signal_shutdown("the node ends")
     # rospy registers its topics once, with the master of its start: for another one the process begins anew.
@@ -96,7 +122,8 @@ class _Transport(xmlrpc.client.Transport):
 class Publications:
     """Publishes what the core says (`rtcp.ros.state.Sink`)."""
 
-    def __init__(self) -> None:
+    def __init__(self, commands: Commands) -> None:
+        self._commands = commands
         # A queue each: no subscriber that reads slowly holds the node.
         self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
         self._feedback = rospy.Publisher(
@@ -128,9 +155,12 @@ class Publications:
         states.header.stamp = feedback.header.stamp = _time(sample.stamp_ns)
         self._joint_states.publish(states)
         self._feedback.publish(feedback)
+        self._commands.publish_feedback(feedback)
 
     def status(self, status: RobotStatus) -> None:
         """Publish robot_status."""
+        if status.in_error is TriState.TRUE:
+            self._commands.commander.note_stop()
         message = RobotStatusMessage(error_code=status.error_code)
         message.header.stamp = _time(status.stamp_ns)
         for name in ("mode", "e_stopped", "drives_powered", "motion_possible", "in_motion", "in_error"):
@@ -148,6 +178,150 @@ class Publications:
         message = DiagnosticArray(status=[entry])
         message.header.stamp = _time(diagnostics.stamp_ns)
         self._diagnostics.publish(message)
+
+
+class Commands:
+    """Takes topics, services and the action; the core carries them out on an event loop in a thread of its own."""
+
+    def __init__(self, options: CommandOptions) -> None:
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        self.commander = self._wait(self._make(options))
+        self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
+        """Of the action: handle and what carries it out, by its id."""
+        rospy.Subscriber("joint_path_command", JointTrajectory, self._on_path, queue_size=10, tcp_nodelay=True)
+        rospy.Subscriber("joint_command", JointTrajectoryPoint, self._on_point, queue_size=1, tcp_nodelay=True)
+        rospy.Service("joint_path_command", CmdJointTrajectory, self._path)
+        rospy.Service("stop_motion", StopMotion, self._stop)
+        rospy.Service("robot_enable", Trigger, lambda request: self._trigger(self.commander.enable()))
+        rospy.Service("robot_disable", Trigger, lambda request: self._trigger(self.commander.disable()))
+        self._action = actionlib.ActionServer(
+            "joint_trajectory_action", FollowJointTrajectoryAction, self._on_goal, self._on_cancel, auto_start=False
+        )
+        self._action.start()
+
+    def close(self) -> None:
+        """Close the connection to the platform: what it moves comes to a controlled stop."""
+        self._wait(self.commander.close())
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def publish_feedback(self, feedback: Any) -> None:
+        """Publish it to the clients of the goals under way."""
+        for handle, _ in list(self._goals.values()):
+            handle.publish_feedback(feedback)
+
+    @staticmethod
+    async def _make(options: CommandOptions) -> Commander:
+        return Commander(_connect, options, rospy.logerr)
+
+    def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
+
+    def _begin(self, what: str, coroutine: Coroutine[Any, Any, Any]) -> None:
+        """Carry it out; nobody waits for the outcome, so a refusal is logged."""
+
+        async def logged() -> None:
+            try:
+                await coroutine
+            except Exception as error:  # also a mistake of ours: without this nobody would hear of it
+                rospy.logerr("%s: %s", what, error)
+
+        asyncio.run_coroutine_threadsafe(logged(), self._loop)
+
+    def _on_path(self, message: Any) -> None:
+        self._begin("joint_path_command", self.commander.begin_trajectory(_trajectory(message)))
+
+    def _on_point(self, message: Any) -> None:
+        self._begin("joint_command", self.commander.command_point(_point(message)))
+
+    def _path(self, request: Any) -> Any:
+        response = CmdJointTrajectoryResponse()
+        response.code.val = self._served(self.commander.begin_trajectory(_trajectory(request.trajectory)))
+        return response
+
+    def _stop(self, request: Any) -> Any:
+        response = StopMotionResponse()
+        response.code.val = self._served(self.commander.stop())
+        return response
+
+    def _served(self, coroutine: Coroutine[Any, Any, None]) -> int:
+        """Return ServiceReturnCode.SUCCESS. FAILURE has no room for a reason: an error reply has."""
+        try:
+            self._wait(coroutine)
+        except RtcpError as error:
+            rospy.logerr("%s", error)
+            raise rospy.ServiceException(str(error)) from None
+        return 1
+
+    def _trigger(self, coroutine: Coroutine[Any, Any, str]) -> Any:
+        try:
+            return TriggerResponse(True, self._wait(coroutine))
+        except RtcpError as error:
+            rospy.logerr("%s", error)
+            return TriggerResponse(False, str(error))
+
+    # -- the action ---------------------------------------------------------------------------------------------------
+
+    def _on_goal(self, handle: Any) -> None:
+        async def begin() -> None:
+            number = handle.get_goal_id().id
+            task = asyncio.create_task(self._follow(handle))
+            self._goals[number] = handle, task
+            task.add_done_callback(lambda task: self._goals.pop(number, None))
+
+        self._wait(begin())
+
+    def _on_cancel(self, handle: Any) -> None:
+        if (goal := self._goals.get(handle.get_goal_id().id)) is not None:
+            self._loop.call_soon_threadsafe(goal[1].cancel)
+
+    async def _follow(self, handle: Any) -> None:
+        goal, result = handle.get_goal(), FollowJointTrajectoryResult()
+        tolerances = Tolerances(
+            _tolerances(goal.path_tolerance), _tolerances(goal.goal_tolerance), goal.goal_time_tolerance.to_sec()
+        )
+        has_begun = False
+
+        def accept() -> None:
+            nonlocal has_begun
+            has_begun = True
+            handle.set_accepted()
+
+        try:
+            code, text = await self.commander.follow(_trajectory(goal.trajectory), tolerances, accept)
+        except asyncio.CancelledError:
+            handle.set_canceled(result, "cancelled: the arm brakes")
+            return
+        except RtcpError as error:  # no code of the action says it
+            code, text = FollowCode.INVALID_GOAL, str(error)
+        result.error_code, result.error_string = int(code), text
+        if code is FollowCode.SUCCESSFUL:
+            if not has_begun:  # there already
+                handle.set_accepted()
+            handle.set_succeeded(result, text)
+        else:
+            rospy.logerr("joint_trajectory_action: %s", text)
+            (handle.set_aborted if has_begun else handle.set_rejected)(result, text)
+
+
+@contextlib.asynccontextmanager
+async def _connect() -> AsyncIterator[Arm]:
+    async with connect_async(rospy.get_name()) as robot:
+        yield StoppingArm(robot)
+
+
+def _trajectory(message: Any) -> Trajectory:
+    return Trajectory(message.joint_names, [_point(point) for point in message.points], message.header.stamp.to_sec())
+
+
+def _point(message: Any) -> TrajectoryPoint:
+    return TrajectoryPoint(
+        message.time_from_start.to_sec(), message.positions, message.velocities, message.accelerations
+    )
+
+
+def _tolerances(messages: Any) -> tuple[Tolerance, ...]:
+    return tuple(Tolerance(one.name, one.position, one.velocity, one.acceleration) for one in messages)
 
 
 def _time(stamp_ns: int) -> Any:

@@ -10,6 +10,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -121,6 +122,12 @@ class Ros:
         self._holder.stdin.close()  # type: ignore[union-attr]
         self._holder.wait()
         shutil.rmtree(self.directory, ignore_errors=True)
+
+
+def begin_node(ros: Ros, platform: Platform, *arguments: str) -> subprocess.Popen[str]:
+    """Start `rtcp ros` in the namespace."""
+    environment = {name: value for name, value in platform.environment.items() if name.startswith("RTCP_")}
+    return ros.background(sys.executable, "-m", "rtcp.cli", "ros", *arguments, **environment)
 
 
 @pytest.fixture(scope="session")

@@ -48,7 +48,7 @@ def main() -> None:
         def on_diagnostics(message: Any) -> None:
             (entry,) = message.status
             values = {pair.key: pair.value for pair in entry.values}
-            write("diagnostics", message, level=entry.level, message=entry.message, values=values)
+            write("diagnostics", message, level=entry.level, text=entry.message, values=values)
 
         for topic, kind, callback in (
             ("joint_states", JointState, on_joints),

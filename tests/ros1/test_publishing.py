@@ -17,7 +17,7 @@ import pytest
 from rtcp.api import Feed
 from tests.e2e.conftest import Platform, kill
 
-from .conftest import PATIENCE_S, Ros, until
+from .conftest import PATIENCE_S, Ros, begin_node, until
 
 pytestmark = pytest.mark.alone
 LISTENER = Path(__file__).parent / "listener.py"
@@ -45,15 +45,6 @@ class Listener:
             lambda: next((message for message in self.heard(topic)[since:] if met(message)), None), f"{topic} as wanted"
         )
         return dict(found)
-
-
-def begin_node(ros: Ros, platform: Platform, *arguments: str) -> subprocess.Popen[str]:
-    """Start `rtcp ros` in the namespace."""
-    return ros.background(sys.executable, "-m", "rtcp.cli", "ros", *arguments, **node_environment(platform))
-
-
-def node_environment(platform: Platform) -> dict[str, str]:
-    return {name: value for name, value in platform.environment.items() if name.startswith("RTCP_")}
 
 
 @pytest.fixture
@@ -181,7 +172,7 @@ def test_after_the_end_of_the_platform_no_joints_come_until_it_is_back(platform:
     assert [gone[name] for name in known] == [-1, -1, -1, 0, -1, -1, 0]
     entry = listener.until("diagnostics", lambda message: message["values"].get("connected") == "false")
     assert entry["level"] == 3
-    assert "has ended" in entry["message"]
+    assert "has ended" in entry["text"]
     joints = len(listener.heard("joint_states"))
     statuses = len(listener.heard("robot_status"))
     until(lambda: len(listener.heard("robot_status")) > statuses + 10, "statuses without a platform")
