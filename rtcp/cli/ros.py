@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rtcp.cli.arguments import option
-from rtcp.cli.output import CommandError, ExitCode, report, signals_raise
+from rtcp.cli.output import CommandError, ExitCode, report
 
 commands = typer.Typer()
 
@@ -39,9 +39,5 @@ def _ros(
     for argument in remappings or ():
         if ":=" not in argument:
             raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
-    try:
-        with signals_raise():
-            report(f"node {name}: Ctrl-C ends it")
-            ros1.run(ros1.NodeOptions(name, rate, remappings or (), CommandOptions(enable, partial)))
-    except KeyboardInterrupt:
-        raise typer.Exit(ExitCode.DONE) from None  # the normal end of a node
+    report(f"node {name}: Ctrl-C ends it")
+    ros1.run(ros1.NodeOptions(name, rate, remappings or (), CommandOptions(enable, partial)))

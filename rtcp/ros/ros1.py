@@ -6,9 +6,11 @@ The only file that imports ROS; `ros1_messages.make_importable` goes before.
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import contextlib
 import http.client
 import os
+import signal
 import sys
 import threading
 import time
@@ -51,6 +53,8 @@ _TURN_S = 0.005
 _MASTER_S = 1.0
 """Interval between two looks at the master, s."""
 _MASTER_TIMEOUT_S = 2.0
+_CLOSE_S = 2.0
+"""Longest wait for the end of the connection; the end of the process ends it too."""
 
 
 @dataclass(frozen=True)
@@ -66,27 +70,30 @@ class NodeOptions:
 
 
 def run(options: NodeOptions) -> None:
-    """Run the node until an exception, as Ctrl-C raises it, ends it; wait for the master and the platform."""
+    """Run the node until SIGINT, SIGTERM or SIGHUP; wait for the master and the platform. From the main thread only."""
+    # A flag and no exception: rospy has bare `except` clauses, which would swallow one.
+    ends = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: ends.set())
     master = Master()
     while not (identity := master.identity()):
-        time.sleep(_MASTER_S)
+        if ends.wait(_MASTER_S):
+            return
     # Without disable_signals rospy would take SIGINT and SIGTERM for itself.
     rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
     commands = Commands(options.commands)
     publisher = StatePublisher(Publications(commands), rate_hz=options.rate_hz, name=rospy.get_name())
-    try:
-        # Not in the middle of a motion, which the end of its connection would stop.
-        while watch.is_alive() or commands.commander.is_moving:
-            publisher.step(_TURN_S)
-    finally:
-        publisher.close()
-        commands.close()
-        if watch.is_alive():
-            rospy.signal_shutdown("the node ends")
-    # rospy registers its topics once, with the master of its start: for another one the process begins anew.
-    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    # Another master is not followed in the middle of a motion, which the end of its connection would stop.
+    while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
+        publisher.step(_TURN_S)
+    publisher.close()
+    commands.close()
+    if not ends.is_set():
+        # rospy registers its topics once, with the master of its start: for another one the process begins anew.
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    rospy.signal_shutdown("the node ends")
 
 
 class Master:
@@ -202,7 +209,8 @@ class Commands:
 
     def close(self) -> None:
         """Close the connection to the platform: what it moves comes to a controlled stop."""
-        self._wait(self.commander.close())
+        with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
+            asyncio.run_coroutine_threadsafe(self.commander.close(), self._loop).result(_CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
 
     def publish_feedback(self, feedback: Any) -> None:
@@ -262,18 +270,26 @@ class Commands:
 
     # -- the action ---------------------------------------------------------------------------------------------------
 
+    # actionlib holds its lock while it calls back, and its handles take it: nothing here may wait for the loop.
+
     def _on_goal(self, handle: Any) -> None:
-        async def begin() -> None:
-            number = handle.get_goal_id().id
-            task = asyncio.create_task(self._follow(handle))
+        number = handle.get_goal_id().id
+
+        def begin() -> None:
+            task = self._loop.create_task(self._follow(handle))
             self._goals[number] = handle, task
             task.add_done_callback(lambda task: self._goals.pop(number, None))
 
-        self._wait(begin())
+        self._loop.call_soon_threadsafe(begin)
 
     def _on_cancel(self, handle: Any) -> None:
-        if (goal := self._goals.get(handle.get_goal_id().id)) is not None:
-            self._loop.call_soon_threadsafe(goal[1].cancel)
+        number = handle.get_goal_id().id
+
+        def cancel() -> None:
+            if number in self._goals:
+                self._goals[number][1].cancel()
+
+        self._loop.call_soon_threadsafe(cancel)
 
     async def _follow(self, handle: Any) -> None:
         goal, result = handle.get_goal(), FollowJointTrajectoryResult()
@@ -292,7 +308,7 @@ class Commands:
         except asyncio.CancelledError:
             handle.set_canceled(result, "cancelled: the arm brakes")
             return
-        except RtcpError as error:  # no code of the action says it
+        except Exception as error:  # no code of the action says it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
         result.error_code, result.error_string = int(code), text
         if code is FollowCode.SUCCESSFUL:

@@ -225,6 +225,16 @@ def test_a_node_that_is_ended_leaves_the_master_without_its_name(ros: Ros, node:
     assert "/rtcp" not in ros.run("/usr/bin/rosnode", "list").stdout.split()
 
 
+def test_a_node_ends_without_a_master_too(ros: Ros, node: subprocess.Popen[str], listener: Listener) -> None:
+    listener.until("joint_states", lambda message: True)
+    ros.kill_core()
+    try:
+        node.send_signal(signal.SIGTERM)
+        assert node.wait() == 0
+    finally:
+        ros.start_core()
+
+
 def test_a_word_that_is_no_remapping_is_refused(ros_on_the_path: None, platform: Platform) -> None:
     assert platform.rtcp("ros", "joint_states", check=2).stderr == (
         "rtcp: joint_states is no remapping: write NAME:=VALUE\n"
