@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol, TypeVar
@@ -90,6 +90,10 @@ NO_TOLERANCES = Tolerances()
 
 class Arm(Protocol):
     """What the commands need of a connected robot; each raises RtcpError."""
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the connection stands."""
 
     async def status(self) -> Status:
         """Return the status."""
@@ -240,19 +244,19 @@ class Commander:
         """stop_motion: stop whatever moves; return when the arm holds."""
         self._next = None
         arm = await self._connected()
-        await self._asked(arm.halt())
+        await arm.halt()
 
     # -- drives -------------------------------------------------------------------------------------------------------
 
     async def enable(self) -> str:
         """robot_enable: leave a fault or an emergency stop, enable the drives; return a sentence."""
         arm = await self._connected()
-        if (await self._asked(arm.status())).state in _NEEDS_RESET:
-            left = await self._asked(arm.reset())
+        if (await arm.status()).state in _NEEDS_RESET:
+            left = await arm.reset()
             if left is State.STOPPED_BY_LIMIT:
                 return "the arm holds again"
-        if (await self._asked(arm.status())).state is not State.HOLDING:
-            await self._asked(arm.enable())
+        if (await arm.status()).state is not State.HOLDING:
+            await arm.enable()
         self._may_enable = True
         return "the drives are enabled"
 
@@ -260,7 +264,7 @@ class Commander:
         """robot_disable: stop, remove the torque; return a sentence."""
         self._may_enable = False
         arm = await self._connected()
-        await self._asked(arm.disable())
+        await arm.disable()
         return "the drives are disabled"
 
     # -- the way there ------------------------------------------------------------------------------------------------
@@ -282,13 +286,13 @@ class Commander:
     async def _enabled(self) -> Status:
         """Return the status, the drives enabled where that is asked for and allowed."""
         arm = await self._connected()
-        status = await self._asked(arm.status())
+        status = await arm.status()
         if status.state is State.READY and self._options.enables:
             if not self._may_enable:
                 message = "the drives were disabled by a stop or by robot_disable: call robot_enable"
                 raise _refusal("needs_enable", message)
-            await self._asked(arm.enable())
-            status = await self._asked(arm.status())
+            await arm.enable()
+            status = await arm.status()
         return status
 
     async def _leave_moving(self, motion: asyncio.Task[Arrival], moves: asyncio.Event) -> None:
@@ -297,7 +301,7 @@ class Commander:
         await asyncio.wait({motion, waiting}, return_when=asyncio.FIRST_COMPLETED)
         waiting.cancel()
         if motion.done():
-            await self._asked(motion)
+            await motion
         else:
             motion.add_done_callback(self._report)
 
@@ -308,27 +312,14 @@ class Commander:
 
     def _report(self, motion: asyncio.Task[Arrival]) -> None:
         if not motion.cancelled() and (error := motion.exception()) is not None:
-            self._forget_lost(error)
             self._log(str(error))
 
     async def _connected(self) -> Arm:
         async with self._connecting:
-            if self._arm is None:
+            if self._arm is None or not self._arm.is_open:
                 await self._closing.aclose()  # a connection that was lost
                 self._arm = await self._closing.enter_async_context(self._connect())
             return self._arm
-
-    async def _asked(self, answer: Awaitable[T]) -> T:
-        try:
-            return await answer
-        except RtcpError as error:
-            self._forget_lost(error)
-            raise
-
-    def _forget_lost(self, error: BaseException) -> None:
-        """The platform has ended: the next command connects anew."""
-        if isinstance(error, RtcpError) and error.kind == "lost":
-            self._arm = None
 
 
 def _once_moving(moves: Callable[[], None]) -> Callable[[Progress], None]:
@@ -391,6 +382,11 @@ class StoppingArm:
         self.status, self.enable, self.disable = robot.status, robot.enable, robot.disable
         self.reset, self.halt = robot.reset, robot.halt
         self._under_way = 0
+
+    @property
+    def is_open(self) -> bool:
+        """See `Arm`."""
+        return bool(self._robot.is_open)
 
     async def move_joints(self, q: Numbers, progress: Callable[[Progress], None]) -> Arrival:
         """See `Arm`."""

@@ -135,7 +135,7 @@ def test_samples_have_the_rate_asked_for_and_at_most_one_a_cycle(
 ) -> None:
     publisher = StatePublisher(heard, lambda: cast(Feed, feed), rate_hz)
     begin = time.monotonic_ns()
-    feed.waiting = [record(begin + at * 2 * MS + (at * 7 % 5 - 2) * jitter_ns // 2) for at in range(500)]
+    feed.waiting = [record(begin + at * 2 * MS + (2 - at * 7 % 5) * jitter_ns // 2) for at in range(500)]
     publisher.step(0)
     assert abs(len(heard.samples) - expected) <= 1
     stamps = [sample.stamp_ns for sample in heard.samples]
