@@ -6,7 +6,7 @@ BIN := .venv/bin
 # Empty is off: a platform's processes start in half the time where Python keeps what it has compiled.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help setup oracles run panel test test-all fast faults lint format clean
+.PHONY: help setup oracles run panel test test-all test-ros fast faults lint format clean
 .DEFAULT_GOAL := help
 
 help: ## show this list
@@ -35,6 +35,10 @@ test-all: oracles ## run all tests: every sample, systemd as PID 1, in a browser
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m 'not alone' --numprocesses auto || status=1; \
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m alone || status=1; \
 	exit $$status
+
+test-ros: setup ## run the tests on ROS 1 in a network namespace; as root on Debian 12 it is installed first
+	@sh .ci/ros
+	@$(BIN)/python -m pytest tests/ros1
 
 fast: setup ## compile the cycle in place: about half the time for each; needs a C compiler, takes minutes
 	@$(BIN)/python hatch_build.py

@@ -74,6 +74,11 @@ class Feed:
         os.close(self._process)
         self._observer.close()
 
+    @property
+    def holder(self) -> str:
+        """Who commands the arm; empty: nobody."""
+        return self._observer.holder()
+
     def ended(self, wait_s: float) -> bool:
         """Wait, and return early and true when the loop's process has ended."""
         return bool(self._loop.poll(wait_s * 1e3))

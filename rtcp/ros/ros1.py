@@ -1,0 +1,344 @@
+"""ROS 1: the node on rospy, a thin skin on `rtcp.ros.state` and `rtcp.ros.commands`.
+
+The only file that imports ROS; `ros1_messages.make_importable` goes before.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import http.client
+import os
+import signal
+import sys
+import threading
+import time
+import xmlrpc.client
+from collections.abc import AsyncIterator, Coroutine, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import actionlib
+import rosgraph
+import rospy
+from control_msgs.msg import FollowJointTrajectoryAction, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from industrial_msgs.msg import RobotStatus as RobotStatusMessage
+from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
+from sensor_msgs.msg import JointState
+from std_srvs.srv import Trigger, TriggerResponse
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from kinematics.urdf import to_urdf
+from rtcp.api import RtcpError
+from rtcp.api.async_robot import connect_async
+from rtcp.config.model import ArmConfig
+from rtcp.ros.commands import (
+    Arm,
+    Commander,
+    CommandOptions,
+    FollowCode,
+    StoppingArm,
+    Tolerance,
+    Tolerances,
+    Trajectory,
+    TrajectoryPoint,
+)
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+
+T = TypeVar("T")
+
+_TURN_S = 0.005
+_MASTER_S = 1.0
+"""Interval between two looks at the master, s."""
+_MASTER_TIMEOUT_S = 2.0
+_CLOSE_S = 2.0
+"""Longest wait for the end of the connection; the end of the process ends it too."""
+
+
+@dataclass(frozen=True)
+class NodeOptions:
+    """What `rtcp ros` was asked for."""
+
+    name: str = "rtcp"
+    rate_hz: float = 100.0
+    """Of joint_states and feedback_states."""
+    arguments: Sequence[str] = ()
+    """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
+    commands: CommandOptions = field(default_factory=CommandOptions)
+
+
+def run(options: NodeOptions) -> None:
+    """Run the node until SIGINT, SIGTERM or SIGHUP; wait for the master and the platform. From the main thread only."""
+    # A flag and no exception: rospy has bare `except` clauses, which would swallow one.
+    ends = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: ends.set())
+    master = Master()
+    while not (identity := master.identity()):
+        if ends.wait(_MASTER_S):
+            return
+    # Without disable_signals rospy would take SIGINT and SIGTERM for itself.
+    rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
+    watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
+    watch.start()
+    commands = Commands(options.commands)
+    publisher = StatePublisher(Publications(commands), rate_hz=options.rate_hz, name=rospy.get_name())
+    # Another master is not followed in the middle of a motion, which the end of its connection would stop.
+    while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
+        publisher.step(_TURN_S)
+    publisher.close()
+    commands.close()
+    if not ends.is_set():
+        # rospy registers its topics once, with the master of its start: for another one the process begins anew.
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+    rospy.signal_shutdown("the node ends")
+
+
+class Master:
+    """The ROS master, and whether it is still the same one."""
+
+    def __init__(self) -> None:
+        self._server: Any = xmlrpc.client.ServerProxy(rosgraph.get_master_uri(), transport=_Transport())
+
+    def identity(self) -> tuple[Any, ...]:
+        """Return process id and run_id of the master; nothing: none answers."""
+        try:
+            _, _, pid = self._server.getPid("/rtcp")
+            code, _, run_id = self._server.getParam("/rtcp", "/run_id")
+        except (OSError, http.client.HTTPException, xmlrpc.client.Error):
+            return ()
+        return pid, run_id if code == 1 else ""
+
+    def wait_for_another(self, identity: tuple[Any, ...]) -> None:
+        """Return when another master than this one answers."""
+        while self.identity() in ((), identity):
+            time.sleep(_MASTER_S)
+
+
+class _Transport(xmlrpc.client.Transport):
+    """HTTP that gives up: a master whose machine is gone would hold the caller for minutes."""
+
+    def make_connection(self, host: Any) -> http.client.HTTPConnection:
+        connection = super().make_connection(host)
+        connection.timeout = _MASTER_TIMEOUT_S
+        return connection
+
+
+class Publications:
+    """Publishes what the core says (`rtcp.ros.state.Sink`)."""
+
+    def __init__(self, commands: Commands) -> None:
+        self._commands = commands
+        # A queue each: no subscriber that reads slowly holds the node.
+        self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
+        self._feedback = rospy.Publisher(
+            "feedback_states", FollowJointTrajectoryFeedback, queue_size=100, tcp_nodelay=True
+        )
+        self._status = rospy.Publisher("robot_status", RobotStatusMessage, queue_size=10, tcp_nodelay=True)
+        self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
+
+    def connected(self, config: ArmConfig) -> None:
+        """Set robot_description, where the geometry is known and nobody has set it."""
+        rospy.loginfo("connected to %s", config.name)
+        try:
+            if config.arm is not None and not rospy.has_param("robot_description"):
+                rospy.set_param("robot_description", to_urdf(config.arm, [joint.torque for joint in config.joints]))
+        except (OSError, rospy.ROSException) as error:  # the master is gone; another one starts the process anew
+            rospy.logwarn("robot_description was not set: %s", error)
+
+    def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
+        """Publish joint_states and feedback_states."""
+        states = JointState(name=names, position=sample.position, velocity=sample.velocity, effort=sample.effort)
+        feedback = FollowJointTrajectoryFeedback(
+            joint_names=names,
+            desired=JointTrajectoryPoint(positions=sample.commanded),
+            actual=JointTrajectoryPoint(positions=sample.position, velocities=sample.velocity),
+            error=JointTrajectoryPoint(
+                positions=[want - have for want, have in zip(sample.commanded, sample.position, strict=True)]
+            ),
+        )
+        states.header.stamp = feedback.header.stamp = _time(sample.stamp_ns)
+        self._joint_states.publish(states)
+        self._feedback.publish(feedback)
+        self._commands.publish_feedback(feedback)
+
+    def status(self, status: RobotStatus) -> None:
+        """Publish robot_status."""
+        if status.in_error is TriState.TRUE:
+            self._commands.commander.note_stop()
+        message = RobotStatusMessage(error_code=status.error_code)
+        message.header.stamp = _time(status.stamp_ns)
+        for name in ("mode", "e_stopped", "drives_powered", "motion_possible", "in_motion", "in_error"):
+            getattr(message, name).val = getattr(status, name)
+        self._status.publish(message)
+
+    def diagnostics(self, diagnostics: Diagnostics) -> None:
+        """Publish diagnostics."""
+        entry = DiagnosticStatus(
+            level=diagnostics.level,
+            name=f"{rospy.get_name().lstrip('/')}: robot",
+            message=diagnostics.message,
+            values=[KeyValue(*pair) for pair in diagnostics.values],
+        )
+        message = DiagnosticArray(status=[entry])
+        message.header.stamp = _time(diagnostics.stamp_ns)
+        self._diagnostics.publish(message)
+
+
+class Commands:
+    """Takes topics, services and the action; the core carries them out on an event loop in a thread of its own."""
+
+    def __init__(self, options: CommandOptions) -> None:
+        self._loop = asyncio.new_event_loop()
+        threading.Thread(target=self._loop.run_forever, daemon=True).start()
+        self.commander = self._wait(self._make(options))
+        self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
+        """Of the action: handle and what carries it out, by its id."""
+        rospy.Subscriber("joint_path_command", JointTrajectory, self._on_path, queue_size=10, tcp_nodelay=True)
+        rospy.Subscriber("joint_command", JointTrajectoryPoint, self._on_point, queue_size=1, tcp_nodelay=True)
+        rospy.Service("joint_path_command", CmdJointTrajectory, self._path)
+        rospy.Service("stop_motion", StopMotion, self._stop)
+        rospy.Service("robot_enable", Trigger, lambda request: self._trigger(self.commander.enable()))
+        rospy.Service("robot_disable", Trigger, lambda request: self._trigger(self.commander.disable()))
+        self._action = actionlib.ActionServer(
+            "joint_trajectory_action", FollowJointTrajectoryAction, self._on_goal, self._on_cancel, auto_start=False
+        )
+        self._action.start()
+
+    def close(self) -> None:
+        """Close the connection to the platform: what it moves comes to a controlled stop."""
+        with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
+            asyncio.run_coroutine_threadsafe(self.commander.close(), self._loop).result(_CLOSE_S)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def publish_feedback(self, feedback: Any) -> None:
+        """Publish it to the clients of the goals under way."""
+        for handle, _ in list(self._goals.values()):
+            handle.publish_feedback(feedback)
+
+    @staticmethod
+    async def _make(options: CommandOptions) -> Commander:
+        return Commander(_connect, options, rospy.logerr)
+
+    def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
+
+    def _begin(self, what: str, coroutine: Coroutine[Any, Any, Any]) -> None:
+        """Carry it out; nobody waits for the outcome, so a refusal is logged."""
+
+        async def logged() -> None:
+            try:
+                await coroutine
+            except Exception as error:  # also a mistake of ours: without this nobody would hear of it
+                rospy.logerr("%s: %s", what, error)
+
+        asyncio.run_coroutine_threadsafe(logged(), self._loop)
+
+    def _on_path(self, message: Any) -> None:
+        self._begin("joint_path_command", self.commander.begin_trajectory(_trajectory(message)))
+
+    def _on_point(self, message: Any) -> None:
+        self._begin("joint_command", self.commander.command_point(_point(message)))
+
+    def _path(self, request: Any) -> Any:
+        response = CmdJointTrajectoryResponse()
+        response.code.val = self._served(self.commander.begin_trajectory(_trajectory(request.trajectory)))
+        return response
+
+    def _stop(self, request: Any) -> Any:
+        response = StopMotionResponse()
+        response.code.val = self._served(self.commander.stop())
+        return response
+
+    def _served(self, coroutine: Coroutine[Any, Any, None]) -> int:
+        """Return ServiceReturnCode.SUCCESS. FAILURE has no room for a reason: an error reply has."""
+        try:
+            self._wait(coroutine)
+        except RtcpError as error:
+            rospy.logerr("%s", error)
+            raise rospy.ServiceException(str(error)) from None
+        return 1
+
+    def _trigger(self, coroutine: Coroutine[Any, Any, str]) -> Any:
+        try:
+            return TriggerResponse(True, self._wait(coroutine))
+        except RtcpError as error:
+            rospy.logerr("%s", error)
+            return TriggerResponse(False, str(error))
+
+    # -- the action ---------------------------------------------------------------------------------------------------
+
+    # actionlib holds its lock while it calls back, and its handles take it: nothing here may wait for the loop.
+
+    def _on_goal(self, handle: Any) -> None:
+        number = handle.get_goal_id().id
+
+        def begin() -> None:
+            task = self._loop.create_task(self._follow(handle))
+            self._goals[number] = handle, task
+            task.add_done_callback(lambda task: self._goals.pop(number, None))
+
+        self._loop.call_soon_threadsafe(begin)
+
+    def _on_cancel(self, handle: Any) -> None:
+        number = handle.get_goal_id().id
+
+        def cancel() -> None:
+            if number in self._goals:
+                self._goals[number][1].cancel()
+
+        self._loop.call_soon_threadsafe(cancel)
+
+    async def _follow(self, handle: Any) -> None:
+        goal, result = handle.get_goal(), FollowJointTrajectoryResult()
+        tolerances = Tolerances(
+            _tolerances(goal.path_tolerance), _tolerances(goal.goal_tolerance), goal.goal_time_tolerance.to_sec()
+        )
+        has_begun = False
+
+        def accept() -> None:
+            nonlocal has_begun
+            has_begun = True
+            handle.set_accepted()
+
+        try:
+            code, text = await self.commander.follow(_trajectory(goal.trajectory), tolerances, accept)
+        except asyncio.CancelledError:
+            handle.set_canceled(result, "cancelled: the arm brakes")
+            return
+        except Exception as error:  # no code of the action says it; a goal always ends with a result
+            code, text = FollowCode.INVALID_GOAL, str(error)
+        result.error_code, result.error_string = int(code), text
+        if code is FollowCode.SUCCESSFUL:
+            if not has_begun:  # there already
+                handle.set_accepted()
+            handle.set_succeeded(result, text)
+        else:
+            rospy.logerr("joint_trajectory_action: %s", text)
+            (handle.set_aborted if has_begun else handle.set_rejected)(result, text)
+
+
+@contextlib.asynccontextmanager
+async def _connect() -> AsyncIterator[Arm]:
+    async with connect_async(rospy.get_name()) as robot:
+        yield StoppingArm(robot)
+
+
+def _trajectory(message: Any) -> Trajectory:
+    return Trajectory(message.joint_names, [_point(point) for point in message.points], message.header.stamp.to_sec())
+
+
+def _point(message: Any) -> TrajectoryPoint:
+    return TrajectoryPoint(
+        message.time_from_start.to_sec(), message.positions, message.velocities, message.accelerations
+    )
+
+
+def _tolerances(messages: Any) -> tuple[Tolerance, ...]:
+    return tuple(Tolerance(one.name, one.position, one.velocity, one.acceleration) for one in messages)
+
+
+def _time(stamp_ns: int) -> Any:
+    return rospy.Time(*divmod(stamp_ns, 1_000_000_000))

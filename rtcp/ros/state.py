@@ -1,0 +1,301 @@
+"""What the node says of the arm, and when: from cycle records alone, without ROS types.
+
+Every stamp is the instant of a cycle, as CLOCK_REALTIME has it now: what is old keeps its stamp and is not said again.
+Joints come from cycles in which every slave answered; in the others the record repeats older values.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+
+from rtcp.api import ControlMode, NotRunning, State
+from rtcp.api.feed import Feed, Records
+from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
+
+RECONNECT_S = 1.0
+"""Interval between two tries to reach the platform (ROS-Industrial driver specification, 1.2.2)."""
+_SECOND_NS = 1_000_000_000
+_STATUS_NS = _SECOND_NS // 10
+"""Longest interval between two statuses; a change comes at once."""
+_DIAGNOSTICS_NS = _SECOND_NS
+_STALE_NS = _SECOND_NS // 2
+"""Age at which a record, or a measured value in one, says nothing about now: far beyond the stalls of a busy host."""
+_AT_REST = 0.01
+"""Measured speed below which a joint stands, rad/s: drives report some counts of noise."""
+_CHANGES = ("state", "flags", "control_mode", "fault", "limit")
+_IN_ERROR = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
+_IN_MOTION = (State.MOVING, State.STOPPING, State.HOMING)
+_AT_REST_STATES = (State.READY, State.ENABLING, State.HOLDING, State.STOPPED_BY_LIMIT)
+_TAKES_MOTIONS = (ControlMode.JOINT, ControlMode.CARTESIAN)
+
+Numbers = tuple[float, ...]
+
+
+class TriState(IntEnum):
+    """A truth that may be unknown (industrial_msgs/TriState)."""
+
+    UNKNOWN = -1
+    FALSE = 0
+    TRUE = 1
+
+
+class RobotMode(IntEnum):
+    """Who moves the arm (industrial_msgs/RobotMode)."""
+
+    UNKNOWN = -1
+    MANUAL = 1
+    AUTO = 2
+
+
+@dataclass(frozen=True)
+class JointSample:
+    """The joints in one cycle, base to tool; `stamp_ns`: its instant, CLOCK_REALTIME."""
+
+    stamp_ns: int
+    position: Numbers
+    """Actual, rad."""
+    velocity: Numbers
+    """Actual, rad/s."""
+    effort: Numbers
+    """Actual, Nm."""
+    commanded: Numbers
+    """Commanded position, rad."""
+
+
+@dataclass(frozen=True)
+class RobotStatus:
+    """industrial_msgs/RobotStatus; `stamp_ns`: CLOCK_REALTIME. Without fields: nothing is known, no motion possible."""
+
+    stamp_ns: int
+    mode: RobotMode = RobotMode.UNKNOWN
+    e_stopped: TriState = TriState.UNKNOWN
+    drives_powered: TriState = TriState.UNKNOWN
+    motion_possible: TriState = TriState.FALSE
+    in_motion: TriState = TriState.UNKNOWN
+    in_error: TriState = TriState.UNKNOWN
+    error_code: int = 0
+    """Number of the event (`docs/machine.md`); 0: no error."""
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """One entry of diagnostic_msgs/DiagnosticArray; `level`: 0 OK, 1 warning, 2 error, 3 stale."""
+
+    stamp_ns: int
+    level: int
+    message: str
+    values: tuple[tuple[str, str], ...] = ()
+
+
+class Sink(Protocol):
+    """Who publishes it."""
+
+    def connected(self, config: Any) -> None:
+        """A platform was reached: its configuration (`rtcp.config.model.ArmConfig`)."""
+
+    def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
+        """Publish joint_states and feedback_states."""
+
+    def status(self, status: RobotStatus) -> None:
+        """Publish robot_status."""
+
+    def diagnostics(self, diagnostics: Diagnostics) -> None:
+        """Publish diagnostics."""
+
+
+def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: bool = False) -> RobotStatus:
+    """Return the status that a cycle record shows.
+
+    Args:
+        record: of the cycle.
+        age_ns: how much older the measured values in it are than itself.
+        stamp_ns: its instant, CLOCK_REALTIME.
+        is_held_by_others: another commander has the arm, so that a motion would be refused.
+    """
+    state, flags, control_mode = State(record["state"]), int(record["flags"]), int(record["control_mode"])
+    is_fresh = age_ns < _STALE_NS
+    # A drive that was last seen without torque does not get it back while no frame reaches it.
+    powered = TriState.UNKNOWN if flags & FLAG_ENABLED and not is_fresh else TriState(bool(flags & FLAG_ENABLED))
+    if state in _IN_MOTION:
+        in_motion = TriState.TRUE
+    elif state in _AT_REST_STATES or (not is_fresh and powered is TriState.FALSE):
+        in_motion = TriState.FALSE
+    elif is_fresh:  # a quick stop decelerates in the state that it led to
+        in_motion = TriState(bool(np.abs(record["actual_velocity"]).max(initial=0.0) > _AT_REST))
+    else:
+        in_motion = TriState.UNKNOWN
+    e_stopped = state is State.EMERGENCY_STOP or bool(flags & FLAG_EMERGENCY_STOP)
+    in_error = e_stopped or state in _IN_ERROR
+    possible = (
+        state in (State.HOLDING, State.MOVING)
+        and bool(flags & FLAG_MOTION_ALLOWED)
+        and not flags & (FLAG_SWITCHING | FLAG_EMERGENCY_STOP)
+        and control_mode in _TAKES_MOTIONS
+        and is_fresh
+        and not is_held_by_others
+    )
+    return RobotStatus(
+        stamp_ns,
+        RobotMode.MANUAL if control_mode == ControlMode.JOYSTICK else RobotMode.AUTO,
+        TriState(e_stopped),
+        powered,
+        TriState(possible),
+        in_motion,
+        TriState(in_error),
+        int(record["fault"] or record["limit"]) if in_error else 0,
+    )
+
+
+class StatePublisher:
+    """Follows the platform while there is one, and tells a sink; tries again at 1 Hz while there is none.
+
+    Args:
+        sink: who publishes.
+        open_feed: returns the records of the platform; raises NotRunning.
+        rate_hz: joint samples a second, at most one a cycle.
+        name: of this node as commander: the lease is another's unless it is this one's.
+    """
+
+    def __init__(
+        self, sink: Sink, open_feed: Callable[[], Feed] = Feed, rate_hz: float = 100.0, name: str = ""
+    ) -> None:
+        self._sink, self._open, self._name = sink, open_feed, name
+        self._period_ns = round(_SECOND_NS / rate_hz)
+        self._names: tuple[str, ...] = ()
+        self._feed: Feed | None = None
+        self._why = ""
+        """Why there is no feed."""
+        self._retry_ns = self._status_ns = self._diagnostics_ns = 0
+        """When each is due, CLOCK_MONOTONIC."""
+        self._joints_ns = 0
+        """When the next sample is due, CLOCK_MONOTONIC of its cycle."""
+        self._measured_ns = 0
+        """Cycle of the last sample, CLOCK_MONOTONIC."""
+        self._last: Any = None
+        """Newest record; None: none yet."""
+        self._level: tuple[int, ...] = ()
+        """Its fields `_CHANGES`."""
+
+    def step(self, wait_s: float) -> None:
+        """Wait for new records, and publish what is due."""
+        now_ns = time.monotonic_ns()
+        if self._feed is None and now_ns >= self._retry_ns:
+            self._retry_ns = now_ns + round(RECONNECT_S * 1e9)
+            self._connect()
+        feed = self._feed
+        if feed is None:
+            time.sleep(wait_s)
+        else:
+            has_ended = feed.ended(wait_s)
+            self._follow(feed, feed.records()[0])
+            if has_ended:
+                self._disconnect("the platform has ended")
+        self._publish_due(time.monotonic_ns())
+
+    def close(self) -> None:
+        """Let go of the records."""
+        if self._feed is not None:
+            self._feed.close()
+            self._feed = None
+
+    def _connect(self) -> None:
+        try:
+            feed = self._open()
+        except NotRunning as error:
+            self._why = error.message
+            return
+        self._last, self._level, self._measured_ns, self._joints_ns = None, (), 0, 0
+        self._feed, self._names = feed, tuple(joint.name for joint in feed.config.joints)
+        self._sink.connected(feed.config)
+
+    def _disconnect(self, why: str) -> None:
+        self.close()
+        self._why, self._last, self._status_ns = why, None, 0
+
+    def _follow(self, feed: Feed, records: Records) -> None:
+        """Publish the samples that are due and each change of the status."""
+        ahead_ns, half_cycle = _ahead_ns(), feed.period_ns // 2
+        is_whole = records["wkc"] == records["wkc_expected"]
+        levels = zip(*(records[name].tolist() for name in _CHANGES), strict=True)
+        for at, (instant, whole, level) in enumerate(
+            zip(records["time_ns"].tolist(), is_whole.tolist(), levels, strict=True)
+        ):
+            if whole:
+                self._measured_ns = instant
+                if instant >= self._joints_ns - half_cycle:
+                    # From when it was due, so that the rate holds; after a pause from now: nothing is caught up.
+                    due = self._joints_ns + self._period_ns
+                    self._joints_ns = due if due > instant else instant + self._period_ns
+                    self._sink.joints(self._names, _sample(records[at], instant + ahead_ns))
+            if level != self._level:
+                self._level = level
+                self._publish_status(feed, records[at], instant, ahead_ns)
+        if len(records):
+            self._last = records[-1]
+
+    def _publish_due(self, now_ns: int) -> None:
+        """Publish the status again, and the diagnostics."""
+        feed, record, ahead_ns = self._feed, self._last, _ahead_ns()
+        is_known = feed is not None and record is not None and now_ns - int(record["time_ns"]) < _STALE_NS
+        if now_ns >= self._status_ns:
+            if feed is not None and is_known:
+                self._publish_status(feed, record, int(record["time_ns"]), ahead_ns)
+            else:
+                self._status_ns = now_ns + _STATUS_NS
+                self._sink.status(RobotStatus(now_ns + ahead_ns))
+        if now_ns >= self._diagnostics_ns:
+            self._diagnostics_ns = now_ns + _DIAGNOSTICS_NS
+            if feed is None or not is_known:
+                why = self._why if feed is None else "the loop publishes no cycles"
+                self._sink.diagnostics(Diagnostics(now_ns + ahead_ns, 3, why, (("connected", "false"),)))
+            else:
+                self._sink.diagnostics(_diagnostics(record, feed.holder, ahead_ns))
+
+    def _publish_status(self, feed: Feed, record: Any, instant: int, ahead_ns: int) -> None:
+        self._status_ns = instant + _STATUS_NS
+        is_held = feed.holder not in ("", self._name)
+        age_ns = instant - self._measured_ns
+        self._sink.status(robot_status(record, age_ns, instant + ahead_ns, is_held))
+
+
+def _ahead_ns() -> int:
+    """Return CLOCK_REALTIME less CLOCK_MONOTONIC, ns: of three readings the one that was held up least."""
+    readings = [(time.monotonic_ns(), time.time_ns(), time.monotonic_ns()) for _ in range(3)]
+    before, wall, after = min(readings, key=lambda reading: reading[2] - reading[0])
+    return wall - (before + after) // 2
+
+
+def _sample(record: Any, stamp_ns: int) -> JointSample:
+    def numbers(name: str) -> Numbers:
+        return tuple(record[name].tolist())
+
+    return JointSample(
+        stamp_ns,
+        numbers("actual_position"),
+        numbers("actual_velocity"),
+        numbers("actual_torque"),
+        numbers("commanded_position"),
+    )
+
+
+def _diagnostics(record: Any, holder: str, ahead_ns: int) -> Diagnostics:
+    state = State(record["state"])
+    level = 2 if state in _IN_ERROR else 0
+    if not level and record["wkc"] != record["wkc_expected"]:
+        level = 1
+    values = {
+        "connected": "true",
+        "state": state.words,
+        "commander": holder,
+        "working counter": f"{record['wkc']} of {record['wkc_expected']}",
+        "cycles without an answer": str(record["lost"]),
+        "ticks skipped": str(record["missed"]),
+        "error code": str(record["fault"] or record["limit"]),
+    }
+    return Diagnostics(int(record["time_ns"]) + ahead_ns, level, state.words, tuple(values.items()))

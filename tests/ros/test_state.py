@@ -1,0 +1,300 @@
+"""What the node publishes of the arm, from records that the test makes: no ROS, no platform."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from rtcp.api import ControlMode, NotRunning, RtcpError, State
+from rtcp.api.feed import Feed
+from rtcp.config.find import default_config
+from rtcp.config.loader import load
+from rtcp.ipc.observer import record_type
+from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING, arm_schema
+from rtcp.ros.state import (
+    Diagnostics,
+    JointSample,
+    RobotMode,
+    RobotStatus,
+    StatePublisher,
+    TriState,
+    robot_status,
+)
+
+SCHEMA = arm_schema(6)
+CONFIG = load(default_config())
+MS = 1_000_000
+READY_TO_MOVE = FLAG_ENABLED | FLAG_MOTION_ALLOWED
+YES, NO, UNKNOWN = TriState.TRUE, TriState.FALSE, TriState.UNKNOWN
+
+
+def record(time_ns: int = 0, **fields: Any) -> Any:
+    made = np.zeros(1, record_type(SCHEMA))
+    values = {"state": State.HOLDING, "control_mode": ControlMode.JOINT, "flags": READY_TO_MOVE, "wkc": 21,
+              "wkc_expected": 21} | fields  # fmt: skip
+    for name, value in (values | {"time_ns": time_ns}).items():
+        made[name] = value
+    return made[0]
+
+
+class FakeFeed:
+    """Records that a test adds."""
+
+    config, period_ns = CONFIG, 2 * MS
+
+    def __init__(self) -> None:
+        self.holder = ""
+        self.waiting: list[Any] = []
+        self.has_ended = self.is_closed = False
+
+    def ended(self, wait_s: float) -> bool:
+        return self.has_ended
+
+    def records(self) -> tuple[Any, int]:
+        found, self.waiting = self.waiting, []
+        return np.array(found, record_type(SCHEMA)), 0
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
+class Heard:
+    """A sink that keeps what it was told."""
+
+    def __init__(self) -> None:
+        self.samples: list[JointSample] = []
+        self.statuses: list[RobotStatus] = []
+        self.entries: list[Diagnostics] = []
+        self.names: tuple[str, ...] = ()
+        self.connections = 0
+
+    def connected(self, config: Any) -> None:
+        self.connections += 1
+
+    def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
+        self.names = names
+        self.samples.append(sample)
+
+    def status(self, status: RobotStatus) -> None:
+        self.statuses.append(status)
+
+    def diagnostics(self, diagnostics: Diagnostics) -> None:
+        self.entries.append(diagnostics)
+
+
+@pytest.fixture
+def feed() -> FakeFeed:
+    return FakeFeed()
+
+
+@pytest.fixture
+def heard() -> Heard:
+    return Heard()
+
+
+@pytest.fixture
+def publisher(feed: FakeFeed, heard: Heard) -> StatePublisher:
+    return StatePublisher(heard, lambda: cast(Feed, feed), 100.0, "node")
+
+
+# -- joints ---------------------------------------------------------------------------------------------------------
+
+
+def test_joints_have_the_names_and_values_of_the_record(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    q = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
+    feed.waiting = [record(time.monotonic_ns(), actual_position=q, actual_velocity=1, actual_torque=2, sent_position=9,
+                           commanded_position=3)]  # fmt: skip
+    publisher.step(0)
+    (sample,) = heard.samples
+    assert heard.names == tuple(joint.name for joint in CONFIG.joints)
+    assert (sample.position, sample.velocity, sample.effort) == (tuple(q), (1.0,) * 6, (2.0,) * 6)
+    assert sample.commanded == (3.0,) * 6
+
+
+def test_a_stamp_is_the_instant_of_the_cycle_on_the_hosts_clock(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    before, woken, after = time.time_ns(), time.monotonic_ns(), time.time_ns()
+    feed.waiting = [record(woken - 30 * MS)]
+    publisher.step(0)
+    stamp = heard.samples[0].stamp_ns + 30 * MS
+    assert before - MS <= stamp <= after + MS
+    assert heard.statuses[0].stamp_ns == heard.samples[0].stamp_ns
+
+
+@pytest.mark.parametrize("jitter_ns", [0, 300_000])
+@pytest.mark.parametrize(("rate_hz", "expected"), [(100.0, 100), (500.0, 500), (5000.0, 500), (30.0, 30)])
+def test_samples_have_the_rate_asked_for_and_at_most_one_a_cycle(
+    feed: FakeFeed, heard: Heard, rate_hz: float, expected: int, jitter_ns: int
+) -> None:
+    publisher = StatePublisher(heard, lambda: cast(Feed, feed), rate_hz)
+    begin = time.monotonic_ns()
+    feed.waiting = [record(begin + at * 2 * MS + (2 - at * 7 % 5) * jitter_ns // 2) for at in range(500)]
+    publisher.step(0)
+    assert abs(len(heard.samples) - expected) <= 1
+    stamps = [sample.stamp_ns for sample in heard.samples]
+    assert stamps == sorted(set(stamps))
+
+
+def test_a_cycle_that_not_every_slave_answered_gives_no_sample(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    begin = time.monotonic_ns()
+    feed.waiting = [record(begin + at * 20 * MS, wkc=-1 if at == 1 else 21) for at in range(3)]
+    publisher.step(0)
+    assert [sample.stamp_ns - heard.samples[0].stamp_ns for sample in heard.samples] == [0, 40 * MS]
+
+
+def test_what_was_published_is_not_published_again(feed: FakeFeed, publisher: StatePublisher, heard: Heard) -> None:
+    feed.waiting = [record(time.monotonic_ns())]
+    for _ in range(5):
+        publisher.step(0)
+    assert len(heard.samples) == 1
+
+
+# -- the link -------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_platform_the_status_is_unknown_and_no_joints_come(heard: Heard) -> None:
+    def refuse() -> Feed:
+        raise RtcpError("not running", "no platform runs: start one")
+
+    publisher = StatePublisher(heard, refuse)
+    publisher.step(0)
+    (status,), (entry,) = heard.statuses, heard.entries
+    assert status == RobotStatus(status.stamp_ns)
+    assert [value for name, value in dataclasses.asdict(status).items() if name != "stamp_ns"] == [
+        -1,
+        -1,
+        -1,
+        0,
+        -1,
+        -1,
+        0,
+    ]
+    assert (entry.level, entry.message, entry.values) == (3, "no platform runs: start one", (("connected", "false"),))
+    assert heard.samples == []
+
+
+def test_the_end_of_the_platform_ends_the_joints_and_leaves_the_status_unknown(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    feed.waiting = [record(time.monotonic_ns())]
+    publisher.step(0)
+    assert heard.statuses[0].motion_possible is YES
+    feed.has_ended = True
+    publisher.step(0)
+    assert feed.is_closed
+    assert heard.statuses[-1] == RobotStatus(heard.statuses[-1].stamp_ns)
+    assert len(heard.samples) == 1
+
+
+def test_a_platform_is_looked_for_once_a_second_and_found_when_it_comes(heard: Heard, feed: FakeFeed) -> None:
+    tries: list[float] = []
+
+    def open_late() -> Feed:
+        tries.append(time.monotonic())
+        if len(tries) < 2:
+            raise RtcpError("not running", "none")
+        return cast(Feed, feed)
+
+    publisher = StatePublisher(heard, open_late)
+    while heard.connections == 0:
+        publisher.step(0.01)
+    assert len(tries) == 2
+    assert tries[1] - tries[0] >= 0.99
+
+
+def test_a_loop_that_publishes_nothing_leaves_the_status_unknown(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    feed.waiting = [record(time.monotonic_ns() - 600 * MS)]
+    publisher.step(0)
+    time.sleep(0.1)
+    publisher.step(0)
+    assert heard.statuses[-1].motion_possible is NO
+    assert heard.statuses[-1].in_motion is UNKNOWN
+
+
+# -- the status -----------------------------------------------------------------------------------------------------
+
+
+def test_each_change_is_published_with_the_instant_of_its_cycle(
+    feed: FakeFeed, publisher: StatePublisher, heard: Heard
+) -> None:
+    begin = time.monotonic_ns()
+    states = [State.HOLDING, State.MOVING, State.MOVING, State.HOLDING]
+    feed.waiting = [record(begin + at * 2 * MS, state=state) for at, state in enumerate(states)]
+    publisher.step(0)
+    seen = [(status.in_motion, status.stamp_ns - heard.statuses[0].stamp_ns) for status in heard.statuses]
+    assert seen == [(NO, 0), (YES, 2 * MS), (NO, 6 * MS)]
+
+
+def status_of(age_ms: int = 0, by_others: bool = False, **fields: Any) -> RobotStatus:
+    return robot_status(record(**fields), age_ms * MS, 0, by_others)
+
+
+@pytest.mark.parametrize(
+    ("fields", "possible"),
+    [
+        ({}, YES),
+        ({"state": State.MOVING}, YES),  # another trajectory replaces the one under way
+        ({"state": State.READY, "flags": FLAG_MOTION_ALLOWED}, NO),
+        ({"state": State.STOPPING}, NO),
+        ({"state": State.FAULT}, NO),
+        ({"flags": FLAG_ENABLED}, NO),  # the enabling switch is released
+        ({"flags": READY_TO_MOVE | FLAG_EMERGENCY_STOP}, NO),
+        ({"flags": READY_TO_MOVE | FLAG_SWITCHING}, NO),
+        ({"control_mode": ControlMode.JOYSTICK}, NO),
+        ({"control_mode": ControlMode.VELOCITY}, NO),
+        ({"by_others": True}, NO),
+        ({"age_ms": 600}, NO),
+    ],
+)
+def test_motion_is_possible_only_where_a_trajectory_would_begin_now(fields: dict[str, Any], possible: TriState) -> None:
+    assert status_of(**fields).motion_possible is possible
+
+
+def test_an_emergency_stop_is_an_error_too() -> None:
+    pressed = status_of(flags=READY_TO_MOVE | FLAG_EMERGENCY_STOP)
+    assert (pressed.e_stopped, pressed.in_error) == (YES, YES)
+    stopped = status_of(state=State.EMERGENCY_STOP, flags=0, fault=23)
+    assert (stopped.e_stopped, stopped.in_error, stopped.error_code) == (YES, YES, 23)
+
+
+@pytest.mark.parametrize(("fields", "code"), [({"fault": 5}, 5), ({"limit": 20, "state": State.STOPPED_BY_LIMIT}, 20)])
+def test_the_error_code_is_the_event_behind_the_error(fields: dict[str, Any], code: int) -> None:
+    assert status_of(**{"state": State.FAULT} | fields).error_code == code
+    assert status_of(**fields | {"state": State.HOLDING}).error_code == 0
+
+
+def test_power_that_no_frame_shows_is_unknown_and_power_that_was_gone_is_not_back() -> None:
+    assert status_of(age_ms=600, state=State.FAULT).drives_powered is UNKNOWN
+    assert status_of(age_ms=600, state=State.FAULT, flags=0).drives_powered is NO
+    assert status_of(age_ms=100, state=State.FAULT).drives_powered is YES
+
+
+def test_an_arm_that_decelerates_in_a_fault_is_in_motion_until_it_rests() -> None:
+    assert status_of(state=State.FAULT, actual_velocity=[0, 0, -0.5, 0, 0, 0]).in_motion is YES
+    assert status_of(state=State.FAULT, actual_velocity=0.001).in_motion is NO
+    assert status_of(age_ms=600, state=State.FAULT, actual_velocity=0.5).in_motion is UNKNOWN
+
+
+def test_under_the_joystick_the_mode_is_manual() -> None:
+    assert status_of(control_mode=ControlMode.JOYSTICK).mode is RobotMode.MANUAL
+    assert status_of().mode is RobotMode.AUTO
+
+
+def test_not_running_is_the_only_error_that_is_waited_out(heard: Heard) -> None:
+    def fail() -> Feed:
+        raise RuntimeError("a mistake of ours")
+
+    assert issubclass(NotRunning, RtcpError)
+    with pytest.raises(RuntimeError):
+        StatePublisher(heard, fail).step(0)
