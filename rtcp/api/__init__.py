@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from rtcp.api.results import (
     Arrival,
+    Buffered,
     EventRecord,
     GripperRest,
+    JointLimits,
     Preview,
     Progress,
     RecorderStatus,
@@ -16,17 +18,20 @@ from rtcp.api.results import (
     Zero,
 )
 from rtcp.api.robot import Robot, connect
-from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, RtcpError, TimedOut
+from rtcp.ipc.errors import ConnectionLost, Faulted, Invalid, NotRunning, Refused, Replaced, RtcpError, TimedOut
+from rtcp.ipc.robot_status import RobotStatus
 from rtcp.ipc.schema import RecordSchema
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
     from rtcp.api.feed import Feed
+    from rtcp.api.stream import Stream
 
 __all__ = [
     "Arrival",
     "AsyncRobot",
+    "Buffered",
     "ConnectionLost",
     "ControlMode",
     "DriveMode",
@@ -36,16 +41,20 @@ __all__ = [
     "GripperRest",
     "Invalid",
     "JogFrame",
+    "JointLimits",
     "NotRunning",
     "Preview",
     "Progress",
     "RecordSchema",
     "RecorderStatus",
     "Refused",
+    "Replaced",
     "Robot",
+    "RobotStatus",
     "RtcpError",
     "State",
     "Status",
+    "Stream",
     "Streamed",
     "TimedOut",
     "Zero",
@@ -64,6 +73,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api.feed import Feed
 
         return Feed
+    if name == "Stream":
+        from rtcp.api.stream import Stream
+
+        return Stream
     raise AttributeError(f"module 'rtcp.api' has no attribute {name!r}")
 
 

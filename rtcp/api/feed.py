@@ -67,6 +67,7 @@ class Feed:
         self._texts_read_ns = time.monotonic_ns()
         self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
         self._gaps: list[LogLine] = []
+        self._due_ns = 0
 
     def close(self) -> None:
         """Let go of the ring."""
@@ -76,6 +77,22 @@ class Feed:
     def ended(self, wait_s: float) -> bool:
         """Wait, and return early and true when the loop's process has ended."""
         return bool(self._loop.poll(wait_s * 1e3))
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for the next cycle record; return whether there is one. It costs the loop nothing.
+
+        The next record is looked for when it is due; a loop that has ended is noticed by `ended`.
+        """
+        until = time.monotonic() + timeout_s
+        rest_s = max(self.period_ns * 0.1e-9, 20e-6)
+        while self._observer.head == self._at:
+            left = until - time.monotonic()
+            if left <= 0.0:
+                return False
+            due = self._due_ns * 1e-9 - time.monotonic()
+            time.sleep(min(max(due, rest_s), left))
+        self._due_ns = time.monotonic_ns() + self.period_ns - round(rest_s * 1e9)
+        return True
 
     def records(self) -> tuple[Records, int]:
         """Return the new cycle records, and how many were overwritten before they were read."""

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
+from rtcp.ipc.robot_status import RobotStatus
 from rtcp.ipc.states import ControlMode, DriveMode, State
 
 T = TypeVar("T")
@@ -50,6 +51,8 @@ class Status:
     goal: Positions | None
     """Joint positions at the end of the motion under way, rad; None: nothing moves, the arm stops, or the motion has no
     known end (jog, stream, a package's own command)."""
+    robot: RobotStatus
+    """As ROS-Industrial has it."""
     holder: str
     """Who commands the arm; empty: nobody."""
     raw: Mapping[str, Any]
@@ -71,6 +74,7 @@ class Status:
             commanded_positions=tuple(joints["commanded_position"]),
             sent_positions=tuple(joints["sent_position"]),
             goal=None if found["goal"] is None else tuple(found["goal"]),
+            robot=RobotStatus(**found["robot"]),
             holder=found["lease"]["holder"],
             raw=found,
         )
@@ -78,6 +82,19 @@ class Status:
 
 def _mode(kind: Any, name: str) -> Any:
     return kind.__members__.get(name.upper())
+
+
+@dataclass(frozen=True)
+class JointLimits:
+    """The limits of a joint that are in force: rad, rad/s, rad/s^2, rad/s^3, Nm."""
+
+    name: str
+    min: float
+    max: float
+    velocity: float
+    acceleration: float
+    jerk: float
+    torque: float
 
 
 @dataclass(frozen=True)
@@ -105,6 +122,16 @@ class Arrival:
     """Length of the path of the tool."""
     slowed: float | None = None
     """Fraction of the wanted speed that the joints' limits allowed."""
+
+
+@dataclass(frozen=True)
+class Buffered:
+    """What an open trajectory still has."""
+
+    room: int
+    """Points that can be appended now."""
+    ahead_s: float
+    """Time until its last point, s."""
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Each method raises `RtcpError` as described there; what a method raises in parti
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import inspect
 import time
@@ -13,12 +14,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, Protocol, TypeVar, overload
 
 from rtcp.api.results import (
     Arrival,
+    Buffered,
     EventRecord,
     GripperRest,
+    JointLimits,
     Preview,
     Progress,
     RecorderStatus,
@@ -29,6 +32,9 @@ from rtcp.api.results import (
 )
 from rtcp.ipc.client import ControlClient
 from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
+
+if TYPE_CHECKING:
+    from rtcp.api.stream import Stream
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -101,11 +107,23 @@ def _as_is(answer: Json) -> Json:
     return answer
 
 
+def _joint_limits(answer: Json) -> tuple[JointLimits, ...]:
+    limits = answer["limits"]
+    keys = [one.name for one in dataclasses.fields(JointLimits)][1:]
+    return tuple(JointLimits(name, *(limits[key][i] for key in keys)) for i, name in enumerate(answer["joint_names"]))
+
+
+def _stream(answer: Json) -> Stream:
+    from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
+
+    return Stream.from_json(answer)
+
+
 def _recordings(answer: Json) -> list[RecorderStatus]:
     return [result(RecorderStatus, one) for one in answer["recordings"]]
 
 
-_arrival, _streamed = partial(result, Arrival), partial(result, Streamed)
+_arrival, _streamed, _buffered = partial(result, Arrival), partial(result, Streamed), partial(result, Buffered)
 
 
 def _held(hold_s: float, sent_s: float | None) -> Json:
@@ -192,6 +210,7 @@ class Methods:
         speed: float | None = None,
         synchronized: bool = True,
         progress: OnProgress | None = None,
+        replace: bool = False,
     ) -> Call[Arrival]:
         """Move to joint positions and return when the arm is there.
 
@@ -200,12 +219,15 @@ class Methods:
             speed: of the fastest joint, rad/s; None: its limit.
             synchronized: all joints arrive together; else each as soon as it can.
             progress: called about ten times a second meanwhile.
+            replace: a motion of this connection that is under way (`AsyncRobot`) goes over into this one without a
+                stop, under the limits; where this one is refused, that goes on.
 
         Raises:
             Refused: a target outside the limits, the wrong state, another commander.
             Faulted: it ended before it arrived.
+            Replaced: another motion took its place.
         """
-        params = {"q": list(q), "speed": speed, "synchronized": synchronized}
+        params = {"q": list(q), "speed": speed, "synchronized": synchronized, "replace": replace}
         return Call("move_joints", params, _arrival, progress)
 
     @Method
@@ -248,14 +270,76 @@ class Methods:
 
     @Method
     def run_trajectory(
-        self, points: Sequence[Mapping[str, Any]], approach: bool = False, progress: OnProgress | None = None
+        self,
+        points: Sequence[Mapping[str, Any]],
+        approach: bool = False,
+        progress: OnProgress | None = None,
+        replace: bool = False,
+        start_tolerance: float = 0.0,
+        path_tolerance: Sequence[float] = (),
+        goal_tolerance: Sequence[float] = (),
+        goal_time_s: float | None = None,
     ) -> Call[Arrival]:
         """Run a trajectory through points `{"t": s, "q": [rad]}`; `approach`: the joints first move to the first point.
 
-        A point may also have velocities `v` and accelerations `a`.
+        A point may also have velocities `v` and accelerations `a`. With `replace` as `move_joints`: a first point at
+        time 0 is left out while the arm moves, and what follows is as much later as the way to the next one demands.
+
+        Args:
+            points: times rise from 0 on, or from later: then the arm is led to the first.
+            approach: see above.
+            progress: called about ten times a second meanwhile.
+            replace: see above.
+            start_tolerance: rad; a first point at time 0 that is so near to where the arm is commanded counts as there.
+            path_tolerance: of the measured from the commanded position, rad, one a joint, 0: none; where it is not kept
+                the arm brakes on its path.
+            goal_tolerance: of the measured position from the last point, rad, one a joint, 0: none.
+            goal_time_s: how much later than planned the arm may be inside `goal_tolerance`, s; None: 3.
+
+        Raises:
+            Faulted: among others reason `path_tolerance_violated` or `goal_tolerance_violated`, with fields `axis`,
+                `error` and `limit`.
         """
-        params = {"points": [dict(point) for point in points], "approach": approach}
+        params = {
+            "points": [dict(point) for point in points],
+            "approach": approach,
+            "replace": replace,
+            "start_tolerance": start_tolerance,
+            "path_tolerance": list(path_tolerance),
+            "goal_tolerance": list(goal_tolerance),
+            "goal_time_s": goal_time_s,
+        }
         return Call("run_trajectory", params, _arrival, progress)
+
+    @Method
+    def open_trajectory(self, points: Sequence[Mapping[str, Any]], replace: bool = False) -> Call[Buffered]:
+        """Begin a trajectory that is open at its end: `append` more points, and `finish_trajectory`; points as there.
+
+        Returns when it is accepted. Points with positions only get velocities that pass no point. Where none is
+        appended in time, the arm comes to rest at the last point or, with velocities given, brakes, and the trajectory
+        has ended with the event `out_of_points`.
+
+        Args:
+            points: at least one; times in s from its begin.
+            replace: as of `move_joints`.
+        """
+        params = {"points": [dict(point) for point in points], "replace": replace}
+        return Call("open_trajectory", params, _buffered)
+
+    @Method
+    def append(self, points: Sequence[Mapping[str, Any]]) -> Call[Buffered]:
+        """Append points to the open trajectory; of points that are refused none is taken, and it goes on.
+
+        Raises:
+            Refused: `not_open`, `no_room_for_points`, or what is wrong with a point.
+            Faulted: it has ended: `reason` says why.
+        """
+        return Call("append", {"points": [dict(point) for point in points]}, _buffered)
+
+    @Method
+    def finish_trajectory(self, progress: OnProgress | None = None) -> Call[Arrival]:
+        """End the open trajectory at its last point, at rest, and return when the arm is there."""
+        return Call("finish_trajectory", {}, _arrival, progress)
 
     @Method
     def run_path(
@@ -357,6 +441,15 @@ class Methods:
         """Send the next position of a stream, rad, with the sender's time stamp, s; it ends when no more come."""
         return Call("stream_position", {"q": list(q), "stamp_s": t}, _streamed)
 
+    @Method
+    def open_stream(self) -> Call[Stream]:
+        """Begin a stream of setpoints, sent without waiting for answers: 1 kHz and more; leave its block to end it.
+
+        Raises:
+            Refused: what would refuse any motion.
+        """
+        return Call("open_stream", {}, _stream)
+
     # -- outputs, limits, zero, objects -------------------------------------------------------------------------------
 
     @Method
@@ -375,6 +468,11 @@ class Methods:
     def limits(self) -> Call[Json]:
         """Return the limits in force beside the configured ones, as `rtcp limits show --json` prints them."""
         return Call("limits", {}, _as_is)
+
+    @Method
+    def joint_limits(self) -> Call[tuple[JointLimits, ...]]:
+        """Return the limits of the joints that are in force, base to tool."""
+        return Call("limits", {}, _joint_limits)
 
     @Method
     def set_limits(self, changes: Mapping[str, float]) -> Call[Json]:

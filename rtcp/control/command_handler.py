@@ -20,6 +20,7 @@ from rtcp.ipc.commands import (
     Home,
     MotionCommand,
     MoveGripper,
+    OpenStream,
     Reset,
     RunLines,
     RunTrajectory,
@@ -62,6 +63,7 @@ from rtcp.ipc.refusals import (
     WrongState,
 )
 from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.motion.controllers.stream import StreamController
 from rtcp.motion.limits import read
 
 MOST_LIMIT_ROWS: Final = 64
@@ -100,6 +102,9 @@ class CommandHandler:
             Home: self._home,
             Shutdown: self._shut_down,
         }
+        stream = self._arm.controllers[OpenStream]
+        assert isinstance(stream, StreamController)
+        self._stream = stream
         for part in machine.context.parts:
             for kind in part.commands:
                 if kind in self._handlers or issubclass(kind, MotionCommand):
@@ -110,6 +115,20 @@ class CommandHandler:
         """Carry out the next command and answer it; called only when one waits."""
         number, lease, command = self._blackboard.take_command()
         self._blackboard.answer(number, self._refusal(command, lease))
+
+    def take_setpoints(self) -> None:
+        """Follow the setpoints that wait; those of a stream that is not open any more are dropped."""
+        board, stream, state = self._blackboard, self._stream, self._arm.state
+        while board.setpoint_waits():
+            number, bits, stamp_s, numbers = board.take_setpoint()
+            if number == self.open_stream != 0:
+                stream.put(state, bits, stamp_s, numbers)
+
+    @property
+    def open_stream(self) -> int:
+        """Number of the stream whose setpoints are followed; 0: none."""
+        moves = self._stream.stream and self._arm.active is self._stream and self._machine.state is State.MOVING
+        return self._stream.stream if moves else 0
 
     def _refusal(self, command: Command | Malformed, lease: int) -> Refusal | None:
         """Carry out a command, or return why not."""
@@ -150,6 +169,9 @@ class CommandHandler:
             return refusal
         if isinstance(command, (RunTrajectory, RunLines)):
             self._blackboard.use_plan(command.slot)
+        elif isinstance(command, OpenStream):
+            # Before the answer: whoever opened it may send at once.
+            self._blackboard.open_stream(command.stream)
         arm.active = controller
         if not (continues and self._context.lease == lease):
             machine.change(command, lease)

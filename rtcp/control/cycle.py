@@ -147,11 +147,16 @@ class Cycle:
             # fill in as it was, so these are the inputs of the box, of now or of before.
             self._stop_device.decode(data)
             self.operator.read_emergency_stop()
-        if self._blackboard.command_waits():
-            self.commands.handle()
+        board, commands = self._blackboard, self.commands
+        if board.command_waits():
+            commands.handle()
+        if board.setpoint_waits():
+            commands.take_setpoints()
         if self._shutdown:
             machine.close()
         machine.update(good)
+        if board.stream and not commands.open_stream:
+            board.open_stream(0)
         for part in parts:
             part.update(context)
             part.encode(data)

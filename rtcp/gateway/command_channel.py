@@ -8,12 +8,12 @@ import struct
 from collections.abc import AsyncIterator, Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from time import monotonic, sleep
+from time import monotonic, monotonic_ns, sleep
 from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.status_snapshot import StatusSnapshot
-from rtcp.ipc.commands import Command
+from rtcp.ipc.commands import Command, OpenStream
 from rtcp.ipc.errors import ErrorKind, RtcpError
 from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn
 from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
@@ -91,6 +91,8 @@ class CommandChannel:
         self.names = snapshot.names
         self._ring = asyncio.Lock()
         self._answer_poll_s = min(0.2e-6 * config.cycle.period_us, _POLL_S)
+        self._shared: dict[int, tuple[int, int]] = {}
+        """Lease, and how many calls hold it, by connection."""
         self._waiters: list[_Waiter[Any]] = []
         self._has_waiters = asyncio.Event()
         self._sleeper = ThreadPoolExecutor(1, "follow")
@@ -131,6 +133,11 @@ class CommandChannel:
             "positions": self.joints("actual_position"),
         }
 
+    def ahead_s(self) -> float:
+        """Return how long the motion under way still lasts, s."""
+        record = self.record()
+        return float(record["duration_s"]) - float(record["elapsed_s"])
+
     def check_loop(self) -> None:
         """Raise RtcpError where the loop has ended."""
         if not self.snapshot.loop_lives:
@@ -142,15 +149,23 @@ class CommandChannel:
     async def lease(self, caller: Caller) -> AsyncIterator[int]:
         """Hold the lease, renewed, until the block ends; report progress meanwhile.
 
-        It is not renewed for a caller that does not read its reports: such a client is stopped (SIGSTOP) or hangs.
+        A motion that replaces another of its connection shares the lease with it. It is not renewed for a caller that
+        does not read its reports: such a client is stopped (SIGSTOP) or hangs.
         """
-        lease = self.acquire(caller)
+        lease, users = self._shared.get(caller.connection, (0, 0))
+        if not users:
+            lease = self.acquire(caller)
+        self._shared[caller.connection] = lease, users + 1
         renewing = asyncio.create_task(self._renew(lease, caller))
         try:
             yield lease
         finally:
             renewing.cancel()
-            self.observer.release(lease)
+            _, users = self._shared.pop(caller.connection)
+            if users > 1:
+                self._shared[caller.connection] = lease, users - 1
+            else:
+                self.observer.release(lease)
 
     def acquire(self, caller: Caller) -> int:
         """Acquire the lease and return its id; the caller renews and releases it."""
@@ -330,11 +345,21 @@ class StreamingCommands:
             raise
         return {"state": channel.state.name.lower(), "positions": channel.joints("actual_position")}
 
+    async def open(self, caller: Caller) -> Json:
+        """Begin a stream that the client feeds itself; return what it needs for that; it renews the lease."""
+        lease, since = self._lease(caller)
+        stream = monotonic_ns()
+        self._head = await self._channel.accept(lease, OpenStream(stream))
+        return {"stream": stream, "lease": lease, "since": since}
+
     async def rest(self, caller: Caller) -> None:
         """End what this connection moves and wait until the arm rests: another command follows."""
-        if caller.connection not in self._leases:
-            return
-        self.end(caller.connection)
+        if caller.connection in self._leases:
+            self.end(caller.connection)
+            await self.wait_for_rest()
+
+    async def wait_for_rest(self) -> None:
+        """Wait until the arm rests, after its commander has let go."""
         channel = self._channel
 
         def rested() -> bool | None:

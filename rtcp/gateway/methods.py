@@ -13,6 +13,7 @@ import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, make_dataclass
 from enum import IntEnum
+from math import inf
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar, get_type_hints
 
@@ -28,6 +29,7 @@ from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.motion_actions import MotionActions, Planner
 from rtcp.gateway.recordings import Recordings
 from rtcp.gateway.status_snapshot import StatusSnapshot
+from rtcp.gateway.tolerances import Tolerances
 from rtcp.ipc import commands
 from rtcp.ipc.commands import COMMANDS, Command, MotionCommand
 from rtcp.ipc.errors import RtcpError
@@ -39,8 +41,10 @@ from rtcp.motion.limits import Limits
 
 HOLD_S = 0.25
 """Hold time of a command that gives none."""
-_INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines)
+_INTERNAL = (commands.Shutdown, commands.SetZero, commands.RunLines, commands.ExtendTrajectory)
 """Commands that no client sends by themselves."""
+GOAL_TIME_S = 3.0
+"""How much later than planned an arm with tolerances may be at its goal, where nothing is said."""
 Numbers = tuple[float, ...]
 Frame = Literal["base", "tool", "joints"]
 F = TypeVar("F", bound=Callable[..., Awaitable[Json]])
@@ -131,12 +135,15 @@ class Methods:
         """Carry out a method by its name; raises RtcpError."""
         one = self.table[name]
         if not (one.streams or one.at_once):
+            if not given.get("replace") and await self._motion.end_connection(caller.connection):
+                await self._streaming.wait_for_rest()
             await self._streaming.rest(caller)
         return await one(caller, given)
 
     async def end_connection(self, connection: int) -> None:
         """End what a connection that has closed was moving or holding."""
         self._streaming.end(connection)
+        await self._motion.end_connection(connection)
         await self.joystick_override.end(connection)
 
     # -- the platform -------------------------------------------------------------------------------------------------
@@ -285,9 +292,18 @@ class Methods:
 
     @method()
     async def move_joints(
-        self, caller: Caller, q: Numbers, speed: float | None = None, synchronized: bool = True
+        self,
+        caller: Caller,
+        q: Numbers,
+        speed: float | None = None,
+        synchronized: bool = True,
+        replace: bool = False,
     ) -> Json:
-        """Move to joint positions, rad, at most at `speed`, rad/s. Returns `positions` and the largest `error`, rad."""
+        """Move to joint positions, rad, at most at `speed`, rad/s. Returns `positions` and the largest `error`, rad.
+
+        With `replace` it waits for no other request of its connection: a motion of that goes over into this one without
+        a stop, and ends with the error kind `replaced`.
+        """
         return await self._motion.move_joints(caller, q, speed, synchronized)
 
     @method()
@@ -335,9 +351,60 @@ class Methods:
         return await self._motion.run_file(caller, file, approach)
 
     @method()
-    async def run_trajectory(self, caller: Caller, points: tuple[Point, ...], approach: bool = False) -> Json:
-        """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`."""
-        return await self._motion.run_trajectory(caller, points, approach)
+    async def run_trajectory(
+        self,
+        caller: Caller,
+        points: tuple[Point, ...],
+        approach: bool = False,
+        replace: bool = False,
+        start_tolerance: Annotated[float, Ge(0)] = 0.0,
+        path_tolerance: Numbers = (),
+        goal_tolerance: Numbers = (),
+        goal_time_s: Annotated[float, Ge(0)] | None = None,
+    ) -> Json:
+        """Run a trajectory through points: time `t`, s, positions `q`, rad, and if given `v` and `a`.
+
+        One that begins at time 0 within `start_tolerance`, rad, of where the arm is commanded begins there. Tolerances,
+        rad, one a joint, 0: none: `path_tolerance` of the measured from the commanded position on the way,
+        `goal_tolerance` at the end, at most `goal_time_s` later than planned. Where one is not kept the arm brakes on
+        its path; reason `path_tolerance_violated` or `goal_tolerance_violated`, with `axis`, `error` and `limit`.
+
+        With `replace` as `move_joints`; a first point at time 0 is left out where the arm moves, and the others come as
+        much later as the way to the next one lasts longer than its time.
+        """
+        tolerances = None
+        if path_tolerance or goal_tolerance or goal_time_s is not None:
+            tolerances = Tolerances(
+                self._tolerance("path_tolerance", path_tolerance),
+                self._tolerance("goal_tolerance", goal_tolerance),
+                GOAL_TIME_S if goal_time_s is None else goal_time_s,
+            )
+        return await self._motion.run_trajectory(caller, points, approach, tolerances, start_tolerance)
+
+    def _tolerance(self, name: str, given: Numbers) -> Numbers:
+        count = len(self._config.joints)
+        if given:
+            self._check_count(name, given, count)
+        return tuple(one if one > 0.0 else inf for one in given) or (inf,) * count
+
+    @method()
+    async def open_trajectory(self, caller: Caller, points: tuple[Point, ...], replace: bool = False) -> Json:
+        """Begin a trajectory that is open at its end; returns as `append` when it is accepted.
+
+        Points with positions only get velocities that pass no point; the last one waits for the next, or the arm comes
+        to rest at it. One that comes to its last point without more is stopped, with the event `out_of_points`.
+        """
+        return await self._motion.open_trajectory(caller, points)
+
+    @method(streams=True)
+    async def append(self, caller: Caller, points: tuple[Point, ...]) -> Json:
+        """Append points to the open trajectory. Returns `room`, points that fit, and `ahead_s`, time to the end."""
+        return await self._motion.append(caller, points)
+
+    @method(streams=True)
+    async def finish_trajectory(self, caller: Caller) -> Json:
+        """End the open trajectory at its last point, at rest; returns as `move_joints` when the arm is there."""
+        return await self._motion.finish_trajectory(caller)
 
     @method()
     async def run_path(
@@ -345,6 +412,15 @@ class Methods:
     ) -> Json:
         """Run straight lines to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s."""
         return await self._motion.run_path(caller, stops, speed, approach)
+
+    @method(streams=True)
+    async def open_stream(self, caller: Caller) -> Json:
+        """Begin a stream of setpoints through shared memory. Returns what `rtcp.Stream` needs for it.
+
+        That is `stream`, its number, `lease`, which its sender renews, `since`, the last event before it, and the
+        runtime `directory`.
+        """
+        return {**await self._streaming.open(caller), "directory": str(self._directory)}
 
     @method(streams=True)
     async def jog(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import bisect
+import contextlib
 import dataclasses
 import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from kinematics.forward import frames
 from kinematics.inverse import InverseKinematics
@@ -16,10 +18,20 @@ from kinematics.model import ArmModel, JointLimit
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
-from rtcp.ipc.commands import Command, MotionCommand, MoveJoints, RunLines, RunTrajectory
+from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
+from rtcp.ipc.commands import Command, ExtendTrajectory, Halt, MotionCommand, MoveJoints, RunLines, RunTrajectory
 from rtcp.ipc.errors import RtcpError
-from rtcp.ipc.layout import PlanTooLong
-from rtcp.ipc.refusals import NoTrajectory, PositionOutOfRange, Refusal, SpeedOutOfRange
+from rtcp.ipc.layout import PLAN_ROWS, PlanTooLong
+from rtcp.ipc.refusals import (
+    NoLease,
+    NoRoomForPoints,
+    NotOpen,
+    NoTrajectory,
+    PositionOutOfRange,
+    Refusal,
+    SpeedOutOfRange,
+    WrongState,
+)
 from rtcp.ipc.states import ControlMode, State
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.joint_motion import LONGEST_S
@@ -27,7 +39,7 @@ from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
 from rtcp.motion.planning.plan import Plan, PlanRefused
-from rtcp.motion.planning.trajectories import plan_trajectory
+from rtcp.motion.planning.trajectories import OpenPlan, plan_trajectory
 
 T = TypeVar("T")
 _COORDINATES = ("x", "y", "z", "rx", "ry", "rz")
@@ -37,6 +49,14 @@ _SAME_RAD, _SAME_PLANNED_RAD = 1e-9, 1e-4
 """Distance of the commanded end from the goal: of a move exact, of a plan as the loop's own sums have it."""
 _SETTLED_RAD, _SETTLE_S = 5e-4, 3.0
 _TIMEOUT_S = 20.0
+LONGEST_OPEN_S = 86_400.0
+"""Longest open trajectory."""
+_LOOK_S, _AHEAD_S = 0.01, 0.05
+"""How often an open trajectory is looked at; and how long before its last row the arm is brought to rest there."""
+_GONE = (NotOpen.name, NoLease.name, WrongState.name)
+"""What the loop refuses more points with once the trajectory has ended."""
+_KEPT_ROWS = 3
+"""Rows of the plan area beside those ahead: the one that the arm comes from, one for a point that waits, one more."""
 _UNPLANNED_S = 600.0
 """Longest motion of a package's own command."""
 
@@ -95,13 +115,18 @@ class Planner:
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused)) from None
 
-    def trajectory(self, points: Sequence[Point], q_now: Sequence[float]) -> Plan:
-        """Return the plan of a trajectory that begins at `q_now`."""
+    def trajectory(self, points: Sequence[Point], q_now: Sequence[float], moving: bool = False) -> Plan:
+        """Return the plan of a trajectory that begins at `q_now`; or, `moving`, on the way there."""
         names = [joint.name for joint in self._config.joints]
         try:
-            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at)
+            return plan_trajectory(points, self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused), type(refused).__name__) from None
+
+    def open_plan(self, q_now: Sequence[float], moving: bool) -> OpenPlan:
+        """Return the plan of an open trajectory that begins at `q_now`; or, `moving`, on the way there."""
+        names = [joint.name for joint in self._config.joints]
+        return OpenPlan(self.limits, q_now, names=names, zone_at=self._zone_at, moving=moving)
 
     def joint_move(
         self, q: Sequence[float], q_now: Sequence[float], speed: float | None, synchronized: bool
@@ -144,6 +169,17 @@ class Planner:
         return motion.trajectory, motion.path, motion.speed
 
 
+class _Open:
+    """An open trajectory under way: its plan, the slot of its rows, and the motion that ends with it."""
+
+    def __init__(self, plan: OpenPlan, lease: int, slot: int) -> None:
+        self.plan, self.lease, self.slot = plan, lease, slot
+        self.accepted = asyncio.Event()
+        self.motion: asyncio.Task[Json] | None = None
+        self.turn = asyncio.Lock()
+        self.ends = False
+
+
 class MotionActions:
     """Moves the arm on behalf of the clients; every method raises RtcpError.
 
@@ -158,6 +194,10 @@ class MotionActions:
         self._count = len(channel.config.joints)
         self.goal: Sequence[float] | None = None
         """Joint positions to which the call under way moves, rad, until it returns; None: none, or a package's own."""
+        self._motion: object = None
+        """The motion that the loop accepted last."""
+        self._open: dict[int, _Open] = {}
+        """Open trajectories by connection; one that has ended stays until its connection is told."""
 
     async def move_joints(self, caller: Caller, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
         """Move to joint positions, rad; `speed`: of the fastest joint, rad/s."""
@@ -183,16 +223,151 @@ class MotionActions:
             return await self.run_path(caller, stops, speed, approach)
         return await self.run_trajectory(caller, points, approach)
 
-    async def run_trajectory(self, caller: Caller, points: Sequence[Point], approach: bool) -> Json:
-        """Run a trajectory; with `approach` the joints first move to its first point."""
+    async def run_trajectory(
+        self,
+        caller: Caller,
+        points: Sequence[Point],
+        approach: bool,
+        tolerances: Tolerances | None = None,
+        start_rad: float = 0.0,
+    ) -> Json:
+        """Run a trajectory; with `approach` the joints first move to its first point.
+
+        One that begins at time 0 at most `start_rad` from where the arm is commanded begins where it is.
+        """
         async with self._channel.lease(caller) as lease:
+            moving = self._channel.state is State.MOVING and not approach
             begin = self._joints(points[0].q) if approach and points else self._start()
+            at_once = not moving and points and points[0].t == 0.0 and len(points[0].q) == len(begin)
+            if at_once and max(abs(a - b) for a, b in zip(points[0].q, begin, strict=True)) <= start_rad:
+                points = [dataclasses.replace(points[0], q=tuple(begin)), *points[1:]]
             # Before the approach: of a trajectory that is refused nothing moves.
-            plan = await asyncio.to_thread(self._planner.trajectory, points, begin)
+            plan = await asyncio.to_thread(self._planner.trajectory, points, begin, moving)
             slot = self._write(plan)
             if approach:
                 await self._move(lease, begin, None, True)
-            return await self._run_plan(lease, RunTrajectory, plan, slot, "the trajectory")
+            try:
+                return await self._run_plan(lease, RunTrajectory, plan, slot, "the trajectory", tolerances)
+            except Violation as violation:
+                await self._brake()
+                raise violation.error from None
+
+    async def _brake(self) -> None:
+        """Stop along the path and wait until the arm holds."""
+        channel = self._channel
+        rest = channel.reaching(State.HOLDING, IN_MOTION, "the stop", channel.observer.last_event)
+        with contextlib.suppress(RtcpError):
+            await channel.run(0, Halt(), rest, _SETTLE_S, "the stop")
+
+    # -- trajectories that are open at their end -----------------------------------------------------------------------
+
+    async def open_trajectory(self, caller: Caller, points: Sequence[Point]) -> Json:
+        """Begin a trajectory to which points are appended; return when the loop has accepted it."""
+        accepted: asyncio.Future[_Open] = asyncio.get_running_loop().create_future()
+        task = asyncio.create_task(self._run_open(caller, points, accepted))
+        either: list[asyncio.Future[Any]] = [task, accepted]
+        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        if not accepted.done():
+            task.result()  # raises why
+        opened = accepted.result()
+        opened.motion = task
+        self._open[caller.connection] = opened
+        return self._buffered(opened)
+
+    async def _run_open(self, caller: Caller, points: Sequence[Point], accepted: asyncio.Future[_Open]) -> Json:
+        channel = self._channel
+        async with channel.lease(dataclasses.replace(caller, report=lambda progress: None)) as lease:
+            moving = channel.state is State.MOVING
+            plan = self._planner.open_plan(self._start(), moving)
+            rows = await asyncio.to_thread(_append, plan, points)
+            opened = _Open(plan, lease, channel.observer.write_plan(rows))
+            resting: asyncio.Task[None] | None = None
+
+            def arrived() -> Json | None:
+                return self._arrival(plan.end, _SAME_PLANNED_RAD, "the trajectory")()
+
+            def begun() -> None:
+                nonlocal resting
+                accepted.set_result(opened)
+                resting = asyncio.create_task(self._rest_in_time(opened))
+
+            command = RunTrajectory(opened.slot, len(rows), open=True)
+            try:
+                return await self._run(lease, command, LONGEST_OPEN_S, "the trajectory", arrived, begun=begun)
+            finally:
+                if resting is not None:
+                    resting.cancel()
+
+    async def append(self, caller: Caller, points: Sequence[Point]) -> Json:
+        """Append points to the open trajectory of this connection."""
+        opened = self._opened(caller)
+        try:
+            await self._extend(opened, points)
+        except RtcpError as error:
+            if error.reason in _GONE and opened.motion is not None:
+                # It ended while the points were looked at: why is the answer.
+                await asyncio.wait([opened.motion], timeout=_SETTLE_S)
+                self._opened(caller)
+            raise
+        return self._buffered(opened)
+
+    async def finish_trajectory(self, caller: Caller) -> Json:
+        """End the open trajectory of this connection with its last point; return when the arm is there."""
+        opened = self._opened(caller)
+        opened.ends = True
+        await self._extend(opened, (), rest=True, ends=True)
+        assert opened.motion is not None
+        try:
+            return await asyncio.shield(opened.motion)
+        finally:
+            self._open.pop(caller.connection, None)
+
+    async def end_connection(self, connection: int) -> bool:
+        """End the open trajectory of a connection; return whether there was one that moved the arm."""
+        opened = self._open.pop(connection, None)
+        if opened is None or opened.motion is None:
+            return False
+        moves = not opened.motion.done()
+        opened.motion.cancel()
+        await asyncio.gather(opened.motion, return_exceptions=True)
+        return moves
+
+    def _opened(self, caller: Caller) -> _Open:
+        opened = self._open.get(caller.connection)
+        if opened is None or opened.motion is None:
+            raise self._channel.error("refused", NotOpen())
+        if opened.motion.done():
+            del self._open[caller.connection]
+            opened.motion.result()  # raises why it has ended
+            raise self._channel.error("refused", NotOpen())
+        return opened
+
+    async def _extend(self, opened: _Open, points: Sequence[Point], rest: bool = False, ends: bool = False) -> None:
+        async with opened.turn:
+            plan, first = opened.plan, len(opened.plan.times)
+            if len(points) > self._room(plan):
+                most = PLAN_ROWS - _KEPT_ROWS
+                raise self._channel.error("refused", NoRoomForPoints(most - self._room(plan) + len(points), most))
+            rows = await asyncio.to_thread(_append, plan, points, rest)
+            self._channel.observer.extend_plan(opened.slot, first, rows)
+            # Also without a row: the loop knows whether it has ended.
+            await self._channel.accept(opened.lease, ExtendTrajectory(len(plan.times), ends))
+
+    async def _rest_in_time(self, opened: _Open) -> None:
+        """Let the arm rest at the last point where the next does not come in time to give it a velocity."""
+        while not opened.ends:
+            await asyncio.sleep(_LOOK_S)
+            if opened.plan.waits and self._channel.ahead_s() < _AHEAD_S:
+                with contextlib.suppress(RtcpError):
+                    await self._extend(opened, (), rest=True)
+
+    def _buffered(self, opened: _Open) -> Json:
+        return {"room": self._room(opened.plan), "ahead_s": self._channel.ahead_s()}
+
+    def _room(self, plan: OpenPlan) -> int:
+        """Return how many points still fit beside the rows that the arm has not passed."""
+        passed = bisect.bisect_left(plan.times, plan.times[-1] - self._channel.ahead_s())
+        return PLAN_ROWS - _KEPT_ROWS - len(plan.times) + passed
 
     async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
         """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
@@ -284,7 +459,7 @@ class MotionActions:
     def _start(self) -> list[float]:
         """Return where a plan begins."""
         # What is refused anyway is refused by the loop: then the plan only has to begin somewhere.
-        is_commanded = self._channel.state is State.HOLDING
+        is_commanded = self._channel.state in (State.HOLDING, State.MOVING)
         return self._channel.joints("commanded_position" if is_commanded else "actual_position")
 
     async def _move(self, lease: int, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
@@ -304,11 +479,21 @@ class MotionActions:
             raise RtcpError("refused", str(error)) from None
 
     async def _run_plan(
-        self, lease: int, command: type[RunTrajectory] | type[RunLines], plan: Plan, slot: int, what: str
+        self,
+        lease: int,
+        command: type[RunTrajectory] | type[RunLines],
+        plan: Plan,
+        slot: int,
+        what: str,
+        tolerances: Tolerances | None = None,
     ) -> Json:
-        arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
+        tracking = None
+        if tolerances is not None:
+            tracking = Tracking(self._channel, tolerances, plan.duration_s, plan.end)
+        arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what, tracking)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
-        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival, plan.end)
+        watch = None if tracking is None else tracking.look
+        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival, plan.end, watch=watch)
         return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
 
     async def _run(
@@ -319,16 +504,29 @@ class MotionActions:
         what: str,
         arrived: Callable[[], T | None],
         goal: Sequence[float] | None = None,
+        begun: Callable[[], None] | None = None,
+        watch: Callable[[], None] | None = None,
     ) -> T:
-        """Send a command and return what `arrived` finds when the arm holds again."""
+        """Send a command and return what `arrived` finds when the arm holds again.
+
+        `begun` is called when it is accepted, `watch` again and again from then on; that may raise.
+        """
         channel = self._channel
         since = channel.observer.last_event
         at_rest = channel.reaching(State.HOLDING, IN_MOTION, what, since)
-        rested = False
+        began = rested = False
+        motion = object()
 
         def outcome() -> T | None:
-            nonlocal rested
-            self.goal = goal  # only once the loop has accepted it
+            nonlocal began, rested
+            if not began:  # only once the loop has accepted it
+                began, self._motion, self.goal = True, motion, goal
+                if begun is not None:
+                    begun()
+            if self._motion is not motion:
+                raise RtcpError("replaced", f"{what} was replaced by another motion")
+            if watch is not None:
+                watch()
             if not rested:
                 if at_rest() is None:
                     return None
@@ -340,10 +538,13 @@ class MotionActions:
         try:
             return await channel.run(lease, command, outcome, timeout_s, what)
         finally:
-            self.goal = None
+            if self._motion is motion:
+                self.goal = None
 
-    def _arrival(self, q: Sequence[float], same_rad: float, what: str) -> Callable[[], Json | None]:
-        """Return an outcome: where the arm is, once the following error has died away."""
+    def _arrival(
+        self, q: Sequence[float], same_rad: float, what: str, tracking: Tracking | None = None
+    ) -> Callable[[], Json | None]:
+        """Return an outcome: where the arm is, once the following error has died away or is inside the tolerances."""
         channel, until = self._channel, 0.0
 
         def look() -> Json | None:
@@ -356,11 +557,21 @@ class MotionActions:
                     raise channel.ended(last[-1].event if last else None, f"{what} ended before it arrived")
             positions = channel.joints("actual_position")
             error = max(abs(a - b) for a, b in zip(positions, q, strict=True))
-            if error > _SETTLED_RAD and time.monotonic() < until:
+            if tracking is not None:
+                if not tracking.arrived(positions):
+                    return None  # `look` ends it
+            elif error > _SETTLED_RAD and time.monotonic() < until:
                 return None
             return {"positions": positions, "error": error}
 
         return look
+
+
+def _append(plan: OpenPlan, points: Sequence[Point], rest: bool = False) -> list[tuple[float, ...]]:
+    try:
+        return plan.append(points, rest)
+    except PlanRefused as refused:
+        raise RtcpError("refused", str(refused), type(refused).__name__) from None
 
 
 def _require_pose(pose: Sequence[float], key: str) -> None:

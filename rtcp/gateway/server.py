@@ -45,6 +45,8 @@ _REPEAT_LOG_S = 10.0
 """Between two lines of the log on the same defect."""
 _MOST_PENDING = 256
 """Requests of one connection that wait for their answers."""
+_MOST_UNREAD = 1 << 16
+"""Bytes of answers that wait for a client; with more, it is told of no progress."""
 _SEND_BUFFER = 4096
 """Bytes, before doubling by the kernel: a client that does not read is noticed after about ten progress reports."""
 _LINGER_S = 1.0
@@ -116,7 +118,7 @@ class _Connection:
 
     async def _answer(self, number: jsonrpc.RequestId, method: str, params: Json) -> None:
         caller = Caller(self._name, self._number, lambda progress: self._report(number, progress), self._is_stalled)
-        at_once = self._methods.table[method].at_once
+        at_once = self._methods.table[method].at_once or params.get("replace") is True
         try:
             async with contextlib.AsyncExitStack() as turn:
                 if not at_once:
@@ -146,7 +148,7 @@ class _Connection:
             self._unread_since = None
         elif self._unread_since is None:
             self._unread_since = time.monotonic()
-        if self._unread() < jsonrpc.LINE_LIMIT:
+        if self._unread() < _MOST_UNREAD:
             self._send({"method": "progress", "params": {"request": number, **progress}})
 
     def _unread(self) -> int:

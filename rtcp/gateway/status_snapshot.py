@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import time
 from collections import deque
@@ -15,16 +16,13 @@ import numpy.typing as npt
 from kinematics.forward import frames
 from kinematics.jacobian import singularity_distances
 from rtcp.config.model import PLATFORM_PARTS
-from rtcp.ipc.events import JOYSTICK_MODES, ProcessDataLost, ResetDone
+from rtcp.ipc.events import JOYSTICK_MODES, ResetDone
 from rtcp.ipc.names import SINGULARITIES, Names
 from rtcp.ipc.observer import EventRecord, Observer
+from rtcp.ipc.robot_status import RobotStatus
 from rtcp.ipc.schema import (
     FLAG_ARM_HAS_JOYSTICK,
     FLAG_DC_LOCKED,
-    FLAG_EMERGENCY_STOP,
-    FLAG_ENABLED,
-    FLAG_MOTION_ALLOWED,
-    FLAG_SWITCHING,
     HELD_BOX_AT,
     HELD_RANGE_AT,
     HELD_SHOULDER,
@@ -51,40 +49,12 @@ _SECOND = ("cycles", "unanswered", "incomplete", "tracked")
 """What is counted of the last second, in cycles: all, those without an answer, those with another working counter than
 the expected, those with an answer and a locked clock."""
 
-_IN_ERROR = frozenset({State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING})
-_IN_MOTION = frozenset({State.MOVING, State.STOPPING, State.HOMING})
-_MOTION_POSSIBLE = frozenset({State.HOLDING, State.MOVING})
-
 
 def al_name(status: int) -> str:
     """Return the AL state in words (ETG.1000.6, table 9); `no answer` for 0."""
     if status == 0:
         return "no answer"
     return AL_NAMES.get(status & 0x0F, f"0x{status:02X}") + (" + ERROR" if status & 0x10 else "")
-
-
-def robot_status(state: State, control_mode: int, flags: int, fault: int, limit: int) -> dict[str, Any]:
-    """Return the fields of ROS-Industrial's RobotStatus (industrial_msgs), from the machine's state and nothing else.
-
-    Args:
-        state: of the machine.
-        control_mode: under the joystick the arm is in manual mode (ISO 10218-1), otherwise in auto.
-        flags: of the cycle record.
-        fault: number of the event that began the fault, 0: none.
-        limit: number of the event that led to the stop by a limit, 0: none.
-    """
-    in_error = state in _IN_ERROR
-    return {
-        "mode": "manual" if control_mode == ControlMode.JOYSTICK else "auto",
-        "e_stopped": state is State.EMERGENCY_STOP or bool(flags & FLAG_EMERGENCY_STOP),
-        "drives_powered": bool(flags & FLAG_ENABLED),
-        "motion_possible": state in _MOTION_POSSIBLE
-        and bool(flags & FLAG_MOTION_ALLOWED)
-        and not flags & (FLAG_SWITCHING | FLAG_EMERGENCY_STOP),
-        "in_motion": state in _IN_MOTION,
-        "in_error": in_error,
-        "error_code": (fault or limit) if in_error else 0,
-    }
 
 
 class StatusSnapshot:
@@ -312,13 +282,7 @@ class StatusSnapshot:
         record = latest[0]
         state, control_mode, flags = State(int(record["state"])), int(record["control_mode"]), int(record["flags"])
         problem = self._loop_problem((time.monotonic_ns() - int(record["time_ns"])) * 1e-9)
-        numbers = (int(record["fault"]), int(record["limit"]))
-        # Where nobody commands the drives any more, their watchdog has stopped them.
-        robot = (
-            robot_status(State.FAULT, control_mode, 0, ProcessDataLost.number, 0)
-            if problem
-            else robot_status(state, control_mode, flags, *numbers)
-        )
+        robot = RobotStatus.lost(control_mode) if problem else RobotStatus.of_record(record)
         figures = {name: figure.read().as_json() for name, figure in self._figures.items()}
         shown = list(self.messages)[-_SHOWN:]
         last_second, wkc = self._last_second()
@@ -333,7 +297,7 @@ class StatusSnapshot:
                 "mode": JOYSTICK_MODES[int(record["joystick_mode"]) % len(JOYSTICK_MODES)],
                 "controls_arm": bool(flags & FLAG_ARM_HAS_JOYSTICK),
             },
-            "robot": robot,
+            "robot": dataclasses.asdict(robot),
             "bus": self._session.bus,
             "cycle_ns": self._observer.period_ns,
             "cycles": int(record["cycle"]),

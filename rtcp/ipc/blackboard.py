@@ -49,8 +49,14 @@ from rtcp.ipc.layout import (
     RECORDS_HEAD_AT,
     SCHEMA_AT,
     SCHEMA_SIZE,
+    SETPOINT,
+    SETPOINT_HEAD_AT,
+    SETPOINT_TAKEN_AT,
+    SETPOINTS,
+    SETPOINTS_AT,
     SLAVES_AT,
     SLAVES_MAX,
+    STREAM_AT,
     TEMPERATURE,
     TEXT,
     TEXTS,
@@ -122,7 +128,9 @@ class Blackboard:
         self._records = 0
         self._events = 0
         self._texts = 0
-        self._taken = 0
+        self._taken = self._setpoints_taken = 0
+        self.stream = 0
+        """Number of the stream that is shown as followed."""
         self._text_lock = threading.Lock()
         for position in range(1, SLAVES_MAX + 1):
             self.health(position, 0, 0, math.nan, [(0, 0, 0)] * PORTS)
@@ -209,6 +217,23 @@ class Blackboard:
             return number, lease, COMMAND_KINDS.unpack_from(kind, self._map, at + COMMAND.size)
         except MalformedMessage:
             return number, lease, Malformed(kind & _I63)
+
+    def setpoint_waits(self) -> bool:
+        """Whether a setpoint waits to be taken."""
+        return self._words[SETPOINT_HEAD_AT] != self._setpoints_taken
+
+    def take_setpoint(self) -> tuple[int, int, float, tuple[float, ...]]:
+        """Read the next setpoint: its stream, `SETPOINT_...` bits, stamp, s, and 3 x `MOST_AXES` numbers."""
+        self._setpoints_taken += 1
+        at = SETPOINTS_AT + (self._setpoints_taken % SETPOINTS) * SETPOINT.size
+        _, stream, bits, stamp_s, *numbers = SETPOINT.unpack_from(self._map, at)
+        self._words[SETPOINT_TAKEN_AT] = self._setpoints_taken
+        return stream, bits, stamp_s, tuple(numbers)
+
+    def open_stream(self, stream: int) -> None:
+        """Show which stream's setpoints are followed; 0: none."""
+        self.stream = stream
+        self._words[STREAM_AT] = stream
 
     def answer(self, number: int, refusal: Refusal | None = None) -> None:
         """Answer the command `number`; None: accepted."""

@@ -154,6 +154,16 @@ class RunTrajectory(MotionCommand):
 
     slot: int
     rows: int
+    open: bool = False
+    """Whether more rows follow (`ExtendTrajectory`): each replaces one that has been passed."""
+
+
+class ExtendTrajectory(MotionCommand):
+    """Say how many rows the open trajectory under way has by now, and whether these are all."""
+
+    states = frozenset({State.MOVING})
+    rows: int
+    ends: bool
 
 
 class RunLines(MotionCommand):
@@ -171,6 +181,15 @@ class StreamPosition(MotionCommand):
     """rad"""
     stamp_s: float
     """Clock of the sender, s."""
+
+
+class OpenStream(MotionCommand):
+    """Begin a stream whose setpoints come through shared memory (`rtcp.Stream`)."""
+
+    states = frozenset({State.HOLDING})
+    renewed = True
+    stream: int
+    """Its number, not 0."""
 
 
 class Jog(MotionCommand):

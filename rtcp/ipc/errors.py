@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-ErrorKind = Literal["refused", "fault", "timeout", "invalid", "internal", "not running", "lost"]
+ErrorKind = Literal["refused", "fault", "replaced", "timeout", "invalid", "internal", "not running", "lost"]
 
 
 class RtcpError(Exception):
     """A request that did not succeed. `RtcpError("refused", ...)` makes a `Refused`, and so on for each kind.
 
     Attributes:
-        kind: for programs: refused, fault, timeout, invalid, internal (the platform's own); not running, lost (found at
-            this end: nobody answers; the connection ended before the answer).
+        kind: for programs: refused, fault, replaced, timeout, invalid, internal (the platform's own); not running, lost
+            (found at this end: nobody answers; the connection ended before the answer).
         message: for people: what happened, where, what to do.
         reason: name of the refusal (`rtcp.ipc.refusals`) or event (`rtcp.ipc.events`) behind it; empty: none.
         fields: its fields by name, SI units.
@@ -46,6 +46,10 @@ class Faulted(RtcpError):
     """It was begun and went wrong: a fault, an emergency stop, a motion that ended before its goal."""
 
 
+class Replaced(RtcpError):
+    """Another motion took its place (`replace=True`), without a stop between them."""
+
+
 class TimedOut(RtcpError):
     """It took too long, or no answer came."""
 
@@ -65,6 +69,7 @@ class ConnectionLost(RtcpError):
 _CLASSES: dict[str, type[RtcpError]] = {
     "refused": Refused,
     "fault": Faulted,
+    "replaced": Replaced,
     "timeout": TimedOut,
     "invalid": Invalid,
     "not running": NotRunning,

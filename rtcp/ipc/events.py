@@ -396,6 +396,36 @@ class StreamEnded(MotionEnded, number=101):
     by_limit = False
 
 
+class OutOfPoints(MotionEnded, number=117):
+    """the open trajectory came to its last point and no more had been appended: controlled stop"""
+
+    by_limit = False
+
+
+class SetpointOutOfRange(MotionEnded, number=114):
+    """{joint}: the stream's setpoint of {value:.6g} rad is outside its range, beyond {limit:g} rad: controlled stop,
+    the stream has ended"""
+
+    by_limit = False
+    axis: int
+    value: float
+    limit: float
+
+
+class SetpointNotFinite(MotionEnded, number=115):
+    """{joint}: a number of the stream's setpoint is not finite: controlled stop, and the stream has ended"""
+
+    by_limit = False
+    axis: int
+
+
+class SetpointOutOfOrder(MotionEnded, number=116):
+    """a setpoint of the stream came {late_s:.6g} s late or out of order: controlled stop, and the stream has ended"""
+
+    by_limit = False
+    late_s: float
+
+
 class CommandExpired(MotionEnded, number=109):
     """the command was not renewed in time: controlled stop"""
 

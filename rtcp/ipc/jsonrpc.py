@@ -14,14 +14,15 @@ from typing import Any, cast
 from rtcp.ipc.errors import ErrorKind, RtcpError
 
 VERSION = "2.0"
-LINE_LIMIT = 1 << 16
-"""Bytes of a request."""
+LINE_LIMIT = 1 << 22
+"""Bytes of a request: a trajectory of the most points, with velocities and accelerations of ten joints."""
 PARSE_ERROR, INVALID_REQUEST, METHOD_NOT_FOUND, INVALID_PARAMS, INTERNAL_ERROR = -32700, -32600, -32601, -32602, -32603
 """JSON-RPC 2.0 specification, section 5.1."""
 CODES = {
     "refused": -32000,
     "fault": -32001,
     "timeout": -32002,
+    "replaced": -32003,
     "invalid": INVALID_PARAMS,
     "internal": INTERNAL_ERROR,
 }
@@ -50,9 +51,12 @@ def line(message: Mapping[str, Any]) -> bytes:
 def request(number: int, method: str, params: Mapping[str, Any]) -> bytes:
     """Return a request; raises RtcpError (`invalid`) for what JSON cannot express."""
     try:
-        return line({"id": number, "method": method, "params": dict(params)})
+        made = line({"id": number, "method": method, "params": dict(params)})
     except (TypeError, ValueError) as error:
         raise RtcpError("invalid", f"{method}: the parameters cannot be sent as JSON: {error}") from error
+    if len(made) > LINE_LIMIT:
+        raise RtcpError("invalid", f"{method}: the parameters are {len(made)} bytes, longer than {LINE_LIMIT} bytes")
+    return made
 
 
 def answer(message: Mapping[str, Any]) -> bytes:

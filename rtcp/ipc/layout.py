@@ -5,19 +5,19 @@
 | 0 | header: magic, sizes, period, loop's pid | loop, once |
 | 128 | lease: id, renewed at, duration, holder's name | commanders, under a file lock |
 | 256 | command head; 264: commands taken; 272: number of the last answer | commander; loop; loop |
+| 280 | setpoint head; 288: setpoints taken; 296: open stream | commander; loop; loop |
 | 384 | published records; published events; published texts | loop |
 | 512 | request and answer of the service thread | commander; service thread |
 | 768 | answer to the last command | loop |
 | 1024 | slave states | service thread |
 | 3072 | slave health: lost, recovered, temperature, error counters | service thread |
-| 16384 | service text, texts, events, commands, plans, schema, cycle records | loop and commanders |
+| 16384 | service text, texts, events, commands, setpoints, plans, schema, cycle records | loop and commanders |
 
 Nothing here imports numpy: its threads would keep the loop's process from joining a user namespace.
 """
 
 from __future__ import annotations
 
-import array
 import math
 import mmap
 import struct
@@ -28,7 +28,7 @@ from typing import Final
 from rtcp.config.model import MOST_AXES
 from rtcp.ipc.message import PAYLOAD_SIZE
 
-MAGIC = 0x5254_4350_0000_0008
+MAGIC = 0x5254_4350_0000_0009
 HEADER = struct.Struct("<QIIIIIIQIi")
 """magic, length of the schema, record size, records, commands, events, texts, period ns, loop pid, reserved"""
 
@@ -45,6 +45,10 @@ COMMAND_HEAD_AT: Final = 256
 COMMAND_TAKEN_AT: Final = 264
 ANSWER_NUMBER_AT: Final = 272
 """Number of the command that the answer belongs to; written last."""
+SETPOINT_HEAD_AT: Final = 280
+SETPOINT_TAKEN_AT: Final = 288
+STREAM_AT: Final = 296
+"""Number of the stream whose setpoints the loop follows; 0: none, or it has ended."""
 ANSWER_AT: Final = 768
 ANSWER = struct.Struct("<Q")
 """number of the refusal's kind (0: accepted); its fields follow (`rtcp.ipc.message`)"""
@@ -91,12 +95,21 @@ COMMAND = struct.Struct("<QQQ")
 COMMAND_SIZE = COMMAND.size + PAYLOAD_SIZE
 COMMANDS: Final = 64
 
+SETPOINTS_AT = COMMANDS_AT + COMMANDS * COMMAND_SIZE
+SETPOINT = struct.Struct(f"<QQQd{3 * MOST_AXES}d")
+"""number, number of the stream, `SETPOINT_...` bits, time stamp, s; positions, rad, velocities, rad/s, accelerations,
+rad/s^2, `MOST_AXES` each"""
+SETPOINTS: Final = 256
+SETPOINT_HAS_VELOCITY, SETPOINT_HAS_ACCELERATION, SETPOINT_ENDS = 1, 2, 4
+"""The last one has no numbers: it brings the arm to rest and ends the stream."""
+
 PLAN_ROWS, PLAN_COLUMNS = 4096, 2 + 3 * MOST_AXES
 """A plan: rows of doubles, each a waypoint of a trajectory or a straight piece (`rtcp.motion.planning.plan`)."""
+_ROW = struct.Struct(f"<{PLAN_COLUMNS}d")
 PLAN_SIZE = PLAN_ROWS * PLAN_COLUMNS * 8
 PLANS: Final = 2
 """Two places: one is written while the plan in the other runs."""
-PLANS_AT = (COMMANDS_AT + COMMANDS * COMMAND_SIZE + 4095) & ~4095
+PLANS_AT = (SETPOINTS_AT + SETPOINTS * SETPOINT.size + 4095) & ~4095
 
 SCHEMA_AT = (PLANS_AT + PLANS * PLAN_SIZE + 4095) & ~4095
 SCHEMA_SIZE = 1 << 18
@@ -168,15 +181,16 @@ def write_plan(memory: mmap.mmap, words: AtomicWords, rows: Sequence[Sequence[fl
     Raises:
         PlanTooLong: with the number of rows and how many fit.
     """
+    slot = 0 if words[PLAN_IN_USE_AT] != 1 else PLANS - 1
+    write_rows(memory, words, slot, 0, rows)
+    return slot
+
+
+def write_rows(memory: mmap.mmap, words: AtomicWords, slot: int, first: int, rows: Sequence[Sequence[float]]) -> None:
+    """Write rows of a plan from number `first` on; a slot is a ring of them. Raises PlanTooLong as `write_plan`."""
     if len(rows) > PLAN_ROWS:
         raise PlanTooLong(f"the plan has {len(rows)} rows, at most {PLAN_ROWS} fit: give fewer points")
-    flat = array.array("d")
-    for row in rows:
-        flat.extend(row)
-        flat.extend([0.0] * (PLAN_COLUMNS - len(row)))
-    slot = 0 if words[PLAN_IN_USE_AT] != 1 else PLANS - 1
-    at = PLANS_AT + slot * PLAN_SIZE
-    encoded = flat.tobytes()
-    memory[at : at + len(encoded)] = encoded
+    for number, row in enumerate(rows, first):
+        at = PLANS_AT + slot * PLAN_SIZE + number % PLAN_ROWS * PLAN_COLUMNS * 8
+        _ROW.pack_into(memory, at, *row, *[0.0] * (PLAN_COLUMNS - len(row)))
     words.fence()
-    return slot

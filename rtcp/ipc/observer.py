@@ -53,7 +53,13 @@ from rtcp.ipc.layout import (
     SERVICE_STATE_AT,
     SERVICE_TEXT_AT,
     SERVICE_TEXT_SIZE,
+    SETPOINT,
+    SETPOINT_HEAD_AT,
+    SETPOINT_TAKEN_AT,
+    SETPOINTS,
+    SETPOINTS_AT,
     SLAVES_AT,
+    STREAM_AT,
     TEMPERATURE,
     TEXT,
     TEXTS,
@@ -63,6 +69,7 @@ from rtcp.ipc.layout import (
     file_size,
     records_for,
     write_plan,
+    write_rows,
 )
 from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import REFUSALS, Refusal
@@ -361,6 +368,41 @@ class Observer:
         self._words[COMMAND_HEAD_AT] = number
         return number
 
+    def setpoint(self, stream: int, bits: int, stamp_s: float, numbers: Sequence[float]) -> bool:
+        """Put a setpoint into its ring; return False where the stream has ended. The stream's owner is the only writer.
+
+        Args:
+            stream: its number.
+            bits: `SETPOINT_...` of `rtcp.ipc.layout`.
+            stamp_s: time stamp of the sender, s.
+            numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
+
+        Raises:
+            BlackboardError: the ring is full: the loop hangs.
+            struct.error: what is no number.
+        """
+        words = self._words
+        if words[STREAM_AT] != stream:
+            return False
+        number = words[SETPOINT_HEAD_AT] + 1
+        if number - words[SETPOINT_TAKEN_AT] > SETPOINTS:
+            raise BlackboardError("the loop takes no setpoints: its process hangs or is gone")
+        at = SETPOINTS_AT + (number % SETPOINTS) * SETPOINT.size
+        SETPOINT.pack_into(self._map, at, number, stream, bits, stamp_s, *numbers)
+        words.fence()
+        words[SETPOINT_HEAD_AT] = number
+        return True
+
+    @property
+    def open_stream(self) -> int:
+        """Number of the stream whose setpoints the loop follows; 0: none."""
+        return self._words[STREAM_AT]
+
+    @property
+    def setpoints_taken(self) -> int:
+        """How many setpoints the loop has taken since the start."""
+        return self._words[SETPOINT_TAKEN_AT]
+
     def write_plan(self, rows: Sequence[Sequence[float]]) -> int:
         """Write a plan, rows of up to 20 numbers, for a command that names the slot which is returned.
 
@@ -368,6 +410,10 @@ class Observer:
             PlanTooLong: where it does not fit.
         """
         return write_plan(self._map, self._words, rows)
+
+    def extend_plan(self, slot: int, first: int, rows: Sequence[Sequence[float]]) -> None:
+        """Write more rows of the open plan in a slot, from number `first` on; raises PlanTooLong."""
+        write_rows(self._map, self._words, slot, first, rows)
 
     def answer(self, number: int) -> Answer | None:
         """Return the loop's answer to the command `number`, or None while there is none."""

@@ -353,3 +353,14 @@ class DriverRaised(Refusal):
 
     slave: int
     """Position on the cable, from 1."""
+
+
+class NotOpen(Refusal):
+    """no open trajectory is under way"""
+
+
+class NoRoomForPoints(Refusal):
+    """{rows} points wait or are under way, at most {most} fit: append fewer, or later"""
+
+    rows: int
+    most: int

@@ -15,11 +15,13 @@ from rtcp.ipc.commands import (
     Command,
     Disable,
     Enable,
+    ExtendTrajectory,
     Halt,
     Home,
     Jog,
     MoveAtVelocity,
     MoveGripper,
+    OpenStream,
     Reset,
     RunLines,
     RunTrajectory,
@@ -46,6 +48,7 @@ from rtcp.ipc.refusals import (
     DamagedRow,
     EmergencyStopPressed,
     NoGeometry,
+    NotOpen,
     PlanStartsElsewhere,
     Refusal,
     WrongControlMode,
@@ -75,8 +78,10 @@ set_drive_mode   .     =     .     =     .     .     .     .     .     .     .  
 set_control_mode .     =     .     =     .     .     .     .     .     .     .     .     .
 move_joints      .     .     .     move  =     .     .     .     .     .     .     .     .
 run_trajectory   .     .     .     =     =     .     .     .     .     .     .     .     .
+extend_trajectory . .   .     .     =     .     .     .     .     .     .     .     .
 run_lines        .     .     .     =     =     .     .     .     .     .     .     .     .
 stream_position  .     .     .     move  =     .     .     .     .     .     .     .     .
+open_stream      .     .     .     move  .     .     .     .     .     .     .     .     .
 jog              .     .     .     move  =     .     .     .     .     .     .     .     .
 move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
 apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
@@ -107,7 +112,8 @@ COMMANDS: dict[str, Command] = {
     command.name: command
     for command in (
         Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
-        RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), Jog((0.0, 0.0), JogFrame.JOINTS, 0.2),
+        RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
+        Jog((0.0, 0.0), JogFrame.JOINTS, 0.2),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
         MoveGripper(False), SetLimits(0, 1), SetZero(0, 0.0), Home(0), Shutdown(),
     )
@@ -115,6 +121,7 @@ COMMANDS: dict[str, Command] = {
 """One of each kind, with fields that nobody could refuse."""
 FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     RunTrajectory: (DamagedRow, PlanStartsElsewhere),
+    ExtendTrajectory: (NotOpen,),
     RunLines: (NoGeometry,),
     MoveAtVelocity: (WrongControlMode,),
     ApplyTorque: (WrongControlMode,),

@@ -1,4 +1,4 @@
-"""The status: its message, what it says of a silent loop, and RobotStatus; the loop is fake."""
+"""The status: its message, what it says of a silent loop; the loop is fake."""
 
 from __future__ import annotations
 
@@ -12,22 +12,18 @@ import pytest
 from rtcp.config import default_config, load
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.gateway import status_snapshot
-from rtcp.gateway.status_snapshot import StatusSnapshot, robot_status
+from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import Arrived, DriveFault, EmergencyStopActivated
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.schema import (
     FLAG_DC_LOCKED,
-    FLAG_EMERGENCY_STOP,
-    FLAG_ENABLED,
-    FLAG_MOTION_ALLOWED,
-    FLAG_SWITCHING,
     HELD_BOX_AT,
     HELD_RANGE_AT,
     HELD_SHOULDER,
 )
 from rtcp.ipc.session import Processes, Session
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import State
 from tests.records import numbers
 
 JOINTS = 6
@@ -158,37 +154,3 @@ def test_what_is_older_than_a_second_does_not_count(written: Written, monkeypatc
     monkeypatch.setattr(status_snapshot, "_SECOND_NS", 0)
     status = written.status
     assert (status["last_second"]["cycles"], status["wkc"]["actual"]) == (0, -1)
-
-
-# -- RobotStatus ------------------------------------------------------------------------------------------------------
-
-ALLOWED = FLAG_ENABLED | FLAG_MOTION_ALLOWED
-JOINT = ControlMode.JOINT
-
-
-@pytest.mark.parametrize("state", State)
-def test_robot_status_follows_the_state(state: State) -> None:
-    found = robot_status(state, JOINT, ALLOWED, 0, 0)
-    assert found["motion_possible"] is (state in (State.HOLDING, State.MOVING))
-    assert found["in_motion"] is (state in (State.MOVING, State.STOPPING, State.HOMING))
-    in_error = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
-    assert found["in_error"] is (state in in_error)
-    assert found["e_stopped"] is (state is State.EMERGENCY_STOP)
-    assert found["drives_powered"]
-
-
-@pytest.mark.parametrize("flags", [ALLOWED | FLAG_EMERGENCY_STOP, ALLOWED | FLAG_SWITCHING, FLAG_ENABLED])
-def test_motion_is_not_possible_with_stop_pressed_or_mode_changing_or_without_permission(flags: int) -> None:
-    assert not robot_status(State.HOLDING, JOINT, flags, 0, 0)["motion_possible"]
-
-
-@pytest.mark.parametrize("mode", ControlMode)
-def test_only_the_joystick_makes_the_mode_manual(mode: ControlMode) -> None:
-    manual = robot_status(State.HOLDING, mode, 0, 0, 0)["mode"] == "manual"
-    assert manual is (mode is ControlMode.JOYSTICK)
-
-
-def test_an_error_code_is_the_number_of_the_event() -> None:
-    assert robot_status(State.FAULT, JOINT, 0, 5, 0)["error_code"] == 5
-    assert robot_status(State.STOPPED_BY_LIMIT, JOINT, FLAG_ENABLED, 0, 107)["error_code"] == 107
-    assert robot_status(State.HOLDING, JOINT, FLAG_ENABLED, 0, 0)["error_code"] == 0

@@ -8,8 +8,17 @@ from typing import Final
 
 from ruckig import InputParameter, Ruckig, Trajectory
 
-from rtcp.ipc.commands import Command, StreamPosition
-from rtcp.ipc.events import ControllerFailed, StreamEnded
+from rtcp.config.model import MOST_AXES
+from rtcp.ipc.commands import Command, OpenStream, StreamPosition
+from rtcp.ipc.events import (
+    ControllerFailed,
+    MotionEnded,
+    SetpointNotFinite,
+    SetpointOutOfOrder,
+    SetpointOutOfRange,
+    StreamEnded,
+)
+from rtcp.ipc.layout import SETPOINT_ENDS, SETPOINT_HAS_ACCELERATION, SETPOINT_HAS_VELOCITY
 from rtcp.ipc.refusals import Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
@@ -36,10 +45,14 @@ _TIMEOUT_NS = round(TIMEOUT_S * 1e9)
 
 
 class StreamController(Controller):
-    """Accepts `StreamPosition`. A target that is late by more than the timeout, or out of order, is dropped."""
+    """Accepts `StreamPosition` and `OpenStream`, and what is `put` into an open stream.
+
+    A `StreamPosition` that is late by more than the timeout, or out of order, is dropped; in an open stream, whose
+    sender waits for no answer, it ends the stream.
+    """
 
     name = "stream"
-    commands = (StreamPosition,)
+    commands = (StreamPosition, OpenStream)
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
@@ -65,9 +78,17 @@ class StreamController(Controller):
         self._first = True
         self._fresh = self._tracks = False
         self._keeps_speed = False
+        self._rate = [0.0] * n
+        """What the sender says of the target's acceleration, rad/s^2."""
+        self.stream = 0
+        """Number of the open stream; 0: there is none, or it has ended."""
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Follow the target from the next cycle on."""
+        if isinstance(command, OpenStream):
+            self._start(state)
+            self.stream = command.stream
+            return None
         assert isinstance(command, StreamPosition)
         if (refusal := self.not_in_range(command.q)) is not None:
             return refusal
@@ -78,8 +99,57 @@ class StreamController(Controller):
         late_s = self._take(command.q, command.stamp_s, state.now_ns)
         return None if late_s is None else StreamPointDropped(late_s)
 
+    def put(self, state: ArmState, bits: int, stamp_s: float, numbers: Sequence[float]) -> None:
+        """Follow a setpoint of the open stream; one that cannot be followed ends it.
+
+        Args:
+            state: of the arm.
+            bits: `SETPOINT_...` of `rtcp.ipc.layout`.
+            stamp_s: clock of the sender, s.
+            numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
+        """
+        if bits & SETPOINT_ENDS:
+            self.stop(state)
+            return
+        low, high = self.limits.low, self.limits.high
+        for i in self._joints:
+            q = numbers[i]
+            if not isfinite(q + numbers[MOST_AXES + i] + numbers[2 * MOST_AXES + i] + stamp_s):
+                self._end(state, SetpointNotFinite(i))
+                return
+            if not low[i] <= q <= high[i]:
+                self._end(state, SetpointOutOfRange(i, q, high[i] if q > high[i] else low[i]))
+                return
+        late_s = self._take(numbers[: len(low)], stamp_s, state.now_ns)
+        if late_s is not None:
+            self._end(state, SetpointOutOfOrder(late_s))
+            return
+        if bits & SETPOINT_HAS_VELOCITY:
+            speed, rate, limits, rates = self._speed, self._rate, self.limits.velocity, self.limits.acceleration
+            for i in self._joints:
+                bound, v = limits[i] * _INSIDE, numbers[MOST_AXES + i]
+                speed[i] = bound if v > bound else -bound if v < -bound else v
+                bound, a = rates[i], numbers[2 * MOST_AXES + i] if bits & SETPOINT_HAS_ACCELERATION else 0.0
+                rate[i] = bound if a > bound else -bound if a < -bound else a
+
+    def _end(self, state: ArmState, ended: MotionEnded) -> None:
+        self.ended = ended
+        self.brake(state)
+
+    def hold(self) -> None:
+        """End the motion where the setpoints are."""
+        super().hold()
+        self.stream = 0
+
+    def brake(self, state: ArmState) -> None:
+        """Bring each joint to rest; an open stream has ended."""
+        super().brake(state)
+        self.stream = 0
+
     def _start(self, state: ArmState) -> None:
         self.begin()
+        self.stream = 0
+        self._rate[:] = self._zero
         self._first, self._interval_s = True, 0.0
         self._came_ns = state.now_ns
         self._fresh = self._tracks = False
@@ -183,7 +253,12 @@ class StreamController(Controller):
                 # Where the two meet, the joint must still be able to stop inside its range.
                 v, most = speed[i], self._stoppable(i, speed[i], wanted[i], ahead)
                 speed[i] = most if v > most else -most if v < -most else v
-            meets = [q + v * ahead for q, v in zip(wanted, speed, strict=True)]
+            rate = self._rate
+            meets = [wanted[i] + (speed[i] + 0.5 * rate[i] * ahead) * ahead for i in self._joints]
+            if any(rate):
+                for i in self._joints:
+                    v, most = speed[i] + rate[i] * ahead, self._stoppable(i, speed[i], meets[i])
+                    speed[i] = most if v > most else -most if v < -most else v
             if self._plan(meets, speed, duration) and leaves_range(self._found, state.commanded, limits) is None:
                 self._tracks = True
                 return

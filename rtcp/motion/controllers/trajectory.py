@@ -11,10 +11,18 @@ from typing import Final, NamedTuple
 
 from ruckig import InputParameter, Ruckig, Trajectory
 
-from rtcp.ipc.commands import Command, RunTrajectory
-from rtcp.ipc.events import PlanDamaged
+from rtcp.ipc.commands import Command, ExtendTrajectory, RunTrajectory
+from rtcp.ipc.events import MotionEnded, OutOfPoints, PlanDamaged
 from rtcp.ipc.layout import PLAN_ROWS
-from rtcp.ipc.refusals import ApproachImpossible, DamagedRow, PlanStartsElsewhere, PlanStartsMoving, Refusal
+from rtcp.ipc.refusals import (
+    ApproachImpossible,
+    DamagedRow,
+    NoRoomForPoints,
+    NotOpen,
+    PlanStartsElsewhere,
+    PlanStartsMoving,
+    Refusal,
+)
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_acceleration, find_way, leaves_range
 from rtcp.motion.limits import Limits
@@ -171,10 +179,10 @@ class Slowdown:
 
 
 class TrajectoryController(Controller):
-    """Accepts `RunTrajectory`."""
+    """Accepts `RunTrajectory`, and `ExtendTrajectory` while an open one is under way."""
 
     name = "trajectory"
-    commands = (RunTrajectory,)
+    commands = (RunTrajectory, ExtendTrajectory)
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
@@ -192,6 +200,8 @@ class TrajectoryController(Controller):
         self._row = self._count = 0
         self._from_s = self._to_s = 0.0
         self._delay_s = 0.0
+        self._open = False
+        """Whether more rows may follow."""
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Run a plan of waypoints (`rtcp.motion.planning.plan`) from `state`.
@@ -200,6 +210,8 @@ class TrajectoryController(Controller):
         joints' limits; it ends at the waypoint's time, or later where the limits demand it, and what follows is as much
         later. Where it is refused, what was under way continues.
         """
+        if isinstance(command, ExtendTrajectory):
+            return self._extend(command, continues)
         assert isinstance(command, RunTrajectory)
         rows, count = self.rows_of(command.slot, command.rows, PLAN_ROWS), command.rows
         if isinstance(rows, Refusal):
@@ -217,10 +229,24 @@ class TrajectoryController(Controller):
             self._fade_out(state, first, last[0])
         else:
             self._approach_s = self._approach.duration_s
-        self._rows, self._row, self._count = rows, 0, count
+        self._rows, self._row, self._count, self._open = rows, 0, count, command.open
         self._waypoint = first
         self._delay_s = max(self._approach_s - first[0], 0.0)
         self._from_s = self._to_s = first[0] + self._delay_s
+        self.duration_s = last[0] + self._delay_s
+        return None
+
+    def _extend(self, command: ExtendTrajectory, continues: bool) -> Refusal | None:
+        rows, count = self._rows, command.rows
+        if not (continues and self._open and self.phase is Phase.MOVE) or rows is None:
+            return NotOpen()
+        # The row that the arm is on its way from is still needed where the piece is made.
+        if not (self._count <= count <= self._row + PLAN_ROWS):
+            return NoRoomForPoints(count - self._row, PLAN_ROWS)
+        last = read_row(rows, (count - 1) % PLAN_ROWS)
+        if (found := self._damage(last)) is not None:
+            return DamagedRow(count - 1, found)
+        self._count, self._open = count, not command.ends
         self.duration_s = last[0] + self._delay_s
         return None
 
@@ -293,19 +319,21 @@ class TrajectoryController(Controller):
                 velocity[i] *= speed
         if speed == 0.0:
             self.phase = Phase.HOLD
-        elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and (damaged := self._arrive()) is not None:
-            return self.give_up(state, damaged)
+        elif self.elapsed_s >= self.duration_s - _AT_ONCE_S and (ended := self._arrive()) is not None:
+            return self.give_up(state, ended)
         target.position, target.velocity = self._position, self._velocity
         return target
 
-    def _arrive(self) -> PlanDamaged | None:
-        """Come to rest at the end, or return that the plan does not end at rest."""
+    def _arrive(self) -> MotionEnded | None:
+        """Come to rest at the end; or return that more rows should have come, or that the plan does not end at rest."""
         self.phase = Phase.HOLD
         for i in self._joints:
             speed = self._velocity[i]
             if not -_SLACK < speed < _SLACK:
-                return PlanDamaged(self._count - 1, speed)
+                return OutOfPoints() if self._open else PlanDamaged(self._count - 1, speed)
             self._velocity[i] = 0.0
+        if self._open:
+            self.ended = OutOfPoints()
         return None
 
     def _go_to(self, at_s: float) -> PlanDamaged | None:
@@ -341,7 +369,7 @@ class TrajectoryController(Controller):
         rows = self._rows
         assert rows is not None
         index = self._row + 1
-        before, waypoint = self._waypoint, read_row(rows, index)
+        before, waypoint = self._waypoint, read_row(rows, index % PLAN_ROWS)
         found = self._damage(waypoint)
         length = waypoint[0] - before[0]
         if found is None and not 0.0 < length <= LONGEST_S:

@@ -40,6 +40,7 @@ def plan_trajectory(
     *,
     names: Sequence[str] = (),
     zone_at: ZoneAt | None = None,
+    moving: bool = False,
 ) -> Plan:
     """Return the plan of a trajectory for `TrajectoryController`.
 
@@ -54,6 +55,8 @@ def plan_trajectory(
         q_now: where the arm is commanded, rad, shape (n,).
         names: of the joints, for the sentences.
         zone_at: looked at every `ZONE_STEP_RAD` of any joint's way.
+        moving: it replaces a motion, which has passed `q_now` when it begins: a first point at time 0 with others
+            behind it is left out, and only the loop knows the way to the next.
 
     Raises:
         PlanRefused: with the point, the joint, what was found and what is allowed.
@@ -61,29 +64,32 @@ def plan_trajectory(
     joints = len(q_now)
     names = list(names) or [f"joint{i + 1}" for i in range(joints)]
     _check_points(points, names)
+    if moving and len(points) > 1 and points[0].t <= _AT_ONCE_S:
+        points = points[1:]
     waypoints = _waypoints(points, q_now)
     first, last = waypoints[0], waypoints[-1]
     _check_ends(first, last, len(points), q_now, names)
     for number, waypoint in enumerate(waypoints, 1):
         _check_waypoint(waypoint, f"point {number}", limits, names)
-    if first.t > _AT_ONCE_S:
+    if first.t > _AT_ONCE_S and not moving:
         _check_approach(first, limits, q_now, names, zone_at)
     for number, (before, after) in enumerate(pairwise(waypoints), 1):
         _check_piece(before, after, f"between points {number} and {number + 1}", limits, names, zone_at)
     return Plan(tuple(_row(waypoint) for waypoint in waypoints), last.t, 0.0, 1.0, last.q)
 
 
-def _check_points(points: Sequence[Point], names: Sequence[str]) -> None:
+def _check_points(points: Sequence[Point], names: Sequence[str], first: int = 1) -> None:
     if not points:
         raise PlanRefused("the trajectory has no points, at least one is needed")
     if len(points) > MOST_POINTS:
         raise PlanRefused(f"the trajectory has {len(points)} points, at most {MOST_POINTS} are allowed")
-    for number, point in enumerate(points, 1):
+    for at, point in enumerate(points):
+        number = first + at
         if not isfinite(point.t) or not 0.0 <= point.t <= LONGEST_S:
             raise PlanRefused(f"point {number}: its time is {point.t} s, allowed is 0 to {LONGEST_S:g} s")
-        if number > 1 and point.t < points[number - 2].t + SHORTEST_S * (1.0 - _ROUNDING):
+        if at and point.t < points[at - 1].t + SHORTEST_S * (1.0 - _ROUNDING):
             raise PlanRefused(
-                f"point {number}: its time is {point.t:g} s after {points[number - 2].t:g} s, "
+                f"point {number}: its time is {point.t:g} s after {points[at - 1].t:g} s, "
                 f"times must rise by at least {SHORTEST_S:g} s"
             )
         for what, unit, given in (
@@ -249,3 +255,111 @@ def _check_zone(q: Sequence[float], at_s: float, where: str, zone_at: ZoneAt) ->
 def _row(waypoint: _Knot) -> tuple[float, ...]:
     rest = (0.0,) * (MOST_AXES - len(waypoint.q))
     return (waypoint.t, *waypoint.q, *rest, *waypoint.v, *rest, *waypoint.a, *rest, waypoint.kind)
+
+
+class OpenPlan:
+    """A trajectory that is open at its end: rows as points come, checked as those of `plan_trajectory`.
+
+    Points with positions only get velocities by the slopes before and behind them, of one sign or 0: so the last one
+    waits for the next. Whatever raises changes nothing.
+
+    Args:
+        limits, names, zone_at: as of `plan_trajectory`.
+        q_now: where the arm is commanded, rad.
+        moving: as of `plan_trajectory`.
+    """
+
+    def __init__(
+        self,
+        limits: Limits,
+        q_now: Sequence[float],
+        *,
+        names: Sequence[str],
+        zone_at: ZoneAt | None = None,
+        moving: bool = False,
+    ) -> None:
+        self._limits, self._q_now, self._names, self._zone_at, self._moving = limits, q_now, names, zone_at, moving
+        self._last: _Knot | None = None
+        self._waiting: Point | None = None
+        self._given: Point | None = None
+        self.times: list[float] = []
+        """Of all rows, s."""
+
+    @property
+    def end(self) -> tuple[float, ...]:
+        """Where the rows end, rad."""
+        return tuple(self._q_now) if self._last is None else self._last.q
+
+    @property
+    def waits(self) -> bool:
+        """Whether the last point waits for its velocity."""
+        return self._waiting is not None
+
+    def append(self, points: Sequence[Point], rest: bool = False) -> list[tuple[float, ...]]:
+        """Return the next rows; with `rest` those of all points, so that the arm is at rest at the last.
+
+        Raises:
+            PlanRefused: with the point, the joint, what was found and what is allowed.
+        """
+        number = len(self.times) + self.waits + 1
+        if self._last is None and self._moving and len(points) > 1 and points[0].t <= _AT_ONCE_S:
+            points = points[1:]
+        known = [] if self._given is None else [self._given]
+        if [*known, *points]:
+            _check_points([*known, *points], self._names, number - len(known))
+        todo = [*([] if self._waiting is None else [self._waiting]), *points]
+        last, rows, waiting = self._last, [], None
+        for at, point in enumerate(todo):
+            ahead = todo[at + 1] if at + 1 < len(todo) else None
+            if ahead is None and point.v is None and not rest and last is not None:
+                waiting = point
+            knot = self._knot(last, point, ahead)
+            where = f"point {number - self.waits + at}"
+            _check_waypoint(knot, where, self._limits, self._names)
+            if waiting is not None:
+                self._check_way(last, knot, where)
+                break
+            if last is not None:
+                _check_piece(last, knot, f"before {where}", self._limits, self._names, self._zone_at)
+            elif knot.t <= _AT_ONCE_S:
+                _check_ends(knot, _Knot(0.0, knot.q, [0.0] * len(knot.q), knot.a, CUBIC), 2, self._q_now, self._names)
+            elif not self._moving:
+                _check_approach(knot, self._limits, self._q_now, self._names, self._zone_at)
+            rows.append(_row(knot))
+            last = knot
+        if rest and last is not None:
+            for name, speed in zip(self._names, last.v, strict=True):
+                if abs(speed) > _STILL:
+                    raise PlanRefused(f"the last point must be at rest, {name} has {speed:g} rad/s")
+        self._last, self._waiting = last, waiting
+        self._given = todo[-1] if todo else self._given
+        self.times += [row[0] for row in rows]
+        return rows
+
+    def _check_way(self, before: _Knot | None, after: _Knot, where: str) -> None:
+        """Refuse a point that no velocity there makes possible: at once, and not with the point behind it."""
+        if before is None:
+            return
+        h = after.t - before.t
+        for name, here, there, most in zip(self._names, before.q, after.q, self._limits.velocity, strict=True):
+            if abs(there - here) > most * h * (1.0 + _ROUNDING):
+                found = f"{name} would move at {(there - here) / h:.4g} rad/s on the mean"
+                raise PlanTooFast(f"before {where}: {found}, allowed is at most {most:g} rad/s")
+
+    def _knot(self, before: _Knot | None, point: Point, ahead: Point | None) -> _Knot:
+        zero = (0.0,) * len(point.q)
+        if point.v is not None:
+            return _Knot(point.t, point.q, point.v, point.a or zero, CUBIC if point.a is None else QUINTIC)
+        from_s, from_q = (0.0, self._q_now) if before is None else (before.t, before.q)
+        h = point.t - from_s
+        if ahead is None or h <= _AT_ONCE_S:
+            return _Knot(point.t, point.q, zero, zero, CUBIC)
+        k = ahead.t - point.t
+        velocities = []
+        for was, here, then in zip(from_q, point.q, ahead.q, strict=True):
+            slope, next_slope = (here - was) / h, (then - here) / k
+            # Fritsch and Butland 1984: between points the cubic passes neither of them.
+            weights = (2 * k + h, k + 2 * h)
+            same = slope * next_slope > 0.0
+            velocities.append(sum(weights) / (weights[0] / slope + weights[1] / next_slope) if same else 0.0)
+        return _Knot(point.t, point.q, velocities, zero, CUBIC)

@@ -1,0 +1,71 @@
+"""Tolerances of a trajectory: every cycle record of its way, and its end, compared with them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from rtcp.gateway.command_channel import CommandChannel
+from rtcp.ipc.errors import RtcpError
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """How far a trajectory may be off: rad a joint, infinite where it may be off by anything; s."""
+
+    path: Sequence[float]
+    """Of the measured position from the commanded one, in every cycle of the way."""
+    goal: Sequence[float]
+    """Of the measured position from the last point, at the end."""
+    time_s: float
+    """How much later than planned the arm may be inside `goal`."""
+
+
+class Violation(Exception):
+    """A tolerance that was not kept."""
+
+    def __init__(self, error: RtcpError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class Tracking:
+    """Compares every record of a motion with its tolerances."""
+
+    def __init__(
+        self, channel: CommandChannel, tolerances: Tolerances, duration_s: float, end: Sequence[float]
+    ) -> None:
+        self._channel = channel
+        self._tolerances = tolerances
+        self._end = end
+        self._at = channel.observer.head
+        self._until = time.monotonic() + duration_s + tolerances.time_s
+
+    def look(self) -> None:
+        """Raise Violation where the path was left, or where the end is late."""
+        records, _ = self._channel.observer.since(self._at)
+        if len(records):
+            self._at = int(records["number"][-1])
+            off = np.abs(records["actual_position"] - records["commanded_position"]).max(axis=0)
+            self._compare("path_tolerance_violated", off.tolist(), self._tolerances.path, "on its way")
+        if time.monotonic() > self._until:
+            positions = self._channel.joints("actual_position")
+            off = [abs(a - b) for a, b in zip(positions, self._end, strict=True)]
+            self._compare("goal_tolerance_violated", off, self._tolerances.goal, "when its time was up")
+
+    def arrived(self, positions: Sequence[float]) -> bool:
+        """Whether the arm is inside the goal's tolerances."""
+        return all(
+            abs(a - b) <= most for a, b, most in zip(positions, self._end, self._tolerances.goal, strict=True)
+        )  # fmt: skip
+
+    def _compare(self, reason: str, off: Sequence[float], most: Sequence[float], when: str) -> None:
+        for axis, (found, allowed) in enumerate(zip(off, most, strict=True)):
+            if found > allowed:
+                joint = self._channel.names.joint(axis)
+                message = f"the trajectory: {joint} was {found:.4g} rad off {when}, allowed is {allowed:g} rad"
+                fields = {"axis": axis, "error": found, "limit": allowed}
+                raise Violation(RtcpError("fault", message, reason, fields))

@@ -1,0 +1,219 @@
+"""What a ROS node, or any program that streams, asks of the API: on a real socket between real processes."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections.abc import Callable, Coroutine
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rtcp
+from rtcp.api import Arrival, AsyncRobot, Robot, State
+from rtcp.ipc.runtime_directory import control_socket
+from tests.e2e.conftest import Platform
+
+pytestmark = pytest.mark.alone
+
+HOME = [0.0, 0.3, 1.57, 0.0, 0.5, 0.0]
+
+
+def at(first: float) -> list[float]:
+    return [first, *HOME[1:]]
+
+
+@pytest.fixture
+def robot(shared: Platform) -> Robot:
+    robot = rtcp.connect("a program", control_socket(shared.directory))
+    if robot.state is State.READY:
+        robot.enable()
+    robot.move_joints(HOME)
+    return robot
+
+
+def run(shared: Platform, work: Callable[[AsyncRobot], Coroutine[Any, Any, Any]]) -> Any:
+    async def connected() -> Any:
+        async with rtcp.connect_async("a program", control_socket(shared.directory)) as made:
+            return await work(made)
+
+    return asyncio.run(connected())
+
+
+def largest_step(feed: rtcp.Feed) -> float:
+    """Return the largest change of a commanded velocity between answered cycles, as part of acceleration x cycle."""
+    records, missing = feed.records()
+    assert not missing
+    answered = records["wkc"] == records["wkc_expected"]
+    assert len(records) > 100
+    period_s = feed.period_ns * 1e-9
+    change = np.abs(np.diff(np.diff(records["commanded_position"], axis=0), axis=0)).max(axis=1) / period_s**2
+    # The setpoints stand still in a cycle without an answer.
+    whole = answered[:-2] & answered[1:-1] & answered[2:]
+    most = min(joint.acceleration for joint in feed.config.joints)
+    return float(change[whole].max() / most)
+
+
+def test_a_motion_replaces_another_without_a_stop_and_each_ends_with_its_own_outcome(
+    shared: Platform, robot: Robot
+) -> None:
+    robot.close()
+    feed = rtcp.Feed(shared.directory)
+
+    async def moves(arm: AsyncRobot) -> list[Any]:
+        first = asyncio.create_task(arm.move_joints(at(0.6)))
+        await asyncio.sleep(0.7)
+        second = asyncio.create_task(arm.move_joints(at(-0.2), replace=True))
+        await asyncio.sleep(0.4)
+        points = [{"t": 0.0, "q": at(0.3)}, {"t": 3.0, "q": at(0.2)}, {"t": 4.5, "q": at(0.3)}]
+        third = asyncio.create_task(arm.run_trajectory(points, replace=True))
+        return await asyncio.gather(first, second, third, return_exceptions=True)
+
+    first, second, third = run(shared, moves)
+    assert (type(first), type(second)) == (rtcp.Replaced, rtcp.Replaced)
+    assert isinstance(third, Arrival)
+    assert third.positions[0] == pytest.approx(0.3, abs=1e-3)
+    assert largest_step(feed) <= 1.01
+    feed.close()
+
+
+def test_a_motion_that_would_replace_and_is_refused_leaves_the_other_as_it_is(shared: Platform, robot: Robot) -> None:
+    robot.close()
+
+    async def moves(arm: AsyncRobot) -> Any:
+        first = asyncio.create_task(arm.move_joints(at(0.3)))
+        await asyncio.sleep(0.4)
+        with pytest.raises(rtcp.Refused) as refused:
+            await arm.move_joints(at(9.0), replace=True)
+        assert refused.value.reason == "position_out_of_range"
+        return await first
+
+    assert run(shared, moves).positions[0] == pytest.approx(0.3, abs=1e-3)
+
+
+@pytest.mark.parametrize("rate_hz", [100, 1000, 2000])
+def test_a_stream_of_setpoints_loses_none_and_is_followed(shared: Platform, robot: Robot, rate_hz: int) -> None:
+    feed, turn = rtcp.Feed(shared.directory), 2 * math.pi * 0.4
+    with robot.open_stream() as stream:
+        began = time.monotonic()
+        for number in range(2 * rate_hz):
+            t = number / rate_hz
+            while time.monotonic() < began + t:
+                time.sleep(0)
+            velocity = [0.1 * turn * math.sin(turn * t), *[0.0] * 5]
+            stream.send(at(0.1 * (1 - math.cos(turn * t))), velocity, t=t)
+        feed.ended(0.1)
+        assert stream.taken == stream.sent == 2 * rate_hz
+    assert largest_step(feed) <= 1.01
+    feed.close()
+    robot.move_joints(HOME)  # the next command waits until the arm rests, and has the lease
+    robot.close()
+
+
+def test_a_setpoint_that_cannot_be_followed_ends_the_stream_and_the_next_send_says_why(robot: Robot) -> None:
+    with robot.open_stream() as stream:
+        stream.send(HOME)
+        stream.send(at(9.0))
+        while stream.is_open:
+            time.sleep(0.002)
+        with pytest.raises(rtcp.Faulted) as ended:
+            stream.send(HOME)
+    assert (ended.value.reason, ended.value.fields["axis"], ended.value.fields["value"]) == (
+        "setpoint_out_of_range", 0, 9.0,
+    )  # fmt: skip
+    with robot.open_stream() as stream:
+        stream.send([math.nan, *HOME[1:]])
+        while stream.is_open:
+            time.sleep(0.002)
+        with pytest.raises(rtcp.Faulted, match="joint1: a number of the stream's setpoint is not finite"):
+            stream.send(HOME)
+    with robot.open_stream() as stream, pytest.raises(rtcp.Invalid, match="q: found 2 numbers"):
+        stream.send([0.0, 0.0])
+    robot.close()
+
+
+def test_a_stream_ends_with_a_halt_of_anyone_and_moves_nothing_after_it(shared: Platform, robot: Robot) -> None:
+    with robot.open_stream() as stream:
+        stream.send(HOME)
+        shared.rtcp("halt")
+        with pytest.raises(rtcp.Faulted):
+            stream.send(at(0.5))
+    assert robot.status().commanded_positions[0] == pytest.approx(0.0, abs=1e-6)
+    robot.close()
+
+
+def test_points_are_appended_while_the_trajectory_runs(shared: Platform, robot: Robot) -> None:
+    feed = rtcp.Feed(shared.directory)
+    robot.open_trajectory([{"t": 0.5 * k, "q": at(0.2 * (1 - math.cos(0.5 * k)))} for k in (1, 2)])
+    for number in range(3, 10):
+        while robot.append([{"t": 0.5 * number, "q": at(0.2 * (1 - math.cos(0.5 * number)))}]).ahead_s > 0.7:
+            time.sleep(0.05)
+            break
+        time.sleep(0.3)
+    arrival = robot.finish_trajectory()
+    assert arrival.positions[0] == pytest.approx(0.2 * (1 - math.cos(4.5)), abs=1e-3)
+    assert largest_step(feed) <= 1.01
+    feed.close()
+    robot.close()
+
+
+def test_a_trajectory_that_runs_out_of_points_stops_and_says_so(robot: Robot) -> None:
+    robot.open_trajectory([{"t": 0.4, "q": at(0.05)}, {"t": 0.8, "q": at(0.1)}])
+    while robot.status().state is State.MOVING:
+        time.sleep(0.05)
+    with pytest.raises(rtcp.Faulted) as ended:
+        robot.append([{"t": 2.0, "q": at(0.2)}])
+    assert ended.value.reason == "out_of_points"
+    assert robot.status().positions[0] == pytest.approx(0.1, abs=1e-3)
+    with pytest.raises(rtcp.Refused) as refused:
+        robot.append([{"t": 3.0, "q": at(0.2)}])
+    assert refused.value.reason == "not_open"
+    robot.close()
+
+
+def test_more_points_than_fit_are_refused_and_the_trajectory_goes_on(robot: Robot) -> None:
+    robot.open_trajectory([{"t": 1.0, "q": at(0.05)}, {"t": 30.0, "q": at(0.1)}])
+    with pytest.raises(rtcp.Refused) as refused:
+        robot.append([{"t": 31.0 + k, "q": HOME} for k in range(4096)])
+    assert refused.value.reason == "no_room_for_points"
+    assert robot.append([{"t": 31.0, "q": at(0.1)}]).room < 4096
+    robot.move_joints(HOME)  # ends it, and waits until the arm rests
+    robot.close()
+
+
+def test_a_trajectory_outside_its_tolerances_brakes_and_says_by_how_much(robot: Robot) -> None:
+    points = [{"t": 0.0, "q": HOME}, {"t": 1.0, "q": at(0.2)}, {"t": 2.0, "q": HOME}]
+    with pytest.raises(rtcp.Faulted) as ended:
+        robot.run_trajectory(points, path_tolerance=[1e-5, *[0.0] * 5])
+    assert ended.value.reason == "path_tolerance_violated"
+    assert ended.value.fields["error"] > ended.value.fields["limit"] == 1e-5
+    robot.move_joints(HOME)
+    robot.run_trajectory(points, goal_tolerance=[0.01] * 6, path_tolerance=[0.5] * 6)
+    with pytest.raises(rtcp.Refused, match="must be where it is"):
+        robot.run_trajectory([{"t": 0.0, "q": at(0.004)}, *points[1:]])
+    robot.run_trajectory([{"t": 0.0, "q": at(0.004)}, *points[1:]], start_tolerance=0.01)
+    robot.close()
+
+
+def test_every_record_wakes_whoever_waits_for_it(shared: Platform, robot: Robot) -> None:
+    robot.close()
+    feed, numbers = rtcp.Feed(shared.directory), []
+    while len(numbers) < 200:
+        assert feed.wait(5.0)
+        records, missing = feed.records()
+        assert not missing
+        numbers += records["number"].tolist()
+    assert all(b == a + 1 for a, b in pairwise(numbers))
+    assert not feed.wait(0.0)
+    feed.close()
+
+
+def test_limits_and_robot_status_are_typed(robot: Robot) -> None:
+    status, limits = robot.status(), robot.joint_limits()
+    assert [one.name for one in limits] == list(status.joint_names)
+    assert limits[0].min < limits[0].max
+    assert (status.robot.mode, status.robot.motion_possible, status.robot.in_error) == ("auto", True, False)
+    robot.close()
