@@ -34,9 +34,8 @@ class FakeTrajectory:
 class FakeArm:
     """`calls` has the name and the arguments of each call; "cancelled" where a motion's task was."""
 
-    def __init__(self, joints: int = 6) -> None:
-        self.joints = joints
-        self.state: ArmState | None = ArmState(1, HOME, (0.0,) * 6, HOME, READY)
+    def __init__(self, positions: Joints = HOME) -> None:
+        self.state: ArmState | None = ArmState(1, positions, (0.0,) * len(positions), positions, READY)
         self.calls: list[tuple[Any, ...]] = []
         self.called = asyncio.Event()
         self.refuses: dict[str, RtcpError] = {}
@@ -100,7 +99,7 @@ class FakeArm:
         self.motion.set_exception(error)
 
     async def until(self, *names: str) -> None:
-        """Wait until these calls, in this order, are the last ones; a cancelled task may come before or after a stop."""
+        """Wait until these calls are the last ones; a task is cancelled before or after its stop."""
         while [name for name in self.names if name != "cancelled"][-len(names) :] != list(names):
             self.called.clear()
             await self.called.wait()

@@ -48,8 +48,8 @@ def at(time: float, q1: float = 0.5) -> Point:
 class Receiver:
     """A sequence of an arm at HOME, with a clock that the test sets."""
 
-    def __init__(self, state: ArmState | None = STATE, joints: int = 6) -> None:
-        self.sequence = PointSequence(joints)
+    def __init__(self, state: ArmState | None = STATE) -> None:
+        self.sequence = PointSequence()
         self.state = state
         self.now = 100.0
 
@@ -215,7 +215,7 @@ def test_another_robot_is_refused(receive: Receiver) -> None:
 
 def test_our_message_moves_an_arm_of_twelve_joints() -> None:
     twelve = tuple(0.1 * joint for joint in range(12))
-    receive = Receiver(replace(STATE, commanded=(0.0,) * 12), 12)
+    receive = Receiver(replace(STATE, commanded=(0.0,) * 12))
     assert receive(JointPoint(0, 1.0, twelve)) == [Begin(Point(1.0, twelve))]
     receive.refuses(point(0), "found 10 joints, and the arm has 12")
 

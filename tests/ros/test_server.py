@@ -663,7 +663,7 @@ def test_the_state_of_an_arm_with_more_than_ten_joints_is_our_own_message() -> N
         while not isinstance(message := await peer.message(), JointPoint):
             assert isinstance(message, Status)
 
-    run(client, arm=FakeArm(12))
+    run(client, arm=FakeArm((0.125,) * 12))
 
 
 def test_a_silent_state_client_is_sent_the_byte_order_of_the_motion_client_at_its_address() -> None:

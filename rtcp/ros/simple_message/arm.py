@@ -54,10 +54,6 @@ class Arm(Protocol):
     """
 
     @property
-    def joints(self) -> int:
-        """How many joints it has."""
-
-    @property
     def state(self) -> ArmState | None:
         """The newest sample; None: the platform is not there."""
 

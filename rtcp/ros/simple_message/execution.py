@@ -126,7 +126,8 @@ class MotionExecutor:
         self._supersede()
         for motion in self._motions:
             motion.cancel()
-        self._keep(self._halts, self._try(self._arm.halt))
+        if not self._halts:
+            self._keep(self._halts, self._try(self._arm.halt))
 
     def halt_own(self) -> None:
         """Stop what this client moves; another commander's motion goes on."""
@@ -233,7 +234,7 @@ class MotionExecutor:
     async def _feed(self, stream: _Stream, trajectory: OpenTrajectory, last: float) -> None:
         """Append points until the trajectory has ended; `last`: time of the last point, s."""
         ended = self._start(trajectory.wait(), stream.series)
-        while not ended.done():
+        while not ended.done() and stream is self._stream:
             if stream.points:
                 points, newest = list(stream.points), stream.points[-1].time
                 try:

@@ -98,15 +98,12 @@ _BEGINNINGS = {
 
 
 class PointSequence:
-    """The sequence of points of one client.
+    """The sequence of points of one client."""
 
-    Args:
-        joints: of the arm.
-    """
-
-    def __init__(self, joints: int) -> None:
-        self._joints = joints
+    def __init__(self) -> None:
         self._ignore_targets_until = -math.inf
+        self._commanded: Joints = ()
+        """Where the arm was commanded at the beginning, rad."""
         self._begin(_Mode.IDLE)
 
     def _begin(self, mode: _Mode) -> None:
@@ -154,7 +151,7 @@ class PointSequence:
             self._ignore_targets_until = now + REALTIME_PAUSE_S
             raise PointIgnored
         self._begin(_Mode.IDLE)
-        _check_ready(state)
+        self._commanded = _commanded_by(state)
         return [Target(self._checked("position", message.positions))]
 
     def _point(self, message: TrajectoryPoint, state: ArmState | None) -> list[Order]:
@@ -162,11 +159,11 @@ class PointSequence:
         is_mark = number < 0 and _is_bare(message)
         if number in _BEGINNINGS and number not in self._next:
             self._begin(_BEGINNINGS[number])
-            _check_ready(state)
+            self._commanded = _commanded_by(state)
             if is_mark:
                 self._next = (0, 1)
                 return []
-            return self._add(message, state)
+            return self._add(message)
         if self._mode is _Mode.IGNORING:
             raise PointIgnored
         if message == self._last:
@@ -174,16 +171,16 @@ class PointSequence:
         if number == SpecialSequence.END_TRAJECTORY and self._mode is not _Mode.IDLE:
             # The reference client sends a trajectory of one point as its begin and as its end.
             is_repeated = self._last is not None and message == replace(self._last, sequence=number)
-            added = [] if is_mark or is_repeated else self._add(message, state)
+            added = [] if is_mark or is_repeated else self._add(message)
             return [*added, *self._end(message)]
         if number not in self._next:
             expected = " or ".join(map(str, self._next)) or "0 (a trajectory) or -1 (a download)"
             raise PointRefused(f"sequence {number} came where {expected} follows: the motion is aborted")
-        return self._add(message, state)
+        return self._add(message)
 
-    def _add(self, message: TrajectoryPoint, state: ArmState | None) -> list[Order]:
+    def _add(self, message: TrajectoryPoint) -> list[Order]:
         """Take the next point of the trajectory."""
-        point = self._point_of(message, state)
+        point = self._point_of(message)
         is_first, self._first = self._first is None, self._first or point
         if [each is None for each in point] != [each is None for each in self._first]:
             raise PointRefused(f"sequence {message.sequence}: its fields are not those of the first point")
@@ -206,7 +203,7 @@ class PointSequence:
             return [Finish()]
         return [Execute(points)] if points[-1].time > 0.0 else []  # the arm is at its only point already
 
-    def _point_of(self, message: TrajectoryPoint, state: ArmState | None) -> Point:
+    def _point_of(self, message: TrajectoryPoint) -> Point:
         """Return the point with its time from the start of the trajectory."""
         velocities: Joints = ()
         accelerations: Joints = ()
@@ -222,16 +219,16 @@ class PointSequence:
                 raise PointRefused(f"valid_fields {valid:d}: a point needs a time (1) and positions (2)")
             velocities = velocities if valid & ValidFields.VELOCITY else ()
             accelerations = accelerations if valid & ValidFields.ACCELERATION else ()
-        elif isinstance(message, JointPoint) and len(message.positions) != self._joints:
-            raise PointRefused(f"found {len(message.positions)} joints, and the arm has {self._joints}")
+        elif isinstance(message, JointPoint) and len(message.positions) != len(self._commanded):
+            raise PointRefused(f"found {len(message.positions)} joints, and the arm has {len(self._commanded)}")
         positions = self._checked("position", message.positions)
         if accelerations and not velocities:
             raise PointRefused(f"sequence {message.sequence}: it has accelerations and no velocities")
         if not math.isfinite(time):
             raise PointRefused(f"sequence {message.sequence}: a time of {time} s is not finite")
-        if self._first is None and _is_at(positions, state):
+        if self._first is None and self._is_at_start(positions):
             self._offset, time = (0.0 if isinstance(message, JointTrajPt) else time), 0.0
-            positions = state.commanded if state else positions
+            positions = self._commanded
         elif time <= self._time:
             raise PointRefused(
                 f"sequence {message.sequence}: its time, {time:g} s, is not later than {self._time:g} s: "
@@ -244,16 +241,21 @@ class PointSequence:
             self._checked("acceleration", accelerations) if accelerations else None,
         )
 
+    def _is_at_start(self, positions: Joints) -> bool:
+        pairs = zip(positions, self._commanded, strict=True)
+        return all(abs(wanted - commanded) <= AT_START_RAD for wanted, commanded in pairs)
+
     def _checked(self, name: str, values: Sequence[float]) -> Joints:
         """Return the arm's share of a message's numbers; the rest of ten must be 0."""
+        count = len(self._commanded)
         for joint, value in enumerate(values, start=1):
             if not math.isfinite(value):
                 raise PointRefused(f"joint {joint}: the {name} {value} is not finite")
-            if joint > self._joints and value:
-                raise PointRefused(f"joint {joint}: found the {name} {value:g}, and the arm has {self._joints} joints")
-        if len(values) < self._joints:
-            raise PointRefused(f"found {len(values)} joints, and the arm has {self._joints}")
-        return tuple(values[: self._joints])
+            if joint > count and value:
+                raise PointRefused(f"joint {joint}: found the {name} {value:g}, and the arm has {count} joints")
+        if len(values) < count:
+            raise PointRefused(f"found {len(values)} joints, and the arm has {count}")
+        return tuple(values[:count])
 
 
 def _is_bare(message: TrajectoryPoint) -> bool:
@@ -262,13 +264,8 @@ def _is_bare(message: TrajectoryPoint) -> bool:
     return time == 0.0 and not any(message.positions)
 
 
-def _is_at(positions: Joints, state: ArmState | None) -> bool:
-    return state is not None and all(
-        abs(wanted - now) <= AT_START_RAD for wanted, now in zip(positions, state.commanded, strict=True)
-    )
-
-
-def _check_ready(state: ArmState | None) -> None:
+def _commanded_by(state: ArmState | None) -> Joints:
+    """Return where the arm is commanded, rad; raises PointRefused where it cannot move."""
     if state is None:
         raise PointRefused("the platform is not there: start it with `rtcp start`")
     for field, value, problem in (
@@ -278,3 +275,4 @@ def _check_ready(state: ArmState | None) -> None:
     ):
         if field is value:
             raise PointRefused(problem)
+    return state.commanded

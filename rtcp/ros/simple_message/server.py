@@ -142,7 +142,7 @@ class _MotionSession:
         self.client = client
         self._arm = arm
         self._executor = executor
-        self._sequence = PointSequence(arm.joints)
+        self._sequence = PointSequence()
         self._is_refusing = False
         self._has_ended = False
         self.has_commanded = False
@@ -338,7 +338,7 @@ class SimpleMessageServer:
 
     def _positions(self, state: ArmState, seconds: float) -> list[Message]:
         """Return the messages on the joints; `seconds`: of the sample since the first one."""
-        if self._arm.joints > JOINTS:
+        if len(state.positions) > JOINTS:
             return [JointPoint(0, seconds, state.positions, state.velocities)]
         messages: list[Message] = [JointPosition(0, state.positions)]
         if self._options.joint_feedback:
