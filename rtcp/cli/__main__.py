@@ -26,6 +26,7 @@ from rtcp.cli import (
     platform,
     record,
     recorded,
+    ros,
     segment,
     service,
     soak,
@@ -65,7 +66,7 @@ def _root(
 
 _GROUPS = (
     platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults, record, recorded, live,
-    experiment, panel,
+    experiment, panel, ros,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)
