@@ -41,6 +41,7 @@ class _Stream:
         self.is_finished = False
         self.is_running = False
         self.changed = asyncio.Event()
+        """A point came, the last one came, or the arm has run out of them."""
 
     def add(self, point: Point) -> None:
         """Put a point behind the others."""
@@ -234,6 +235,7 @@ class MotionExecutor:
     async def _feed(self, stream: _Stream, trajectory: OpenTrajectory, last: float) -> None:
         """Append points until the trajectory has ended; `last`: time of the last point, s."""
         ended = self._start(trajectory.wait(), stream.series)
+        ended.add_done_callback(lambda _: stream.changed.set())
         while not ended.done() and stream is self._stream:
             if stream.points:
                 points, newest = list(stream.points), stream.points[-1].time
@@ -249,7 +251,5 @@ class MotionExecutor:
                 await asyncio.wait({ended})
             else:
                 stream.changed.clear()
-                more = asyncio.ensure_future(stream.changed.wait())
-                await asyncio.wait({ended, more}, return_when=asyncio.FIRST_COMPLETED)
-                more.cancel()
+                await stream.changed.wait()
         stream.begin = last
