@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import math
 import re
 from collections.abc import Sequence
@@ -144,3 +145,11 @@ def check_picture(option: str, file: Path) -> None:
     """Refuse a picture file whose ending names no known format; raises CommandError."""
     if file.suffix.lower() not in PICTURES:
         raise CommandError(f"{option} {file}: the ending must be one of {', '.join(PICTURES)}")
+
+
+def is_loopback(host: str) -> bool:
+    """Return whether an address to listen at is reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import ipaddress
 from typing import Annotated
 
 import typer
 
-from rtcp.cli.arguments import option
+from rtcp.cli.arguments import is_loopback, option
 from rtcp.cli.output import CommandError, ExitCode, report, signals_raise
 from rtcp.config.find import default_config
 from rtcp.ipc.runtime_directory import runtime_directory
@@ -31,16 +30,9 @@ def _live(
             view = LiveView(runtime_directory(), host, port, every)
             layout = default_config().parent / "layouts" / "foxglove.json"
             report(f"{view.url}: open it in Foxglove or Lichtblick, with the layout {layout}; Ctrl-C ends it")
-            if not _is_loopback(host):
+            if not is_loopback(host):
                 report(f"whoever reaches {host} can watch: nobody is asked for a name")
             view.run()
     except KeyboardInterrupt:
         raise typer.Exit(ExitCode.DONE) from None  # the normal end of a view
     raise CommandError("the platform has ended", ExitCode.NOT_RUNNING)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

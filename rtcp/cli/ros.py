@@ -1,13 +1,22 @@
-"""`rtcp ros`: the arm as a ROS node."""
+"""`rtcp ros`: the arm as a ROS node, or as a Simple Message server."""
 
 from __future__ import annotations
 
-from typing import Annotated
+import asyncio
+import logging
+import signal
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from rtcp.cli.arguments import option
+from rtcp.cli.arguments import is_loopback, option
 from rtcp.cli.output import CommandError, ExitCode, report
+from rtcp.ipc.runtime_directory import log_format
+
+if TYPE_CHECKING:
+    from rtcp.ros.simple_message.server import ServerOptions
 
 commands = typer.Typer()
 
@@ -25,8 +34,40 @@ def _ros(
         bool, option("--auto-enable", "A motion enables the drives, but not after a stop, a fault or robot_disable.")
     ] = False,
     partial: Annotated[bool, option("--partial", "Joints that a trajectory does not name hold.")] = False,
+    simple_message: Annotated[
+        bool, option("--simple-message", "No node: serve Simple Message, motion and state (docs/simple_message.md).")
+    ] = False,
+    motion_port: Annotated[int, typer.Option("--motion-port", min=0, max=65535, help="Port; 0: a free one.")] = 11000,
+    state_port: Annotated[int, typer.Option("--state-port", min=0, max=65535, help="Port; 0: a free one.")] = 11002,
+    bind: Annotated[
+        str, option("--bind", "ADDRESS", "Address to listen at. Default: this machine only.")
+    ] = "127.0.0.1",
+    byte_order: Annotated[
+        str, option("--byte-order", "auto|little|big", "Of the clients; auto: as they speak, else little.")
+    ] = "auto",
+    joint_feedback: Annotated[
+        bool,
+        option("--joint-feedback", "Send velocities too (JOINT_FEEDBACK), which the reference client complains of."),
+    ] = False,
 ) -> None:
-    """Run the arm as a ROS 1 node, until Ctrl-C (docs/ros.md); waits for the master and the platform."""
+    """Serve the arm to ROS until Ctrl-C: a ROS 1 node (docs/ros.md), or a Simple Message server.
+
+    Waits for a platform, and for a master, that do not run.
+    """
+    if simple_message:
+        from rtcp.ros.simple_message.messages import ByteOrder
+        from rtcp.ros.simple_message.server import ServerOptions
+
+        orders = {"auto": None, "little": ByteOrder.LITTLE, "big": ByteOrder.BIG}
+        if byte_order not in orders:
+            raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
+        asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)))
+    else:
+        _run_node(name, rate, remappings or (), enable, partial)
+
+
+def _run_node(name: str, rate: float, remappings: Sequence[str], enable: bool, partial: bool) -> None:
+    """Run a ROS 1 node."""
     from rtcp.ros import ros1_messages
 
     try:
@@ -36,8 +77,32 @@ def _ros(
     from rtcp.ros import ros1
     from rtcp.ros.commands import CommandOptions
 
-    for argument in remappings or ():
+    for argument in remappings:
         if ":=" not in argument:
             raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
     report(f"node {name}: Ctrl-C ends it")
-    ros1.run(ros1.NodeOptions(name, rate, remappings or (), CommandOptions(enable, partial)))
+    ros1.run(ros1.NodeOptions(name, rate, remappings, CommandOptions(enable, partial)))
+
+
+async def _serve(options: ServerOptions) -> None:
+    """Serve Simple Message until a signal comes; the arm stops then as if its client was lost."""
+    from rtcp.ros.simple_message.robot_arm import RobotArm
+    from rtcp.ros.simple_message.server import SimpleMessageServer
+
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(log_format())
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    ended = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        asyncio.get_running_loop().add_signal_handler(number, ended.set)
+    arm = RobotArm()
+    connection = asyncio.create_task(arm.run())
+    try:
+        async with SimpleMessageServer(arm, options) as server:
+            motion, state = server.ports
+            report(f"motion at {options.bind}:{motion}, state at {options.bind}:{state}; Ctrl-C ends it")
+            if not is_loopback(options.bind):
+                report(f"whoever reaches {options.bind} can move the arm: nobody is asked for a name")
+            await ended.wait()
+    finally:
+        connection.cancel()

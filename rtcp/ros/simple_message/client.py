@@ -1,0 +1,175 @@
+"""A client of controllers that speak Simple Message, other makers' too: their state, and motion.
+
+Each connection is made again once a second while there is none, as the driver specification of ROS-Industrial asks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+
+from rtcp.ros.simple_message.framing import Frame, FrameDecoder, FrameError
+from rtcp.ros.simple_message.messages import (
+    JOINTS,
+    ByteOrder,
+    CommType,
+    JointTrajPt,
+    Message,
+    MessageError,
+    ReplyCode,
+    SpecialSequence,
+)
+from rtcp.ros.simple_message.server import MOTION_PORT, STATE_PORT, notice_lost_peer
+
+RECONNECT_S = 1.0
+REPLY_TIMEOUT_S = 5.0
+_READ_BYTES = 4096
+log = logging.getLogger(__name__)
+
+
+class _Connection:
+    """A connection that is made again while `run` runs.
+
+    Args:
+        host: name or address.
+        port: of the controller.
+        order: its byte order; None: that of its first length.
+    """
+
+    def __init__(self, host: str, port: int, order: ByteOrder | None) -> None:
+        self._host, self._port, self._order = host, port, order
+        self._writer: asyncio.StreamWriter | None = None
+        self._problem = ""
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the controller is there, as far as is known."""
+        return self._writer is not None
+
+    async def run(self) -> None:
+        """Connect and receive, again and again, until cancelled; a problem is logged once for as long as it lasts."""
+        while True:
+            try:
+                await self._serve()
+                problem = "the controller closed the connection"
+            except (FrameError, MessageError, OSError) as error:
+                problem = str(error)
+            if problem != self._problem:
+                log.warning("controller %s:%d: %s", self._host, self._port, problem)
+            self._problem = problem
+            await asyncio.sleep(RECONNECT_S)
+
+    async def _serve(self) -> None:
+        reader, writer = await asyncio.open_connection(self._host, self._port)
+        try:
+            notice_lost_peer(writer.get_extra_info("socket"))
+            decoder = FrameDecoder(self._order)
+            self._writer = writer
+            log.info("controller %s:%d: connected", self._host, self._port)
+            while data := await reader.read(_READ_BYTES):
+                for frame in decoder.feed(data):
+                    self._problem = ""
+                    self._receive(frame, decoder.order or ByteOrder.LITTLE)
+            decoder.end()
+        finally:
+            self._writer = None
+            writer.transport.abort()
+            self._disconnected()
+
+    def _receive(self, frame: Frame, order: ByteOrder) -> None:
+        raise NotImplementedError
+
+    def _disconnected(self) -> None:
+        pass
+
+
+class StateClient(_Connection):
+    """Receives the state of a controller.
+
+    Args:
+        host: name or address.
+        receive: called with each message; unknown ones are left out.
+        port: of the controller.
+        order: its byte order; None: that of its first length.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        receive: Callable[[Message], None],
+        port: int = STATE_PORT,
+        order: ByteOrder | None = None,
+    ) -> None:
+        super().__init__(host, port, order)
+        self._received = receive
+
+    def _receive(self, frame: Frame, order: ByteOrder) -> None:
+        code = ReplyCode.SUCCESS
+        try:
+            self._received(frame.message(order))
+        except MessageError as error:
+            code = ReplyCode.FAILURE
+            log.debug("controller %s:%d: %s", self._host, self._port, error)
+        if frame.comm_type is CommType.SERVICE_REQUEST and self._writer is not None:
+            self._writer.write(frame.reply(code).pack(order))
+
+
+class MotionClient(_Connection):
+    """Sends motion to a controller; `run` it beside.
+
+    Args:
+        host: name or address.
+        port: of the controller.
+        order: its byte order, in which the client speaks first.
+    """
+
+    def __init__(self, host: str, port: int = MOTION_PORT, order: ByteOrder = ByteOrder.LITTLE) -> None:
+        super().__init__(host, port, order)
+        self._speaks = order
+        self._pending: deque[asyncio.Future[Frame]] = deque()
+        """Requests in the order in which their replies come."""
+
+    def send(self, message: Message) -> None:
+        """Send a topic, which nobody answers; raises ConnectionError where there is no connection."""
+        self._write(Frame.topic(message, self._speaks))
+
+    async def request(self, message: Message) -> Frame:
+        """Send a request and return its reply; it waits for no other one.
+
+        Raises:
+            ConnectionError: no connection, or it was lost before the reply.
+            TimeoutError: no reply in 5 s; the connection is closed, so that none comes in the place of a later one.
+        """
+        self._write(Frame.request(message, self._speaks))
+        reply: asyncio.Future[Frame] = asyncio.get_running_loop().create_future()
+        self._pending.append(reply)
+        try:
+            return await asyncio.wait_for(reply, REPLY_TIMEOUT_S)
+        except asyncio.TimeoutError:
+            if self._writer is not None:
+                self._writer.transport.abort()
+            raise TimeoutError(f"no reply to {message.TYPE.name} in {REPLY_TIMEOUT_S:g} s") from None
+
+    async def stop(self) -> bool:
+        """Stop the robot; return whether the controller says that it does. Errors as of `request`."""
+        stop = JointTrajPt(SpecialSequence.STOP_TRAJECTORY, (0.0,) * JOINTS, 0.0, 0.0)
+        return (await self.request(stop)).reply_code is ReplyCode.SUCCESS
+
+    def _write(self, frame: Frame) -> None:
+        if self._writer is None:
+            raise ConnectionError(f"no connection to the controller {self._host}:{self._port}")
+        self._writer.write(frame.pack(self._speaks))
+
+    def _receive(self, frame: Frame, order: ByteOrder) -> None:
+        if frame.comm_type is CommType.SERVICE_REPLY and self._pending:
+            reply = self._pending.popleft()
+            if not reply.done():  # else nobody waits for it any more
+                reply.set_result(frame)
+
+    def _disconnected(self) -> None:
+        for reply in self._pending:
+            if not reply.done():
+                reply.set_exception(ConnectionError("the connection was lost before the reply"))
+        self._pending.clear()

@@ -1,0 +1,363 @@
+"""The messages of Simple Message and their bytes (ROS-Industrial REP-I0004: numbers, REP-I0006: layouts).
+
+A body has int32 and float32 without padding, in either byte order. Joints are from base to tool. Units: rad, s.
+`JointPoint` is our own: any number of joints, float64.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
+from enum import Enum, IntEnum, IntFlag
+from typing import ClassVar, TypeAlias
+
+JOINTS = 10
+"""Joints of every message but `JointPoint`; those that an arm does not have are 0."""
+Joints: TypeAlias = tuple[float, ...]
+
+
+class ByteOrder(Enum):
+    """A build option of the peer; nothing in the protocol says it. The values are those of `struct`."""
+
+    LITTLE = "<"
+    BIG = ">"
+
+
+class MessageType(IntEnum):
+    """The messages known here; 12, 20 and 21 are deprecated, and no layout of them is agreed on."""
+
+    PING = 1
+    GET_VERSION = 2
+    JOINT_POSITION = 10
+    JOINT_TRAJ_PT = 11
+    STATUS = 13
+    JOINT_TRAJ_PT_FULL = 14
+    JOINT_FEEDBACK = 15
+    JOINT_POINT = 65000
+    """Ours, from the range that REP-I0004 leaves free."""
+
+
+class CommType(IntEnum):
+    """How a message is answered: a topic is not."""
+
+    TOPIC = 1
+    SERVICE_REQUEST = 2
+    SERVICE_REPLY = 3
+
+
+class ReplyCode(IntEnum):
+    """INVALID in all but replies."""
+
+    INVALID = 0
+    SUCCESS = 1
+    FAILURE = 2
+
+
+class SpecialSequence(IntEnum):
+    """What a sequence number below 0 says; from 0 it counts the points of a trajectory."""
+
+    START_TRAJECTORY_DOWNLOAD = -1
+    START_TRAJECTORY_STREAMING = -2
+    END_TRAJECTORY = -3
+    STOP_TRAJECTORY = -4
+
+
+class ValidFields(IntFlag):
+    """Which fields of a point have a meaning."""
+
+    TIME = 1
+    POSITION = 2
+    VELOCITY = 4
+    ACCELERATION = 8
+
+
+class TriState(IntEnum):
+    """A yes or no that may be unknown."""
+
+    UNKNOWN = -1
+    FALSE = 0
+    TRUE = 1
+
+
+class RobotMode(IntEnum):
+    """Who may command the arm."""
+
+    UNKNOWN = -1
+    MANUAL = 1
+    AUTO = 2
+
+
+class MessageError(ValueError):
+    """Values that a message cannot carry, or a body of another length than its layout."""
+
+
+@dataclass(frozen=True)
+class Ping:
+    """Is the peer there. REP-I0006 has ten zeros behind the header, the reference client none: both are read."""
+
+    TYPE: ClassVar = MessageType.PING
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        return b""
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> Ping:
+        """Read a body; raises MessageError."""
+        if body:
+            _unpack(cls.TYPE, order, "10i", body)
+        return cls()
+
+
+@dataclass(frozen=True)
+class GetVersion:
+    """Ask for a `Version`."""
+
+    TYPE: ClassVar = MessageType.GET_VERSION
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        return b""
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> GetVersion:
+        """Read a body; raises MessageError."""
+        _unpack(cls.TYPE, order, "", body)
+        return cls()
+
+
+@dataclass(frozen=True)
+class Version:
+    """The reply to `GetVersion`."""
+
+    TYPE: ClassVar = MessageType.GET_VERSION
+    major: int
+    minor: int
+    patch: int
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        return _pack(self.TYPE, order, "3i", self.major, self.minor, self.patch)
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> Version:
+        """Read a body; raises MessageError."""
+        major, minor, patch = _unpack(cls.TYPE, order, "3i", body)
+        return cls(int(major), int(minor), int(patch))
+
+
+@dataclass(frozen=True)
+class JointPosition:
+    """Where the joints are (state), or shall be now (motion)."""
+
+    TYPE: ClassVar = MessageType.JOINT_POSITION
+    sequence: int
+    positions: Joints
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        return _pack(self.TYPE, order, "i10f", self.sequence, *_ten(self.TYPE, self.positions))
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> JointPosition:
+        """Read a body, with ten positions; raises MessageError."""
+        sequence, *positions = _unpack(cls.TYPE, order, "i10f", body)
+        return cls(int(sequence), tuple(positions))
+
+
+@dataclass(frozen=True)
+class JointTrajPt:
+    """A point of a trajectory, with the time since the point before."""
+
+    TYPE: ClassVar = MessageType.JOINT_TRAJ_PT
+    sequence: int
+    positions: Joints
+    velocity: float
+    """Fraction of the joint limits, 0 to 1."""
+    duration: float
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        positions = _ten(self.TYPE, self.positions)
+        return _pack(self.TYPE, order, "i10fff", self.sequence, *positions, self.velocity, self.duration)
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> JointTrajPt:
+        """Read a body, with ten positions; raises MessageError."""
+        sequence, *positions, velocity, duration = _unpack(cls.TYPE, order, "i10fff", body)
+        return cls(int(sequence), tuple(positions), velocity, duration)
+
+
+@dataclass(frozen=True)
+class Status:
+    """The fields of RobotStatus; without arguments: nothing is known."""
+
+    TYPE: ClassVar = MessageType.STATUS
+    drives_powered: TriState = TriState.UNKNOWN
+    e_stopped: TriState = TriState.UNKNOWN
+    error_code: int = -1
+    in_error: TriState = TriState.UNKNOWN
+    in_motion: TriState = TriState.UNKNOWN
+    mode: RobotMode = RobotMode.UNKNOWN
+    motion_possible: TriState = TriState.UNKNOWN
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        return _pack(self.TYPE, order, "7i", *astuple(self))
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> Status:
+        """Read a body; raises MessageError."""
+        powered, stopped, code, error, motion, mode, possible = map(int, _unpack(cls.TYPE, order, "7i", body))
+        try:
+            states = [TriState(each) for each in (powered, stopped, error, motion, possible)]
+            return cls(states[0], states[1], code, states[2], states[3], RobotMode(mode), states[4])
+        except ValueError as wrong:
+            raise MessageError(f"STATUS: {wrong}") from None
+
+
+@dataclass(frozen=True)
+class JointTrajPtFull:
+    """A point of a trajectory, with the time since its start; `valid_fields` says which fields count."""
+
+    TYPE: ClassVar = MessageType.JOINT_TRAJ_PT_FULL
+    robot_id: int
+    sequence: int
+    valid_fields: ValidFields
+    time: float
+    positions: Joints
+    velocities: Joints = ()
+    accelerations: Joints = ()
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        joints = _thirty(self.TYPE, self.positions, self.velocities, self.accelerations)
+        return _pack(self.TYPE, order, "3i31f", self.robot_id, self.sequence, self.valid_fields, self.time, *joints)
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> JointTrajPtFull:
+        """Read a body, with ten numbers in each field of the joints; raises MessageError."""
+        robot, sequence, valid, time, *joints = _unpack(cls.TYPE, order, "3i31f", body)
+        return cls(int(robot), int(sequence), ValidFields(int(valid) & 15), time, *_by_ten(joints))
+
+
+@dataclass(frozen=True)
+class JointFeedback:
+    """Where the joints are, and how they move."""
+
+    TYPE: ClassVar = MessageType.JOINT_FEEDBACK
+    robot_id: int
+    valid_fields: ValidFields
+    time: float
+    positions: Joints
+    velocities: Joints = ()
+    accelerations: Joints = ()
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        joints = _thirty(self.TYPE, self.positions, self.velocities, self.accelerations)
+        return _pack(self.TYPE, order, "2i31f", self.robot_id, self.valid_fields, self.time, *joints)
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> JointFeedback:
+        """Read a body, with ten numbers in each field of the joints; raises MessageError."""
+        robot, valid, time, *joints = _unpack(cls.TYPE, order, "2i31f", body)
+        return cls(int(robot), ValidFields(int(valid) & 15), time, *_by_ten(joints))
+
+
+@dataclass(frozen=True)
+class JointPoint:
+    """Any number of joints, in float64: a point of a trajectory (motion) or what is measured (state).
+
+    `sequence` and `time` are those of `JointTrajPtFull`. Empty velocities or accelerations are not sent.
+    """
+
+    TYPE: ClassVar = MessageType.JOINT_POINT
+    sequence: int
+    time: float
+    positions: Joints
+    velocities: Joints = ()
+    accelerations: Joints = ()
+
+    def pack(self, order: ByteOrder) -> bytes:
+        """Return the body."""
+        count, valid = len(self.positions), ValidFields.TIME | ValidFields.POSITION
+        for field, values in (
+            (ValidFields.VELOCITY, self.velocities),
+            (ValidFields.ACCELERATION, self.accelerations),
+        ):
+            if values and len(values) != count:
+                raise MessageError(f"JOINT_POINT: {len(values)} numbers beside the positions of {count} joints")
+            valid |= field if values else 0
+        numbers = (*self.positions, *self.velocities, *self.accelerations)
+        if (size := _POINT_HEAD_BYTES + 8 * len(numbers)) > MOST_BODY_BYTES:
+            raise MessageError(f"JOINT_POINT: {size} bytes of body for {count} joints; at most {MOST_BODY_BYTES} fit")
+        return _pack(self.TYPE, order, f"3id{len(numbers)}d", self.sequence, valid, count, self.time, *numbers)
+
+    @classmethod
+    def unpack(cls, body: bytes, order: ByteOrder) -> JointPoint:
+        """Read a body; raises MessageError."""
+        if len(body) < _POINT_HEAD_BYTES:
+            raise MessageError(f"JOINT_POINT: {len(body)} bytes of body; {_POINT_HEAD_BYTES} are its least")
+        sequence, bits, count = struct.unpack_from(f"{order.value}3i", body)
+        valid = ValidFields(bits & 15)
+        if count < 1 or not valid & ValidFields.TIME or not valid & ValidFields.POSITION:
+            raise MessageError(f"JOINT_POINT: {count} joints, valid_fields {bits}: it has a time (1) and positions (2)")
+        fields = 1 + bool(valid & ValidFields.VELOCITY) + bool(valid & ValidFields.ACCELERATION)
+        if len(body) != (size := _POINT_HEAD_BYTES + 8 * fields * count):
+            raise MessageError(f"JOINT_POINT: {len(body)} bytes of body; {size} are {fields} fields of {count} joints")
+        time, *numbers = struct.unpack_from(f"{order.value}{1 + fields * count}d", body, 12)
+        rows = [tuple(numbers[at : at + count]) for at in range(0, fields * count, count)]
+        velocities = rows[1] if valid & ValidFields.VELOCITY else ()
+        accelerations = rows[-1] if valid & ValidFields.ACCELERATION else ()
+        return cls(sequence, time, rows[0], velocities, accelerations)
+
+
+Message: TypeAlias = (
+    Ping | GetVersion | Version | JointPosition | JointTrajPt | Status | JointTrajPtFull | JointFeedback | JointPoint
+)
+TrajectoryPoint: TypeAlias = JointTrajPt | JointTrajPtFull | JointPoint
+
+MOST_BODY_BYTES = 1023 - 12
+"""The reference client receives into 1024 bytes and does not check; 12 bytes of the length are header."""
+_POINT_HEAD_BYTES = 20
+_KINDS: dict[int, type[Message]] = {
+    kind.TYPE: kind
+    for kind in (Ping, GetVersion, JointPosition, JointTrajPt, Status, JointTrajPtFull, JointFeedback, JointPoint)
+}
+
+
+def unpack_message(number: int, body: bytes, order: ByteOrder, is_reply: bool = False) -> Message:
+    """Return the message with this number; raises MessageError for an unknown one or another length."""
+    if number not in _KINDS:
+        raise MessageError(f"message {number} is not known")
+    kind = Version if is_reply and number == MessageType.GET_VERSION else _KINDS[number]
+    return kind.unpack(body, order)
+
+
+def _pack(kind: MessageType, order: ByteOrder, layout: str, *values: float) -> bytes:
+    try:
+        return struct.pack(order.value + layout, *values)
+    except (struct.error, OverflowError) as error:
+        raise MessageError(f"{kind.name}: {error}") from None
+
+
+def _unpack(kind: MessageType, order: ByteOrder, layout: str, body: bytes) -> tuple[float, ...]:
+    if len(body) != (size := struct.calcsize(order.value + layout)):
+        raise MessageError(f"{kind.name}: {len(body)} bytes of body; it has {size}")
+    return struct.unpack(order.value + layout, body)
+
+
+def _ten(kind: MessageType, values: Sequence[float]) -> Joints:
+    if len(values) > JOINTS:
+        raise MessageError(f"{kind.name}: {len(values)} joints; {JOINTS} fit, JOINT_POINT has room for more")
+    return (*values, *[0.0] * (JOINTS - len(values)))
+
+
+def _thirty(kind: MessageType, *fields: Sequence[float]) -> Joints:
+    return tuple(value for field in fields for value in _ten(kind, field))
+
+
+def _by_ten(values: Sequence[float]) -> tuple[Joints, Joints, Joints]:
+    return tuple(values[:10]), tuple(values[10:20]), tuple(values[20:])

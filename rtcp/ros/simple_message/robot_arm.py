@@ -1,0 +1,154 @@
+"""The arm of the running platform, through the public API."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Mapping, Sequence
+from typing import Any
+
+import rtcp
+from rtcp.ros.simple_message.arm import ArmState, Point
+from rtcp.ros.simple_message.messages import Joints, RobotMode, Status, TriState
+
+_RECONNECT_S = 1.0
+_WATCH_S = 0.1
+_LOOK_S = 0.05
+_OVER = ("out_of_points", "not_open")
+"""Reasons with which an open trajectory ends at its last point."""
+
+
+class RobotArm:
+    """An `Arm`: a connection to the platform, made again once a second while there is none; `run` it beside."""
+
+    def __init__(self) -> None:
+        self._robot: rtcp.AsyncRobot | None = None
+        self._feed: rtcp.Feed | None = None
+        self._state: ArmState | None = None
+        self._motions = 0
+        """Motions begun: the open trajectory of an earlier one is over."""
+
+    async def run(self) -> None:
+        """Keep the connection until cancelled; the end of it stops what the arm does through it."""
+        while True:
+            try:
+                await self._follow()
+            except rtcp.RtcpError:
+                pass  # its absence is seen in the state
+            await asyncio.sleep(_RECONNECT_S)
+
+    async def _follow(self) -> None:
+        feed = rtcp.Feed()
+        try:
+            async with rtcp.connect_async("Simple Message") as robot:
+                self._robot, self._feed = robot, feed
+                while robot.is_open and not feed.ended(0.0):
+                    await asyncio.sleep(_WATCH_S)
+        finally:
+            self._robot = self._feed = self._state = None
+            feed.close()
+
+    @property
+    def state(self) -> ArmState | None:
+        """The newest cycle record."""
+        if self._feed is not None:
+            records, _ = self._feed.records()
+            if len(records):
+                self._state = _state_of(records[-1])
+        return self._state
+
+    @property
+    def _connected(self) -> rtcp.AsyncRobot:
+        if self._robot is None:
+            raise rtcp.RtcpError("not running", "the platform is not there: start it with `rtcp start`")
+        return self._robot
+
+    async def run_trajectory(self, points: Sequence[Point]) -> None:
+        """Run a trajectory in the place of what moves."""
+        await self._moved(self._connected.run_trajectory(_as_json(points), replace=True))
+
+    async def move_joints(self, positions: Joints) -> None:
+        """Move to joint positions in the place of what moves."""
+        await self._moved(self._connected.move_joints(positions, replace=True))
+
+    async def _moved(self, motion: Awaitable[object]) -> None:
+        self._motions += 1
+        try:
+            await motion
+        except rtcp.Replaced:
+            pass
+
+    async def open_trajectory(self, points: Sequence[Point]) -> RobotTrajectory:
+        """Begin a trajectory in the place of what moves."""
+        self._motions += 1
+        trajectory = RobotTrajectory(self, self._connected, self._motions)
+        await self._connected.open_trajectory(_as_json(points), replace=True)
+        return trajectory
+
+    async def halt(self) -> None:
+        """Stop along the path."""
+        await self._connected.halt()
+
+    async def disable(self) -> None:
+        """Remove the torque."""
+        await self._connected.disable()
+
+    def is_newest(self, motion: int) -> bool:
+        """Whether no motion was begun after this one."""
+        return self._motions == motion
+
+
+class RobotTrajectory:
+    """The open trajectory of a `RobotArm`."""
+
+    def __init__(self, arm: RobotArm, robot: rtcp.AsyncRobot, motion: int) -> None:
+        self._arm, self._robot, self._motion = arm, robot, motion
+
+    async def append(self, points: Sequence[Point]) -> None:
+        """Append points."""
+        await self._robot.append(_as_json(points))
+
+    async def finish(self) -> None:
+        """Come to rest at the last point; returns there."""
+        await self._robot.finish_trajectory()
+
+    async def wait(self) -> None:
+        """Return when the arm has come to rest; how it ended comes only as the answer to a call."""
+        while self._arm.is_newest(self._motion):
+            await asyncio.sleep(_LOOK_S)
+            state = self._arm.state
+            if state is not None and state.status.in_motion is TriState.TRUE:
+                continue
+            try:
+                await self._robot.append([])
+            except rtcp.RtcpError as error:
+                if error.reason in _OVER or isinstance(error, rtcp.Replaced):
+                    return
+                raise
+
+
+def _as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
+    given: list[dict[str, Any]] = []
+    for time, positions, velocities, accelerations in points:
+        optional = {"v": velocities, "a": accelerations}
+        given.append({"t": time, "q": positions, **{key: value for key, value in optional.items() if value}})
+    return given
+
+
+def _state_of(record: Mapping[str, Any]) -> ArmState:
+    found = rtcp.RobotStatus.of_record(record)
+    status = Status(
+        drives_powered=TriState(found.drives_powered),
+        e_stopped=TriState(found.e_stopped),
+        error_code=found.error_code,
+        in_error=TriState(found.in_error),
+        in_motion=TriState(found.in_motion),
+        mode=RobotMode.MANUAL if found.mode == "manual" else RobotMode.AUTO,
+        motion_possible=TriState(found.motion_possible),
+    )
+    return ArmState(
+        stamp_ns=int(record["time_ns"]),
+        positions=tuple(map(float, record["actual_position"])),
+        velocities=tuple(map(float, record["actual_velocity"])),
+        commanded=tuple(map(float, record["commanded_position"])),
+        status=status,
+    )

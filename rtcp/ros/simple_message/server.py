@@ -1,0 +1,347 @@
+"""The arm as a robot controller of ROS-Industrial: asyncio servers for motion and state (`docs/simple_message.md`).
+
+Every request is answered in the turn of the event loop in which it was read: the reference client waits for replies
+without a limit of time, and takes a late one for the answer to its stop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import socket
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from types import TracebackType
+
+from rtcp import __version__
+from rtcp.ros.simple_message.arm import Arm, ArmState
+from rtcp.ros.simple_message.execution import MotionExecutor
+from rtcp.ros.simple_message.framing import Frame, FrameDecoder, FrameError
+from rtcp.ros.simple_message.messages import (
+    JOINTS,
+    ByteOrder,
+    CommType,
+    JointFeedback,
+    JointPoint,
+    JointPosition,
+    JointTrajPt,
+    JointTrajPtFull,
+    Message,
+    MessageError,
+    MessageType,
+    Ping,
+    ReplyCode,
+    Status,
+    TriState,
+    ValidFields,
+    Version,
+)
+from rtcp.ros.simple_message.sequence import Halt, PointIgnored, PointRefused, PointSequence
+
+MOTION_PORT = 11000
+STATE_PORT = 11002
+STATE_PERIOD_S = 0.01
+STALE_S = 0.5
+"""A sample older than this says nothing on the arm: all of RobotStatus is unknown."""
+_MOST_UNREAD = 1 << 16
+"""Bytes: a client that reads nothing is dropped."""
+_KEEPALIVE_IDLE_S, _KEEPALIVE_INTERVAL_S, _KEEPALIVE_PROBES = 1, 1, 3
+_USER_TIMEOUT_MS = 4000
+_POINTS = (
+    MessageType.JOINT_POSITION,
+    MessageType.JOINT_TRAJ_PT,
+    MessageType.JOINT_TRAJ_PT_FULL,
+    MessageType.JOINT_POINT,
+)
+_VERSION = Version(*(int(part) for part in __version__.split(".")[:3]))
+_UNKNOWN = Status(motion_possible=TriState.FALSE)
+"""RobotStatus has no field `connected`: this is how one says that it is not."""
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ServerOptions:
+    """Where and how to serve."""
+
+    bind: str = "127.0.0.1"
+    motion_port: int = MOTION_PORT
+    """0: a free one."""
+    state_port: int = STATE_PORT
+    byte_order: ByteOrder | None = None
+    """None: that of a client's first length; for a state client that sends nothing, that of the motion client at its
+    address, else little endian."""
+    joint_feedback: bool = False
+    """Send JOINT_FEEDBACK, which the reference client reports as an error each time."""
+
+
+def notice_lost_peer(connection: socket.socket) -> None:
+    """Let a connection fail some seconds after its cable was pulled, whether data waits for the peer or not."""
+    for level, option, value in (
+        (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, _KEEPALIVE_IDLE_S),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, _KEEPALIVE_INTERVAL_S),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _KEEPALIVE_PROBES),
+        # Nothing is probed while data waits for an acknowledgement.
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _USER_TIMEOUT_MS),
+    ):
+        connection.setsockopt(level, option, value)
+
+
+class _Client:
+    """A connection: frames in, replies out."""
+
+    def __init__(self, role: str, writer: asyncio.StreamWriter, order: ByteOrder | None) -> None:
+        self._writer = writer
+        self.host, port = writer.get_extra_info("peername")[:2]
+        self.name = f"{role} client {self.host}:{port}"
+        self._decoder = FrameDecoder(order)
+        self.why_closed = ""
+        notice_lost_peer(writer.get_extra_info("socket"))
+
+    @property
+    def order(self) -> ByteOrder | None:
+        """None before its first frame."""
+        return self._decoder.order
+
+    async def serve(self, reader: asyncio.StreamReader, answer: Callable[[Frame, ByteOrder], Frame | None]) -> str:
+        """Answer frames until the connection ends; return why it did."""
+        try:
+            while (data := await reader.read(_MOST_UNREAD)) and not self._writer.is_closing():
+                for frame in self._decoder.feed(data):
+                    order = self._decoder.order or ByteOrder.LITTLE
+                    if (reply := answer(frame, order)) is not None:
+                        self.send(reply.pack(order))
+            if not self.why_closed:
+                self._decoder.end()
+        except (FrameError, OSError) as error:
+            return self.why_closed or str(error)
+        finally:
+            self.close()
+        return self.why_closed or "it closed the connection"
+
+    def send(self, data: bytes) -> None:
+        """Send bytes, or close the connection of a client that does not read."""
+        if self._writer.transport.get_write_buffer_size() > _MOST_UNREAD:
+            self.close("it does not read")
+        elif not self._writer.is_closing():
+            self._writer.write(data)
+
+    def close(self, why: str = "") -> None:
+        """Close the connection; what was not sent yet is dropped."""
+        self.why_closed = self.why_closed or why
+        self._writer.transport.abort()
+
+
+class _MotionSession:
+    """What one motion client asks of the arm."""
+
+    def __init__(self, client: _Client, arm: Arm, executor: MotionExecutor) -> None:
+        self.client = client
+        self._arm = arm
+        self._executor = executor
+        self._sequence = PointSequence()
+        self._is_refusing = False
+        self._has_ended = False
+        self.has_commanded = False
+
+    def end(self) -> None:
+        """The client is lost: stop the arm and disable its drives if it has moved it; a second time is harmless."""
+        if self.has_commanded and not self._has_ended:
+            self._executor.release()
+        self._has_ended = True
+
+    def answer(self, frame: Frame, order: ByteOrder) -> Frame | None:
+        """Carry a frame out as far as it can be now; return its reply, or None for a topic."""
+        if frame.msg_type not in _POINTS or frame.comm_type is CommType.SERVICE_REPLY:
+            return answer_basics(frame, order)
+        code = self._receive(frame, order)
+        return frame.reply(code) if frame.comm_type is CommType.SERVICE_REQUEST else None
+
+    def refuse(self, reason: str) -> None:
+        """Stop what the client moves, ignore what follows up to the next beginning, and say why."""
+        log.warning("%s: %s", self.client.name, reason)
+        self._is_refusing = True
+        self._sequence.ignore(time.monotonic())
+        self._executor.halt_own()
+
+    def _receive(self, frame: Frame, order: ByteOrder) -> ReplyCode:
+        self.has_commanded = True
+        try:
+            message = frame.message(order)
+            assert isinstance(message, JointPosition | JointTrajPt | JointTrajPtFull | JointPoint)  # _POINTS
+            for step in self._sequence.receive(message, self._arm.state, time.monotonic()):
+                if self._executor.is_releasing and not isinstance(step, Halt):
+                    raise PointRefused("the arm is stopping, because the client before was lost: send it again then")
+                self._executor.carry_out(step)
+        except PointIgnored:
+            return ReplyCode.FAILURE
+        except PointRefused as error:
+            self.refuse(str(error))
+            return ReplyCode.FAILURE
+        except MessageError as error:
+            # Its sequence number is not known, so a client of another build would cause a line with every point.
+            if not self._is_refusing:
+                self.refuse(str(error))
+            return ReplyCode.FAILURE
+        self._is_refusing = False
+        return ReplyCode.SUCCESS
+
+
+def answer_basics(frame: Frame, order: ByteOrder) -> Frame | None:
+    """Answer what every server understands; any other request with FAILURE, a topic and a reply with nothing."""
+    if frame.comm_type is not CommType.SERVICE_REQUEST:
+        return None
+    try:
+        if frame.msg_type in (MessageType.PING, MessageType.GET_VERSION):
+            is_ping = isinstance(frame.message(order), Ping)
+            return frame.reply(ReplyCode.SUCCESS, b"" if is_ping else _VERSION.pack(order))
+    except MessageError as error:
+        log.warning("%s", error)
+    return frame.reply(ReplyCode.FAILURE)
+
+
+class SimpleMessageServer:
+    """Serves an arm: `async with SimpleMessageServer(arm) as server: await asyncio.Event().wait()`.
+
+    Args:
+        arm: what moves.
+        options: where and how.
+    """
+
+    def __init__(self, arm: Arm, options: ServerOptions | None = None) -> None:
+        self._arm = arm
+        self._options = options or ServerOptions()
+        self._executor = MotionExecutor(arm, self._refused_by_arm)
+        self._motion: _MotionSession | None = None
+        self._clients: set[_Client] = set()
+        self._states: set[_Client] = set()
+        self._orders: dict[str, ByteOrder] = {}
+        """Byte order of the last motion client at each address."""
+        self._turned_away = ""
+        """Whom the log has named already."""
+        self._servers: list[asyncio.Server] = []
+        self._serving: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> SimpleMessageServer:
+        """Listen; raises OSError where a port is taken."""
+        options = self._options
+        for serve, port in ((self._serve_motion, options.motion_port), (self._serve_state, options.state_port)):
+            try:
+                self._servers.append(await asyncio.start_server(serve, options.bind, port))
+            except OSError:
+                self._close_servers()
+                raise
+        self._publishing = asyncio.create_task(self._publish())
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close every connection; where a client has moved the arm it stops, and its drives are disabled."""
+        self._close_servers()
+        self._publishing.cancel()
+        for client in self._clients:
+            client.close("the server ends")
+        if self._serving:
+            await asyncio.wait(self._serving)
+        await self._executor.released()
+
+    @property
+    def ports(self) -> tuple[int, int]:
+        """Those of motion and state."""
+        motion, state = (int(server.sockets[0].getsockname()[1]) for server in self._servers)
+        return motion, state
+
+    def _close_servers(self) -> None:
+        for server in self._servers:
+            server.close()
+
+    @contextlib.contextmanager
+    def _connected(self, role: str, writer: asyncio.StreamWriter) -> Iterator[_Client]:
+        task = asyncio.current_task()
+        assert task is not None
+        client = _Client(role, writer, self._options.byte_order)
+        self._clients.add(client)
+        self._serving.add(task)
+        try:
+            yield client
+        finally:
+            client.close()
+            self._clients.discard(client)
+            self._serving.discard(task)
+
+    # -- motion -------------------------------------------------------------------------------------------------------
+
+    async def _serve_motion(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with self._connected("motion", writer) as client:
+            before = self._motion
+            if before is not None and before.client.host != client.host:
+                if client.host != self._turned_away:
+                    log.warning("%s is turned away: the arm has the %s", client.name, before.client.name)
+                self._turned_away = client.host
+                return
+            if before is not None:
+                # A client that crashed is back while its old connection still looks alive.
+                before.client.close(f"{client.name} takes its place")
+                before.end()
+            log.info("%s: connected", client.name)
+            self._turned_away = ""
+            session = self._motion = _MotionSession(client, self._arm, self._executor)
+
+            def answer(frame: Frame, order: ByteOrder) -> Frame | None:
+                self._orders[client.host] = order
+                return session.answer(frame, order)
+
+            try:
+                why = await client.serve(reader, answer)
+            finally:
+                if self._motion is session:
+                    self._motion = None
+                session.end()
+            outcome = ": the arm stops and its drives are disabled" if session.has_commanded else ""
+            log.warning("%s: %s%s", client.name, why, outcome)
+
+    def _refused_by_arm(self, reason: str) -> None:
+        if self._motion is not None:
+            self._motion.refuse(reason)
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    async def _serve_state(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with self._connected("state", writer) as client:
+            log.info("%s: connected", client.name)
+            self._states.add(client)
+            try:
+                why = await client.serve(reader, answer_basics)
+            finally:
+                self._states.discard(client)
+            log.info("%s: %s", client.name, why)
+
+    async def _publish(self) -> None:
+        """Send state at a fixed rate: positions once a sample, the status always."""
+        stamp, begin, fresh_at = 0, 0, -math.inf
+        while True:
+            state, now = self._arm.state, time.monotonic()
+            messages: list[Message] = []
+            if state is not None and state.stamp_ns != stamp:
+                stamp, begin, fresh_at = state.stamp_ns, begin or state.stamp_ns, now
+                messages += self._positions(state, (stamp - begin) * 1e-9)
+            is_known = state is not None and now - fresh_at < STALE_S
+            messages.append(state.status if state is not None and is_known else _UNKNOWN)
+            packed = {order: b"".join(Frame.topic(each, order).pack(order) for each in messages) for order in ByteOrder}
+            for client in self._states:
+                client.send(packed[client.order or self._orders.get(client.host, ByteOrder.LITTLE)])
+            await asyncio.sleep(STATE_PERIOD_S)
+
+    def _positions(self, state: ArmState, seconds: float) -> list[Message]:
+        """Return the messages on the joints; `seconds`: of the sample since the first one."""
+        if len(state.positions) > JOINTS:
+            return [JointPoint(0, seconds, state.positions, state.velocities)]
+        messages: list[Message] = [JointPosition(0, state.positions)]
+        if self._options.joint_feedback:
+            valid = ValidFields.TIME | ValidFields.POSITION | ValidFields.VELOCITY
+            messages.append(JointFeedback(0, valid, seconds, state.positions, state.velocities))
+        return messages

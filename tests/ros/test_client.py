@@ -1,0 +1,183 @@
+"""Our client of controllers, against a server of ours and against sockets that misbehave."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable
+
+import pytest
+
+from rtcp.ros.simple_message import client as client_module
+from rtcp.ros.simple_message.client import MotionClient, StateClient
+from rtcp.ros.simple_message.framing import Frame, FrameDecoder
+from rtcp.ros.simple_message.messages import (
+    ByteOrder,
+    CommType,
+    GetVersion,
+    JointPosition,
+    JointTrajPt,
+    Message,
+    Ping,
+    ReplyCode,
+    Status,
+)
+from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
+from tests.ros.fake_arm import HOME, FakeArm
+
+OK = ReplyCode.SUCCESS
+
+
+@pytest.fixture(autouse=True)
+def reconnects_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "RECONNECT_S", 0.01)
+
+
+async def connected(client: MotionClient | StateClient) -> None:
+    while not client.is_connected:
+        await asyncio.sleep(0.001)
+
+
+def run(test: Awaitable[None]) -> None:
+    async def whole() -> None:
+        await test
+
+    asyncio.run(whole())
+
+
+def test_it_is_tried_again_once_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    assert client_module.RECONNECT_S == 1.0
+
+
+@pytest.mark.parametrize("order", ByteOrder)
+def test_motion_and_state_of_a_controller_in_either_byte_order(order: ByteOrder) -> None:
+    async def test() -> None:
+        arm, received = FakeArm(), list[Message]()
+        async with SimpleMessageServer(arm, ServerOptions(motion_port=0, state_port=0, byte_order=order)) as server:
+            motion = MotionClient("127.0.0.1", server.ports[0], order)
+            state = StateClient("127.0.0.1", received.append, server.ports[1])
+            tasks = [asyncio.create_task(each.run()) for each in (motion, state)]
+            await connected(motion)
+            assert (await motion.request(GetVersion())).reply_code is OK
+            motion.send(JointTrajPt(-1, HOME, 0.1, 10.0))
+            motion.send(JointTrajPt(-3, (0.5, *HOME[1:]), 0.1, 0.5))
+            await arm.until("run_trajectory")
+            assert await motion.stop()
+            await arm.until("halt")
+            while {type(each) for each in received} < {JointPosition, Status}:
+                arm.set_status(error_code=0)  # a new sample
+                await asyncio.sleep(0.001)
+            for task in tasks:
+                task.cancel()
+
+    run(test())
+
+
+class Controller:
+    """A socket of which a test says what it answers."""
+
+    def __init__(self) -> None:
+        self.writers: list[asyncio.StreamWriter] = []
+        self.frames: list[Frame] = []
+        self.changed = asyncio.Event()
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        decoder = FrameDecoder()
+        self.writers.append(writer)
+        self.changed.set()
+        while data := await reader.read(1000):
+            self.frames += decoder.feed(data)
+            self.changed.set()
+
+    async def until(self, connections: int = 0, frames: int = 0) -> None:
+        while len(self.writers) < connections or len(self.frames) < frames:
+            self.changed.clear()
+            await self.changed.wait()
+
+    async def listen(self) -> int:
+        self.server = await asyncio.start_server(self.serve, "127.0.0.1", 0)
+        return int(self.server.sockets[0].getsockname()[1])
+
+
+def test_a_lost_connection_is_made_again_and_logged_once_and_its_request_fails(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def test() -> None:
+        controller = Controller()
+        client = MotionClient("127.0.0.1", await controller.listen())
+        running = asyncio.create_task(client.run())
+        for number in range(1, 5):
+            await controller.until(connections=number)
+            await connected(client)
+            request = asyncio.create_task(client.request(Ping()))
+            await controller.until(frames=number)
+            controller.writers[-1].close()
+            with pytest.raises(ConnectionError, match="before the reply"):
+                await request
+        running.cancel()
+        assert len([each for each in caplog.records if each.levelno >= logging.WARNING]) == 1
+
+    run(test())
+
+
+def test_without_a_connection_nothing_is_sent() -> None:
+    async def test() -> None:
+        client = MotionClient("127.0.0.1", 1)
+        with pytest.raises(ConnectionError, match="no connection"):
+            client.send(Ping())
+        with pytest.raises(ConnectionError, match="no connection"):
+            await client.request(Ping())
+
+    run(test())
+
+
+def test_replies_belong_to_requests_in_their_order_also_where_one_was_cancelled() -> None:
+    async def test() -> None:
+        controller = Controller()
+        client = MotionClient("127.0.0.1", await controller.listen())
+        running = asyncio.create_task(client.run())
+        await connected(client)
+        first, second, third = (asyncio.create_task(client.request(Ping())) for _ in range(3))
+        await controller.until(frames=3)
+        second.cancel()
+        for code in (ReplyCode.SUCCESS, ReplyCode.SUCCESS, ReplyCode.FAILURE):
+            controller.writers[0].write(controller.frames[0].reply(code).pack(ByteOrder.LITTLE))
+        assert (await first).reply_code is ReplyCode.SUCCESS
+        assert (await third).reply_code is ReplyCode.FAILURE
+        running.cancel()
+
+    run(test())
+
+
+def test_a_request_without_a_reply_ends_the_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "REPLY_TIMEOUT_S", 0.05)
+
+    async def test() -> None:
+        controller = Controller()
+        client = MotionClient("127.0.0.1", await controller.listen())
+        running = asyncio.create_task(client.run())
+        await connected(client)
+        with pytest.raises(TimeoutError, match="no reply to PING"):
+            await client.request(Ping())
+        await controller.until(connections=2)
+        running.cancel()
+
+    run(test())
+
+
+def test_a_controller_that_requests_is_answered_and_garbage_ends_the_connection() -> None:
+    async def test() -> None:
+        controller, received = Controller(), list[Message]()
+        client = StateClient("127.0.0.1", received.append, await controller.listen())
+        running = asyncio.create_task(client.run())
+        await controller.until(connections=1)
+        controller.writers[0].write(Frame.request(Status(), ByteOrder.BIG).pack(ByteOrder.BIG))
+        await controller.until(frames=1)
+        assert controller.frames[0] == Frame(Status.TYPE, CommType.SERVICE_REPLY, OK)
+        assert received == [Status()]
+        controller.writers[0].write(b"\0\0\0\0")
+        await controller.until(connections=2)
+        running.cancel()
+
+    run(test())
