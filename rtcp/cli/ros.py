@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import signal
 import sys
@@ -37,6 +36,8 @@ def _ros(
     ] = False,
 ) -> None:
     """Serve the arm to ROS-Industrial, until Ctrl-C; it waits for a platform that does not run."""
+    import asyncio
+
     from rtcp.ros.simple_message.messages import ByteOrder
     from rtcp.ros.simple_message.server import ServerOptions
 
@@ -54,6 +55,8 @@ def _ros(
 
 async def _serve(options: ServerOptions) -> None:
     """Serve until a signal comes; the arm stops then as if its client was lost."""
+    import asyncio
+
     from rtcp.ros.simple_message.robot_arm import RobotArm
     from rtcp.ros.simple_message.server import SimpleMessageServer
 
