@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 import signal
 import sys
@@ -55,6 +54,8 @@ def _ros(
     Waits for a platform, and for a master, that do not run.
     """
     if simple_message:
+        import asyncio  # here: it loads slowly, as what follows
+
         from rtcp.ros.simple_message.messages import ByteOrder
         from rtcp.ros.simple_message.server import ServerOptions
 
@@ -86,6 +87,8 @@ def _run_node(name: str, rate: float, remappings: Sequence[str], enable: bool, p
 
 async def _serve(options: ServerOptions) -> None:
     """Serve Simple Message until a signal comes; the arm stops then as if its client was lost."""
+    import asyncio
+
     from rtcp.ros.simple_message.robot_arm import RobotArm
     from rtcp.ros.simple_message.server import SimpleMessageServer
 

@@ -572,6 +572,23 @@ def test_a_client_from_the_same_address_takes_over_and_gets_no_arm_before_it_res
     run(client)
 
 
+def test_points_that_come_with_a_connection_that_takes_over_find_the_arm_already_stopping() -> None:
+    async def client(rig: Rig) -> None:
+        old = await rig.motion()
+        rig.arm.stopped.clear()
+        await old.codes(point(0), point(1))
+        await rig.arm.until("open_trajectory")
+        with socket.create_connection(("127.0.0.1", rig.server.ports[0])) as new:
+            # It waits in the buffer of the kernel before the server accepts the connection.
+            new.sendall(Frame.request(point(0), LITTLE).pack(LITTLE))
+            new.setblocking(False)
+            reply = await asyncio.get_running_loop().sock_recv(new, 16)
+            assert reply == Frame.request(point(0), LITTLE).reply(NO).pack(LITTLE)
+            rig.arm.stopped.set()
+
+    run(client)
+
+
 def test_a_client_from_another_address_is_turned_away(caplog: pytest.LogCaptureFixture) -> None:
     async def client(rig: Rig) -> None:
         first = await rig.motion()
