@@ -168,7 +168,7 @@ def test_negative_numbers_are_taken_as_they_are_written(
 ) -> None:
     assert rtcp("move", *arguments).code == 0
     assert platform.asked("move_joints") == [
-        {"q": [0.0, -0.5, 1.57, -0.5, -0.1, -2.0], "speed": speed, "synchronized": True}
+        {"q": [0.0, -0.5, 1.57, -0.5, -0.1, -2.0], "speed": speed, "synchronized": True, "replace": False}
     ]
 
 
