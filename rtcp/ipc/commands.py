@@ -189,7 +189,7 @@ class OpenStream(MotionCommand):
     states = frozenset({State.HOLDING})
     renewed = True
     stream: int
-    """Its number, not 0."""
+    """Its number, greater than 0."""
 
 
 class Jog(MotionCommand):

@@ -83,6 +83,14 @@ def test_only_what_makes_the_arm_safer_needs_no_lease() -> None:
     assert {kind for kind in own if kind.needs_lease} == tried | {ExtendTrajectory}
 
 
+@pytest.mark.parametrize("stream", [0, -1, -(1 << 63)])
+def test_a_stream_has_a_number_above_0(rig: LoopRig, stream: int) -> None:
+    rig.hold()
+    assert rig.send(OpenStream(stream)).refusal == Malformed(OpenStream.number)
+    rig.run(0.1)
+    assert rig.state is State.HOLDING
+
+
 def test_a_number_that_no_refusal_can_hold_is_malformed_and_ends_nothing(rig: LoopRig) -> None:
     rig.hold()
     assert rig.send(SetOutput(1, True, (1 << 63) - 1)).refusal == Malformed(SetOutput.number)

@@ -19,7 +19,7 @@ from rtcp.ipc.events import (
     StreamEnded,
 )
 from rtcp.ipc.layout import SETPOINT_ENDS, SETPOINT_HAS_ACCELERATION, SETPOINT_HAS_VELOCITY
-from rtcp.ipc.refusals import Refusal, StampNotFinite, StreamPointDropped
+from rtcp.ipc.refusals import Malformed, Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
@@ -86,6 +86,8 @@ class StreamController(Controller):
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Follow the target from the next cycle on."""
         if isinstance(command, OpenStream):
+            if command.stream <= 0:
+                return Malformed(command.number)
             self._start(state)
             self.stream = command.stream
             return None
