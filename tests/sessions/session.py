@@ -9,11 +9,13 @@ from math import sqrt
 from random import Random
 
 from kinematics import forward
-from rtcp.config.model import ArmConfig
+from rtcp.config.model import MOST_AXES, ArmConfig
 from rtcp.ipc.commands import (
     Command,
     Enable,
+    ExtendTrajectory,
     MoveJoints,
+    OpenStream,
     Reset,
     RunLines,
     RunTrajectory,
@@ -157,7 +159,8 @@ class Session(RandomActions):
         mode = self.random.choice(list(ControlMode)) if self.random.random() < 0.1 else self.mode
         special = {ControlMode.VELOCITY: self.velocity, ControlMode.TORQUE: self.torque,
                    ControlMode.JOYSTICK: self.joystick}  # fmt: skip
-        usual = (self._move, self._move, self.trajectory, self.invade, self.line, self.stream, self.jog)
+        usual = (self._move, self._move, self.trajectory, self.invade, self.line, self.stream, self.jog,
+                 self.setpoints, self.open_trajectory)  # fmt: skip
         (special[mode] if mode in special else self.random.choice(usual))()
 
     def _change_mode(self) -> None:
@@ -212,6 +215,50 @@ class Session(RandomActions):
             rows.append(_waypoint(t, q, kind, speed))
         rows[-1][VELOCITIES : VELOCITIES + 6] = [0.0] * 6
         self._run(RunTrajectory, rows)
+
+    def open_trajectory(self) -> None:
+        """A trajectory to which rows are appended that nobody has planned; in time, too late, or never."""
+        random, observer = self.random, self.driver.simulation.observer
+        kind = random.choice((CUBIC, QUINTIC))
+        rows = [
+            _waypoint(t, q, kind, [random.choice((0.0, random.uniform(-0.3, 0.3))) for _ in q])
+            for t, q in self.waypoints((0.1, 0.3, 0.3, 1.0), 12)
+        ]
+        known = random.randrange(1, len(rows) + 1)
+        slot = observer.write_plan(rows[:known])
+        going = self.send(RunTrajectory(slot, known, open=True))
+        while going and known < len(rows):
+            self.seconds(0.0, 0.6)
+            more = random.randrange(1, len(rows) - known + 1)
+            observer.extend_plan(slot, known, rows[known : known + more])
+            known += more
+            going = self.send(ExtendTrajectory(self.or_odd(known), random.random() < 0.3))
+
+    def setpoints(self) -> None:
+        """A stream through shared memory, with and without velocities, and with what nobody should send."""
+        random, simulation = self.random, self.driver.simulation
+        stream = self.or_odd(simulation.now_ns)
+        interval, pace = random.choice((0.0005, 0.002, 0.01, 0.05)), random.choice((0.1, 0.3, 0.6))
+        here = self.commanded
+        velocity = [random.uniform(-pace, pace) for _ in here]
+        if not self.send(OpenStream(stream)):
+            return
+        for _ in range(random.randrange(3, 40)):
+            self.stamp += interval
+            if random.random() < 0.1:
+                velocity = [random.uniform(-pace, pace) for _ in here]
+            here = [q + v * interval for q, v in zip(here, velocity, strict=True)]
+            rest = [0.0] * (MOST_AXES - len(here))
+            sent = self.near(0.5) if random.random() < 0.02 else here
+            speeds = velocity if random.random() < 0.9 else [random.uniform(-9.0, 9.0) for _ in here]
+            rates = [random.uniform(-5.0, 5.0) for _ in here]
+            numbers = [*self.some(sent), *rest, *self.some(speeds), *rest, *self.some(rates), *rest]
+            bits = random.choice((0, 1, 1, 3)) if random.random() < 0.97 else random.randrange(256)
+            stamp = self.or_nonsense(self.stamp - random.choice((0.0, 0.0, 0.0, 0.0, 0.0, 0.5, interval)), 0.01)
+            if not simulation.observer.setpoint(stream, bits, stamp, numbers):
+                break
+            if random.random() < 0.7:
+                self.seconds(0.5 * interval, 1.5 * interval)
 
     def _run(self, kind: type[RunTrajectory] | type[RunLines], rows: list[list[float]]) -> None:
         random = self.random
