@@ -90,7 +90,7 @@ int main()
       std::cin >> limit >> rejected;
       const Values limits(6, limit);
       const auto callback = [&](const Pose&, const Values&, KinematicsBase::ErrorCodes& verdict) {
-        verdict.val = ++calls > rejected ? verdict.SUCCESS : verdict.NO_IK_SOLUTION;
+        verdict.val = ++calls > rejected ? verdict.SUCCESS : -12;  // GOAL_IN_COLLISION
       };
       if (command == "vector")
         solver->searchPositionIK(std::vector<Pose>{ pose }, seed, 0.1, limits, solution, callback, error);

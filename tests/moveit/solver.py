@@ -7,7 +7,7 @@ import shutil
 import subprocess
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import pi
+from math import inf, pi
 from pathlib import Path
 
 import numpy as np
@@ -142,7 +142,7 @@ class Comparison:
 def configurations(model: ArmModel, count: int, seed: int) -> tuple[Array, Array]:
     """Joint positions (N, 6), rad, and factors (N,) of the tool's position: some above 1, to be out of reach.
 
-    Three of 16 are on or beside a singularity.
+    Three of 16 are on or beside the wrist's or the elbow's singularity.
     """
     random = np.random.default_rng(seed)
     q, kind = random.uniform(-1.1 * pi, 1.1 * pi, (count, 6)), np.arange(count) % 16
@@ -164,6 +164,11 @@ def compare(model: ArmModel, solver: CSolver, count: int, seed: int = 1) -> Comp
         q, stretch = configurations(model, min(20_000, count - block), seed + block)
         positions, rotations = forward_batch(model, q)
         poses = np.hstack([positions * stretch[:, None], rotations.reshape(-1, 9)])
+        if model.rows[0].alpha == 0.0:  # every 16th onto the shoulder's singularity: the wrist centre on axis 1
+            last = model.rows[5].d * np.array([0.0, 0.0, 1.0]) + model.tool.position
+            levers = rotations @ np.reshape(model.tool.rotation, (3, 3)).T @ last
+            centres = poses[:, :3] - levers
+            poses[5::16, :2] -= (centres[:, :2] - [model.rows[0].a, 0.0])[5::16]
         nears = np.random.default_rng(seed + block).uniform(-3.0, 3.0, q.shape)
         found, counts, _ = solver.many(poses, nears)
         for row, number, given, near in zip(poses.tolist(), counts.tolist(), found, nears.tolist(), strict=True):
@@ -184,6 +189,8 @@ def _count(
     if is_same and wanted:
         bits = [(BITS[one.branch], one.singularity.value, sum(1 << joint for joint in one.outside)) for one in wanted]
         is_same = bits == given[["branch", "singularity", "outside"]].tolist()
+        outside = given["outside"][:, None] >> np.arange(6) & 1
+        is_same &= bool((given["q"] > np.where(outside, -pi, -inf)).all())
         difference = np.abs((given["q"] - [one.q for one in wanted] + pi) % (2 * pi) - pi).max(axis=1)
         result.worst = max(result.worst, float(difference.max()))
         for number in np.flatnonzero(difference > SAME):

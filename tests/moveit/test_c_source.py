@@ -33,6 +33,8 @@ ARMS: dict[str, Callable[[], ArmModel]] = {
     "with every offset": lambda: with_row(
         with_row(with_row(irb120(), 1, a=0.05, d=0.03), 2, d=-0.02), 0, alpha=0.3, a=0.1
     ),
+    "with turned joints": lambda: with_row(with_row(assistive(), 0, offset=0.4, a=0.05), 3, offset=-0.7),
+    "with links of one length": lambda: with_row(assistive(), 2, a=0.55),
     "with a lower arm behind": lambda: with_row(assistive(), 2, a=-0.44),
     "with wide limits": lambda: replace(irb120(), limits=(JointLimit(-7.0, 6.5),) * 6),
     "with narrow limits": lambda: replace(assistive(), limits=(JointLimit(0.1, 0.9),) * 6),
@@ -107,6 +109,19 @@ def test_joint_6_at_its_limit_is_compensated_by_joint_4_on_the_wrist_singularity
         assert found[0].q == pytest.approx(wanted.q, abs=1e-9)
         assert found[0].q[5] == model.limits[5].upper
         assert Singularity.WRIST in found[0].singularity
+
+
+@needs_c
+def test_a_free_joint_stays_at_the_seed_or_at_the_limit_nearest_to_it(tmp_path: Path) -> None:
+    model = assistive()
+    solver, inverse = CSolver(model, tmp_path), InverseKinematics(model)
+    pose = forward(model, (0.3, 0.5, -0.8, 0.4, 0.0, 0.2))
+    for seed4 in (0.1, 2.0, 4.0, -5.0):
+        seed = (0.3, 0.5, -0.8, seed4, 0.0, 0.6 - min(max(seed4, -3.1), 3.1))
+        wanted, found = inverse.solve_near(pose, seed), solver.nearest(pose, seed)
+        assert found
+        assert wanted.q is not None
+        assert found[0].q == pytest.approx(wanted.q, abs=1e-9)
 
 
 # -- arguments ------------------------------------------------------------------------------------------------------

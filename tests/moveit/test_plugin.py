@@ -215,6 +215,12 @@ def test_a_pose_without_solution_is_no_ik_solution(ready: Plugin, pose: Sequence
     assert ready.numbers("all", 1, pose, Q) == [NO_SOLUTION, 0]
 
 
+def test_an_orientation_that_is_not_of_length_1_is_refused(ready: Plugin) -> None:
+    x, y, z, *orientation = message(forward(ready.model, Q))
+    for factor, code in ((1.0001, SUCCESS), (2.0, NO_IK_SOLUTION), (0.5, NO_IK_SOLUTION)):
+        assert ready.numbers("ik", (x, y, z, *(factor * value for value in orientation)), Q)[0] == code
+
+
 def test_one_pose_at_a_time_is_solved(ready: Plugin) -> None:
     pose = message(forward(ready.model, Q))
     assert ready.numbers("all", 0, Q) == [EMPTY_TIP_POSES, 0]
