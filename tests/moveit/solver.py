@@ -69,7 +69,7 @@ class CSolver:
         (folder / "many.c").write_text(MANY.replace("arm_", f"{text.prefix}_"))
         sources = [str(folder / f"{text.prefix}_kinematics.c"), str(folder / "many.c")]
         library = folder / f"lib{text.prefix}.so"
-        command = ["cc", "-O2", "-shared", "-fPIC", *options, "-o", str(library), *sources, "-lm"]
+        command = ["cc", "-O2", "-ffp-contract=off", "-shared", "-fPIC", *options, "-o", str(library), *sources, "-lm"]
         subprocess.run(command, check=True)
         self.library = ctypes.CDLL(str(library))
 
