@@ -44,6 +44,7 @@ COMPILED = (
     "rtcp/virtual/models/profile_modes.py",
 )
 INTERPRETED = (
+    "kinematics/c_source.py",
     "kinematics/compiled.py",
     "kinematics/model.py",
     "kinematics/pose.py",

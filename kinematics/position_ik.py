@@ -50,6 +50,14 @@ class PlanarArm:
         # sign of the bend for front and up
         self._up = -1.0 if sign * s1 * self._a2 > 0.0 else 1.0
 
+    def numbers(self) -> dict[str, float]:
+        """The constants by their names in `solver.c`."""
+        return {
+            "A1": self._a1, "A2": self._a2, "S1": self._s1, "C1": self._c1, "SIGN": self._sign, "PX": self._px,
+            "PY": self._py, "LENGTH": self._length, "PHASE": self._phase, "HEIGHT": self._height,
+            "LONGEST": self._longest, "SHORTEST": self._shortest, "S3": self._s3, "C3": self._c3, "UP": self._up,
+        }  # fmt: skip
+
     def solve(self, wx: float, wy: float, wz: float, near1: float, near2: float) -> list[Angles]:
         """All angles of joints 1 to 3 that bring the wrist centre to the point; empty when it is out of reach.
 

@@ -123,7 +123,7 @@ class AngleWrap:
         self._triples = {0: self.limits[:3], 3: self.limits[3:]}
         x, y, z = model.tool.position
         reach = sum(abs(row.a) + abs(row.d) for row in model.rows) + abs(x) + abs(y) + abs(z)
-        self._slack = 1e-10 / max(1.0, reach)
+        self.slack = 1e-10 / max(1.0, reach)
 
     def into_limits(self, joint: int, one: float, two: float, three: float) -> tuple[Vector, tuple[int, ...]]:
         """Wrap the angles of `joint` (0 or 3) and the two after it into their limits, else into (-pi, pi].
@@ -162,7 +162,7 @@ class AngleWrap:
 
     def _shifted(self, angle: float, lower: float, upper: float) -> float:
         """An angle outside its limits, shifted by the fewest turns that bring it back inside, else as it is."""
-        slack = self._slack
+        slack = self.slack
         if angle > upper:
             shifted = angle - tau * ceil((angle - upper - slack) / tau)
         else:

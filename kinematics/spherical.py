@@ -61,11 +61,18 @@ class SphericalArm:
         accuracy = 5e-10 / max(1.0, hypot(*self._lever))
         self.confirmed = 2.0 * accuracy * accuracy
         turn4, turn5 = model.constants[4][:2], model.constants[5][:2]
-        self.wrist: RightAngledWrist | ObliqueWrist
+        self._oblique = ObliqueWrist(turn4, turn5, 0.8 * accuracy)
+        self.wrist: RightAngledWrist | ObliqueWrist = self._oblique
         if turn4[1] == 0.0 and turn5[1] == 0.0:
             self.wrist = RightAngledWrist(turn4[0], turn5[0], 0.8 * accuracy)
-        else:
-            self.wrist = ObliqueWrist(turn4, turn5, 0.8 * accuracy)
+
+    def numbers(self) -> dict[str, float | tuple[float, ...]]:
+        """The constants by their names in `solver.c`, less those of joints 1 to 3."""
+        return {
+            "A0": self._a0, "D1": self._d1, "BASE_INVERSE": self._base, "TOOL_INVERSE": self._tool,
+            "LEVER": self._lever, "CONFIRMED": self.confirmed, "LIMIT_SLACK": self.wrap.slack,
+            **self._oblique.numbers(),
+        }  # fmt: skip
 
     def target(self, pose: Pose) -> tuple[Vector, Rotation]:
         """Wrist centre and rotation of frame 6 for a tool pose, in the fixed frame that `PlanarArm` uses."""
@@ -167,6 +174,13 @@ class ObliqueWrist:
         alpha4, alpha5 = atan2(*turn4), atan2(*turn5)
         # angle between axes 4 and 6 at theta5 = 0 and at theta5 = pi
         self._at_zero, self._at_pi = abs(remainder(alpha4 + alpha5, tau)), abs(remainder(alpha4 - alpha5, tau))
+
+    def numbers(self) -> dict[str, float]:
+        """The constants by their names in `solver.c`."""
+        return {
+            "SINE4": self._s4, "COSINE4": self._c4, "SINE5": self._s5, "COSINE5": self._c5,
+            "AT_ZERO": self._at_zero, "AT_PI": self._at_pi, "FREE": self._free,
+        }  # fmt: skip
 
     def solve(self, rotation: Rotation, near4: float) -> tuple[Angles, ...]:
         """All (theta4, theta5, theta6) with their bits: two, one at an edge or on the singularity, or none."""

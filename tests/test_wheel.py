@@ -27,7 +27,7 @@ def built(directory: Path, *, pure: bool) -> Path:
     """Build the wheel from a copy, so that the checkout may be read-only."""
     source = directory / "source"
     source.mkdir()
-    for name in ("rtcp", "kinematics", "config", "systemd"):
+    for name in ("rtcp", "kinematics", "config", "moveit", "systemd"):
         shutil.copytree(REPOSITORY / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "_fast"))
     for name in ("pyproject.toml", "README.md", "LICENSE", "hatch_build.py"):
         shutil.copy(REPOSITORY / name, source)
@@ -102,6 +102,13 @@ def test_an_installed_wheel_brings_the_service_along(installed: Path, tmp_path: 
     command = [installed.parent / "rtcp", "service", "install", "--root", tmp_path, "--program", "/usr/bin/env"]
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
     assert "ExecStart=/usr/bin/env start" in (tmp_path / "etc/systemd/system/rtcp@.service").read_text()
+
+
+def test_an_installed_wheel_exports_the_package_for_moveit(installed: Path, tmp_path: Path) -> None:
+    command = [installed.parent / "rtcp", "arm", "export-moveit", "--arm", "abb_irb120", "--out", tmp_path]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=installed.parent)
+    assert (tmp_path / "abb_irb120_moveit_config" / "src" / "abb_irb120_kinematics.c").is_file()
+    assert (tmp_path / "abb_irb120_moveit_config" / "src" / "kinematics_plugin.cpp").is_file()
 
 
 def test_the_demo_of_an_installed_wheel_runs(installed: Path, tmp_path: Path) -> None:

@@ -1,10 +1,10 @@
-"""`rtcp arm`: forward and inverse kinematics, a picture, a URDF file. No platform is needed."""
+"""`rtcp arm`: forward and inverse kinematics, a picture, exports as URDF, C and MoveIt. No platform is needed."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from kinematics.model import ArmModel
     from kinematics.solution import Solution
 
+_Exported = TypeVar("_Exported")
 SINGULAR = 1e-9
 """m or rad; a configuration nearer than this is on the singularity."""
 
@@ -36,7 +37,7 @@ ArmFile = Annotated[
 ]
 Positions = Annotated[list[str], as_written("Q1..Q6", "Joint positions, rad or as -pi/2, base to tool.")]
 
-HELP = "Compute with an arm: forward and inverse kinematics, picture, URDF."
+HELP = "Compute with an arm: forward and inverse kinematics, picture, exports as URDF, C and MoveIt."
 commands = typer.Typer(name="arm", help=HELP, no_args_is_help=True)
 
 
@@ -111,14 +112,42 @@ def _urdf(
     """Export the arm as URDF, for viewers, simulators and planners."""
     from kinematics.urdf import to_urdf
     from rtcp.config import find_arm, load_kinematics
-    from rtcp.config.loader import torque_limits
+    from rtcp.config.loader import joints_of
 
     file = find_arm(arm)
-    text = to_urdf(load_kinematics(file), torque_limits(file))
+    text = to_urdf(load_kinematics(file), [joint.torque for joint in joints_of(file)] or None)
     if out is None:
         emit(text.rstrip("\n"))
     else:
         _write(out, lambda: out.write_text(text, encoding="utf-8"))
+
+
+@commands.command("export-c")
+def _export_c(
+    out: Annotated[Path, option("--out", "DIR", "Folder to write to; it is made where it is missing.")] = Path(),
+    arm: ArmFile = None,
+) -> None:
+    """Export forward and inverse kinematics as a C file and its header, which need no Python."""
+    from kinematics.c_source import to_c
+
+    model = _model(arm)
+    _write_files(out, _covered(lambda: to_c(model)).files)
+
+
+@commands.command("export-moveit")
+def _export_moveit(
+    out: Annotated[Path, option("--out", "DIR", "Folder for the package, as the src of a workspace.")] = Path(),
+    arm: ArmFile = None,
+) -> None:
+    """Export a ROS package for MoveIt: analytic kinematics, URDF, SRDF, limits, controllers."""
+    from rtcp.cli.arm_moveit import moveit_package
+    from rtcp.config import find_arm
+
+    file = find_arm(arm)
+    package = _covered(lambda: moveit_package(file))
+    if (out / package.name).exists():
+        raise CommandError(f"{out / package.name} exists: remove it, or name another folder by --out")
+    _write_files(out / package.name, package.files)
 
 
 def _model(arm: str | None) -> ArmModel:
@@ -131,6 +160,26 @@ def _joints(positions: Sequence[str]) -> list[float]:
     if len(positions) != JOINTS:
         raise CommandError(f"{len(positions)} positions for an arm of {JOINTS} joints: give {JOINTS} numbers, rad")
     return joint_values(positions)
+
+
+def _covered(export: Callable[[], _Exported]) -> _Exported:
+    """Return what is exported; an arm that cannot be is refused with the reason."""
+    try:
+        return export()
+    except ValueError as error:
+        raise CommandError(str(error), ExitCode.REFUSED) from error
+
+
+def _write_files(folder: Path, files: dict[str, str]) -> None:
+    """Write files, by their paths below a folder."""
+    for name, text in files.items():
+        path = folder / name
+
+        def write(path: Path = path, text: str = text) -> None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+
+        _write(path, write)
 
 
 def _write(out: Path, write: Callable[[], object]) -> None:

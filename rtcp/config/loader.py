@@ -134,13 +134,13 @@ def load_kinematics(path: Path) -> ArmModel:
     return _arm_model(document, file.name, file.kinematics, ())
 
 
-def torque_limits(path: Path) -> tuple[float, ...] | None:
-    """Return the torque limits, Nm, of a whole arm's joints; None where the file has kinematics alone.
+def joints_of(path: Path) -> tuple[Joint, ...]:
+    """Return a whole arm's joints; none where the file has kinematics alone.
 
     Raises:
         ConfigError: as `load_kinematics`.
     """
-    return tuple(joint.torque for joint in load(path).joints) if _is_whole_arm(read(path)) else None
+    return load(path).joints if _is_whole_arm(read(path)) else ()
 
 
 def device_path(arm: Path, key: str) -> Path:

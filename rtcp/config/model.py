@@ -506,6 +506,29 @@ class RecordingConfig:
 
 
 @dataclass(frozen=True)
+class SimpleMessageConfig:
+    """Where Simple Message is served; see [Simple Message](simple_message.md)."""
+
+    bind: str = "127.0.0.1"
+    """Address; whoever reaches it can move the arm."""
+    motion_port: Annotated[int, Ge(0), Le(65535)] = 11000
+    """TCP port; 0: a free one, which the log names."""
+    state_port: Annotated[int, Ge(0), Le(65535)] = 11002
+    """TCP port; 0: a free one, which the log names."""
+    byte_order: Literal["auto", "little", "big"] = "auto"
+    """Of the clients; auto: as they speak, else little."""
+    joint_feedback: bool = False
+    """Whether velocities are sent too, which the reference client complains of."""
+
+
+@dataclass(frozen=True)
+class RosConfig:
+    """What serves ROS as long as the platform runs."""
+
+    simple_message: SimpleMessageConfig = field(default_factory=SimpleMessageConfig)
+
+
+@dataclass(frozen=True)
 class Row:
     """A row of modified (Craig) parameters: T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
 
@@ -586,6 +609,7 @@ class ArmSettings:
     outputs: OutputsConfig = field(default_factory=OutputsConfig)
     gripper: GripperConfig | None = None
     recording: RecordingConfig | None = None
+    ros: RosConfig | None = None
 
     @property
     def axes(self) -> tuple[Joint, ...]:

@@ -74,6 +74,10 @@ _FIXED_DRIVE_MODE = frozenset({ControlMode.VELOCITY, ControlMode.TORQUE})
 _AUTOMATIC = frozenset({ControlMode.JOINT, ControlMode.CARTESIAN})
 
 
+_MOST_SETPOINTS: Final = 8
+"""Taken in one cycle: a sender that is faster than the loop must not keep it."""
+
+
 class CommandHandler:
     """Takes at most one command a cycle.
 
@@ -123,9 +127,11 @@ class CommandHandler:
             self._blackboard.answer(number, Malformed(command.number))
 
     def take_setpoints(self) -> None:
-        """Follow the setpoints that wait; those of a stream that is not open any more are dropped."""
+        """Follow the setpoints that wait, some a cycle; those of a stream that is not open any more are dropped."""
         board, stream, state = self._blackboard, self._stream, self._arm.state
-        while board.setpoint_waits():
+        for _ in range(_MOST_SETPOINTS):
+            if not board.setpoint_waits():
+                break
             number, bits, stamp_s, numbers = board.take_setpoint()
             if number == self.open_stream != 0:
                 stream.put(state, bits, stamp_s, numbers)

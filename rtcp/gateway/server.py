@@ -22,6 +22,7 @@ from rtcp.config.find import load_messages
 from rtcp.gateway.black_box import BlackBox
 from rtcp.gateway.command_channel import Caller, Json
 from rtcp.gateway.methods import Methods
+from rtcp.gateway.ros_server import RosServer
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.errors import RtcpError
@@ -199,6 +200,7 @@ class Gateway:
         self._box = BlackBox(self._observer, session, faults_directory(), self._snapshot.note)
         self._methods = Methods(self._observer, self._snapshot, session, directory, self._end_platform)
         self._recording = session.config.recording
+        self._ros, self._ros_server = session.config.ros, RosServer(directory)
         self._logged: dict[str, float] = {}
         """When a defect was logged, by what met it."""
         self._connections = 0
@@ -227,6 +229,8 @@ class Gateway:
         watching = asyncio.create_task(joystick.watch())
         recording = asyncio.create_task(self._record())
         ready()
+        if self._ros is not None:
+            await self._ros_server.start_once(self._ros.simple_message)
         await self._ended.wait()
         # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
         server.close()
@@ -316,6 +320,7 @@ class Gateway:
             # The blocking waits run beside, so that this process goes on answering `status`.
             if not await asyncio.to_thread(wait_for_exit, processes.loop, 6.0):
                 await asyncio.to_thread(terminate, processes.loop, 4.0)
+        await self._ros_server.finish()
         await self._methods.recordings.finish()
         await asyncio.to_thread(terminate, processes.segment, 3.0)
         if self._following is not None:

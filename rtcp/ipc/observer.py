@@ -378,7 +378,7 @@ class Observer:
             numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
 
         Raises:
-            BlackboardError: the ring is full: the loop hangs.
+            BlackboardError: the ring is full: they come faster than the loop takes them, or it hangs.
             struct.error: what is no number.
         """
         words = self._words
@@ -386,7 +386,7 @@ class Observer:
             return False
         number = words[SETPOINT_HEAD_AT] + 1
         if number - words[SETPOINT_TAKEN_AT] > SETPOINTS:
-            raise BlackboardError("the loop takes no setpoints: its process hangs or is gone")
+            raise BlackboardError(f"{SETPOINTS} setpoints wait: they come faster than the loop takes them, or it hangs")
         at = SETPOINTS_AT + (number % SETPOINTS) * SETPOINT.size
         SETPOINT.pack_into(self._map, at, number, stream, bits, stamp_s, *numbers)
         words.fence()

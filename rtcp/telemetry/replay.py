@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from math import ceil
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rtcp.ipc.jsonrpc import LINE_LIMIT
+from rtcp.config.model import MOST_POINTS
 from rtcp.ipc.recording import RecordingError
 from rtcp.ipc.schema import FLAG_ENABLED
 from rtcp.telemetry.reading import Recorded
@@ -18,9 +17,8 @@ Array = npt.NDArray[np.float64]
 POSITIONS = ("sent_position", "commanded_position", "actual_position")
 """The first of them that a recording has is replayed."""
 TOLERANCES_RAD = (1e-4, 3e-4, 9e-4)
-"""Largest distance of the trajectory from the recorded positions; the first whose points fit into a request."""
+"""Largest distance of the trajectory from the recorded positions; the first whose points are not too many."""
 _ROUNDING = 1e-10
-_REQUEST = LINE_LIMIT - 1024
 _SLOPE_S, _SHORTEST_S = 5e-3, 2e-3
 """Time before and after a sample over which its velocity is taken; shortest time between two points."""
 _AT_REST = 5e-3
@@ -71,11 +69,10 @@ def trajectory(recorded: Recorded, scale: float = 1.0) -> list[dict[str, Any]]:
             {"t": round(t[at] - t[0], 6), "q": rounded[at].tolist(), "v": np.round(v[at], 5).tolist()}
             for at in _knots(t, q, v, least, tolerance)
         ]
-        if len(json.dumps(points)) <= _REQUEST:
+        if len(points) <= MOST_POINTS:
             return points
-    size = len(json.dumps(points))
-    defect = f"its motion of {t[-1] - t[0]:.1f} s needs {len(points)} points, {size} bytes; a request has {_REQUEST}"
-    raise RecordingError("long", recorded.path, f"{defect}: choose a part by --start and --end", found=size)
+    defect = f"its motion of {t[-1] - t[0]:.1f} s needs {len(points)} points, at most {MOST_POINTS} are allowed"
+    raise RecordingError("long", recorded.path, f"{defect}: choose a part by --start and --end", found=len(points))
 
 
 def _sent_again(speeds: Array) -> npt.NDArray[np.int64]:

@@ -1,4 +1,4 @@
-"""`rtcp arm`: fk, ik, plot, urdf."""
+"""`rtcp arm`: fk, ik, plot, urdf, export-c, export-moveit."""
 
 from __future__ import annotations
 
@@ -216,6 +216,12 @@ WRONG = {
     "a place that is not there": (("plot", *HOME, "--out", "none/arm.png"), "--out none/arm.png cannot be written"),
     "a URDF nowhere": (("urdf", "--out", "none/arm.urdf"), "--out none/arm.urdf cannot be written: No such file"),
     "a URDF over a directory": (("urdf", "--out", "."), "--out . cannot be written: Is a directory"),
+    "C over a file": (
+        ("export-c", "--out", "/dev/null"),
+        "_kinematics.h cannot be written",
+    ),
+    "a number for export-c": (("export-c", "1"), "extra argument"),
+    "a package over a file": (("export-moveit", "--out", "/dev/null"), "cannot be written: "),
     "a number for urdf": (("urdf", "1"), "extra argument"),
 }
 

@@ -15,7 +15,7 @@ COMMANDS = ("start", "stop", "status", "enable", "disable", "reset", "halt", "mo
             "output", "gripper", "zero", "home", "limits", "scan", "sdo", "segment", "demo", "soak", "doctor",
             "service", "faults", "arm")  # fmt: skip
 SUBCOMMANDS = ("limits set", "sdo write", "segment fault", "service install", "faults show", "arm fk", "arm ik",
-               "arm plot", "arm urdf")  # fmt: skip
+               "arm plot", "arm urdf", "arm export-c", "arm export-moveit")  # fmt: skip
 
 
 @pytest.mark.parametrize("option", ["-h", "--help"])

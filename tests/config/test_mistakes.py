@@ -72,12 +72,12 @@ MISTAKES: list[tuple[str, Changes, str]] = [
     (ARM, [("lease_s:", "leese_s:")],
      "leese_s: this key does not exist; did you mean lease_s? allowed are name, joints, cycle, bus, drive_mode, "
      "control_mode, enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, "
-     "recording, slaves, kinematics"),
+     "recording, ros, slaves, kinematics"),
     (ARM, [("priority: 80", "zzz: 1")],
      "cycle.zzz: this key does not exist; allowed are period_us, priority, cpu, spin_us"),
     (ARM, [("lease_s: 0.5", "source: here")],
      "source: this key does not exist; allowed are name, joints, cycle, bus, drive_mode, control_mode, "
-     "enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, "
+     "enable_timeout_s, lease_s, cartesian, jog, supervision, stops, inputs, outputs, gripper, recording, ros, "
      "slaves, kinematics"),
     (ARM, [("    jerk: 20.0\n", "")],
      "joints[0]: the key jerk is missing; it must be a number of at least 0.001"),

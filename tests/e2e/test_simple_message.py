@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import re
+import socket
+import time
 from collections.abc import Callable, Iterator
 from math import cos, pi
 from typing import Any
@@ -11,8 +13,8 @@ from typing import Any
 import pytest
 
 from rtcp.ros.simple_message.client import MotionClient
-from rtcp.ros.simple_message.messages import JointPosition, JointTrajPt, ReplyCode
-from tests.e2e.conftest import Platform
+from rtcp.ros.simple_message.messages import JointPosition, JointTrajPt, Ping, ReplyCode
+from tests.e2e.conftest import Platform, gone, kill
 
 pytestmark = pytest.mark.alone
 TOLERANCE_RAD = 0.01
@@ -105,3 +107,28 @@ def test_a_lost_client_leaves_an_arm_at_rest_and_disabled(enabled: Platform, por
         running.cancel()
 
     asyncio.run(test())
+
+
+def test_the_arms_file_starts_the_server_once_and_it_ends_with_the_platform(platform: Platform) -> None:
+    platform.be_patient(2000)
+    file = platform.directory / "config" / "assistive_arm.yaml"
+    file.write_text(file.read_text() + "\nros: {simple_message: {motion_port: 0, state_port: 0}}\n")
+    platform.rtcp("start", "--detach")
+    while not (found := re.search(r"motion at 127\.0\.0\.1:(\d+)", platform.logs())):
+        time.sleep(0.05)
+    gateway = platform.pids()["gateway"]
+    kill(gateway)
+    gone(gateway)
+    platform.rtcp("status")  # starts the gateway anew
+
+    async def answers() -> ReplyCode:
+        client, running = await connect(int(found[1]))
+        reply = await client.request(Ping())
+        running.cancel()
+        return reply.reply_code
+
+    assert asyncio.run(answers()) is ReplyCode.SUCCESS
+    assert len(re.findall(r"motion at ", platform.logs())) == 1
+    platform.rtcp("stop")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", int(found[1])))

@@ -113,9 +113,9 @@ def test_where_nothing_moves_or_too_much_there_is_one_sentence(tmp_path: Path) -
     with pytest.raises(RecordingError, match="nothing moves in it") as raised:
         trajectory(read(mcap(tmp_path / "a.mcap", still)))
     assert raised.value.kind == "empty"
-    restless = cycles(8000)
+    restless = cycles(20_000)
     restless["flags"] = FLAG_ENABLED
-    restless["sent_position"] = np.random.default_rng(1).normal(size=(8000, 6))
+    restless["sent_position"] = np.random.default_rng(1).normal(size=(20_000, 6))
     with pytest.raises(RecordingError, match="choose a part by --start and --end") as raised:
         trajectory(read(mcap(tmp_path / "b.mcap", restless)))
     assert raised.value.kind == "long"

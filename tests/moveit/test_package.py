@@ -1,0 +1,173 @@
+"""`rtcp arm export-c` and `rtcp arm export-moveit`: what is written fits together and to the arm."""
+
+from __future__ import annotations
+
+import ast
+import os
+import shutil
+import subprocess
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+import yaml
+
+from kinematics.c_source import to_c
+from rtcp.cli.__main__ import main
+from rtcp.cli.arm_moveit import moveit_package
+from rtcp.config import find_arm, load, load_kinematics
+from tests.moveit.solver import needs_cpp
+from tests.moveit.test_plugin import HEADERS
+
+STUBS = {
+    "catkin": "set(catkin_FOUND TRUE)\nset(catkin_INCLUDE_DIRS ${STAND_INS})\nset(CATKIN_PACKAGE_LIB_DESTINATION lib)\n"
+    "set(CATKIN_PACKAGE_SHARE_DESTINATION share)\nmacro(catkin_package)\nendmacro()\n",
+    "ament_cmake": "set(ament_cmake_FOUND TRUE)\nmacro(ament_package)\nendmacro()\n",
+    "pluginlib": "set(pluginlib_FOUND TRUE)\ninclude_directories(${STAND_INS})\n"
+    "macro(pluginlib_export_plugin_description_file package file)\n"
+    "message(STATUS \"exported to ${package}: ${file}\")\nendmacro()\n",
+    **{name: f"set({name}_FOUND TRUE)\n" for name in ("geometry_msgs", "moveit_core", "moveit_msgs", "rclcpp")},
+}  # fmt: skip
+"""Stand-ins of the CMake packages that CMakeLists.txt looks for."""
+HERE = Path(__file__).parent
+UR5 = """\
+name: ur5
+kinematics:
+  dh:
+    - {alpha: 0, a: 0, d: 0.089}
+    - {alpha: pi/2, a: 0, d: 0}
+    - {alpha: 0, a: -0.425, d: 0}
+    - {alpha: 0, a: -0.392, d: 0.109}
+    - {alpha: pi/2, a: 0, d: 0.095}
+    - {alpha: -pi/2, a: 0, d: 0.082}
+  limits: [&l {min: -pi, max: pi}, *l, *l, *l, *l, *l]
+"""
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("ws")
+    assert main(["arm", "export-moveit", "--arm", "assistive_arm", "--out", str(out)]) == 0
+    return out / "assistive_arm_moveit_config"
+
+
+def read(package: Path, name: str) -> str:
+    return (package / name).read_text()
+
+
+def test_the_solver_in_the_package_is_the_exported_one(package: Path, tmp_path: Path) -> None:
+    assert main(["arm", "export-c", "--arm", "assistive_arm", "--out", str(tmp_path / "new")]) == 0
+    files = {file.name: file.read_text() for file in (tmp_path / "new").iterdir()}
+    assert files == to_c(load_kinematics(find_arm("assistive_arm"))).files
+    assert files == {name: read(package, f"src/{name}") for name in files}
+
+
+def test_the_urdf_is_the_exported_one(package: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["arm", "urdf", "--arm", "assistive_arm"]) == 0
+    assert capsys.readouterr().out == read(package, "config/assistive_arm.urdf")
+
+
+def test_the_srdf_names_what_is_in_the_urdf(package: Path) -> None:
+    urdf, srdf = (ET.fromstring(read(package, f"config/assistive_arm.{kind}")) for kind in ("urdf", "srdf"))
+    assert srdf.get("name") == urdf.get("name")
+    links = [link.get("name") for link in urdf.findall("link")]
+    chain = srdf.find("group/chain")
+    assert chain is not None
+    assert chain.attrib == {"base_link": links[0], "tip_link": links[-1]}
+    neighbours = {
+        (joint.find("parent").get("link"), joint.find("child").get("link"))  # type: ignore[union-attr]
+        for joint in urdf.findall("joint")
+    }
+    assert {(pair.get("link1"), pair.get("link2")) for pair in srdf.findall("disable_collisions")} == neighbours
+    revolute = [joint.get("name") for joint in urdf.findall("joint") if joint.get("type") == "revolute"]
+    assert [joint.get("name") for joint in srdf.findall("group_state/joint")] == revolute
+
+
+def test_the_limits_are_those_of_the_joints(package: Path) -> None:
+    limits = yaml.safe_load(read(package, "config/joint_limits.yaml"))["joint_limits"]
+    joints = load(find_arm("assistive_arm")).joints
+    assert list(limits) == [joint.name for joint in joints]
+    for joint in joints:
+        for kind in ("velocity", "acceleration", "jerk"):
+            assert limits[joint.name][f"has_{kind}_limits"] is True
+            assert limits[joint.name][f"max_{kind}"] == getattr(joint, kind)
+
+
+def test_what_an_arm_does_not_say_has_no_limit() -> None:
+    files = moveit_package(find_arm("abb_irb120")).files
+    limits = yaml.safe_load(files["config/joint_limits.yaml"])["joint_limits"]["joint1"]
+    assert [limits[f"has_{kind}_limits"] for kind in ("velocity", "acceleration", "jerk")] == [True, False, False]
+
+
+def test_the_plugin_has_one_name_everywhere(package: Path) -> None:
+    name = "assistive_arm_moveit_config"
+    solver = yaml.safe_load(read(package, "config/kinematics.yaml"))["manipulator"]["kinematics_solver"]
+    library = ET.fromstring(read(package, "kinematics_plugin.xml"))
+    declared = library.find("class")
+    assert declared is not None
+    assert solver == declared.get("name") == f"{name}/KinematicsPlugin"
+    assert declared.get("type") == f"{name}::KinematicsPlugin"
+    assert library.get("path") == ET.fromstring(read(package, "package.xml")).findtext("name") == package.name == name
+    assert f"PLUGINLIB_EXPORT_CLASS({name}::KinematicsPlugin," in read(package, "src/kinematics_plugin.cpp")
+
+
+def test_the_controllers_of_both_moveits_have_the_same_action_and_joints(package: Path) -> None:
+    new = yaml.safe_load(read(package, "config/moveit_controllers.yaml"))["moveit_simple_controller_manager"]
+    [name] = new.pop("controller_names")
+    [old] = yaml.safe_load(read(package, "config/simple_moveit_controllers.yaml"))["controller_list"]
+    assert old == {"name": name, **new[name]}
+    assert old["joints"] == [joint.name for joint in load(find_arm("assistive_arm")).joints]
+
+
+def test_the_launch_files_name_files_that_are_there(package: Path) -> None:
+    texts = [
+        node.value
+        for node in ast.walk(ast.parse(read(package, "launch/move_group.launch.py")))
+        if isinstance(node, ast.Constant)
+    ]
+    named = [str(text) for text in texts if str(text).startswith("config/")]
+    parameters = ET.fromstring(read(package, "launch/planning_context.launch"))
+    files = [element.get("textfile") or element.get("file", "") for element in parameters]
+    named += [file.replace(f"$(find {package.name})/", "") for file in files]
+    assert len(named) == 6
+    assert [name for name in named if not (package / name).is_file()] == []
+
+
+@needs_cpp
+@pytest.mark.skipif(shutil.which("cmake") is None, reason="there is no CMake on this machine")
+@pytest.mark.parametrize(("ros", "library"), [(1, "{}.so"), (2, "lib{}.so")])
+def test_cmake_builds_the_library_under_the_name_that_pluginlib_looks_for(
+    package: Path, tmp_path: Path, ros: int, library: str
+) -> None:
+    for name in (*HEADERS[ros], "pluginlib/class_list_macros.hpp"):
+        (tmp_path / "include" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "include" / name).write_text(f'#include "{HERE / "stand_in.hpp"}"\n')
+    for name, text in STUBS.items():
+        (tmp_path / f"Find{name}.cmake").write_text(text)
+    environment = {**os.environ, "ROS_VERSION": str(ros), "CXXFLAGS": f"-DSTAND_IN_MOVEIT={ros}"}
+    options = [f"-DCMAKE_MODULE_PATH={tmp_path}", f"-DSTAND_INS={tmp_path / 'include'}"]
+    build = tmp_path / "build"
+    configured = subprocess.run(
+        ["cmake", "-S", package, "-B", build, *options], env=environment, capture_output=True, text=True, check=False
+    )
+    assert configured.returncode == 0, configured.stderr
+    assert ("exported to moveit_core: kinematics_plugin.xml" in configured.stdout) == (ros == 2)
+    built = subprocess.run(["cmake", "--build", build], env=environment, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert (build / library.format(package.name)).is_file()
+
+
+def test_an_existing_package_is_not_overwritten(package: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (package / "mine").write_text("")
+    assert main(["arm", "export-moveit", "--arm", "assistive_arm", "--out", str(package.parent)]) == 2
+    assert f"{package} exists: remove it, or name another folder by --out" in capsys.readouterr().err.replace("\n", " ")
+
+
+@pytest.mark.parametrize("command", ["export-c", "export-moveit"])
+def test_an_arm_without_a_solver_is_refused_with_the_reason(
+    tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "ur5.yaml").write_text(UR5)
+    assert main(["arm", command, "--arm", str(tmp_path / "ur5.yaml"), "--out", str(tmp_path / "out")]) == 3
+    assert "ur5 has no spherical wrist" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
