@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import AsyncIterator, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -31,15 +31,13 @@ from std_srvs.srv import Trigger, TriggerResponse
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from kinematics.urdf import to_urdf
-from rtcp.api import RtcpError
+from rtcp.api import Replaced, RtcpError
 from rtcp.api.async_robot import connect_async
 from rtcp.config.model import ArmConfig
 from rtcp.ros.commands import (
-    Arm,
     Commander,
     CommandOptions,
     FollowCode,
-    StoppingArm,
     Tolerance,
     Tolerances,
     Trajectory,
@@ -196,8 +194,12 @@ class Commands:
         self.commander = self._wait(self._make(options))
         self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
         """Of the action: handle and what carries it out, by its id."""
-        rospy.Subscriber("joint_path_command", JointTrajectory, self._on_path, queue_size=10, tcp_nodelay=True)
-        rospy.Subscriber("joint_command", JointTrajectoryPoint, self._on_point, queue_size=1, tcp_nodelay=True)
+        for topic, kind, carry_out in (
+            ("joint_path_command", JointTrajectory, lambda m: self.commander.begin_trajectory(_trajectory(m))),
+            ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m))),
+            ("joint_trajectory", JointTrajectory, lambda m: self.commander.command_joints(_trajectory(m))),
+        ):
+            rospy.Subscriber(topic, kind, self._begin, (topic, carry_out), queue_size=100, tcp_nodelay=True)
         rospy.Service("joint_path_command", CmdJointTrajectory, self._path)
         rospy.Service("stop_motion", StopMotion, self._stop)
         rospy.Service("robot_enable", Trigger, lambda request: self._trigger(self.commander.enable()))
@@ -220,27 +222,22 @@ class Commands:
 
     @staticmethod
     async def _make(options: CommandOptions) -> Commander:
-        return Commander(_connect, options, rospy.logerr)
+        return Commander(lambda: connect_async(rospy.get_name()), options, rospy.logerr)
 
     def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    def _begin(self, what: str, coroutine: Coroutine[Any, Any, Any]) -> None:
-        """Carry it out; nobody waits for the outcome, so a refusal is logged."""
+    def _begin(self, message: Any, how: tuple[str, Callable[[Any], Coroutine[Any, Any, None]]]) -> None:
+        """Carry a message out; nobody waits for the outcome, so a refusal is logged."""
+        topic, carry_out = how
 
         async def logged() -> None:
             try:
-                await coroutine
+                await carry_out(message)
             except Exception as error:  # also a mistake of ours: without this nobody would hear of it
-                rospy.logerr("%s: %s", what, error)
+                rospy.logerr("%s: %s", topic, error)
 
         asyncio.run_coroutine_threadsafe(logged(), self._loop)
-
-    def _on_path(self, message: Any) -> None:
-        self._begin("joint_path_command", self.commander.begin_trajectory(_trajectory(message)))
-
-    def _on_point(self, message: Any) -> None:
-        self._begin("joint_command", self.commander.command_point(_point(message)))
 
     def _path(self, request: Any) -> Any:
         response = CmdJointTrajectoryResponse()
@@ -308,6 +305,9 @@ class Commands:
         except asyncio.CancelledError:
             handle.set_canceled(result, "cancelled: the arm brakes")
             return
+        except Replaced as error:
+            handle.set_canceled(result, str(error))
+            return
         except Exception as error:  # no code of the action says it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
         result.error_code, result.error_string = int(code), text
@@ -318,12 +318,6 @@ class Commands:
         else:
             rospy.logerr("joint_trajectory_action: %s", text)
             (handle.set_aborted if has_begun else handle.set_rejected)(result, text)
-
-
-@contextlib.asynccontextmanager
-async def _connect() -> AsyncIterator[Arm]:
-    async with connect_async(rospy.get_name()) as robot:
-        yield StoppingArm(robot)
 
 
 def _trajectory(message: Any) -> Trajectory:
