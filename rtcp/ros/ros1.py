@@ -24,12 +24,15 @@ import rosgraph
 import rospy
 from control_msgs.msg import FollowJointTrajectoryAction, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from industrial_msgs.msg import RobotStatus as RobotStatusMessage
 from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger, TriggerResponse
+from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from kinematics.model import ArmModel
 from kinematics.urdf import to_urdf
 from rtcp.api import Replaced, RtcpError
 from rtcp.api.async_robot import connect_async
@@ -43,7 +46,7 @@ from rtcp.ros.commands import (
     Trajectory,
     TrajectoryPoint,
 )
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState, transforms_of
 
 T = TypeVar("T")
 
@@ -61,7 +64,9 @@ class NodeOptions:
 
     name: str = "rtcp"
     rate_hz: float = 100.0
-    """Of joint_states and feedback_states."""
+    """Of joint_states, feedback_states and /tf."""
+    has_link_frames: bool = False
+    """/tf has the frames of the links too: no robot_state_publisher runs."""
     arguments: Sequence[str] = ()
     """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
     commands: CommandOptions = field(default_factory=CommandOptions)
@@ -82,7 +87,9 @@ def run(options: NodeOptions) -> None:
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
     commands = Commands(options.commands)
-    publisher = StatePublisher(Publications(commands), rate_hz=options.rate_hz, name=rospy.get_name())
+    publisher = StatePublisher(
+        Publications(commands, options.has_link_frames), rate_hz=options.rate_hz, name=rospy.get_name()
+    )
     # Another master is not followed in the middle of a motion, which the end of its connection would stop.
     while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
         publisher.step(_TURN_S)
@@ -127,8 +134,9 @@ class _Transport(xmlrpc.client.Transport):
 class Publications:
     """Publishes what the core says (`rtcp.ros.state.Sink`)."""
 
-    def __init__(self, commands: Commands) -> None:
-        self._commands = commands
+    def __init__(self, commands: Commands, has_link_frames: bool) -> None:
+        self._commands, self._has_link_frames = commands, has_link_frames
+        self._arm: ArmModel | None = None
         # A queue each: no subscriber that reads slowly holds the node.
         self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
         self._feedback = rospy.Publisher(
@@ -136,10 +144,12 @@ class Publications:
         )
         self._status = rospy.Publisher("robot_status", RobotStatusMessage, queue_size=10, tcp_nodelay=True)
         self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
+        self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
 
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and nobody has set it."""
         rospy.loginfo("connected to %s", config.name)
+        self._arm = config.arm
         try:
             if config.arm is not None and not rospy.has_param("robot_description"):
                 rospy.set_param("robot_description", to_urdf(config.arm, [joint.torque for joint in config.joints]))
@@ -147,7 +157,7 @@ class Publications:
             rospy.logwarn("robot_description was not set: %s", error)
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
-        """Publish joint_states and feedback_states."""
+        """Publish joint_states, feedback_states, and the frames where the geometry is known."""
         states = JointState(name=names, position=sample.position, velocity=sample.velocity, effort=sample.effort)
         feedback = FollowJointTrajectoryFeedback(
             joint_names=names,
@@ -161,6 +171,15 @@ class Publications:
         self._joint_states.publish(states)
         self._feedback.publish(feedback)
         self._commands.publish_feedback(feedback)
+        if self._arm is None:
+            return
+        message = TFMessage()
+        for name, (position, (w, x, y, z)) in transforms_of(self._arm, sample.position, self._has_link_frames).items():
+            one = TransformStamped(child_frame_id=name)
+            one.header.stamp, one.header.frame_id = states.header.stamp, "base_link"
+            one.transform.translation, one.transform.rotation = Vector3(*position), Quaternion(x, y, z, w)
+            message.transforms.append(one)
+        self._tf.publish(message)
 
     def status(self, status: RobotStatus) -> None:
         """Publish robot_status."""
@@ -222,7 +241,7 @@ class Commands:
 
     @staticmethod
     async def _make(options: CommandOptions) -> Commander:
-        return Commander(lambda: connect_async(rospy.get_name()), options, rospy.logerr)
+        return Commander(lambda: connect_async(rospy.get_name(), disable_when_lost=True), options, rospy.logerr)
 
     def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()

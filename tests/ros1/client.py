@@ -45,7 +45,7 @@ def publish(topic: str, message: Any) -> None:
 def stream(given: dict[str, Any]) -> dict[str, Any]:
     """Publish `count` points of (1 - cos) with its velocity; only the first joint moves."""
     topic, rate_hz = given["topic"], given["rate_hz"]
-    is_point = topic == "joint_command"
+    is_point = topic != "joint_trajectory"
     kind = JointTrajectoryPoint if is_point else JointTrajectory
     publisher = rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
     while publisher.get_num_connections() == 0:
@@ -102,7 +102,7 @@ def main() -> None:
     rospy.init_node("client", anonymous=True)
     answer: dict[str, Any] = {}
     if kind == "path":
-        publish("joint_path_command", trajectory_of(given))
+        publish(given.get("topic", "joint_path_command"), trajectory_of(given))
     elif kind == "point":
         publish("joint_command", point_of(given))
     elif kind == "stream":
