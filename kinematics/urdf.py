@@ -23,8 +23,8 @@ def to_urdf(model: ArmModel, effort: Sequence[float] | None = None) -> str:
     the model is the frame of link i, so q of the document is q of the model.
 
     Links have the masses and centres of mass of the model, if it has any. Moments of inertia are unknown; those of a
-    solid ball of 50 mm radius let simulators accept the file: gravity is right, dynamics are not. Links are drawn as
-    cylinders, without meshes.
+    solid ball of 50 mm radius let simulators accept the file: gravity is right, dynamics are not. Links are
+    cylinders, without meshes, for drawing and for collisions: pad them to the real covers in the planner.
 
     Raises ValueError for a count of efforts other than six, and for one that is negative or not finite.
     Format: http://wiki.ros.org/urdf/XML
@@ -121,11 +121,13 @@ def _rod(link: ET.Element, start: Vector, end: Vector, size: float) -> None:
 def _cylinder(
     link: ET.Element, radius: float, length: float, centre: Sequence[float], rpy: Vector, colour: str
 ) -> None:
-    visual = ET.SubElement(link, "visual")
-    _origin(visual, centre, rpy)
-    geometry = ET.SubElement(visual, "geometry")
-    ET.SubElement(geometry, "cylinder", radius=f"{radius:.4g}", length=f"{length:.4g}")
-    ET.SubElement(visual, "material", name=colour)
+    for use in ("visual", "collision"):
+        body = ET.SubElement(link, use)
+        _origin(body, centre, rpy)
+        geometry = ET.SubElement(body, "geometry")
+        ET.SubElement(geometry, "cylinder", radius=f"{radius:.4g}", length=f"{length:.4g}")
+        if use == "visual":
+            ET.SubElement(body, "material", name=colour)
 
 
 def _origin(parent: ET.Element, xyz: Sequence[float], rpy: Vector) -> None:

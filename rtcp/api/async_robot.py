@@ -32,10 +32,11 @@ class AsyncRobot(Methods):
     Args:
         name: who commands, as others are told when they are refused; empty: this process.
         path: the control socket; None: that of the runtime directory.
+        disable_when_lost: the drives are disabled, after the stop, where the connection ends in a motion of its own.
     """
 
-    def __init__(self, name: str = "", path: Path | None = None) -> None:
-        self._name = client_name(name)
+    def __init__(self, name: str = "", path: Path | None = None, disable_when_lost: bool = False) -> None:
+        self._identity = {"name": client_name(name), "disable_when_lost": disable_when_lost}
         self._path = control_socket(runtime_directory()) if path is None else path
         self._numbers = itertools.count(1)
         self._pending: dict[int, _Pending] = {}
@@ -53,7 +54,7 @@ class AsyncRobot(Methods):
             reader, self._writer = await asyncio.open_unix_connection(self._path, limit=_REPLY_LIMIT)
         except OSError as error:
             raise connection_error(self._path, error) from error
-        self._writer.write(jsonrpc.line({"method": "identify", "params": {"name": self._name}}))
+        self._writer.write(jsonrpc.line({"method": "identify", "params": self._identity}))
         self._receiving = asyncio.create_task(self._receive(reader))
         return self
 
@@ -158,6 +159,6 @@ class _Pending:
             self.answer.set_exception(RtcpError("lost", message))
 
 
-def connect_async(name: str = "", path: Path | None = None) -> AsyncRobot:
+def connect_async(name: str = "", path: Path | None = None, disable_when_lost: bool = False) -> AsyncRobot:
     """Return a robot that connects when its `async with` block begins; arguments as of `AsyncRobot`."""
-    return AsyncRobot(name, path)
+    return AsyncRobot(name, path, disable_when_lost)

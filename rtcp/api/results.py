@@ -106,6 +106,8 @@ class Progress:
     remaining_s: float = 0.0
     positions: Positions = ()
     """Actual positions, rad."""
+    accepted: bool = False
+    """True once, in the report of a joint move or trajectory that the loop has accepted just now."""
 
 
 @dataclass(frozen=True)

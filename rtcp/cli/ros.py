@@ -33,6 +33,13 @@ def _ros(
         bool, option("--auto-enable", "A motion enables the drives, but not after a stop, a fault or robot_disable.")
     ] = False,
     partial: Annotated[bool, option("--partial", "Joints that a trajectory does not name hold.")] = False,
+    tf: Annotated[bool, option("--tf", "Publish the frames of the links too: no robot_state_publisher runs.")] = False,
+    buffer: Annotated[
+        float,
+        typer.Option(
+            "--buffer", min=0.0, max=60.0, help="joint_command is executed so many seconds later; 0: each replaces."
+        ),
+    ] = 0.0,
     simple_message: Annotated[
         bool, option("--simple-message", "No node: serve Simple Message, motion and state (docs/simple_message.md).")
     ] = False,
@@ -64,10 +71,12 @@ def _ros(
             raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
         asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)))
     else:
-        _run_node(name, rate, remappings or (), enable, partial)
+        _run_node(name, rate, remappings or (), tf, enable, partial, buffer)
 
 
-def _run_node(name: str, rate: float, remappings: Sequence[str], enable: bool, partial: bool) -> None:
+def _run_node(
+    name: str, rate: float, remappings: Sequence[str], tf: bool, enable: bool, partial: bool, buffer_s: float
+) -> None:
     """Run a ROS 1 node."""
     from rtcp.ros import ros1_messages
 
@@ -82,7 +91,7 @@ def _run_node(name: str, rate: float, remappings: Sequence[str], enable: bool, p
         if ":=" not in argument:
             raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
     report(f"node {name}: Ctrl-C ends it")
-    ros1.run(ros1.NodeOptions(name, rate, remappings, CommandOptions(enable, partial)))
+    ros1.run(ros1.NodeOptions(name, rate, tf, remappings, CommandOptions(enable, partial, buffer_s)))
 
 
 async def _serve(options: ServerOptions) -> None:

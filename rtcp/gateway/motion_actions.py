@@ -204,7 +204,11 @@ class MotionActions:
         if len(q) != self._count:
             raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
         async with self._channel.lease(caller) as lease:
-            return await self._move(lease, q, speed, synchronized)
+            return await self._move(lease, q, speed, synchronized, self._says_accepted(caller))
+
+    def _says_accepted(self, caller: Caller) -> Callable[[], None]:
+        """Return what reports that the loop has accepted a motion: progress before may be of one that it replaces."""
+        return lambda: caller.report({**self._channel.progress(), "accepted": True})
 
     async def move_pose(self, caller: Caller, pose: Sequence[float], speed: float | None, line: bool) -> Json:
         """Move the tool to a pose (m, rad): on a straight line where `line` or the control mode says so, else by the
@@ -247,7 +251,8 @@ class MotionActions:
             if approach:
                 await self._move(lease, begin, None, True)
             try:
-                return await self._run_plan(lease, RunTrajectory, plan, slot, "the trajectory", tolerances)
+                accepted = self._says_accepted(caller)
+                return await self._run_plan(lease, RunTrajectory, plan, slot, "the trajectory", tolerances, accepted)
             except Violation as violation:
                 await self._brake()
                 raise violation.error from None
@@ -462,7 +467,14 @@ class MotionActions:
         is_commanded = self._channel.state in (State.HOLDING, State.MOVING)
         return self._channel.joints("commanded_position" if is_commanded else "actual_position")
 
-    async def _move(self, lease: int, q: Sequence[float], speed: float | None, synchronized: bool) -> Json:
+    async def _move(
+        self,
+        lease: int,
+        q: Sequence[float],
+        speed: float | None,
+        synchronized: bool,
+        begun: Callable[[], None] | None = None,
+    ) -> Json:
         velocities = self._planner.limits.velocity
         slowest = min(velocities)
         if speed is not None and speed > 0.0:
@@ -470,7 +482,8 @@ class MotionActions:
         command = MoveJoints(tuple(q), max(velocities) if speed is None else speed, synchronized)
         # Twice round at that speed and some more: only a machine that hangs takes longer.
         timeout_s = _TIMEOUT_S + 4 * math.tau / slowest
-        return await self._run(lease, command, timeout_s, "the move", self._arrival(q, _SAME_RAD, "the move"), q)
+        arrived = self._arrival(q, _SAME_RAD, "the move")
+        return await self._run(lease, command, timeout_s, "the move", arrived, q, begun)
 
     def _write(self, plan: Plan) -> int:
         try:
@@ -486,6 +499,7 @@ class MotionActions:
         slot: int,
         what: str,
         tolerances: Tolerances | None = None,
+        begun: Callable[[], None] | None = None,
     ) -> Json:
         tracking = None
         if tolerances is not None:
@@ -493,7 +507,8 @@ class MotionActions:
         arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what, tracking)
         timeout_s = _TIMEOUT_S + 2 * plan.duration_s
         watch = None if tracking is None else tracking.look
-        found = await self._run(lease, command(slot, len(plan.rows)), timeout_s, what, arrival, plan.end, watch=watch)
+        sent = command(slot, len(plan.rows))
+        found = await self._run(lease, sent, timeout_s, what, arrival, plan.end, begun, watch)
         return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
 
     async def _run(

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rtcp.config.find import load_messages
 from rtcp.gateway.black_box import BlackBox
-from rtcp.gateway.command_channel import Caller, Json
+from rtcp.gateway.command_channel import IN_MOTION, Caller, Json
 from rtcp.gateway.methods import Methods
 from rtcp.gateway.ros_server import RosServer
 from rtcp.gateway.status_snapshot import StatusSnapshot
@@ -65,6 +65,7 @@ class _Connection:
         self._methods = methods
         self._answered = answered
         self._name = "an unnamed client"
+        self._disables_when_lost = False
         self._turn = asyncio.Lock()
         self._requests: dict[asyncio.Task[None], jsonrpc.RequestId] = {}
         self._unread_since: float | None = None
@@ -82,10 +83,17 @@ class _Connection:
                 self._send(jsonrpc.failure(None, RtcpError("invalid", message), jsonrpc.INVALID_REQUEST))
                 await _discard(reader)
         finally:
+            channel = self._methods.channel
+            disables = (
+                self._disables_when_lost and channel.observer.holder() == self._name and channel.state in IN_MOTION
+            )
             for task in self._requests:
                 task.cancel()
             await asyncio.gather(*self._requests, return_exceptions=True)
             await self._methods.end_connection(self._number)
+            if disables:
+                with contextlib.suppress(RtcpError):
+                    await self._methods.machine.disable()
 
     def _receive(self, given: bytes) -> None:
         try:
@@ -109,6 +117,7 @@ class _Connection:
     def _notified(self, method: str, params: Json) -> None:
         if method == "identify":
             self._name = str(params.get("name") or self._name).encode(errors="replace").decode()
+            self._disables_when_lost = params.get("disable_when_lost") is True
         elif method == "cancel":
             for task, number in self._requests.items():
                 if number is not None and number == params.get("request"):

@@ -8,20 +8,30 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
-from rtcp.api import Arrival, Progress, RtcpError, State, Status
+from rtcp.api import Arrival, AsyncRobot, Progress, Replaced, RtcpError, State, Status, Stream
 from rtcp.config.model import MOST_POINTS
 
-T = TypeVar("T")
 Numbers = Sequence[float]
 _NEEDS_RESET = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT)
-_LATE_S = 1.0
+_PAUSE_S = 1.0
 """After such a pause a joint_command begins a new stream, whose times begin anew."""
+_REPEAT_S = 0.1
+"""A target is sent again after so long: the platform takes 0.2 s without one for the end of a stream."""
+_LOOK_S = 0.05
+_THERE_RAD = 1e-6
+_RAN_OUT = ("out_of_points", "not_open")
+"""An open trajectory that came to rest at its last point."""
+START_RAD = 0.01
+"""Largest distance of a trajectory's first point from where the arm is commanded; MoveIt allows as much."""
+GOAL_RAD = 0.01
+"""Default tolerance of a goal, that of the reference client; on the way the platform supervises the drives."""
 
 
 @dataclass(frozen=True)
@@ -85,41 +95,7 @@ class Tolerances:
     goal_time_s: float = 0.0
 
 
-NO_TOLERANCES = Tolerances()
-
-
-class Arm(Protocol):
-    """What the commands need of a connected robot; each raises RtcpError."""
-
-    @property
-    def is_open(self) -> bool:
-        """Whether the connection stands."""
-
-    async def status(self) -> Status:
-        """Return the status."""
-
-    async def enable(self) -> None:
-        """Enable the drives."""
-
-    async def disable(self) -> Any:
-        """Disable them."""
-
-    async def reset(self) -> State:
-        """Leave a fault or an emergency stop."""
-
-    async def halt(self) -> None:
-        """Stop every motion; return when the arm holds."""
-
-    async def move_joints(self, q: Numbers, progress: Callable[[Progress], None]) -> Arrival:
-        """Move there, in place of what is under way."""
-
-    async def run_trajectory(
-        self, points: Sequence[dict[str, Any]], tolerances: Tolerances, progress: Callable[[Progress], None]
-    ) -> Arrival:
-        """Run points `t`, `q`, `v`, `a`, in place of what is under way; cancelled, it brakes on the path."""
-
-
-Connect = Callable[[], contextlib.AbstractAsyncContextManager[Arm]]
+Connect = Callable[[], contextlib.AbstractAsyncContextManager[AsyncRobot]]
 
 
 @dataclass(frozen=True)
@@ -130,6 +106,8 @@ class CommandOptions:
     """A motion enables the drives; not after an emergency stop, a fault, or robot_disable."""
     allows_partial: bool = False
     """Joints that a trajectory does not name hold their position."""
+    buffer_s: float = 0.0
+    """joint_command is executed so much later than it came, by a trajectory through the points; 0: each replaces."""
 
 
 class Commander:
@@ -143,24 +121,21 @@ class Commander:
 
     def __init__(self, connect: Connect, options: CommandOptions, log: Callable[[str], None]) -> None:
         self._connect, self._options, self._log = connect, options, log
-        self._arm: Arm | None = None
+        self._robot: AsyncRobot | None = None
         self._closing = contextlib.AsyncExitStack()
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Arrival]] = set()
         self._may_enable = True
-        self._next: Numbers | None = None
-        """Newest joint_command, not yet sent."""
-        self._sending: asyncio.Task[None] | None = None
-        self._last_point_s, self._last_point_at = 0.0, 0.0
+        self._points = _Points(self, options.buffer_s, log)
 
     @property
     def is_moving(self) -> bool:
         """Whether something that was asked for here is under way."""
-        return bool(self._motions)
+        return bool(self._motions) or self._points.are_followed
 
     async def close(self) -> None:
         """Close the connection: what it moves comes to a controlled stop."""
-        self._arm = None
+        self._robot = None
         await self._closing.aclose()
 
     def note_stop(self) -> None:
@@ -170,25 +145,32 @@ class Commander:
     # -- motions ------------------------------------------------------------------------------------------------------
 
     async def begin_trajectory(self, trajectory: Trajectory) -> None:
-        """joint_path_command: begin it, in place of what is under way; return when it moves or is over.
+        """joint_path_command: begin it, in place of what is under way; return when it is accepted.
 
         A trajectory without points stops the motion.
         """
         if not trajectory.points:
             await self.stop()
             return
-        moves = asyncio.Event()
-        await self._leave_moving(await self._begin(trajectory, NO_TOLERANCES, moves.set), moves)
+        accepted = asyncio.Event()
+        motion = await self._begin(trajectory, None, accepted.set)
+        waiting = asyncio.ensure_future(accepted.wait())
+        await asyncio.wait({motion, waiting}, return_when=asyncio.FIRST_COMPLETED)
+        waiting.cancel()
+        if motion.done():
+            await motion
+        else:
+            motion.add_done_callback(self._report)
 
     async def follow(
-        self, trajectory: Trajectory, tolerances: Tolerances, moves: Callable[[], None]
+        self, trajectory: Trajectory, tolerances: Tolerances, accepted: Callable[[], None]
     ) -> tuple[FollowCode, str]:
         """FollowJointTrajectory: run it and return how it ended. Cancelled, the arm brakes on the path.
 
         Args:
             trajectory: with at least one point.
             tolerances: what the goal allows.
-            moves: called when it has been accepted.
+            accepted: called when it is.
 
         Raises:
             RtcpError: it was begun and ended before its end, for a reason that no code says.
@@ -197,9 +179,8 @@ class Commander:
 
         def begun() -> None:
             nonlocal has_begun
-            if not has_begun:
-                has_begun = True
-                moves()
+            has_begun = True
+            accepted()
 
         try:
             arrival = await (await self._begin(trajectory, tolerances, begun))
@@ -211,120 +192,256 @@ class Commander:
         return FollowCode.SUCCESSFUL, f"there, largest error {arrival.error:.6f} rad"
 
     async def command_point(self, point: TrajectoryPoint) -> None:
-        """joint_command: move there in place of what is under way; of points that come faster only the newest counts.
+        """joint_command: the joints, base to tool, go there in place of what is under way; at any rate.
 
         A point with a time that is not after the one before is dropped, unless a second has passed since.
         """
-        now = time.monotonic()
-        is_new = now - self._last_point_at > _LATE_S
-        self._last_point_at = now
-        if point.time_s > 0.0 and not is_new and point.time_s <= self._last_point_s:
-            raise _refusal(
-                "point_in_the_past",
-                f"joint_command: its time {point.time_s:g} s is not after {self._last_point_s:g} s: dropped",
-            )
-        self._last_point_s = point.time_s
-        if not point.positions:
-            raise _refusal("no_positions", "joint_command: it has no positions: give one a joint, rad")
-        self._next = tuple(point.positions)
-        if self._sending is None or self._sending.done():
-            self._sending = asyncio.create_task(self._send_points())
-        await self._sending
+        await self._points.take(point)
 
-    async def _send_points(self) -> None:
-        await self._enabled()
-        while (q := self._next) is not None:
-            self._next = None
-            arm = await self._connected()
-            moves = asyncio.Event()
-            motion = self._keep(asyncio.ensure_future(arm.move_joints(q, _once_moving(moves.set))))
-            await self._leave_moving(motion, moves)
+    async def command_joints(self, trajectory: Trajectory) -> None:
+        """joint_trajectory: one point, as MoveIt Servo sends it, is a `joint_command`; more are a trajectory."""
+        if len(trajectory.points) != 1:
+            await self.begin_trajectory(trajectory)
+            return
+        status = self._points.status or await (await self.connected()).status()
+        (ordered,) = points_of(trajectory, status, self._options.allows_partial)
+        time_s = trajectory.begin_s + ordered["t"] if trajectory.begin_s else 0.0
+        await self._points.take(TrajectoryPoint(time_s, ordered["q"], ordered.get("v", ()), ordered.get("a", ())))
 
     async def stop(self) -> None:
         """stop_motion: stop whatever moves; return when the arm holds."""
-        self._next = None
-        arm = await self._connected()
-        await arm.halt()
+        self._points.end()
+        robot = await self.connected()
+        await robot.halt()
 
     # -- drives -------------------------------------------------------------------------------------------------------
 
     async def enable(self) -> str:
         """robot_enable: leave a fault or an emergency stop, enable the drives; return a sentence."""
-        arm = await self._connected()
-        if (await arm.status()).state in _NEEDS_RESET:
-            left = await arm.reset()
+        robot = await self.connected()
+        if (await robot.status()).state in _NEEDS_RESET:
+            left = await robot.reset()
             if left is State.STOPPED_BY_LIMIT:
                 return "the arm holds again"
-        if (await arm.status()).state is not State.HOLDING:
-            await arm.enable()
+        if (await robot.status()).state is not State.HOLDING:
+            await robot.enable()
         self._may_enable = True
         return "the drives are enabled"
 
     async def disable(self) -> str:
         """robot_disable: stop, remove the torque; return a sentence."""
         self._may_enable = False
-        arm = await self._connected()
-        await arm.disable()
+        self._points.end()
+        robot = await self.connected()
+        await robot.disable()
         return "the drives are disabled"
 
     # -- the way there ------------------------------------------------------------------------------------------------
 
     async def _begin(
-        self, trajectory: Trajectory, tolerances: Tolerances, moves: Callable[[], None]
+        self, trajectory: Trajectory, tolerances: Tolerances | None, accepted: Callable[[], None]
     ) -> asyncio.Task[Arrival]:
-        status = await self._enabled()
+        status = await self.enabled()
         points = points_of(trajectory, status, self._options.allows_partial)
+        limits = {} if tolerances is None else tolerances_of(tolerances, status.joint_names)
         if trajectory.begin_s > 0.0:
             wait_s = trajectory.begin_s - time.time()
             if wait_s + trajectory.points[-1].time_s < 0.0:
-                raise _refusal("old_stamp", f"the trajectory ended {-wait_s:.3f} s ago by its stamp: send it in time")
+                raise refusal("old_stamp", f"the trajectory ended {-wait_s:.3f} s ago by its stamp: send it in time")
             await asyncio.sleep(max(wait_s, 0.0))
 
-        arm = await self._connected()
-        return self._keep(asyncio.ensure_future(arm.run_trajectory(points, tolerances, _once_moving(moves))))
+        robot = await self.connected()
+        self._points.end()
 
-    async def _enabled(self) -> Status:
-        """Return the status, the drives enabled where that is asked for and allowed."""
-        arm = await self._connected()
-        status = await arm.status()
-        if status.state is State.READY and self._options.enables:
-            if not self._may_enable:
-                message = "the drives were disabled by a stop or by robot_disable: call robot_enable"
-                raise _refusal("needs_enable", message)
-            await arm.enable()
-            status = await arm.status()
-        return status
+        def report(progress: Progress) -> None:
+            if progress.accepted:
+                accepted()
 
-    async def _leave_moving(self, motion: asyncio.Task[Arrival], moves: asyncio.Event) -> None:
-        """Return when it moves, and have its outcome logged; raise what it is refused with."""
-        waiting = asyncio.ensure_future(moves.wait())
-        await asyncio.wait({motion, waiting}, return_when=asyncio.FIRST_COMPLETED)
-        waiting.cancel()
-        if motion.done():
-            await motion
-        else:
-            motion.add_done_callback(self._report)
-
-    def _keep(self, motion: asyncio.Task[Arrival]) -> asyncio.Task[Arrival]:
+        run = robot.run_trajectory(points, progress=report, replace=True, start_tolerance=START_RAD, **limits)
+        motion = asyncio.ensure_future(run)
         self._motions.add(motion)
         motion.add_done_callback(self._motions.discard)
         return motion
 
+    async def end_motions(self) -> None:
+        """Stop the trajectory under way along its path."""
+        if self._motions:
+            await (await self.connected()).halt()
+            await asyncio.gather(*self._motions, return_exceptions=True)
+
+    async def enabled(self) -> Status:
+        """Return the status, the drives enabled where that is asked for and allowed."""
+        robot = await self.connected()
+        status = await robot.status()
+        if status.state is State.READY and self._options.enables:
+            if not self._may_enable:
+                message = "the drives were disabled by a stop or by robot_disable: call robot_enable"
+                raise refusal("needs_enable", message)
+            await robot.enable()
+            status = await robot.status()
+        return status
+
+    async def connected(self) -> AsyncRobot:
+        """Return the connection to the platform, made anew where it was lost."""
+        async with self._connecting:
+            if self._robot is None or not self._robot.is_open:
+                await self._closing.aclose()  # a connection that was lost
+                self._robot = await self._closing.enter_async_context(self._connect())
+            return self._robot
+
     def _report(self, motion: asyncio.Task[Arrival]) -> None:
-        if not motion.cancelled() and (error := motion.exception()) is not None:
+        error = None if motion.cancelled() else motion.exception()
+        if error is not None and not isinstance(error, Replaced):
             self._log(str(error))
 
-    async def _connected(self) -> Arm:
-        async with self._connecting:
-            if self._arm is None or not self._arm.is_open:
-                await self._closing.aclose()  # a connection that was lost
-                self._arm = await self._closing.enter_async_context(self._connect())
-            return self._arm
 
+class _Points:
+    """joint_command: each a setpoint of a stream, or, buffered, a point of an open trajectory.
 
-def _once_moving(moves: Callable[[], None]) -> Callable[[Progress], None]:
-    """Return a report of progress that calls `moves` while the motion is under way: it was not refused."""
-    return lambda progress: moves() if progress.remaining_s > 0.0 else None
+    A stream that something else has ended (a stop, a trajectory, a target out of range) stays ended until its sender
+    pauses for `_PAUSE_S`: nobody who just goes on sending starts the arm again.
+    """
+
+    def __init__(self, commander: Commander, buffer_s: float, log: Callable[[str], None]) -> None:
+        self._commander, self._buffer_s, self._log = commander, buffer_s, log
+        self._turn = asyncio.Lock()
+        self._stream: Stream | None = None
+        self._attending: asyncio.Task[None] | None = None
+        self.status: Status | None = None
+        """Of the robot when the stream began; None: there is none."""
+        self._has_ended = False
+        self._newest: TrajectoryPoint | None = None
+        self._last_s = 0.0
+        """Time of the last point, on its sender's clock."""
+        self._came_s = self._before_s = -math.inf
+        """When it came, and the one before."""
+        self._sent_s = 0.0
+        self._anchor_s: float | None = None
+        """Our clock less the sender's; None: to be found with the next point."""
+        self._began_s = 0.0
+        """Time 0 of the open trajectory."""
+
+    @property
+    def are_followed(self) -> bool:
+        """Whether the arm is on its way to one."""
+        lasts_s = self._buffer_s + _PAUSE_S if self._buffer_s else math.inf
+        return self.status is not None and time.monotonic() - self._came_s < lasts_s
+
+    def end(self) -> None:
+        """End the stream: something else moves or stops the arm."""
+        self._has_ended = True
+        self._close()
+
+    def _close(self) -> None:
+        if self._attending is not None:
+            self._attending.cancel()
+        if self._stream is not None:
+            self._stream.close()
+        self._stream = self.status = self._attending = None
+
+    async def take(self, point: TrajectoryPoint) -> None:
+        """Follow a point; while the stream is being opened the newest counts."""
+        now = time.monotonic()
+        is_first = now - self._came_s > _PAUSE_S
+        self._before_s, self._came_s = self._came_s, now
+        if is_first:
+            self._has_ended, self._anchor_s = False, None
+        elif self._has_ended:
+            return
+        if point.time_s > 0.0 and not is_first and point.time_s <= self._last_s:
+            message = f"its time {point.time_s:g} s is not after {self._last_s:g} s: dropped"
+            raise refusal("point_in_the_past", message)
+        self._last_s = point.time_s
+        for what, values in vars(point).items():
+            if what != "time_s" and not all(map(math.isfinite, values)):
+                raise refusal("not_finite", f"{what} has a number that is not finite: dropped")
+        self._newest = point
+        try:
+            if self._buffer_s:
+                async with self._turn:
+                    await self._append(point)
+            elif self._stream is not None:
+                self._send(self._stream, point)
+            elif not self._turn.locked():  # else whoever opens the stream sends the newest
+                async with self._turn:
+                    await self._open()
+        except RtcpError:
+            self.end()
+            raise
+
+    def _stamp(self, point: TrajectoryPoint) -> float:
+        """Return the instant of a point on our clock: its sender's times tell more than when they came."""
+        if self._anchor_s is None:
+            self._anchor_s = time.monotonic() - point.time_s
+        return time.monotonic() if point.time_s == 0.0 else self._anchor_s + point.time_s
+
+    # -- as a stream --------------------------------------------------------------------------------------------------
+
+    async def _open(self) -> None:
+        status = await self._commander.enabled()
+        joints = len(status.joint_names)
+        if self._newest is not None and len(self._newest.positions) != joints:
+            message = f"found {len(self._newest.positions)} positions, allowed are {joints}: dropped"
+            raise refusal("wrong_count", message)
+        self.status = status
+        await self._commander.end_motions()
+        robot = await self._commander.connected()
+        while (await robot.status()).state is State.STOPPING:
+            await asyncio.sleep(_LOOK_S)
+        stream = await robot.open_stream()
+        if self._newest is None or self._has_ended:
+            stream.close()
+            return
+        self._stream = stream
+        self._send(stream, self._newest)
+        self._attending = asyncio.create_task(self._attend(robot))
+
+    def _send(self, stream: Stream, point: TrajectoryPoint) -> None:
+        # At a low rate the arm has to rest at a target: how long it would keep the speed nobody knows.
+        has_speed = point.velocities and self._came_s - self._before_s < _REPEAT_S
+        velocity = point.velocities if has_speed else None
+        self._sent_s = time.monotonic()
+        stream.send(point.positions, velocity, (has_speed and point.accelerations) or None, self._stamp(point))
+
+    async def _attend(self, robot: AsyncRobot) -> None:
+        """Keep the stream open until the arm is at its last point."""
+        while (stream := self._stream) is not None and (point := self._newest) is not None:
+            await asyncio.sleep(_LOOK_S)
+            if time.monotonic() - self._sent_s < _REPEAT_S:
+                continue
+            try:
+                if time.monotonic() - self._came_s > _PAUSE_S:
+                    commanded = (await robot.status()).commanded_positions
+                    if max(abs(a - b) for a, b in zip(commanded, point.positions, strict=True)) < _THERE_RAD:
+                        self._close()
+                        return
+                self._anchor_s, self._sent_s = None, time.monotonic()
+                stream.send(point.positions, (0.0,) * len(point.positions))
+            except RtcpError as error:
+                self._log(f"joint_command: {error}")
+                self._attending = None
+                self.end()
+
+    # -- buffered -----------------------------------------------------------------------------------------------------
+
+    async def _append(self, point: TrajectoryPoint) -> None:
+        robot = await self._commander.connected()
+        made: dict[str, Any] = {"q": list(point.positions)}
+        if point.velocities:
+            made["v"] = list(point.velocities)
+            if point.accelerations:
+                made["a"] = list(point.accelerations)
+        if self.status is not None:
+            try:
+                await robot.append([made | {"t": self._stamp(point) - self._began_s}])
+            except RtcpError as error:
+                if error.reason not in _RAN_OUT:
+                    raise
+                self.status = self._anchor_s = None
+        if self.status is None:
+            self.status = await self._commander.enabled()
+            self._began_s = self._stamp(point) - self._buffer_s
+            await robot.open_trajectory([made | {"t": self._buffer_s}], replace=True)
 
 
 def points_of(trajectory: Trajectory, status: Status, allows_partial: bool = False) -> list[dict[str, Any]]:
@@ -334,22 +451,22 @@ def points_of(trajectory: Trajectory, status: Status, allows_partial: bool = Fal
         RtcpError: `refused`; reasons too_many_points, unknown_joint, missing_joint, wrong_count.
     """
     if len(trajectory.points) > MOST_POINTS:
-        raise _refusal(
+        raise refusal(
             "too_many_points", f"the trajectory has {len(trajectory.points)} points, at most {MOST_POINTS} are allowed"
         )
     given, names = list(trajectory.joint_names), status.joint_names
     if unknown := [name for name in given if name not in names or given.count(name) > 1]:
-        raise _refusal(
+        raise refusal(
             "unknown_joint", f"joint {unknown[0]!r} is unknown or named twice: the robot has {', '.join(names)}"
         )
     if (missing := [name for name in names if name not in given]) and not (allows_partial and given):
-        raise _refusal("missing_joint", f"joint {missing[0]!r} is missing: name all of {', '.join(names)}")
+        raise refusal("missing_joint", f"joint {missing[0]!r} is missing: name all of {', '.join(names)}")
     place = [given.index(name) if name in given else None for name in names]
 
     def ordered(number: int, what: str, values: Numbers, others: Numbers) -> list[float]:
         if len(values) != len(given):
             message = f"point {number} has {len(values)} {what}, its trajectory names {len(given)} joints"
-            raise _refusal("wrong_count", message)
+            raise refusal("wrong_count", message)
         return [other if at is None else float(values[at]) for at, other in zip(place, others, strict=True)]
 
     holds, rests = status.commanded_positions, [0.0] * len(names)
@@ -366,52 +483,34 @@ def points_of(trajectory: Trajectory, status: Status, allows_partial: bool = Fal
     return points
 
 
-def _refusal(reason: str, message: str) -> RtcpError:
-    return RtcpError("refused", message, reason)
+def tolerances_of(tolerances: Tolerances, names: Sequence[str]) -> dict[str, Any]:
+    """Return them as `Robot.run_trajectory` takes them: one number a joint, rad, 0: none.
 
-
-class StoppingArm:
-    """`Arm` on today's API, which cannot replace a motion or observe tolerances: what is under way is stopped first.
-
-    Args:
-        robot: a connected `rtcp.AsyncRobot`.
+    Raises:
+        RtcpError: `refused`; reasons unknown_joint, unsupported_tolerance.
     """
 
-    def __init__(self, robot: Any) -> None:
-        self._robot = robot
-        self.status, self.enable, self.disable = robot.status, robot.enable, robot.disable
-        self.reset, self.halt = robot.reset, robot.halt
-        self._under_way = 0
+    def numbers(given: Sequence[Tolerance], default: float) -> list[float]:
+        found = dict.fromkeys(names, default)
+        for one in given:
+            if one.name not in found:
+                raise refusal(
+                    "unknown_joint", f"a tolerance names joint {one.name!r}: the robot has {', '.join(names)}"
+                )
+            if one.velocity > 0.0 or one.acceleration > 0.0:
+                message = f"the tolerance of {one.name} has a velocity or acceleration: only positions are supervised"
+                raise refusal("unsupported_tolerance", message)
+            if one.position:
+                found[one.name] = max(one.position, 0.0)
+        return list(found.values())
 
-    @property
-    def is_open(self) -> bool:
-        """See `Arm`."""
-        return bool(self._robot.is_open)
+    return {
+        "path_tolerance": numbers(tolerances.path, 0.0),
+        "goal_tolerance": numbers(tolerances.goal, GOAL_RAD),
+        "goal_time_s": tolerances.goal_time_s or None,
+    }
 
-    async def move_joints(self, q: Numbers, progress: Callable[[Progress], None]) -> Arrival:
-        """See `Arm`."""
-        async with self._alone():
-            arrival: Arrival = await self._robot.move_joints(q, progress=progress)
-            return arrival
 
-    async def run_trajectory(
-        self, points: Sequence[dict[str, Any]], tolerances: Tolerances, progress: Callable[[Progress], None]
-    ) -> Arrival:
-        """See `Arm`; a path or goal tolerance that is given is refused."""
-        if tolerances != NO_TOLERANCES:
-            raise _refusal("tolerances", "tolerances are not supported yet: leave them empty")
-        async with self._alone() as has_stopped:
-            # It stands where the stop ended, and not at the first point any more.
-            arrival: Arrival = await self._robot.run_trajectory(points, approach=has_stopped, progress=progress)
-            return arrival
-
-    @contextlib.asynccontextmanager
-    async def _alone(self) -> AsyncIterator[bool]:
-        has_stopped = self._under_way > 0
-        self._under_way += 1
-        try:
-            if has_stopped:
-                await self._robot.halt()
-            yield has_stopped
-        finally:
-            self._under_way -= 1
+def refusal(reason: str, message: str) -> RtcpError:
+    """Return the error of a command that is refused here."""
+    return RtcpError("refused", message, reason)

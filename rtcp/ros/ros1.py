@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import xmlrpc.client
-from collections.abc import AsyncIterator, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -24,28 +24,29 @@ import rosgraph
 import rospy
 from control_msgs.msg import FollowJointTrajectoryAction, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from industrial_msgs.msg import RobotStatus as RobotStatusMessage
 from industrial_msgs.srv import CmdJointTrajectory, CmdJointTrajectoryResponse, StopMotion, StopMotionResponse
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger, TriggerResponse
+from tf2_msgs.msg import TFMessage
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from kinematics.model import ArmModel
 from kinematics.urdf import to_urdf
-from rtcp.api import RtcpError
+from rtcp.api import Replaced, RtcpError
 from rtcp.api.async_robot import connect_async
 from rtcp.config.model import ArmConfig
 from rtcp.ros.commands import (
-    Arm,
     Commander,
     CommandOptions,
     FollowCode,
-    StoppingArm,
     Tolerance,
     Tolerances,
     Trajectory,
     TrajectoryPoint,
 )
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState, transforms_of
 
 T = TypeVar("T")
 
@@ -63,7 +64,9 @@ class NodeOptions:
 
     name: str = "rtcp"
     rate_hz: float = 100.0
-    """Of joint_states and feedback_states."""
+    """Of joint_states, feedback_states and /tf."""
+    has_link_frames: bool = False
+    """/tf has the frames of the links too: no robot_state_publisher runs."""
     arguments: Sequence[str] = ()
     """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
     commands: CommandOptions = field(default_factory=CommandOptions)
@@ -84,7 +87,9 @@ def run(options: NodeOptions) -> None:
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
     commands = Commands(options.commands)
-    publisher = StatePublisher(Publications(commands), rate_hz=options.rate_hz, name=rospy.get_name())
+    publisher = StatePublisher(
+        Publications(commands, options.has_link_frames), rate_hz=options.rate_hz, name=rospy.get_name()
+    )
     # Another master is not followed in the middle of a motion, which the end of its connection would stop.
     while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
         publisher.step(_TURN_S)
@@ -129,8 +134,9 @@ class _Transport(xmlrpc.client.Transport):
 class Publications:
     """Publishes what the core says (`rtcp.ros.state.Sink`)."""
 
-    def __init__(self, commands: Commands) -> None:
-        self._commands = commands
+    def __init__(self, commands: Commands, has_link_frames: bool) -> None:
+        self._commands, self._has_link_frames = commands, has_link_frames
+        self._arm: ArmModel | None = None
         # A queue each: no subscriber that reads slowly holds the node.
         self._joint_states = rospy.Publisher("joint_states", JointState, queue_size=100, tcp_nodelay=True)
         self._feedback = rospy.Publisher(
@@ -138,10 +144,12 @@ class Publications:
         )
         self._status = rospy.Publisher("robot_status", RobotStatusMessage, queue_size=10, tcp_nodelay=True)
         self._diagnostics = rospy.Publisher("/diagnostics", DiagnosticArray, queue_size=10)
+        self._tf = rospy.Publisher("/tf", TFMessage, queue_size=100, tcp_nodelay=True)
 
     def connected(self, config: ArmConfig) -> None:
         """Set robot_description, where the geometry is known and nobody has set it."""
         rospy.loginfo("connected to %s", config.name)
+        self._arm = config.arm
         try:
             if config.arm is not None and not rospy.has_param("robot_description"):
                 rospy.set_param("robot_description", to_urdf(config.arm, [joint.torque for joint in config.joints]))
@@ -149,7 +157,7 @@ class Publications:
             rospy.logwarn("robot_description was not set: %s", error)
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
-        """Publish joint_states and feedback_states."""
+        """Publish joint_states, feedback_states, and the frames where the geometry is known."""
         states = JointState(name=names, position=sample.position, velocity=sample.velocity, effort=sample.effort)
         feedback = FollowJointTrajectoryFeedback(
             joint_names=names,
@@ -163,6 +171,15 @@ class Publications:
         self._joint_states.publish(states)
         self._feedback.publish(feedback)
         self._commands.publish_feedback(feedback)
+        if self._arm is None:
+            return
+        message = TFMessage()
+        for name, (position, (w, x, y, z)) in transforms_of(self._arm, sample.position, self._has_link_frames).items():
+            one = TransformStamped(child_frame_id=name)
+            one.header.stamp, one.header.frame_id = states.header.stamp, "base_link"
+            one.transform.translation, one.transform.rotation = Vector3(*position), Quaternion(x, y, z, w)
+            message.transforms.append(one)
+        self._tf.publish(message)
 
     def status(self, status: RobotStatus) -> None:
         """Publish robot_status."""
@@ -196,8 +213,12 @@ class Commands:
         self.commander = self._wait(self._make(options))
         self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
         """Of the action: handle and what carries it out, by its id."""
-        rospy.Subscriber("joint_path_command", JointTrajectory, self._on_path, queue_size=10, tcp_nodelay=True)
-        rospy.Subscriber("joint_command", JointTrajectoryPoint, self._on_point, queue_size=1, tcp_nodelay=True)
+        for topic, kind, carry_out in (
+            ("joint_path_command", JointTrajectory, lambda m: self.commander.begin_trajectory(_trajectory(m))),
+            ("joint_command", JointTrajectoryPoint, lambda m: self.commander.command_point(_point(m))),
+            ("joint_trajectory", JointTrajectory, lambda m: self.commander.command_joints(_trajectory(m))),
+        ):
+            rospy.Subscriber(topic, kind, self._begin, (topic, carry_out), queue_size=100, tcp_nodelay=True)
         rospy.Service("joint_path_command", CmdJointTrajectory, self._path)
         rospy.Service("stop_motion", StopMotion, self._stop)
         rospy.Service("robot_enable", Trigger, lambda request: self._trigger(self.commander.enable()))
@@ -220,27 +241,22 @@ class Commands:
 
     @staticmethod
     async def _make(options: CommandOptions) -> Commander:
-        return Commander(_connect, options, rospy.logerr)
+        return Commander(lambda: connect_async(rospy.get_name(), disable_when_lost=True), options, rospy.logerr)
 
     def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()
 
-    def _begin(self, what: str, coroutine: Coroutine[Any, Any, Any]) -> None:
-        """Carry it out; nobody waits for the outcome, so a refusal is logged."""
+    def _begin(self, message: Any, how: tuple[str, Callable[[Any], Coroutine[Any, Any, None]]]) -> None:
+        """Carry a message out; nobody waits for the outcome, so a refusal is logged."""
+        topic, carry_out = how
 
         async def logged() -> None:
             try:
-                await coroutine
+                await carry_out(message)
             except Exception as error:  # also a mistake of ours: without this nobody would hear of it
-                rospy.logerr("%s: %s", what, error)
+                rospy.logerr("%s: %s", topic, error)
 
         asyncio.run_coroutine_threadsafe(logged(), self._loop)
-
-    def _on_path(self, message: Any) -> None:
-        self._begin("joint_path_command", self.commander.begin_trajectory(_trajectory(message)))
-
-    def _on_point(self, message: Any) -> None:
-        self._begin("joint_command", self.commander.command_point(_point(message)))
 
     def _path(self, request: Any) -> Any:
         response = CmdJointTrajectoryResponse()
@@ -308,6 +324,9 @@ class Commands:
         except asyncio.CancelledError:
             handle.set_canceled(result, "cancelled: the arm brakes")
             return
+        except Replaced as error:
+            handle.set_canceled(result, str(error))
+            return
         except Exception as error:  # no code of the action says it; a goal always ends with a result
             code, text = FollowCode.INVALID_GOAL, str(error)
         result.error_code, result.error_string = int(code), text
@@ -318,12 +337,6 @@ class Commands:
         else:
             rospy.logerr("joint_trajectory_action: %s", text)
             (handle.set_aborted if has_begun else handle.set_rejected)(result, text)
-
-
-@contextlib.asynccontextmanager
-async def _connect() -> AsyncIterator[Arm]:
-    async with connect_async(rospy.get_name()) as robot:
-        yield StoppingArm(robot)
 
 
 def _trajectory(message: Any) -> Trajectory:

@@ -14,10 +14,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+import rtcp
+from kinematics.forward import frames
+from kinematics.model import ArmModel
+from kinematics.pose import Vector
 from rtcp.api import ControlMode, NotRunning, State
 from rtcp.api.feed import Feed, Records
-from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING
+from rtcp.motion.planning.interpolation import Quaternion, quaternion
 
+TOOL_FRAME = "tool0_controller"
+"""As other drivers name it: `tool0` itself hangs at the last link of the URDF."""
 RECONNECT_S = 1.0
 """Interval between two tries to reach the platform (ROS-Industrial driver specification, 1.2.2)."""
 _SECOND_NS = 1_000_000_000
@@ -30,7 +36,6 @@ _AT_REST = 0.01
 """Measured speed below which a joint stands, rad/s: drives report some counts of noise."""
 _CHANGES = ("state", "flags", "control_mode", "fault", "limit")
 _IN_ERROR = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT, State.RESETTING)
-_IN_MOTION = (State.MOVING, State.STOPPING, State.HOMING)
 _AT_REST_STATES = (State.READY, State.ENABLING, State.HOLDING, State.STOPPED_BY_LIMIT)
 _TAKES_MOTIONS = (ControlMode.JOINT, ControlMode.CARTESIAN)
 
@@ -118,11 +123,11 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
         stamp_ns: its instant, CLOCK_REALTIME.
         is_held_by_others: another commander has the arm, so that a motion would be refused.
     """
-    state, flags, control_mode = State(record["state"]), int(record["flags"]), int(record["control_mode"])
+    found, state = rtcp.RobotStatus.of_record(record), State(record["state"])
     is_fresh = age_ns < _STALE_NS
     # A drive that was last seen without torque does not get it back while no frame reaches it.
-    powered = TriState.UNKNOWN if flags & FLAG_ENABLED and not is_fresh else TriState(bool(flags & FLAG_ENABLED))
-    if state in _IN_MOTION:
+    powered = TriState.UNKNOWN if found.drives_powered and not is_fresh else TriState(found.drives_powered)
+    if found.in_motion:
         in_motion = TriState.TRUE
     elif state in _AT_REST_STATES or (not is_fresh and powered is TriState.FALSE):
         in_motion = TriState.FALSE
@@ -130,26 +135,31 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
         in_motion = TriState(bool(np.abs(record["actual_velocity"]).max(initial=0.0) > _AT_REST))
     else:
         in_motion = TriState.UNKNOWN
-    e_stopped = state is State.EMERGENCY_STOP or bool(flags & FLAG_EMERGENCY_STOP)
-    in_error = e_stopped or state in _IN_ERROR
-    possible = (
-        state in (State.HOLDING, State.MOVING)
-        and bool(flags & FLAG_MOTION_ALLOWED)
-        and not flags & (FLAG_SWITCHING | FLAG_EMERGENCY_STOP)
-        and control_mode in _TAKES_MOTIONS
-        and is_fresh
-        and not is_held_by_others
-    )
+    takes_motions = int(record["control_mode"]) in _TAKES_MOTIONS and is_fresh and not is_held_by_others
     return RobotStatus(
         stamp_ns,
-        RobotMode.MANUAL if control_mode == ControlMode.JOYSTICK else RobotMode.AUTO,
-        TriState(e_stopped),
+        RobotMode.MANUAL if found.mode == "manual" else RobotMode.AUTO,
+        TriState(found.e_stopped),
         powered,
-        TriState(possible),
+        TriState(found.motion_possible and takes_motions),
         in_motion,
-        TriState(in_error),
-        int(record["fault"] or record["limit"]) if in_error else 0,
+        TriState(found.in_error),
+        found.error_code,
     )
+
+
+def transforms_of(arm: ArmModel, q: Numbers, has_links: bool) -> dict[str, tuple[Vector, Quaternion]]:
+    """Return position, m, and orientation (w, x, y, z) in `base_link` of the tool, as `TOOL_FRAME`, by its name.
+
+    Args:
+        arm: the geometry.
+        q: rad
+        has_links: also of the links and `tool0`, which a robot_state_publisher publishes else.
+    """
+    poses = frames(arm, q)
+    names = [*(f"link{number}" for number in range(1, len(poses))), "tool0"] if has_links else []
+    found = dict(zip([*names, TOOL_FRAME], [*poses, poses[-1]] if has_links else poses[-1:], strict=True))
+    return {name: (pose.position, quaternion(pose.rotation)) for name, pose in found.items()}
 
 
 class StatePublisher:
@@ -192,7 +202,10 @@ class StatePublisher:
         if feed is None:
             time.sleep(wait_s)
         else:
-            has_ended = feed.ended(wait_s)
+            # Between two samples it rests: not each of up to 2000 records a second has to wake it.
+            rest_s = (self._joints_ns - feed.period_ns - now_ns) * 1e-9
+            has_ended = feed.ended(min(max(rest_s, 0.0), wait_s))
+            feed.wait(wait_s)
             self._follow(feed, feed.records()[0])
             if has_ended:
                 self._disconnect("the platform has ended")

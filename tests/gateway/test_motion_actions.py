@@ -54,6 +54,24 @@ def test_a_move_reports_its_progress(arm: FakePlatform) -> None:
     assert {"state", "fraction", "remaining_s", "positions"} == set(reports[0])
 
 
+@pytest.mark.parametrize(
+    ("motion", "params"),
+    [("move_joints", {"q": THERE}), ("run_trajectory", {"points": [{"t": 0.0, "q": BENT}, {"t": 2.0, "q": THERE}]})],
+)
+def test_a_motion_reports_once_that_it_was_accepted_and_one_that_is_refused_does_not(
+    arm: FakePlatform, motion: str, params: dict[str, Any]
+) -> None:
+    reports: list[dict[str, Any]] = []
+    arm.loop.ends[RunTrajectory] = tuple(THERE)
+    arm.run(lambda: arm.methods.call(motion, Caller("one", 1, reports.append), params))
+    assert [report.get("accepted") for report in reports].count(True) == 1
+    reports.clear()
+    arm.loop.refusals = dict.fromkeys((MoveJoints, RunTrajectory), EmergencyStopPressed())
+    with pytest.raises(RtcpError):
+        arm.run(lambda: arm.methods.call(motion, Caller("one", 1, reports.append), params))
+    assert not any("accepted" in report for report in reports)
+
+
 @pytest.mark.parametrize("motion", ["move_joints", "run_trajectory", "move_line"])
 def test_the_status_has_the_goal_while_the_arm_moves_there(arm: FakePlatform, motion: str) -> None:
     pose = beside(arm, 0.1)

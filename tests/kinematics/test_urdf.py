@@ -69,6 +69,16 @@ def test_the_tool_pose_of_the_document_matches_the_model(change, either):
         assert found[:3, :3].ravel() == pytest.approx(expected.rotation, abs=1e-13)
 
 
+def test_every_body_that_is_drawn_is_a_collision_body_too(irb120):
+    for link in ET.fromstring(to_urdf(irb120)).findall("link"):
+        drawn, solid = (
+            [(body.find("origin").attrib, body.find("geometry/cylinder").attrib) for body in link.findall(use)]
+            for use in ("visual", "collision")
+        )
+        assert drawn == solid
+        assert drawn or link.get("name") == "tool0"
+
+
 def test_limits_are_exact(irb120):
     joints = ET.fromstring(to_urdf(irb120, effort=[6.1, 5.0, 4.0, 3.0, 2.0, 1.0])).findall("joint[@type='revolute']")
     assert [joint.get("name") for joint in joints] == list(irb120.joint_names)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -13,8 +15,10 @@ import pytest
 
 from rtcp.api import Arrival, Progress, RtcpError, State, Status
 from rtcp.config.model import MOST_POINTS
+from rtcp.ros import commands
 from rtcp.ros.commands import (
-    NO_TOLERANCES,
+    GOAL_RAD,
+    START_RAD,
     Commander,
     CommandOptions,
     FollowCode,
@@ -31,15 +35,39 @@ STATUS = cast(Status, SimpleNamespace(joint_names=NAMES, commanded_positions=HER
 PATH = Trajectory(NAMES, [TrajectoryPoint(0.0, HERE), TrajectoryPoint(1.0, (0, 0, 0))])
 
 
+class FakeStream:
+    """Keeps what is sent; `error`: what the next `send` raises."""
+
+    def __init__(self, arm: FakeArm) -> None:
+        self._arm = arm
+        self.sent: list[tuple[Any, Any, Any, Any]] = []
+        self.error: RtcpError | None = None
+        self.is_closed = False
+
+    def send(self, q: Any, velocity: Any = None, acceleration: Any = None, t: Any = None) -> None:
+        if self.error is not None:
+            raise self.error
+        self.sent.append((tuple(q), velocity, acceleration, t))
+        self._arm.commanded = tuple(q)
+
+    def close(self) -> None:
+        self.is_closed = True
+
+
 class FakeArm:
-    """Moves until the next motion, a halt or `arrive`; `refusal`: what it refuses everything with."""
+    """A robot that moves until the next motion, a halt or `end`; `refusal`: what it refuses everything with."""
 
     def __init__(self) -> None:
         self.state = State.HOLDING
+        self.commanded = HERE
         self.calls: list[Any] = []
         self.refusal: RtcpError | None = None
+        self.refuse_runs: RtcpError | None = None
         self.connections = self.closed = 0
         self.is_open = True
+        self.streams: list[FakeStream] = []
+        self.appended: list[dict[str, Any]] = []
+        self.ran_out = False
         self._motion: asyncio.Future[Arrival] | None = None
 
     @contextlib.asynccontextmanager
@@ -51,7 +79,8 @@ class FakeArm:
 
     async def status(self) -> Status:
         self._check()
-        return cast(Status, SimpleNamespace(joint_names=NAMES, commanded_positions=HERE, state=self.state))
+        status = SimpleNamespace(joint_names=NAMES, commanded_positions=self.commanded, state=self.state)
+        return cast(Status, status)
 
     async def enable(self) -> None:
         self.calls.append("enable")
@@ -70,25 +99,40 @@ class FakeArm:
         self.calls.append("halt")
         self.end(RtcpError("fault", "the motion was stopped"))
 
-    async def move_joints(self, q: Sequence[float], progress: Callable[[Progress], None]) -> Arrival:
-        return await self._move(("move", tuple(q)), progress)
-
     async def run_trajectory(
-        self, points: Sequence[dict[str, Any]], tolerances: Tolerances, progress: Callable[[Progress], None]
+        self, points: Sequence[dict[str, Any]], progress: Callable[[Progress], None], replace: bool, **given: Any
     ) -> Arrival:
-        return await self._move(("run", [point["q"] for point in points], tolerances), progress)
-
-    async def _move(self, call: Any, progress: Callable[[Progress], None]) -> Arrival:
+        assert replace
+        progress(Progress(0.5, 1.0))  # of what it replaces
         self._check()
-        self.end(RtcpError("fault", "the motion was replaced"))
-        self.calls.append(call)
+        if self.refuse_runs is not None:
+            await asyncio.sleep(0.01)
+            raise self.refuse_runs
+        self.end(RtcpError("replaced", "the motion was replaced"))
+        self.calls.append(("run", [point["q"] for point in points], given))
         self._motion = asyncio.get_running_loop().create_future()
-        progress(Progress(0.0, 1.0))
+        progress(Progress(0.0, 1.0, accepted=True))
         try:
             return await self._motion
         except asyncio.CancelledError:
             self.calls.append("brake")
             raise
+
+    async def open_stream(self) -> FakeStream:
+        self._check()
+        self.streams.append(FakeStream(self))
+        return self.streams[-1]
+
+    async def open_trajectory(self, points: Sequence[dict[str, Any]], replace: bool) -> None:
+        self._check()
+        self.calls.append("open")
+        self.appended += points
+
+    async def append(self, points: Sequence[dict[str, Any]]) -> None:
+        if self.ran_out:
+            self.ran_out = False
+            raise RtcpError("fault", "no points", "out_of_points")
+        self.appended += points
 
     def _check(self) -> None:
         if self.refusal is not None:
@@ -107,7 +151,7 @@ def arm() -> FakeArm:
     return FakeArm()
 
 
-def carry_out(arm: FakeArm, test: Callable[[Commander], Coroutine[Any, Any, None]], **options: bool) -> list[str]:
+def carry_out(arm: FakeArm, test: Callable[[Commander], Coroutine[Any, Any, None]], **options: Any) -> list[str]:
     """Run a coroutine with a commander; return what was logged."""
     logged: list[str] = []
 
@@ -178,18 +222,40 @@ def test_a_trajectory_is_begun_and_its_end_is_not_waited_for(arm: FakeArm) -> No
         assert not commander.is_moving
 
     assert carry_out(arm, test) == []
-    assert arm.calls == [("run", [list(HERE), [0, 0, 0]], NO_TOLERANCES)]
+    assert arm.calls == [("run", [list(HERE), [0, 0, 0]], {"start_tolerance": START_RAD})]
 
 
-def test_a_new_trajectory_replaces_the_one_under_way_whose_outcome_is_logged(arm: FakeArm) -> None:
+def test_a_new_trajectory_replaces_the_one_under_way(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         await commander.begin_trajectory(PATH)
         await commander.begin_trajectory(PATH)
         arm.end()
         await asyncio.sleep(0.01)
 
-    assert carry_out(arm, test) == ["the motion was replaced"]
+    assert carry_out(arm, test) == []
     assert len(arm.calls) == 2
+
+
+def test_a_trajectory_that_ends_before_its_end_is_logged(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.begin_trajectory(PATH)
+        await commander.stop()
+        await asyncio.sleep(0.01)
+
+    assert carry_out(arm, test) == ["the motion was stopped"]
+
+
+def test_a_trajectory_that_is_refused_in_place_of_another_is_refused_to_its_caller(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.begin_trajectory(PATH)
+        points = [TrajectoryPoint(0.0, HERE), TrajectoryPoint(1.0, (9, 9, 9))]
+        arm.refuse_runs = RtcpError("refused", "out of range")
+        with pytest.raises(RtcpError, match="out of range"):
+            await commander.begin_trajectory(Trajectory(NAMES, points))
+        arm.end()
+        await asyncio.sleep(0.01)
+
+    assert carry_out(arm, test) == []
 
 
 def test_a_refusal_reaches_the_caller(arm: FakeArm) -> None:
@@ -250,7 +316,7 @@ def test_a_goal_is_accepted_once_and_ends_with_its_code(arm: FakeArm) -> None:
     accepted: list[bool] = []
 
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, NO_TOLERANCES, lambda: accepted.append(True)))
+        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: accepted.append(True)))
         await asyncio.sleep(0.01)
         arm.end()
         assert (await following)[0] is FollowCode.SUCCESSFUL
@@ -260,16 +326,40 @@ def test_a_goal_is_accepted_once_and_ends_with_its_code(arm: FakeArm) -> None:
 
 
 def test_the_tolerances_of_a_goal_reach_the_arm(arm: FakeArm) -> None:
-    wanted = Tolerances([Tolerance("a", 0.1)], [Tolerance("b", -1)], 0.5)
+    path, goal = [Tolerance("b", 0.1), Tolerance("c", -1)], [Tolerance("b", -1), Tolerance("c", 0.02)]
 
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, wanted, lambda: None))
+        following = asyncio.create_task(commander.follow(PATH, Tolerances(path, goal, 0.5), lambda: None))
         await asyncio.sleep(0.01)
         arm.end()
         await following
 
     carry_out(arm, test)
-    assert arm.calls[0][2] == wanted
+    assert arm.calls[0][2] == {
+        "start_tolerance": START_RAD,
+        "path_tolerance": [0.0, 0.1, 0.0],  # 0: none
+        "goal_tolerance": [GOAL_RAD, 0.0, 0.02],
+        "goal_time_s": 0.5,
+    }
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "code", "words"),
+    [
+        (Tolerance("z", 0.1), FollowCode.INVALID_JOINTS, "joint 'z'"),
+        (Tolerance("a", 0.1, velocity=0.1), FollowCode.INVALID_GOAL, "only positions are supervised"),
+    ],
+)
+def test_a_tolerance_that_cannot_be_honoured_refuses_the_goal(
+    arm: FakeArm, tolerance: Tolerance, code: FollowCode, words: str
+) -> None:
+    async def test(commander: Commander) -> None:
+        ended, text = await commander.follow(PATH, Tolerances([tolerance]), lambda: None)
+        assert ended is code
+        assert words in text
+
+    carry_out(arm, test)
+    assert arm.calls == []
 
 
 @pytest.mark.parametrize(
@@ -277,12 +367,11 @@ def test_the_tolerances_of_a_goal_reach_the_arm(arm: FakeArm) -> None:
     [
         ("path_tolerance_violated", FollowCode.PATH_TOLERANCE_VIOLATED),
         ("goal_tolerance_violated", FollowCode.GOAL_TOLERANCE_VIOLATED),
-        ("goal_time_exceeded", FollowCode.GOAL_TOLERANCE_VIOLATED),
     ],
 )
 def test_a_violated_tolerance_has_its_code_and_says_why(arm: FakeArm, reason: str, code: FollowCode) -> None:
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, NO_TOLERANCES, lambda: None))
+        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
         await asyncio.sleep(0.01)
         arm.end(RtcpError("fault", "joint a was 0.2 rad beside the path", reason))
         assert await following == (code, "joint a was 0.2 rad beside the path")
@@ -293,11 +382,11 @@ def test_a_violated_tolerance_has_its_code_and_says_why(arm: FakeArm, reason: st
 def test_a_goal_that_is_refused_is_invalid_and_one_that_is_stopped_raises(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         unknown = Trajectory(("a", "b", "z"), PATH.points)
-        assert (await commander.follow(unknown, NO_TOLERANCES, lambda: None))[0] is FollowCode.INVALID_JOINTS
+        assert (await commander.follow(unknown, Tolerances(), lambda: None))[0] is FollowCode.INVALID_JOINTS
         arm.refusal = RtcpError("refused", "too fast")
-        assert await commander.follow(PATH, NO_TOLERANCES, lambda: None) == (FollowCode.INVALID_GOAL, "too fast")
+        assert await commander.follow(PATH, Tolerances(), lambda: None) == (FollowCode.INVALID_GOAL, "too fast")
         arm.refusal = None
-        following = asyncio.create_task(commander.follow(PATH, NO_TOLERANCES, lambda: None))
+        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
         await asyncio.sleep(0.01)
         await commander.stop()
         with pytest.raises(RtcpError, match="was stopped"):
@@ -308,7 +397,7 @@ def test_a_goal_that_is_refused_is_invalid_and_one_that_is_stopped_raises(arm: F
 
 def test_a_goal_that_is_cancelled_brakes(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
-        following = asyncio.create_task(commander.follow(PATH, NO_TOLERANCES, lambda: None))
+        following = asyncio.create_task(commander.follow(PATH, Tolerances(), lambda: None))
         await asyncio.sleep(0.01)
         following.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -321,27 +410,146 @@ def test_a_goal_that_is_cancelled_brakes(arm: FakeArm) -> None:
 # -- points one by one ----------------------------------------------------------------------------------------------
 
 
-def test_each_joint_command_replaces_the_one_before(arm: FakeArm) -> None:
+def point(first: float, time_s: float = 0.0, speed: float | None = None) -> TrajectoryPoint:
+    return TrajectoryPoint(time_s, (first, 0, 0), () if speed is None else (speed, 0, 0))
+
+
+def test_joint_commands_are_setpoints_of_one_stream_with_their_senders_times(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         for number in (1, 2, 3):
-            await commander.command_point(TrajectoryPoint(0.0, (number, 0, 0)))
-        arm.end()
+            await commander.command_point(point(number, number * 0.004, 0.5))
+        assert commander.is_moving
 
-    carry_out(arm, test)
-    assert arm.calls == [("move", (number, 0, 0)) for number in (1, 2, 3)]
+    assert carry_out(arm, test) == []
+    (stream,) = arm.streams
+    assert [sent[0][0] for sent in stream.sent] == [1, 2, 3]
+    # The rate is not known with the first one.
+    assert [sent[1] for sent in stream.sent] == [None, (0.5, 0, 0), (0.5, 0, 0)]
+    stamps = [sent[3] for sent in stream.sent]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.004, 0.004])
+
+
+def test_a_slow_joint_command_is_sent_again_until_the_arm_is_there_and_then_its_stream_ends(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.command_point(point(1.0, 0.0, 0.5))
+        (stream,) = arm.streams
+        while len(stream.sent) < 3:
+            arm.commanded = HERE
+            await asyncio.sleep(0.01)
+        arm.commanded = (1.0, 0.0, 0.0)
+        while commander.is_moving:
+            await asyncio.sleep(0.01)
+        assert stream.is_closed
+
+    assert carry_out(arm, test) == []
+    first, *again = arm.streams[0].sent
+    assert first[:2] == ((1.0, 0, 0), None)
+    assert {sent[:2] for sent in again} == {((1.0, 0, 0), (0.0, 0.0, 0.0))}
 
 
 def test_a_joint_command_from_the_past_is_dropped(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
-        await commander.command_point(TrajectoryPoint(2.0, HERE))
+        await commander.command_point(point(1.0, 2.0))
         with pytest.raises(RtcpError) as refused:
-            await commander.command_point(TrajectoryPoint(1.5, HERE))
+            await commander.command_point(point(2.0, 1.5))
         assert refused.value.reason == "point_in_the_past"
-        await commander.command_point(TrajectoryPoint(2.5, HERE))
+        await commander.command_point(point(3.0, 2.5))
+
+    carry_out(arm, test)
+    assert [sent[0][0] for sent in arm.streams[0].sent] == [1.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        (TrajectoryPoint(0.0, (math.nan, 0, 0)), "not_finite"),
+        (TrajectoryPoint(0.0, HERE, (math.inf, 0, 0)), "not_finite"),
+        (TrajectoryPoint(0.0, ()), "wrong_count"),
+        (TrajectoryPoint(0.0, (0.0,) * 13), "wrong_count"),
+    ],
+)
+def test_a_joint_command_that_no_arm_could_follow_opens_no_stream(
+    arm: FakeArm, given: TrajectoryPoint, reason: str
+) -> None:
+    async def test(commander: Commander) -> None:
+        with pytest.raises(RtcpError) as refused:
+            await commander.command_point(given)
+        assert refused.value.reason == reason
+        assert not commander.is_moving
+
+    carry_out(arm, test)
+    assert arm.streams == []
+
+
+@pytest.mark.parametrize("by", ["stop", "robot_disable", "a trajectory", "the platform"])
+def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
+    arm: FakeArm, by: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = SimpleNamespace(monotonic=lambda: now, time=time.time)
+    now = 100.0
+
+    async def test(commander: Commander) -> None:
+        nonlocal now
+        monkeypatch.setattr(commands, "time", clock)
+        await commander.command_point(point(1.0))
+        if by == "stop":
+            await commander.stop()
+        elif by == "robot_disable":
+            await commander.disable()
+        elif by == "a trajectory":
+            await commander.begin_trajectory(PATH)
+            arm.end()
+        else:
+            arm.streams[0].error = RtcpError("fault", "the stream has ended: out of range")
+            with pytest.raises(RtcpError, match="out of range"):
+                await commander.command_point(point(2.0))
+        arm.state = State.HOLDING
+        for _ in range(4):
+            now += 0.5
+            await commander.command_point(point(3.0))
+        assert (len(arm.streams), arm.streams[0].is_closed) == (1, True)
+        now += 1.5
+        await commander.command_point(point(4.0))
+        assert len(arm.streams) == 2
+
+    assert carry_out(arm, test) == []
+
+
+def test_a_joint_command_takes_the_place_of_a_trajectory(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.begin_trajectory(PATH)
+        await commander.command_point(point(1.0))
+
+    carry_out(arm, test)
+    assert arm.calls[-1] == "halt"
+    assert [sent[0][0] for sent in arm.streams[0].sent] == [1.0]
+
+
+def test_buffered_joint_commands_are_points_of_an_open_trajectory_that_much_later(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        for number in (1, 2, 3):
+            await commander.command_point(point(number, float(number)))
+        arm.ran_out = True
+        await commander.command_point(point(9, 9.0))
+
+    assert carry_out(arm, test, buffer_s=2.0) == []
+    assert [one["t"] for one in arm.appended] == pytest.approx([2.0, 3.0, 4.0, 2.0])
+    assert [one["q"][0] for one in arm.appended] == [1, 2, 3, 9]
+    assert arm.calls == ["open", "open"]
+
+
+def test_a_joint_trajectory_of_one_point_is_a_joint_command_and_a_longer_one_is_executed(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        for number in (1, 2):
+            given = Trajectory(NAMES[::-1], [TrajectoryPoint(0.03, (3, 2, number), (6, 5, 4))], 50.0 + number / 100)
+            await commander.command_joints(given)
+        await commander.command_joints(PATH)
         arm.end()
 
     carry_out(arm, test)
-    assert len(arm.calls) == 2
+    assert [sent[:2] for sent in arm.streams[0].sent] == [((1, 2, 3), None), ((2, 2, 3), [4, 5, 6])]
+    assert arm.streams[0].sent[1][3] - arm.streams[0].sent[0][3] == pytest.approx(0.01)
+    assert arm.calls[-1][0] == "run"
 
 
 # -- drives ---------------------------------------------------------------------------------------------------------

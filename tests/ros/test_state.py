@@ -9,13 +9,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from kinematics.forward import forward
 from rtcp.api import ControlMode, NotRunning, RtcpError, State
 from rtcp.api.feed import Feed
 from rtcp.config.find import default_config
 from rtcp.config.loader import load
 from rtcp.ipc.observer import record_type
 from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_ENABLED, FLAG_MOTION_ALLOWED, FLAG_SWITCHING, arm_schema
+from rtcp.motion.planning.interpolation import rotation
 from rtcp.ros.state import (
+    TOOL_FRAME,
     Diagnostics,
     JointSample,
     RobotMode,
@@ -23,6 +26,7 @@ from rtcp.ros.state import (
     StatePublisher,
     TriState,
     robot_status,
+    transforms_of,
 )
 
 SCHEMA = arm_schema(6)
@@ -53,6 +57,9 @@ class FakeFeed:
 
     def ended(self, wait_s: float) -> bool:
         return self.has_ended
+
+    def wait(self, timeout_s: float) -> bool:
+        return bool(self.waiting)
 
     def records(self) -> tuple[Any, int]:
         found, self.waiting = self.waiting, []
@@ -298,3 +305,17 @@ def test_not_running_is_the_only_error_that_is_waited_out(heard: Heard) -> None:
     assert issubclass(NotRunning, RtcpError)
     with pytest.raises(RuntimeError):
         StatePublisher(heard, fail).step(0)
+
+
+def test_the_tool_has_a_frame_and_the_links_where_that_is_asked_for() -> None:
+    arm = CONFIG.arm
+    assert arm is not None
+    q = (0.1, 0.3, 1.2, 0.2, 0.4, 0.5)
+    pose = forward(arm, q)
+    alone, every = transforms_of(arm, q, False), transforms_of(arm, q, True)
+    assert list(alone) == [TOOL_FRAME]
+    assert list(every) == [*(f"link{number}" for number in range(1, 7)), "tool0", TOOL_FRAME]
+    assert every["tool0"] == every[TOOL_FRAME] == alone[TOOL_FRAME]
+    position, turn = alone[TOOL_FRAME]
+    assert position == pytest.approx(pose.position)
+    assert rotation(turn) == pytest.approx(pose.rotation)

@@ -1,12 +1,14 @@
 """One command from a client on rospy: `client.py KIND JSON` prints what came of it as JSON.
 
-`path` and `point` publish; `service`, `stop_motion`, `robot_enable`, `robot_disable` call; `follow` sends a goal of the
-action, and with `cancel_s` cancels it after so many seconds.
+`path` and `point` publish once, `stream` publishes points of a sine at `rate_hz` on `topic`; `service`, `stop_motion`,
+`robot_enable`, `robot_disable` call; `follow` sends a goal of the action, and with `cancel_s` cancels it after so many
+seconds.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from typing import Any
@@ -28,7 +30,8 @@ def point_of(given: dict[str, Any]) -> Any:
 
 
 def trajectory_of(given: dict[str, Any]) -> Any:
-    return JointTrajectory(joint_names=given["names"], points=[point_of(point) for point in given["points"]])
+    points = [point_of(point) for point in given["points"]]
+    return JointTrajectory(joint_names=given["names"], points=points * given.get("times", 1))
 
 
 def publish(topic: str, message: Any) -> None:
@@ -37,6 +40,33 @@ def publish(topic: str, message: Any) -> None:
         time.sleep(0.05)
     publisher.publish(message)
     time.sleep(0.5)  # rospy sends from a thread
+
+
+def stream(given: dict[str, Any]) -> dict[str, Any]:
+    """Publish `count` points of (1 - cos) with its velocity; only the first joint moves."""
+    topic, rate_hz = given["topic"], given["rate_hz"]
+    is_point = topic != "joint_trajectory"
+    kind = JointTrajectoryPoint if is_point else JointTrajectory
+    publisher = rospy.Publisher(topic, kind, queue_size=100, tcp_nodelay=True)
+    while publisher.get_num_connections() == 0:
+        time.sleep(0.05)
+    w = 2 * math.pi / given["period_s"]
+    rest, begin = [0.0] * 5, time.monotonic()
+    for number in range(1, given["count"] + 1):
+        t = number / rate_hz
+        time.sleep(max(0.0, begin + t - time.monotonic()))
+        point = JointTrajectoryPoint(positions=[given["radius"] * (1 - math.cos(w * t)), *rest])
+        if given["velocities"]:
+            point.velocities = [given["radius"] * w * math.sin(w * t), *rest]
+        point.time_from_start = rospy.Duration(t)
+        message = point
+        if not is_point:
+            point.time_from_start = rospy.Duration(1 / rate_hz)  # as MoveIt Servo has it
+            message = JointTrajectory(joint_names=given["names"], points=[point])
+            message.header.stamp = rospy.Time.now()
+        publisher.publish(message)
+    time.sleep(0.5)
+    return {"last": list(point.positions)}
 
 
 def call(name: str, kind: Any, *arguments: Any) -> dict[str, Any]:
@@ -55,6 +85,7 @@ def follow(given: dict[str, Any]) -> dict[str, Any]:
     client.wait_for_server()
     goal = FollowJointTrajectoryGoal(trajectory=trajectory_of(given))
     goal.path_tolerance = [JointTolerance(**one) for one in given.get("path_tolerance", ())]
+    goal.goal_tolerance = [JointTolerance(**one) for one in given.get("goal_tolerance", ())]
     client.send_goal(goal)
     if "cancel_s" in given:
         while client.get_state() == actionlib.GoalStatus.PENDING:
@@ -71,9 +102,11 @@ def main() -> None:
     rospy.init_node("client", anonymous=True)
     answer: dict[str, Any] = {}
     if kind == "path":
-        publish("joint_path_command", trajectory_of(given))
+        publish(given.get("topic", "joint_path_command"), trajectory_of(given))
     elif kind == "point":
         publish("joint_command", point_of(given))
+    elif kind == "stream":
+        answer = stream(given)
     elif kind == "service":
         answer = call("joint_path_command", CmdJointTrajectory, trajectory_of(given))
     elif kind == "stop_motion":

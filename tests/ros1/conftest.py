@@ -6,6 +6,7 @@ sentence; `make test-ros` installs them.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -22,6 +23,7 @@ import pytest
 from rtcp.ros import ros1_messages
 from tests.e2e.conftest import Platform
 
+CLIENT = Path(__file__).parent / "client.py"
 PATIENCE_S = 120.0
 """For what must come: only keeps a broken node from hanging the tests."""
 
@@ -87,6 +89,17 @@ class Ros:
         assert not check or done.returncode == 0, f"{command} -> {done.returncode}\n{done.stdout}\n{done.stderr}"
         return done
 
+    def logs(self) -> str:
+        """Return what the commands in the background have written."""
+        return "".join(path.read_text() for path in sorted(self.directory.glob("*.log")))
+
+    def begin_client(self, kind: str, **given: Any) -> subprocess.Popen[str]:
+        """Start a client on rospy (`client.py`), whose output is a pipe."""
+        return subprocess.Popen(
+            self.enter(sys.executable, CLIENT, kind, json.dumps(given)),
+            env=self.environment, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
     def start_core(self) -> None:
         """Start a roscore and wait until it answers."""
         self.core = self.background("/usr/bin/roscore")
@@ -128,6 +141,20 @@ def begin_node(ros: Ros, platform: Platform, *arguments: str) -> subprocess.Pope
     """Start `rtcp ros` in the namespace."""
     environment = {name: value for name, value in platform.environment.items() if name.startswith("RTCP_")}
     return ros.background(sys.executable, "-m", "rtcp.cli", "ros", *arguments, **environment)
+
+
+def command(ros: Ros, kind: str, **given: Any) -> dict[str, Any]:
+    """Carry out a command of a client on rospy; return what came of it."""
+    said = ros.run(sys.executable, CLIENT, kind, json.dumps(given)).stdout
+    (line,) = (line for line in said.splitlines() if line.startswith("answer "))
+    answer: dict[str, Any] = json.loads(line.removeprefix("answer "))
+    return answer
+
+
+def is_at(arm: Platform, goal: list[float]) -> bool:
+    """Whether the arm rests there; a stream is open for up to a second longer."""
+    status = arm.status()
+    return bool(status["state"] == "holding" and status["joints"]["actual_position"] == pytest.approx(goal, abs=2e-3))
 
 
 @pytest.fixture(scope="session")

@@ -17,6 +17,7 @@ from control_msgs.msg import FollowJointTrajectoryFeedback  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from industrial_msgs.msg import RobotStatus  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
+from tf2_msgs.msg import TFMessage  # noqa: E402
 
 
 def main() -> None:
@@ -50,7 +51,14 @@ def main() -> None:
             values = {pair.key: pair.value for pair in entry.values}
             write("diagnostics", message, level=entry.level, text=entry.message, values=values)
 
+        def on_tf(message: Any) -> None:
+            for one in message.transforms:
+                at, turn = one.transform.translation, one.transform.rotation
+                write("/tf", one, parent=one.header.frame_id, child=one.child_frame_id, at=[at.x, at.y, at.z],
+                      turn=[turn.w, turn.x, turn.y, turn.z])  # fmt: skip
+
         for topic, kind, callback in (
+            ("/tf", TFMessage, on_tf),
             ("joint_states", JointState, on_joints),
             ("feedback_states", FollowJointTrajectoryFeedback, on_feedback),
             ("robot_status", RobotStatus, on_status),

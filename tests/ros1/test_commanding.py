@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
+import signal
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+from rtcp.api import Feed
 from tests.e2e.conftest import Platform
 
-from .conftest import Ros, begin_node, until
+from .conftest import Ros, begin_node, command, is_at, until
 
 pytestmark = pytest.mark.alone
-CLIENT = Path(__file__).parent / "client.py"
 THERE = [0.2, -0.1, 0.1, 0.0, 0.1, 0.3]
 SUCCEEDED, PREEMPTED, ABORTED, REJECTED = 3, 2, 4, 5
 """actionlib_msgs/GoalStatus."""
@@ -34,27 +33,16 @@ def commanded(ros: Ros, platform: Platform) -> Iterator[Platform]:
 def arm(commanded: Platform) -> Platform:
     """The same, enabled, at rest at 0."""
     commanded.call("halt") if commanded.status()["state"] == "moving" else None
+    commanded.until(lambda status: not status["lease"]["holder"], "the end of the last stream's lease")
     commanded.restore()
     commanded.call("enable")
     return commanded
-
-
-def command(ros: Ros, kind: str, **given: Any) -> dict[str, Any]:
-    said = ros.run(sys.executable, CLIENT, kind, json.dumps(given)).stdout
-    (line,) = (line for line in said.splitlines() if line.startswith("answer "))
-    answer: dict[str, Any] = json.loads(line.removeprefix("answer "))
-    return answer
 
 
 def path(arm: Platform, goal: list[float], seconds: float = 2.0, here: list[float] | None = None) -> dict[str, Any]:
     """Return a trajectory from 0, or `here`, to a goal."""
     points = [{"t": 0.0, "q": here or [0.0] * 6}, {"t": seconds, "q": goal}]
     return {"names": arm.status()["joint_names"], "points": points}
-
-
-def is_at(arm: Platform, goal: list[float]) -> bool:
-    status = arm.status()
-    return bool(status["state"] == "holding" and status["joints"]["actual_position"] == pytest.approx(goal, abs=2e-3))
 
 
 def stays_at_rest(arm: Platform) -> bool:
@@ -83,8 +71,17 @@ def test_joints_in_another_order_go_where_they_belong(ros: Ros, arm: Platform) -
 def test_a_new_trajectory_takes_the_place_of_the_one_under_way(ros: Ros, arm: Platform) -> None:
     far = [value * 2 for value in THERE]
     assert command(ros, "service", **path(arm, far, 20.0)) == {"code": 1}
+    feed = Feed(arm.directory)
+    arm.until_moving(0.01)
     assert command(ros, "service", **path(arm, THERE)) == {"code": 1}
     until(lambda: is_at(arm, THERE), "the end of the second trajectory")
+    records, _ = feed.records()
+    feed.close()
+    # Without a stop: it moves in every cycle of its way.
+    whole = records[records["wkc"] == records["wkc_expected"]]
+    change = np.abs(np.diff(whole["commanded_position"], axis=0)).max(axis=1)
+    moves = np.flatnonzero(change > 1e-6)
+    assert change[moves[0] : moves[-1]].min() > 0.0
 
 
 @pytest.mark.parametrize(
@@ -96,6 +93,9 @@ def test_a_new_trajectory_takes_the_place_of_the_one_under_way(ros: Ros, arm: Pl
         ({"points": [{"t": 2.0, "q": THERE}, {"t": 1.0, "q": THERE}]}, "times must rise"),
         ({"points": [{"t": 1.0, "q": [float("nan")] * 6}]}, ""),
         ({"points": [{"t": 1.0, "q": [0.0] * 5}]}, "5 positions"),
+        ({"points": [{"t": 1.0, "q": [0.0] * 13}]}, "13 positions"),
+        ({"names": [f"joint{number}" for number in range(1, 14)]}, "joint 'joint7' is unknown"),
+        ({"points": [{"t": 1.0, "q": [0.0] * 6}], "times": 100_000}, "100000 points"),
     ],
 )
 def test_a_trajectory_that_is_refused_is_answered_with_the_reason_and_nothing_moves(
@@ -108,6 +108,30 @@ def test_a_trajectory_that_is_refused_is_answered_with_the_reason_and_nothing_mo
     assert "error processing" not in answer["error"]
     assert stays_at_rest(arm)
     assert arm.events(since) == []
+
+
+@pytest.mark.parametrize(
+    ("q", "words"),
+    [
+        ([float("nan")] * 6, "not finite"),
+        ([0.1] * 5, "found 5 positions"),
+        ([0.1] * 13, "found 13 positions"),
+        ([9.0] * 6, "outside its range"),
+    ],
+)
+def test_a_joint_command_that_is_refused_is_logged_with_the_reason_and_nothing_moves(
+    ros: Ros, arm: Platform, q: list[float], words: str
+) -> None:
+    before = ros.logs().count(words)
+    command(ros, "point", t=0.0, q=q)
+    until(lambda: ros.logs().count(words) > before, "the reason in the log")
+    until(lambda: stays_at_rest(arm), "rest at 0")
+
+
+def test_a_published_trajectory_that_is_refused_is_logged_with_the_reason(ros: Ros, arm: Platform) -> None:
+    command(ros, "path", **path(arm, [9.0, 0, 0, 0, 0, 0]))
+    until(lambda: "joint_path_command: point 2" in ros.logs(), "the reason in the log")
+    assert stays_at_rest(arm)
 
 
 def test_a_second_commander_is_refused_with_the_name_of_the_first(ros: Ros, arm: Platform) -> None:
@@ -149,6 +173,32 @@ def test_a_goal_of_the_action_ends_with_its_result(ros: Ros, arm: Platform) -> N
     assert is_at(arm, THERE)
 
 
+def test_a_goal_whose_path_tolerance_is_not_kept_is_aborted_with_its_code(ros: Ros, arm: Platform) -> None:
+    tolerances = [{"name": "joint1", "position": 1e-9}, {"name": "joint2", "position": -1}]
+    ended = command(ros, "follow", **path(arm, THERE), path_tolerance=tolerances)
+    assert (ended["state"], ended["code"]) == (ABORTED, -4)
+    assert "joint1 was" in ended["text"]
+    arm.until(lambda status: status["state"] == "holding", "rest")
+
+
+def test_a_goal_inside_its_tolerances_succeeds(ros: Ros, arm: Platform) -> None:
+    every = [{"name": name, "position": 0.5} for name in arm.status()["joint_names"]]
+    ended = command(ros, "follow", **path(arm, THERE), path_tolerance=every, goal_tolerance=every)
+    assert (ended["state"], ended["code"]) == (SUCCEEDED, 0)
+
+
+def test_a_new_goal_preempts_the_one_under_way(ros: Ros, arm: Platform) -> None:
+    first = ros.begin_client("follow", **path(arm, [value * 2 for value in THERE], 20.0))
+    try:
+        arm.until_moving(0.005)
+        ended = command(ros, "follow", **path(arm, THERE))
+        said, _ = first.communicate()
+    finally:
+        first.kill()
+    assert (ended["state"], ended["code"]) == (SUCCEEDED, 0)
+    assert json.loads(said.partition("answer ")[2])["state"] == PREEMPTED
+
+
 def test_a_goal_with_unknown_joints_is_rejected_with_code_and_reason(ros: Ros, arm: Platform) -> None:
     ended = command(ros, "follow", **path(arm, THERE) | {"names": ["a", "b", "c", "d", "e", "f"]})
     assert (ended["state"], ended["code"]) == (REJECTED, -2)
@@ -157,7 +207,7 @@ def test_a_goal_with_unknown_joints_is_rejected_with_code_and_reason(ros: Ros, a
 
 
 def test_a_goal_that_is_cancelled_ends_and_the_arm_holds_on_the_way(ros: Ros, arm: Platform) -> None:
-    ended = command(ros, "follow", **path(arm, THERE, 20.0), cancel_s=0.5)
+    ended = command(ros, "follow", **path(arm, THERE, 20.0), cancel_s=6.0)
     assert ended["state"] == PREEMPTED
     rest = arm.until(lambda status: status["state"] == "holding", "rest")["joints"]["actual_position"]
     assert 0.0 < rest[0] < THERE[0] - 0.01
@@ -167,11 +217,37 @@ def test_a_goal_that_is_cancelled_ends_and_the_arm_holds_on_the_way(ros: Ros, ar
     )
 
 
+@pytest.mark.parametrize("kind", ["path", "stream"])
+def test_after_the_loss_of_its_node_the_arm_stops_and_the_drives_are_disabled(
+    ros: Ros, platform: Platform, kind: str
+) -> None:
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the last lease")
+    platform.restore()
+    platform.call("enable")
+    node = begin_node(ros, platform, "--name", "short_lived", "joint_command:=/mine", "joint_path_command:=/my_path")
+    given = {"topic": "/mine", "velocities": True, "radius": 0.3, "period_s": 20.0, "rate_hz": 50, "count": 500}
+    sent = path(platform, THERE, 20.0) | {"topic": "/my_path"} if kind == "path" else given
+    client = ros.begin_client(kind, **sent)
+    try:
+        platform.until_moving(0.01)
+        node.send_signal(signal.SIGKILL)
+        platform.until(lambda status: status["state"] == "ready", "drives without torque")
+    finally:
+        client.kill()
+        client.communicate()
+        ros.stop(node)
+    rest = platform.status()["joints"]["actual_position"]
+    another = begin_node(ros, platform, "--name", "short_lived")
+    try:
+        assert command(ros, "robot_enable")["success"]
+        # Nothing moves by itself.
+        assert platform.status()["joints"]["actual_position"] == pytest.approx(rest, abs=2e-3)
+    finally:
+        ros.stop(another)
+
+
 def test_a_goal_during_which_the_platform_dies_ends(ros: Ros, arm: Platform) -> None:
-    goal = subprocess.Popen(
-        ros.enter(sys.executable, CLIENT, "follow", json.dumps(path(arm, THERE, 30.0))),
-        env=ros.environment, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    goal = ros.begin_client("follow", **path(arm, THERE, 30.0))
     try:
         arm.until(lambda status: status["state"] == "moving", "motion")
         arm.rtcp("stop")

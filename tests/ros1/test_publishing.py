@@ -14,7 +14,10 @@ from typing import Any
 
 import pytest
 
+from kinematics.forward import forward
 from rtcp.api import Feed
+from rtcp.ipc.session import read_session
+from rtcp.motion.planning.interpolation import rotation
 from tests.e2e.conftest import Platform, kill
 
 from .conftest import PATIENCE_S, Ros, begin_node, until
@@ -148,11 +151,35 @@ def test_robot_state_publisher_makes_the_transforms_of_the_arm_from_it(
     assert "<robot" in description(ros)
     publisher = ros.background("/usr/lib/robot_state_publisher/robot_state_publisher")
     try:
-        transforms = ros.run("timeout", str(PATIENCE_S), "/usr/bin/rostopic", "echo", "-n", "1", "/tf").stdout
+        # Ours has one transform, theirs the six of the joints.
+        echo = ["/usr/bin/rostopic", "echo", "-n", "1", "--filter", "len(m.transforms) == 6", "/tf"]
+        transforms = ros.run("timeout", str(PATIENCE_S), *echo).stdout
     finally:
         ros.stop(publisher)
     children = re.findall(r'child_frame_id: "(\w+)"', transforms)
     assert children == ["link1", "link2", "link3", "link4", "link5", "link6"]
+
+
+@pytest.mark.parametrize("options", [(), ("--tf",)], ids=["tool", "links too"])
+def test_the_frame_of_the_tool_is_that_of_the_joints_with_the_same_stamp(
+    ros: Ros, platform: Platform, options: tuple[str, ...]
+) -> None:
+    node, listener = begin_node(ros, platform, *options), Listener(ros)
+    try:
+        frame = listener.until("/tf", lambda message: message["child"] == "tool0_controller")
+        joints = listener.until("joint_states", lambda message: message["stamp_ns"] == frame["stamp_ns"])
+    finally:
+        ros.stop(listener.process)
+        ros.stop(node)
+    arm = read_session(platform.directory).config.arm
+    assert arm is not None
+    pose = forward(arm, joints["position"])
+    assert frame["parent"] == "base_link"
+    assert frame["at"] == pytest.approx(pose.position)
+    assert rotation(frame["turn"]) == pytest.approx(pose.rotation)
+    children = {message["child"] for message in listener.heard("/tf")}
+    links = {f"link{number}" for number in range(1, 7)} | {"tool0"} if options else set()
+    assert children == links | {"tool0_controller"}
 
 
 def test_rostopic_hz_and_rosbag_take_the_topics(ros: Ros, listener: Listener) -> None:
@@ -192,7 +219,7 @@ def test_after_the_return_of_a_killed_roscore_everything_is_there_again(
     before = len(listener.heard("joint_states"))
     until(lambda: len(listener.heard("joint_states")) > before + 10, "joint states without a master")
     ros.start_core()
-    topics = {"/joint_states", "/feedback_states", "/robot_status", "/diagnostics"}
+    topics = {"/joint_states", "/feedback_states", "/robot_status", "/diagnostics", "/tf", "/joint_command"}
     until(lambda: topics <= set(ros.run("/usr/bin/rostopic", "list").stdout.split()), "the topics")
     assert "/rtcp" in ros.run("/usr/bin/rosnode", "list").stdout.split()
     until(lambda: "<robot" in description(ros), "robot_description")

@@ -1,0 +1,108 @@
+"""Streams of points at any rate, from a ROS client to the frames: the commanded position has no step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rtcp.api import Feed
+from tests.e2e.conftest import Platform
+
+from .conftest import Ros, begin_node, command, is_at, until
+
+pytestmark = pytest.mark.alone
+RADIUS_RAD, PERIOD_S = 0.1, 4.0
+
+
+@pytest.fixture(params=[()], ids=["replacing"])
+def arm(ros: Ros, platform: Platform, request: pytest.FixtureRequest) -> Iterator[Platform]:
+    """A platform, enabled, at rest at 0, with a node in front of it."""
+    platform.restore()
+    node = begin_node(ros, platform, *request.param)
+    platform.call("enable")
+    yield platform
+    ros.stop(node)
+
+
+def largest_step(records: Any, feed: Feed) -> float:
+    """Return the largest change of a commanded velocity from cycle to cycle, as part of acceleration x cycle."""
+    answered = records["wkc"] == records["wkc_expected"]
+    change = np.abs(np.diff(np.diff(records["commanded_position"], axis=0), axis=0)) / (feed.period_ns * 1e-9) ** 2
+    most = np.array([joint.acceleration for joint in feed.config.joints])
+    # The setpoints stand still in a cycle without an answer.
+    whole = answered[:-2] & answered[1:-1] & answered[2:]
+    return float((change[whole] / most).max())
+
+
+def stream(ros: Ros, arm: Platform, **given: Any) -> tuple[list[float], Any, float]:
+    """Stream; return the last target, the records until the arm is there, and the largest step in them."""
+    feed = Feed(arm.directory)
+    taken = []
+    asked = {"topic": "joint_command", "velocities": True, "radius": RADIUS_RAD, "period_s": PERIOD_S, **given}
+    client = ros.begin_client("stream", **asked)
+
+    def ended() -> bool:
+        records, missing = feed.records()
+        assert not missing
+        taken.append(records)
+        return client.poll() is not None
+
+    until(ended, "the end of the stream")
+    last: list[float] = json.loads((client.communicate()[0]).partition("answer ")[2])["last"]
+    until(lambda: ended() and is_at(arm, last), "the last target")
+    records = np.concatenate(taken)
+    step = largest_step(records, feed)
+    feed.close()
+    return last, records, step
+
+
+@pytest.mark.parametrize("has_velocities", [True, False], ids=["velocities", "positions"])
+@pytest.mark.parametrize("rate_hz", [1, 30, 250, 1000])
+def test_a_stream_at_any_rate_is_followed_without_a_step(
+    ros: Ros, arm: Platform, rate_hz: int, has_velocities: bool
+) -> None:
+    count = max(4, round(0.875 * PERIOD_S * rate_hz))
+    _, records, step = stream(ros, arm, rate_hz=rate_hz, count=count, velocities=has_velocities)
+    assert step <= 1.01
+    assert records["commanded_position"][:, 0].max() == pytest.approx(2 * RADIUS_RAD, abs=0.02)
+
+
+@pytest.mark.parametrize("arm", [("--buffer", "2")], indirect=True, ids=["buffered"])
+@pytest.mark.parametrize("rate_hz", [1, 30])
+def test_a_buffered_stream_is_executed_that_much_later_without_a_stop_between_its_points(
+    ros: Ros, arm: Platform, rate_hz: int
+) -> None:
+    _, records, step = stream(ros, arm, rate_hz=rate_hz, count=5 * rate_hz, period_s=12.0)
+    assert step <= 1.01
+    whole = records[records["wkc"] == records["wkc_expected"]]
+    change = np.abs(np.diff(whole["commanded_position"][:, 0]))
+    moves = np.flatnonzero(change > change.max() / 5)
+    assert change[moves[0] : moves[-1]].min() > 0.0
+
+
+def test_a_joint_trajectory_as_of_moveit_servo_is_followed_without_a_step(ros: Ros, arm: Platform) -> None:
+    names = arm.status()["joint_names"]
+    _, records, step = stream(ros, arm, topic="joint_trajectory", rate_hz=30, count=105, names=names)
+    assert step <= 1.01
+    assert records["commanded_position"][:, 0].max() == pytest.approx(2 * RADIUS_RAD, abs=0.02)
+
+
+def test_whoever_goes_on_streaming_after_stop_motion_moves_nothing(ros: Ros, arm: Platform) -> None:
+    client = ros.begin_client(
+        "stream", topic="joint_command", velocities=True, radius=RADIUS_RAD, period_s=20.0, rate_hz=50, count=400
+    )
+    try:
+        arm.until_moving(0.01)
+        assert command(ros, "stop_motion") == {"code": 1}
+        rest = arm.status()["joints"]["commanded_position"]
+        client.communicate()
+        assert arm.status()["joints"]["commanded_position"] == rest
+    finally:
+        client.kill()
+    # Its next stream begins anew.
+    command(ros, "point", t=0.0, q=[0.05, *[0.0] * 5])
+    until(lambda: is_at(arm, [0.05, *[0.0] * 5]), "the point")
