@@ -197,7 +197,7 @@ def _numbers(kind: Any) -> str:
 
 
 def _array(values: Iterable[Any], base: str) -> Any:
-    return np.array(values, "uint8" if base in ("byte", "char") else base)
+    return np.array(list(values), "uint8" if base in ("byte", "char") else base)
 
 
 make = Family(_STORE.types.__getitem__, _array).make
