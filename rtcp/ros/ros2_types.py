@@ -7,17 +7,33 @@ same. Names are those of ROS: `sensor_msgs/msg/JointState`. The only file that i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from typing import Any
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from rtcp.ros.ros1_messages import DEFINITIONS
 
-Field = tuple[str, Any]
-"""Name, and type as rosbags has it: a pair of kind (Nodetype) and what that kind needs."""
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of a message."""
+
+    name: str
+    type: str
+    """A basic type, as `float64`, or a message, whose name has slashes."""
+    length: int | None
+    """None: one value; 0: a sequence; else an array of so many."""
+
+    @property
+    def has_numbers(self) -> bool:
+        """Whether it is a sequence or an array of numbers."""
+        return self.length is not None and self.type != "string" and "/" not in self.type
+
 
 FOLLOW = "control_msgs/action/FollowJointTrajectory"
 CANCEL = "action_msgs/srv/CancelGoal"
@@ -88,7 +104,11 @@ _SERVICES = {
 """Request and response."""
 
 
+@cache
 def _store() -> Typestore:
+    # Here: with rclpy nobody needs it, and it is not installed there.
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
     store = get_typestore(Stores.ROS2_JAZZY)
     types: dict[str, Any] = {}
     for name in _AS_IN_ROS_1:
@@ -104,6 +124,9 @@ def _store() -> Typestore:
 
 def _service(name: str, request: str, response: str) -> dict[str, Any]:
     """Return the types of a service; that of its introspection events counts for its hash."""
+    from rosbags.interfaces import Nodetype
+    from rosbags.typesys import get_types_from_msg
+
     texts = {f"{name}_Request": request, f"{name}_Response": response}
     types: dict[str, Any] = {part: get_types_from_msg(text, "x/msg/X")["x/msg/X"] for part, text in texts.items()}
     at_most_one = [(Nodetype.SEQUENCE, ((Nodetype.NAME, part), 1)) for part in texts]
@@ -114,20 +137,24 @@ def _service(name: str, request: str, response: str) -> dict[str, Any]:
     return types
 
 
-_STORE = _store()
-_HASHES: dict[str, str] = {}
-
-
 def fields_of(name: str) -> list[Field]:
     """Return the fields of a message."""
-    return list(_STORE.fielddefs[name][1])
+    from rosbags.interfaces import Nodetype
+
+    fields = []
+    defined: list[tuple[str, Any]] = list(_store().fielddefs[name][1])
+    for field, definition in defined:
+        kind, what = definition
+        inner, length = what if kind in (Nodetype.SEQUENCE, Nodetype.ARRAY) else (definition, None)
+        basic_or_name = inner[1][0] if inner[0] is Nodetype.BASE else inner[1]
+        fields.append(Field(field, basic_or_name, 0 if kind is Nodetype.SEQUENCE else length))
+    return fields
 
 
+@cache
 def type_hash(name: str) -> str:
     """Return the hash of a message or service, `RIHS01_` and 64 hexadecimal digits."""
-    if name not in _HASHES:
-        _HASHES[name] = _STORE.hash_rihs01(name)
-    return _HASHES[name]
+    return _store().hash_rihs01(name)
 
 
 def dds_type(name: str) -> str:
@@ -138,7 +165,7 @@ def dds_type(name: str) -> str:
 
 def encode(name: str, message: Any) -> bytes:
     """Return a message of `make` in XCDR1, little endian, with its header 00 01 00 00."""
-    return bytes(_STORE.serialize_cdr(message, name, little_endian=True))
+    return bytes(_store().serialize_cdr(message, name, little_endian=True))
 
 
 def decode(name: str, data: bytes) -> Any:
@@ -148,7 +175,7 @@ def decode(name: str, data: bytes) -> Any:
         ValueError: it is none of this type.
     """
     try:
-        return _STORE.deserialize_cdr(data, name)
+        return _store().deserialize_cdr(data, name)
     except Exception as error:  # whatever a walk over foreign bytes meets
         raise ValueError(f"{len(data)} bytes are no {name}: {error}") from None
 
@@ -169,8 +196,8 @@ class Family:
         """Return a message."""
         if name not in self._made:
             defined = fields_of(name)
-            zeros = {field: self._zero(kind) for field, kind in defined}
-            numbers = {field: base for field, kind in defined if (base := _numbers(kind))}
+            zeros = {field.name: self._zero(field) for field in defined}
+            numbers = {field.name: field.type for field in defined if field.has_numbers}
             self._made[name] = self._class_of(name), zeros, numbers
         made, zeros, numbers = self._made[name]
         given = {
@@ -179,26 +206,15 @@ class Family:
         }
         return made(**{**zeros, **given})
 
-    def _zero(self, kind: Any) -> Any:
-        if kind[0] is Nodetype.NAME:
-            return self.make(kind[1])
-        if kind[0] is Nodetype.BASE:
-            return {"string": "", "bool": False}.get(kind[1][0], 0)
-        length = kind[1][1] if kind[0] is Nodetype.ARRAY else 0
-        return self._numbers([0] * length, base) if (base := _numbers(kind)) else []
-
-
-def _numbers(kind: Any) -> str:
-    """Return the type of the numbers where a field is a sequence of them."""
-    if kind[0] in (Nodetype.SEQUENCE, Nodetype.ARRAY) and kind[1][0][0] is Nodetype.BASE:
-        base: str = kind[1][0][1][0]
-        return "" if base == "string" else base
-    return ""
+    def _zero(self, field: Field) -> Any:
+        if field.length is not None:
+            return self._numbers([0] * field.length, field.type) if field.has_numbers else []
+        return self.make(field.type) if "/" in field.type else {"string": "", "bool": False}.get(field.type, 0)
 
 
 def _array(values: Iterable[Any], base: str) -> Any:
     return np.array(list(values), "uint8" if base in ("byte", "char") else base)
 
 
-make = Family(_STORE.types.__getitem__, _array).make
+make = Family(lambda name: _store().types[name], _array).make
 """Makes messages that `encode` takes."""
