@@ -131,5 +131,5 @@ class DdsWire:
                     for message in reader.take(DEPTH):
                         if isinstance(message, struct_of(IN[topic])):  # and not the end of a writer
                             self._commands.receive(topic, message)
-                except Exception as error:  # whatever cyclonedds meets in foreign bytes
+                except Exception as error:  # the thread goes on; foreign bytes cyclonedds drops by itself
                     _LOG.error("%s: %s", topic, error)
