@@ -59,6 +59,9 @@ def _ros(
 
     Waits for a platform, and for a master or router, that do not run.
     """
+    for argument in remappings or ():
+        if ":=" not in argument:
+            raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
     wires = [wire for wire, chosen in (("zenoh", zenoh), ("dds", dds), ("ros2", ros2)) if chosen]
     if len(wires) + simple_message > 1:
         raise CommandError("choose one of --zenoh, --dds, --ros2, --simple-message", ExitCode.USAGE)
@@ -73,7 +76,9 @@ def _ros(
             raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
         asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)))
     elif wires:
-        _run_ros2(wires[0], router, name, rate, domain, enable, partial)
+        if remappings and not ros2:
+            raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
+        _run_ros2(wires[0], router, name, rate, domain, enable, partial, remappings or ())
     else:
         _run_node(name, rate, remappings or (), enable, partial)
 
@@ -89,14 +94,13 @@ def _run_node(name: str, rate: float, remappings: Sequence[str], enable: bool, p
     from rtcp.ros import ros1
     from rtcp.ros.commands import CommandOptions
 
-    for argument in remappings:
-        if ":=" not in argument:
-            raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
     report(f"node {name}: Ctrl-C ends it")
     ros1.run(ros1.NodeOptions(name, rate, remappings, CommandOptions(enable, partial)))
 
 
-def _run_ros2(wire: str, router: str, name: str, rate: float, domain: int, enable: bool, partial: bool) -> None:
+def _run_ros2(
+    wire: str, router: str, name: str, rate: float, domain: int, enable: bool, partial: bool, remappings: Sequence[str]
+) -> None:
     """Run a ROS 2 node."""
     try:
         from rtcp.ros.ros2_node import Ros2Options, run
@@ -113,7 +117,7 @@ def _run_ros2(wire: str, router: str, name: str, rate: float, domain: int, enabl
     _log_to_stderr()
     report(f"node {name}: Ctrl-C ends it")
     open_wire = module.open_wire(router) if wire == "zenoh" else module.open_wire
-    run(Ros2Options(name, rate, domain, CommandOptions(enable, partial)), open_wire)
+    run(Ros2Options(name, rate, domain, CommandOptions(enable, partial), remappings), open_wire)
 
 
 def _log_to_stderr() -> None:

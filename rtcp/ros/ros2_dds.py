@@ -87,6 +87,7 @@ class DdsWire:
     """The node as a participant."""
 
     make = staticmethod(make)
+    topics = tuple(OUT)
 
     def __init__(self, options: Ros2Options, commands: Commands) -> None:
         self._commands = commands

@@ -11,7 +11,7 @@ import contextlib
 import logging
 import signal
 import threading
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Protocol
@@ -91,6 +91,8 @@ class Ros2Options:
     domain: int = 0
     """ROS_DOMAIN_ID."""
     commands: CommandOptions = field(default_factory=CommandOptions)
+    remappings: Sequence[str] = ()
+    """`joint_states:=/left/joint_states`; with rclpy."""
 
 
 class Wire(Protocol):
@@ -98,8 +100,12 @@ class Wire(Protocol):
 
     make: Make
 
+    @property
+    def topics(self) -> Collection[str]:
+        """Those of `OUT` that can be published."""
+
     def publish(self, topic: str, message: Any) -> None:
-        """Publish on a topic of `OUT`."""
+        """Publish on one of them."""
 
     def publish_feedback(self, feedback: Any) -> None:
         """Publish it to the clients of the goals under way."""
@@ -215,7 +221,7 @@ class Publications:
             self._publish("robot_description", data=urdf)
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
-        """Publish joint_states, feedback_states, the feedback of goals, and tf."""
+        """Publish joint_states, tf, feedback_states, and the feedback of goals."""
         make, header = self._make, self._header(sample.stamp_ns)
         self._publish(
             "joint_states",
@@ -225,6 +231,10 @@ class Publications:
             velocity=sample.velocity,
             effort=sample.effort,
         )
+        if self._arm is not None:
+            self._publish("tf", transforms=self._transforms(self._arm, sample))
+        if "feedback_states" not in self._wire.topics:
+            return
         error = [want - have for want, have in zip(sample.commanded, sample.position, strict=True)]
         feedback = make(
             _FEEDBACK,
@@ -236,13 +246,13 @@ class Publications:
         )
         self._wire.publish("feedback_states", feedback)
         self._wire.publish_feedback(feedback)
-        if self._arm is not None:
-            self._publish("tf", transforms=self._transforms(self._arm, sample))
 
     def status(self, status: RobotStatus) -> None:
         """Publish robot_status."""
         if status.in_error is TriState.TRUE:
             self._note_stop()
+        if "robot_status" not in self._wire.topics:
+            return
         make = self._make
         fields = {
             name: make("industrial_msgs/msg/TriState", val=int(getattr(status, name)))

@@ -95,6 +95,7 @@ class ZenohWire:
     """The node on a session."""
 
     make = staticmethod(make)
+    topics = tuple(OUT)
 
     def __init__(self, session: zenoh.Session, options: Ros2Options, commands: Commands) -> None:
         self._session, self._options, self._commands = session, options, commands

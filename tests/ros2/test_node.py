@@ -26,6 +26,7 @@ class Kept:
     """A wire that keeps the last message of each topic; each can be encoded."""
 
     make = staticmethod(make)
+    topics = tuple(OUT)
 
     def __init__(self) -> None:
         self.messages: dict[str, Any] = {}
