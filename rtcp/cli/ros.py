@@ -1,7 +1,8 @@
-"""`rtcp ros`: the arm as a ROS node, or as a Simple Message server."""
+"""`rtcp ros`: the arm as a node of ROS 1 or ROS 2, or as a Simple Message server."""
 
 from __future__ import annotations
 
+import importlib
 import logging
 import signal
 import sys
@@ -40,6 +41,11 @@ def _ros(
             "--buffer", min=0.0, max=60.0, help="joint_command is executed so many seconds later; 0: each replaces."
         ),
     ] = 0.0,
+    zenoh: Annotated[bool, option("--zenoh", "ROS 2 without ROS, over a Zenoh router (docs/ros2.md).")] = False,
+    router: Annotated[str, option("--router", "tcp/HOST:PORT", "Zenoh router.")] = "tcp/localhost:7447",
+    dds: Annotated[bool, option("--dds", "ROS 2 without ROS, over DDS: topics only (docs/ros2.md).")] = False,
+    ros2: Annotated[bool, option("--ros2", "ROS 2 with rclpy, from a sourced ROS environment.")] = False,
+    domain: Annotated[int, typer.Option("--domain", min=0, max=232, envvar="ROS_DOMAIN_ID", help="Of ROS 2.")] = 0,
     simple_message: Annotated[
         bool, option("--simple-message", "No node: serve Simple Message, motion and state (docs/simple_message.md).")
     ] = False,
@@ -56,10 +62,16 @@ def _ros(
         option("--joint-feedback", "Send velocities too (JOINT_FEEDBACK), which the reference client complains of."),
     ] = False,
 ) -> None:
-    """Serve the arm to ROS until Ctrl-C: a ROS 1 node (docs/ros.md), or a Simple Message server.
+    """Serve the arm to ROS until Ctrl-C: a node of ROS 1 (docs/ros.md) or ROS 2, or a Simple Message server.
 
-    Waits for a platform, and for a master, that do not run.
+    Waits for a platform, and for a master or router, that do not run.
     """
+    for argument in remappings or ():
+        if ":=" not in argument:
+            raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
+    wires = [wire for wire, chosen in (("zenoh", zenoh), ("dds", dds), ("ros2", ros2)) if chosen]
+    if len(wires) + simple_message > 1:
+        raise CommandError("choose one of --zenoh, --dds, --ros2, --simple-message", ExitCode.USAGE)
     if simple_message:
         import asyncio  # here: it loads slowly, as what follows
 
@@ -70,6 +82,10 @@ def _ros(
         if byte_order not in orders:
             raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
         asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)))
+    elif wires:
+        if remappings and not ros2:
+            raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
+        _run_ros2(wires[0], router, name, rate, domain, enable, partial, remappings or ())
     else:
         _run_node(name, rate, remappings or (), tf, enable, partial, buffer)
 
@@ -87,11 +103,36 @@ def _run_node(
     from rtcp.ros import ros1
     from rtcp.ros.commands import CommandOptions
 
-    for argument in remappings:
-        if ":=" not in argument:
-            raise CommandError(f"{argument} is no remapping: write NAME:=VALUE", ExitCode.USAGE)
     report(f"node {name}: Ctrl-C ends it")
     ros1.run(ros1.NodeOptions(name, rate, tf, remappings, CommandOptions(enable, partial, buffer_s)))
+
+
+def _run_ros2(
+    wire: str, router: str, name: str, rate: float, domain: int, enable: bool, partial: bool, remappings: Sequence[str]
+) -> None:
+    """Run a ROS 2 node."""
+    try:
+        from rtcp.ros.ros2_node import Ros2Options, run
+
+        module = importlib.import_module(f"rtcp.ros.ros2_{'rclpy' if wire == 'ros2' else wire}")
+    except ImportError as error:
+        if wire == "ros2":
+            how = "source a ROS 2 environment, in its Python"
+        else:
+            how = f"pip install 'rtcp[{wire}]'" + (" (x86_64)" if wire == "dds" else "")
+        raise CommandError(f"--{wire} cannot run here, {error}: {how}") from None
+    from rtcp.ros.commands import CommandOptions
+
+    _log_to_stderr()
+    report(f"node {name}: Ctrl-C ends it")
+    open_wire = module.open_wire(router) if wire == "zenoh" else module.open_wire
+    run(Ros2Options(name, rate, domain, CommandOptions(enable, partial), remappings), open_wire)
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(log_format())
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
 async def _serve(options: ServerOptions) -> None:
@@ -101,9 +142,7 @@ async def _serve(options: ServerOptions) -> None:
     from rtcp.ros.simple_message.robot_arm import RobotArm
     from rtcp.ros.simple_message.server import SimpleMessageServer
 
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(log_format())
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    _log_to_stderr()
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)

@@ -1,0 +1,357 @@
+"""The ROS 2 node without its wire: which topics and services there are, what they carry, what becomes of commands.
+
+A wire (`ros2_zenoh`, `ros2_dds`, `ros2_rclpy`) makes messages of its own classes, and carries them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import concurrent.futures
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Protocol
+
+from kinematics.forward import frames
+from kinematics.model import ArmModel
+from kinematics.pose import IDENTITY
+from kinematics.urdf import to_urdf
+from rtcp.api import RtcpError
+from rtcp.api.async_robot import connect_async
+from rtcp.config.model import ArmConfig
+from rtcp.motion.planning.interpolation import quaternion
+from rtcp.ros.commands import (
+    Commander,
+    CommandOptions,
+    Connect,
+    FollowCode,
+    Tolerance,
+    Tolerances,
+    Trajectory,
+    TrajectoryPoint,
+)
+from rtcp.ros.ros2_types import CANCEL, FOLLOW, PATH_COMMAND, STOP_MOTION, TRIGGER
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+
+Make = Callable[..., Any]
+"""Makes a message from the name of its type and its fields."""
+
+ACTION = "joint_trajectory_action"
+_FEEDBACK = f"{FOLLOW}_Feedback"
+_POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+OUT: Mapping[str, str] = {
+    "joint_states": "sensor_msgs/msg/JointState",
+    "feedback_states": _FEEDBACK,
+    "robot_status": "industrial_msgs/msg/RobotStatus",
+    "diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "tf": "tf2_msgs/msg/TFMessage",
+    "robot_description": "std_msgs/msg/String",
+}
+"""Topics that are published, with their types."""
+IN: Mapping[str, str] = {"joint_command": _POINT, "joint_path_command": "trajectory_msgs/msg/JointTrajectory"}
+"""Topics that are taken."""
+SERVICES: Mapping[str, str] = {
+    "joint_path_command": PATH_COMMAND,
+    "stop_motion": STOP_MOTION,
+    "robot_enable": TRIGGER,
+    "robot_disable": TRIGGER,
+}
+ACTION_SERVICES: Mapping[str, str] = {
+    f"{ACTION}/_action/send_goal": f"{FOLLOW}_SendGoal",
+    f"{ACTION}/_action/cancel_goal": CANCEL,
+    f"{ACTION}/_action/get_result": f"{FOLLOW}_GetResult",
+}
+ACTION_TOPICS: Mapping[str, str] = {
+    f"{ACTION}/_action/feedback": f"{FOLLOW}_FeedbackMessage",
+    f"{ACTION}/_action/status": "action_msgs/msg/GoalStatusArray",
+}
+LATCHED = ("robot_description", f"{ACTION}/_action/status")
+"""Topics whose last message a late reader receives too: reliable, transient local, keep last 1."""
+DEPTH = 10
+"""Of all others: reliable, volatile, keep last 10."""
+RETRY_S = 1.0
+_STEP_S = 0.005
+_CLOSE_S = 2.0
+"""Longest wait for the end of the connection; the end of the process ends it too."""
+_LOG = logging.getLogger("rtcp.ros")
+
+
+@dataclass(frozen=True)
+class Ros2Options:
+    """What `rtcp ros` was asked for."""
+
+    name: str = "rtcp"
+    rate_hz: float = 100.0
+    """Of joint_states, feedback_states and tf."""
+    domain: int = 0
+    """ROS_DOMAIN_ID."""
+    commands: CommandOptions = field(default_factory=CommandOptions)
+    remappings: Sequence[str] = ()
+    """`joint_states:=/left/joint_states`; with rclpy."""
+
+
+class Wire(Protocol):
+    """Carries the messages."""
+
+    make: Make
+
+    @property
+    def topics(self) -> Collection[str]:
+        """Those of `OUT` that can be published."""
+
+    def publish(self, topic: str, message: Any) -> None:
+        """Publish on one of them."""
+
+    def publish_feedback(self, feedback: Any) -> None:
+        """Publish it to the clients of the goals under way."""
+
+
+class Commands:
+    """Carries out what comes in, on an event loop in a thread of its own, which a wire's threads call.
+
+    Args:
+        options: name of this commander, and how commands are taken.
+        connect: connects to the platform; None: to that of this process' environment.
+    """
+
+    def __init__(
+        self,
+        options: Ros2Options,
+        connect: Connect | None = None,
+    ) -> None:
+        self.loop = asyncio.new_event_loop()
+        threading.Thread(target=self.loop.run_forever, daemon=True).start()
+
+        async def commander() -> Commander:
+            return Commander(connect or (lambda: connect_async(options.name)), options.commands, _LOG.error)
+
+        self.commander = self.submit(commander()).result()
+
+    def __enter__(self) -> Commands:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
+            self.submit(self.commander.close()).result(_CLOSE_S)
+        self.loop.call_soon_threadsafe(self.loop.stop)
+
+    def submit(self, coroutine: Coroutine[Any, Any, Any]) -> concurrent.futures.Future[Any]:
+        """Run it on the loop."""
+        return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
+
+    def receive(self, topic: str, message: Any) -> None:
+        """Carry out a message on a topic of `IN`; nobody waits for the outcome, so a refusal is logged."""
+        if topic == "joint_command":
+            command = self.commander.command_point(point_of(message))
+        else:
+            command = self.commander.begin_trajectory(trajectory_of(message))
+
+        async def logged() -> None:
+            try:
+                await command
+            except Exception as error:  # also a mistake of ours: without this nobody would hear of it
+                _LOG.error("%s: %s", topic, error)
+
+        self.submit(logged())
+
+    async def respond(self, make: Make, service: str, request: Any) -> Any:
+        """Carry out a service of `SERVICES` and return its response."""
+        kind = SERVICES[service]
+        commander = self.commander
+        has_succeeded, text = True, ""
+        try:
+            if service == "robot_enable":
+                text = await commander.enable()
+            elif service == "robot_disable":
+                text = await commander.disable()
+            elif service == "stop_motion":
+                await commander.stop()
+            else:
+                await commander.begin_trajectory(trajectory_of(request.trajectory))
+        except Exception as error:  # a client would wait for ever for a service that does not answer
+            _LOG.error("%s: %s", service, error)
+            has_succeeded, text = False, str(error)
+        if kind == TRIGGER:
+            return make(f"{kind}_Response", success=has_succeeded, message=text)
+        # These responses have no room for the reason, and ROS 2 knows no error reply: it is in the log.
+        code = make("industrial_msgs/msg/ServiceReturnCode", val=1 if has_succeeded else -1)
+        return make(f"{kind}_Response", code=code)
+
+    async def follow(self, goal: Any) -> tuple[FollowCode, str]:
+        """Run a goal of the action; return how it ended. Cancelled, the arm brakes on its path."""
+        tolerances = Tolerances(
+            _tolerances(goal.path_tolerance), _tolerances(goal.goal_tolerance), seconds(goal.goal_time_tolerance)
+        )
+        try:
+            code, text = await self.commander.follow(trajectory_of(goal.trajectory), tolerances, lambda: None)
+        except Exception as error:  # no code of the action says it; a goal always ends with a result
+            code, text = FollowCode.INVALID_GOAL, str(error)
+        if code is not FollowCode.SUCCESSFUL:
+            _LOG.error("%s: %s", ACTION, text)
+        return code, text
+
+
+class Publications:
+    """Publishes what the core says (`rtcp.ros.state.Sink`).
+
+    Args:
+        wire: carries it.
+        name: of the node.
+        note_stop: called with each status in error.
+    """
+
+    def __init__(self, wire: Wire, name: str, note_stop: Callable[[], None]) -> None:
+        self._wire, self._make = wire, wire.make
+        self._name, self._note_stop = name, note_stop
+        self._arm: ArmModel | None = None
+
+    def connected(self, config: ArmConfig) -> None:
+        """Publish robot_description, where the geometry is known."""
+        _LOG.info("connected to %s", config.name)
+        self._arm = config.arm
+        if config.arm is not None:
+            urdf = to_urdf(config.arm, [joint.torque for joint in config.joints])
+            self._publish("robot_description", data=urdf)
+
+    def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
+        """Publish joint_states, tf, feedback_states, and the feedback of goals."""
+        make, header = self._make, self._header(sample.stamp_ns)
+        self._publish(
+            "joint_states",
+            header=header,
+            name=list(names),
+            position=sample.position,
+            velocity=sample.velocity,
+            effort=sample.effort,
+        )
+        if self._arm is not None:
+            self._publish("tf", transforms=self._transforms(self._arm, sample))
+        if "feedback_states" not in self._wire.topics:
+            return
+        error = [want - have for want, have in zip(sample.commanded, sample.position, strict=True)]
+        feedback = make(
+            _FEEDBACK,
+            header=header,
+            joint_names=list(names),
+            desired=make(_POINT, positions=sample.commanded),
+            actual=make(_POINT, positions=sample.position, velocities=sample.velocity),
+            error=make(_POINT, positions=error),
+        )
+        self._wire.publish("feedback_states", feedback)
+        self._wire.publish_feedback(feedback)
+
+    def status(self, status: RobotStatus) -> None:
+        """Publish robot_status."""
+        if status.in_error is TriState.TRUE:
+            self._note_stop()
+        if "robot_status" not in self._wire.topics:
+            return
+        make = self._make
+        fields = {
+            name: make("industrial_msgs/msg/TriState", val=int(getattr(status, name)))
+            for name in ("e_stopped", "drives_powered", "motion_possible", "in_motion", "in_error")
+        }
+        self._publish(
+            "robot_status",
+            header=self._header(status.stamp_ns),
+            mode=make("industrial_msgs/msg/RobotMode", val=int(status.mode)),
+            error_codes=[status.error_code] if status.error_code else [],
+            **fields,
+        )
+
+    def diagnostics(self, diagnostics: Diagnostics) -> None:
+        """Publish diagnostics."""
+        make = self._make
+        entry = make(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=diagnostics.level,
+            name=f"{self._name}: robot",
+            message=diagnostics.message,
+            values=[make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in diagnostics.values],
+        )
+        self._publish("diagnostics", header=self._header(diagnostics.stamp_ns), status=[entry])
+
+    def _publish(self, topic: str, **fields: Any) -> None:
+        self._wire.publish(topic, self._make(OUT[topic], **fields))
+
+    def _header(self, stamp_ns: int, frame: str = "") -> Any:
+        return self._make("std_msgs/msg/Header", stamp=time_of(self._make, stamp_ns), frame_id=frame)
+
+    def _transforms(self, arm: ArmModel, sample: JointSample) -> list[Any]:
+        """Return the links of the URDF, each in the frame of the one before: what robot_state_publisher says."""
+        make = self._make
+        poses = (IDENTITY, *frames(arm, sample.position))
+        links = ["base_link", *(f"link{number}" for number in range(1, len(poses) - 1)), "tool0"]
+        transforms = []
+        for at, child in enumerate(links[1:]):
+            pose = poses[at].inverse() @ poses[at + 1]
+            x, y, z = pose.position
+            qw, qx, qy, qz = quaternion(pose.rotation)
+            transform = make(
+                "geometry_msgs/msg/Transform",
+                translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw),
+            )
+            header = self._header(sample.stamp_ns, links[at])
+            transforms.append(
+                make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform)
+            )
+        return transforms
+
+
+OpenWire = Callable[[Ros2Options, Commands, threading.Event], contextlib.AbstractContextManager[Wire]]
+"""Opens a wire; returns early, with any wire, where the event is set."""
+
+
+def run(options: Ros2Options, open_wire: OpenWire) -> None:
+    """Run the node until SIGINT, SIGTERM or SIGHUP. From the main thread only."""
+    ends = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: ends.set())
+    with Commands(options) as commands, open_wire(options, commands, ends) as wire:
+        publications = Publications(wire, options.name, commands.commander.note_stop)
+        publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=options.name)
+        while not ends.is_set():
+            publisher.step(_STEP_S)
+        publisher.close()
+
+
+def time_of(make: Make, stamp_ns: int) -> Any:
+    """Return a builtin_interfaces/Time."""
+    seconds_, nanoseconds = divmod(stamp_ns, 1_000_000_000)
+    return make("builtin_interfaces/msg/Time", sec=seconds_, nanosec=nanoseconds)
+
+
+def seconds(time: Any) -> float:
+    """Return a Time or Duration in s."""
+    return float(time.sec) + 1e-9 * float(time.nanosec)
+
+
+def trajectory_of(message: Any) -> Trajectory:
+    """Return a trajectory_msgs/JointTrajectory as the core has it."""
+    points = [point_of(point) for point in message.points]
+    return Trajectory(list(message.joint_names), points, seconds(message.header.stamp))
+
+
+def point_of(message: Any) -> TrajectoryPoint:
+    """Return a trajectory_msgs/JointTrajectoryPoint as the core has it."""
+    return TrajectoryPoint(
+        seconds(message.time_from_start),
+        _numbers(message.positions),
+        _numbers(message.velocities),
+        _numbers(message.accelerations),
+    )
+
+
+def _numbers(values: Iterable[Any]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)
+
+
+def _tolerances(messages: Iterable[Any]) -> tuple[Tolerance, ...]:
+    return tuple(Tolerance(one.name, one.position, one.velocity, one.acceleration) for one in messages)

@@ -1,0 +1,56 @@
+"""A node of ROS 2 on an arm that moves nothing, and what it needs: no ROS, no platform."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rtcp.config.find import default_config
+from rtcp.config.loader import load
+from rtcp.ros.commands import CommandOptions
+from rtcp.ros.ros2_node import Commands, Ros2Options
+from rtcp.ros.ros2_types import make
+from rtcp.ros.state import JointSample
+from tests.ros.test_commands import HERE, NAMES, FakeArm
+
+CONFIG = load(default_config())
+SAMPLE = JointSample(1_700_000_000_250_000_000, (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.15,) * 6)
+OPTIONS = Ros2Options("arm", commands=CommandOptions())
+PATIENCE_S = 120.0
+"""For what must come: only keeps a broken node from hanging the tests."""
+
+
+def until(met: Callable[[], Any], what: str) -> Any:
+    """Return what `met` returns as soon as that is true."""
+    end = time.monotonic() + PATIENCE_S
+    while not (found := met()):
+        assert time.monotonic() < end, f"{what} did not come within {PATIENCE_S:g} s"
+        time.sleep(0.01)
+    return found
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def point(t: float, q: Any, **fields: Any) -> Any:
+    duration = make("builtin_interfaces/msg/Duration", sec=int(t), nanosec=round(t % 1 * 1e9))
+    return make("trajectory_msgs/msg/JointTrajectoryPoint", positions=q, time_from_start=duration, **fields)
+
+
+def trajectory(names: Any = NAMES) -> Any:
+    points = [point(0.0, HERE), point(1.5, (0.0, 0.0, 0.0))]
+    return make("trajectory_msgs/msg/JointTrajectory", joint_names=list(names), points=points)
+
+
+def arrive(arm: FakeArm, commands: Commands) -> None:
+    """End the motion under way."""
+
+    async def end() -> None:
+        arm.end()
+
+    commands.submit(end()).result()

@@ -1,0 +1,68 @@
+"""`rtcp ros --zenoh` on a real platform with its virtual arm."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed: pip install 'rtcp[zenoh]'")
+
+from rtcp.ros.ros2_types import decode, make
+from rtcp.ros.ros2_zenoh import open_session
+from tests.e2e.conftest import Platform
+
+from .node import free_port, point, until
+from .zenoh_client import JOINT_STATES, Router, call
+
+pytestmark = pytest.mark.alone
+THERE = [0.2, 0.1, 0.0, 0.1, 0.0, 0.1]
+
+
+@pytest.fixture
+def platform() -> Iterator[Platform]:
+    """A started platform, which forgives what a shared host does."""
+    made = Platform()
+    made.be_patient(2000)
+    made.rtcp("start", "--detach")
+    yield made
+    made.end()
+
+
+def test_the_arm_is_enabled_moved_and_seen_over_zenoh(platform: Platform) -> None:
+    router = Router()
+    node = platform.background("ros", "--zenoh", "--router", router.address, "--name", "arm")
+    received: list[Any] = []
+    with open_session(router.address) as session:
+        subscriber = session.declare_subscriber(JOINT_STATES, received.append)
+        assert call(session, "robot_enable", "std_srvs/srv/Trigger").success
+        names = platform.status()["joint_names"]
+        points = [point(0.0, [0.0] * 6), point(2.0, THERE)]
+        trajectory = make("trajectory_msgs/msg/JointTrajectory", joint_names=names, points=points)
+        answer = call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=trajectory)
+        assert answer.code.val == 1
+
+        def is_there() -> bool:
+            message = decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes())
+            return bool(message.name == names and message.position.tolist() == pytest.approx(THERE, abs=1e-3))
+
+        until(lambda: received and is_there(), "the end of the trajectory")
+        stamp = decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes()).header.stamp
+        assert 0.0 <= time.time() - stamp.sec - 1e-9 * stamp.nanosec < 3600.0
+        subscriber.undeclare()
+    node.send_signal(signal.SIGINT)
+    _, log = node.communicate()
+    assert node.returncode == 0, log
+    router.close()
+
+
+def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to(platform: Platform) -> None:
+    node = platform.background("ros", "--zenoh", "--router", f"tcp/127.0.0.1:{free_port()}")
+    assert node.stderr is not None
+    assert "waiting for the router" in until(node.stderr.readline, "a line of the log")
+    node.send_signal(signal.SIGTERM)
+    node.communicate()
+    assert node.returncode == 0
