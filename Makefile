@@ -36,9 +36,9 @@ test-all: oracles ## run all tests: every sample, systemd as PID 1, in a browser
 	RTCP_SLOW=1 $(BIN)/python -m pytest -m alone || status=1; \
 	exit $$status
 
-test-ros: setup ## run the tests on ROS 1 in a network namespace; as root on Debian 12 it is installed first
+test-ros: setup ## run the tests on ROS 1 and Fast DDS in network namespaces; as root on Debian 12 they are installed first
 	@sh .ci/ros
-	@$(BIN)/python -m pytest tests/ros1
+	@$(BIN)/python -m pytest tests/ros1 tests/ros2
 
 fast: setup ## compile the cycle in place: about half the time for each; needs a C compiler, takes minutes
 	@$(BIN)/python hatch_build.py

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import signal
 import sys
@@ -112,9 +111,21 @@ def _run_ros2(
 ) -> None:
     """Run a ROS 2 node."""
     try:
-        from rtcp.ros.ros2_node import Ros2Options, run
+        from rtcp.ros.ros2_node import OpenWire, Ros2Options, run
 
-        module = importlib.import_module(f"rtcp.ros.ros2_{'rclpy' if wire == 'ros2' else wire}")
+        open_wire: OpenWire
+        if wire == "zenoh":
+            from rtcp.ros import ros2_zenoh
+
+            open_wire = ros2_zenoh.open_wire(router)
+        elif wire == "dds":
+            from rtcp.ros import ros2_dds
+
+            open_wire = ros2_dds.open_wire
+        else:
+            from rtcp.ros import ros2_rclpy
+
+            open_wire = ros2_rclpy.open_wire
     except ImportError as error:
         if wire == "ros2":
             how = "source a ROS 2 environment, in its Python"
@@ -125,7 +136,6 @@ def _run_ros2(
 
     _log_to_stderr()
     report(f"node {name}: Ctrl-C ends it")
-    open_wire = module.open_wire(router) if wire == "zenoh" else module.open_wire
     run(Ros2Options(name, rate, domain, CommandOptions(enable, partial), remappings), open_wire)
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import importlib
 import logging
 import threading
 from collections.abc import Iterator, Mapping
@@ -20,6 +19,7 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.signals import SignalHandlerOptions
+from rosidl_runtime_py.utilities import get_interface
 
 from rtcp.ros.commands import FollowCode
 from rtcp.ros.ros2_node import ACTION, DEPTH, IN, LATCHED, OUT, SERVICES, Commands, Ros2Options
@@ -40,7 +40,7 @@ def class_of(name: str) -> Any:
     """
     package, folder, last = name.split("/")
     base, _, part = last.partition("_")
-    found = getattr(importlib.import_module(f"{package}.{folder}"), base)
+    found = get_interface(f"{package}/{folder}/{base}")
     return getattr(found, part) if part else found
 
 

@@ -52,16 +52,16 @@ def key_of(domain: int, topic: str, kind: str) -> str:
     return f"{domain}/{topic}/{dds_type(kind)}/{type_hash(kind)}"
 
 
-def open_session(router: str) -> zenoh.Session:
-    """Return a session as client of a router.
+def open_session(router: str, is_router: bool = False) -> zenoh.Session:
+    """Return a session as client of a router, or as a router of its own that listens there.
 
     Raises:
-        zenoh.ZError: it does not answer.
+        zenoh.ZError: it does not answer, or the address is in use.
     """
     config = zenoh.Config()
     for key, value in {
-        "mode": "client",
-        "connect/endpoints": [router],
+        "mode": "router" if is_router else "client",
+        "listen/endpoints" if is_router else "connect/endpoints": [router],
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,  # the cache of a latched topic needs it
     }.items():

@@ -5,6 +5,7 @@ It has what `ros2_rclpy.py` and its test use, and takes messages as strictly: a 
 
 from __future__ import annotations
 
+import importlib
 import importlib.machinery
 import threading
 import uuid
@@ -178,6 +179,11 @@ class MultiThreadedExecutor:
         self._ends.set()
 
 
+def _interface(name: str) -> Any:
+    package, folder, last = name.split("/")
+    return getattr(importlib.import_module(f"{package}.{folder}"), last)
+
+
 def modules() -> dict[str, ModuleType]:
     """Return what takes the place of rclpy and the message packages in `sys.modules`."""
     contents: dict[str, dict[str, Any]] = {
@@ -191,6 +197,8 @@ def modules() -> dict[str, ModuleType]:
         "rclpy.executors": {"MultiThreadedExecutor": MultiThreadedExecutor},
         "rclpy.qos": {"DurabilityPolicy": DurabilityPolicy, "QoSProfile": QoSProfile},
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
+        "rosidl_runtime_py": {},
+        "rosidl_runtime_py.utilities": {"get_interface": _interface},
     }
     for name in ros2_types._store().fielddefs:
         package, folder, last = name.split("/")

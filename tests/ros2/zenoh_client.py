@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import struct
 import time
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import zenoh
 
 from rtcp.ros.ros2_types import FOLLOW, decode, encode, make, type_hash
+from rtcp.ros.ros2_zenoh import open_session
 from tests.ros.test_commands import NAMES
 
 from .node import free_port, trajectory, until
@@ -30,14 +30,7 @@ class Router:
         self.open()
 
     def open(self) -> None:
-        config = zenoh.Config()
-        for key, value in {
-            "mode": "router",
-            "listen/endpoints": [self.address],
-            "scouting/multicast/enabled": False,
-        }.items():
-            config.insert_json5(key, json.dumps(value))
-        self.session = zenoh.open(config)
+        self.session = open_session(self.address, is_router=True)
 
     def close(self) -> None:
         self.session.close()

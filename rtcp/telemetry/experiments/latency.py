@@ -7,7 +7,10 @@ feedback lags by 455 ms, of which 33 ms are the period of the commands.
 from __future__ import annotations
 
 import contextlib
+import json
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -178,6 +181,7 @@ class LatencyExperiment(Experiment):
                     rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
             rows += self._parts(setup, robot)
             rows += self._to_frame(robot)
+            rows += _by_ros2(setup)
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
@@ -301,6 +305,21 @@ class LatencyExperiment(Experiment):
         axes.legend()
         axes.grid(alpha=0.3)
         setup.draw(f"latency-{name}", figure)
+
+
+def _by_ros2(setup: Setup) -> list[Row]:
+    """Measure how long a joint_command of ROS 2 takes until the frame has left, over each wire that is installed."""
+    rows: list[Row] = []
+    for wire in ("DDS", "Zenoh"):
+        done = subprocess.run(
+            [sys.executable, "-m", "rtcp.ros.ros2_latency", wire.lower()], capture_output=True, text=True, check=False
+        )
+        if done.returncode:
+            setup.note(f"{wire} was not measured: {done.stderr.strip().rpartition(chr(10))[2]}")
+            continue
+        cycles = json.loads(done.stdout)
+        rows += [Row(f"{wire}: publish to frame, p{p}", "cycles", float(np.percentile(cycles, p))) for p in (50, 99)]
+    return rows
 
 
 def _recorded_series(recorded: Recorded) -> dict[str, tuple[Array, Array]]:

@@ -1,0 +1,129 @@
+"""The latency of a joint_command of ROS 2, from its publishing until the frame has left.
+
+`python -m rtcp.ros.ros2_latency dds|zenoh` measures it on the platform that runs, whose drives are enabled: with the
+node in a process of its own, over the loopback interface. It prints the cycles of each command as JSON.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import count
+
+import numpy as np
+
+from rtcp.api import connect
+from rtcp.api.feed import Feed
+
+Publish = Callable[[Sequence[float]], None]
+"""Publishes joint positions, rad, as joint_command."""
+
+_DOMAIN = 77
+_ON_LOOPBACK = (
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='false'/></Interfaces></General>"
+    "<Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
+    "</Domain></CycloneDDS>"
+)
+_PROBES, _PROBE_INTERVAL_S = 100, 0.15
+_STEP_RAD = 1e-5
+"""Way of each command, there and back: the arm rests again long before the next."""
+_BEGIN_S = 30.0
+"""Longest wait for the node's first command."""
+_POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+
+
+@contextlib.contextmanager
+def _by_dds() -> Iterator[tuple[Publish, list[str]]]:
+    from cyclonedds.domain import Domain, DomainParticipant
+    from cyclonedds.pub import DataWriter
+    from cyclonedds.topic import Topic
+
+    from rtcp.ros.ros2_dds import make, qos_of, struct_of
+
+    _domain = Domain(_DOMAIN, _ON_LOOPBACK)  # ends with its last reference
+    participant = DomainParticipant(_DOMAIN)
+    topic = Topic(participant, "rt/joint_command", struct_of(_POINT))
+    writer = DataWriter(participant, topic, qos_of("joint_command", _POINT))
+    yield lambda q: writer.write(make(_POINT, positions=q)), ["--dds", "--domain", str(_DOMAIN)]
+
+
+@contextlib.contextmanager
+def _by_zenoh() -> Iterator[tuple[Publish, list[str]]]:
+    from rtcp.ros.ros2_types import encode, make
+    from rtcp.ros.ros2_zenoh import key_of, open_session
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        router = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    with open_session(router, is_router=True), open_session(router) as session:
+        publisher = session.declare_publisher(key_of(_DOMAIN, "joint_command", _POINT))
+        arguments = ["--zenoh", "--router", router, "--domain", str(_DOMAIN)]
+        yield lambda q: publisher.put(encode(_POINT, make(_POINT, positions=q))), arguments
+
+
+def measure(wire: str) -> list[float]:
+    """Return the cycles of each command.
+
+    Raises:
+        SystemExit: with a sentence, where the library is missing or the node passes nothing on.
+    """
+    try:
+        with {"dds": _by_dds, "zenoh": _by_zenoh}[wire]() as (publish, arguments):
+            return _measure(publish, arguments)
+    except ImportError as error:
+        raise SystemExit(f"{error}: pip install 'rtcp[{wire}]'") from None
+
+
+def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
+    with connect() as robot:
+        here = robot.status().commanded_positions
+    node = subprocess.Popen(
+        [sys.executable, "-m", "rtcp.cli", "ros", "--name", "latency", *arguments],
+        env=os.environ | {"CYCLONEDDS_URI": _ON_LOOPBACK},
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    )  # fmt: skip
+    cycles: list[float] = []
+    try:
+        with contextlib.closing(Feed()) as feed:
+            until = time.monotonic() + _BEGIN_S
+            for number in count(1):
+                if len(cycles) == _PROBES:
+                    break
+                if not cycles and time.monotonic() > until:
+                    raise SystemExit(f"the node has passed on no joint_command within {_BEGIN_S:g} s")
+                target = [here[0] + (_STEP_RAD if number % 2 else 0.0), *here[1:]]
+                cycles += _cycles_until_it_moves(feed, partial(publish, target))
+    finally:
+        node.terminate()
+        node.wait()
+    return cycles
+
+
+def _cycles_until_it_moves(feed: Feed, publish: Callable[[], None]) -> list[float]:
+    """Return the cycles from the publishing until the frame with the first other position has left; nothing: none has.
+
+    The arm is at rest before, and has time to come to rest again.
+    """
+    before, _ = feed.records()
+    published_ns = time.monotonic_ns()
+    publish()
+    time.sleep(_PROBE_INTERVAL_S)
+    records, _ = feed.records()
+    if not len(before) or not len(records):
+        return []
+    moved = np.flatnonzero(records["sent_position"][:, 0] != before["sent_position"][-1, 0])
+    # What a record calls sent leaves with the beginning of the next cycle.
+    if not len(moved) or moved[0] + 1 >= len(records):
+        return []
+    return [(int(records["time_ns"][moved[0] + 1]) - published_ns) / feed.period_ns]
+
+
+if __name__ == "__main__":
+    print(json.dumps(measure(sys.argv[1])))
