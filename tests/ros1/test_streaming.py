@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rtcp.api import Feed
+from rtcp.api import Feed, RtcpError
+from rtcp.ros import ros1_messages
+from rtcp.ros.ros1_latency import measure
 from tests.e2e.conftest import Platform
 
 from .conftest import Ros, begin_node, command, is_at, until
@@ -106,3 +108,23 @@ def test_whoever_goes_on_streaming_after_stop_motion_moves_nothing(ros: Ros, arm
     # Its next stream begins anew.
     command(ros, "point", t=0.0, q=[0.05, *[0.0] * 5])
     until(lambda: is_at(arm, [0.05, *[0.0] * 5]), "the point")
+
+
+def test_the_latency_of_topic_and_service_is_measured_in_the_frames(
+    ros_on_the_path: None, platform: Platform, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the last stream's lease")
+    platform.restore()
+    platform.call("enable")
+    for name in ("RTCP_RUNTIME_DIR", "RTCP_STATE_DIR"):
+        monkeypatch.setenv(name, platform.environment[name])
+    found = measure(10)
+    assert sorted(found) == ["service", "topic"]
+    # At least the cycle in which a command is taken: how much more depends on the host.
+    assert all(len(seconds) >= 5 and min(seconds) > 0.0 for seconds in found.values())
+
+
+def test_without_ros_the_latency_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros1_messages, "missing", lambda: "ROS 1 is not installed")
+    with pytest.raises(RtcpError, match="ROS 1 is not installed"):
+        measure(10)

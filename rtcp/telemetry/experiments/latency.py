@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import curve_fit
 
-from rtcp.api import Robot, State
+from rtcp.api import Robot, RtcpError, State
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.observer import Observer
 from rtcp.ipc.runtime_directory import blackboard_file, control_socket, runtime_directory
@@ -178,6 +178,7 @@ class LatencyExperiment(Experiment):
                     rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
             rows += self._parts(setup, robot)
             rows += self._to_frame(robot)
+            rows += self._by_ros(setup, robot)
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
@@ -285,6 +286,26 @@ class LatencyExperiment(Experiment):
         cycles = (records["time_ns"][at[known]] - np.array(sent_at)[known]) / period_ns
         return [
             Row(f"Python API: command to frame, p{p}", "cycles", float(np.percentile(cycles, p)), None, 0.0, AIM_CYCLES)
+            for p in (50, 99)
+        ]
+
+    @staticmethod
+    def _by_ros(setup: Setup, robot: Robot) -> list[Row]:
+        """Measure commands of a ROS 1 client until the frame has left, where ROS 1 is installed."""
+        from rtcp.ros.ros1_latency import measure
+
+        until = time.monotonic() + _REST_S
+        while robot.status().holder and time.monotonic() < until:  # the lease of the last stream
+            time.sleep(0.05)
+        period_s = 1e-6 * setup.arm.cycle.period_us
+        try:
+            found = measure(_PROBES // 2)
+        except RtcpError as error:
+            setup.note(f"no figures for ROS 1: {error}")
+            return []
+        return [
+            Row(f"ROS 1 {way}: command to frame, p{p}", "cycles", float(np.percentile(seconds, p)) / period_s)
+            for way, seconds in found.items()
             for p in (50, 99)
         ]
 
