@@ -1,6 +1,8 @@
-"""How long commands of a ROS 1 client take until the frame has left: `measure` runs master, node and client.
+"""How long commands of a ROS 1 client take until the frame has left, on the platform that runs.
 
-`python -m rtcp.ros.ros1_latency PROBES` is the client: a process of its own, as a user's.
+`python -m rtcp.ros.ros1_latency PROBES` runs a master, a node and, by itself again, a client: processes as a user's. It
+prints JSON: s from the call of rospy to the frame, for `topic` joint_command and `service` joint_path_command. The arm
+is enabled, at rest, and nobody commands it; it stays where it is.
 """
 
 from __future__ import annotations
@@ -18,9 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from rtcp.api import RtcpError, State
-from rtcp.ipc.observer import Observer
-from rtcp.ipc.runtime_directory import blackboard_file, runtime_directory
+from rtcp.api import Feed, State
 from rtcp.ros import ros1_messages
 
 _MASTER = "/usr/bin/rosmaster"
@@ -31,34 +31,25 @@ _PAUSE_S = 2.0
 """After which a stream has ended."""
 
 
-def measure(probes: int) -> dict[str, list[float]]:
-    """Return seconds from the call of rospy to the frame: `topic` joint_command, `service` joint_path_command.
-
-    The arm holds, and nobody commands it; it stays where it is.
-
-    Raises:
-        RtcpError: ROS 1 is not installed, or the client failed.
-    """
+def _measure(probes: str) -> str:
+    """Return what the client prints; exit with one sentence where ROS 1 is missing or the client fails."""
     if problem := ros1_messages.missing():
-        raise RtcpError("not running", problem)
+        raise SystemExit(problem)
     if not os.path.exists(_MASTER):
-        raise RtcpError("not running", f"there is no ROS master: {_MASTER} is missing (apt install python3-rosmaster)")
+        raise SystemExit(f"there is no ROS master ({_MASTER} is missing): apt install python3-rosmaster")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = str(free.getsockname()[1])
     environment = {**os.environ, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
     with contextlib.ExitStack() as running:
         for command in ([_MASTER, "--core", "-p", port], [sys.executable, "-m", "rtcp.cli", "ros"]):
-            begun = subprocess.Popen(
-                command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, stdin=subprocess.DEVNULL
-            )
+            begun = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             running.callback(begun.wait)
             running.callback(begun.terminate)
-        client = [sys.executable, "-m", "rtcp.ros.ros1_latency", str(probes)]
+        client = [sys.executable, "-m", "rtcp.ros.ros1_latency", probes, "client"]
         done = subprocess.run(client, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise RtcpError("fault", f"the ROS client failed: {done.stderr.strip().rpartition(chr(10))[2]}")
-    seconds: dict[str, list[float]] = json.loads(done.stdout.rpartition("latency ")[2])
-    return seconds
+        raise SystemExit(f"the ROS client failed: {done.stderr.strip().rpartition(chr(10))[2]}")
+    return done.stdout.strip().rpartition("\n")[2]
 
 
 def _probe(count: int) -> dict[str, list[float]]:
@@ -75,10 +66,9 @@ def _probe(count: int) -> dict[str, list[float]]:
     names = rospy.wait_for_message("joint_states", JointState).name
     while publisher.get_num_connections() == 0:
         time.sleep(0.05)
-    observer = Observer(blackboard_file(runtime_directory()))
-    latest = observer.latest()
-    assert latest is not None
-    here = [float(value) for value in latest[0]["commanded_position"][: len(names)]]
+    feed = Feed()
+    feed.wait(_PAUSE_S)
+    here = feed.records()[0]["commanded_position"][-1].tolist()
     rest = [JointTrajectoryPoint(positions=here, time_from_start=rospy.Duration(t)) for t in (0.0, _MOVE_S)]
     path = JointTrajectory(joint_names=names, points=rest)
     beside = [here[0] + _STEP_RAD, *here[1:]]
@@ -87,10 +77,11 @@ def _probe(count: int) -> dict[str, list[float]]:
     def latencies(way: str, send: Callable[[], object], has_begun: Callable[[Any], Any]) -> list[float]:
         found = []
         for _ in range(count):
-            head, sent_ns = observer.head, time.monotonic_ns()
+            feed.records()
+            sent_ns = time.monotonic_ns()
             send()
             time.sleep(_INTERVAL_S[way])
-            records, _ = observer.since(head)
+            records, _ = feed.records()
             begun = np.flatnonzero(has_begun(records))
             # What a cycle computes leaves with the beginning of the next one.
             if begun.size and begun[0] + 1 < len(records):
@@ -109,4 +100,4 @@ def _probe(count: int) -> dict[str, list[float]]:
 
 
 if __name__ == "__main__":
-    print("latency", json.dumps(_probe(int(sys.argv[1]))))
+    print(json.dumps(_probe(int(sys.argv[1]))) if sys.argv[2:] else _measure(sys.argv[1]))
