@@ -29,9 +29,11 @@ process from joining the virtual segment's user namespace, so it is not."""
 LET_IN_BY_OTHERS = {"typing_extensions"}
 """annotated_types imports it where it is installed."""
 
-ROS = {"actionlib", "control_msgs", "diagnostic_msgs", "industrial_msgs", "rosgraph", "rospy", "sensor_msgs",
-       "std_srvs", "trajectory_msgs"}  # fmt: skip
-"""Modules of ROS 1: Debian's, or generated. One file imports them, once `rtcp.ros.ros1_messages` has found them."""
+ROS = {"actionlib", "control_msgs", "diagnostic_msgs", "geometry_msgs", "industrial_msgs", "rosgraph", "rospy",
+       "sensor_msgs", "std_srvs", "tf2_msgs", "trajectory_msgs"}  # fmt: skip
+ROS_FILES = {"rtcp/ros/ros1.py", "rtcp/ros/ros1_latency.py"}
+"""Modules of ROS 1: Debian's, or generated. The node and the client that measures it import them, once
+`rtcp.ros.ros1_messages` has found them."""
 
 ROS_2 = {
     "rtcp/ros/ros2_types.py": {"rosbags"},
@@ -219,7 +221,7 @@ def declared(key: str) -> set[str]:
 def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
     # typing_extensions is imported for the type checker alone.
     ours = {"rtcp", "kinematics", "typing_extensions", *sys.stdlib_module_names}
-    optional = ROS_2 | {"rtcp/ros/ros1.py": ROS}
+    optional = ROS_2 | dict.fromkeys(ROS_FILES, ROS)
     imports = [found for found in IMPORTS if found.module.partition(".")[0] not in optional.get(found.file, ())]
     outside = [(found.importer, found.module.partition(".")[0]) for found in imports]
     names = {(importer == "panel", PACKAGES.get(name, name)) for importer, name in outside if name not in ours}
@@ -228,13 +230,11 @@ def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
 
 
 def test_ros_is_a_client_of_the_api() -> None:
-    """What it reads besides are files, configuration and geometry, and the bits of a cycle record."""
+    """What it reads besides are files, configuration and geometry; of `motion` it has the quaternion of a rotation."""
     imported = {found.module for found in IMPORTS if found.importer == "ros" and is_ours(found)} - {"rtcp"}
-    allowed = (
-        "rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.schema", "rtcp.ipc.runtime_directory",
-        "rtcp.motion.planning.interpolation",  # geometry: quaternions
-    )  # fmt: skip
-    assert {module for module in imported if not module.startswith(allowed)} == set()
+    allowed = ("rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.runtime_directory")
+    others = {module for module in imported if not module.startswith(allowed)}
+    assert others == {"rtcp.motion.planning.interpolation"}
 
 
 def test_the_panel_is_a_client_of_the_api() -> None:

@@ -32,7 +32,8 @@ class AsyncRobot(Methods):
     Args:
         name: who commands, as others are told when they are refused; empty: this process.
         path: the control socket; None: that of the runtime directory.
-        disable_when_lost: the drives are disabled, after the stop, where the connection ends in a motion of its own.
+        disable_when_lost: where the connection ends without `close`, as with the end of this process, the drives are
+            disabled after the stop, unless another commands the arm.
     """
 
     def __init__(self, name: str = "", path: Path | None = None, disable_when_lost: bool = False) -> None:
@@ -68,6 +69,9 @@ class AsyncRobot(Methods):
         if self._receiving is not None:
             self._receiving.cancel()
         if self._writer is not None:
+            if not self._writer.is_closing():
+                identity = {**self._identity, "disable_when_lost": False}
+                self._writer.write(jsonrpc.line({"method": "identify", "params": identity}))
             self._writer.close()
             with contextlib.suppress(ConnectionError):
                 await self._writer.wait_closed()

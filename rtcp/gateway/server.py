@@ -20,7 +20,7 @@ from pathlib import Path
 
 from rtcp.config.find import load_messages
 from rtcp.gateway.black_box import BlackBox
-from rtcp.gateway.command_channel import IN_MOTION, Caller, Json
+from rtcp.gateway.command_channel import Caller, Json
 from rtcp.gateway.methods import Methods
 from rtcp.gateway.ros_server import RosServer
 from rtcp.gateway.status_snapshot import StatusSnapshot
@@ -83,15 +83,11 @@ class _Connection:
                 self._send(jsonrpc.failure(None, RtcpError("invalid", message), jsonrpc.INVALID_REQUEST))
                 await _discard(reader)
         finally:
-            channel = self._methods.channel
-            disables = (
-                self._disables_when_lost and channel.observer.holder() == self._name and channel.state in IN_MOTION
-            )
             for task in self._requests:
                 task.cancel()
             await asyncio.gather(*self._requests, return_exceptions=True)
             await self._methods.end_connection(self._number)
-            if disables:
+            if self._disables_when_lost and self._methods.channel.observer.holder() in ("", self._name):
                 with contextlib.suppress(RtcpError):
                     await self._methods.machine.disable()
 

@@ -122,6 +122,8 @@ class Commander:
     def __init__(self, connect: Connect, options: CommandOptions, log: Callable[[str], None]) -> None:
         self._connect, self._options, self._log = connect, options, log
         self._robot: AsyncRobot | None = None
+        self._status: Status | None = None
+        """The last one of this connection."""
         self._closing = contextlib.AsyncExitStack()
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Arrival]] = set()
@@ -270,9 +272,11 @@ class Commander:
             await asyncio.gather(*self._motions, return_exceptions=True)
 
     async def enabled(self) -> Status:
-        """Return the status, the drives enabled where that is asked for and allowed."""
+        """Return a status, which may be old, the drives enabled where that is asked for and allowed."""
         robot = await self.connected()
-        status = await robot.status()
+        if self._status is not None and not (self._options.enables or self._options.allows_partial):
+            return self._status  # for the names of the joints: a request less before a motion
+        status = self._status = await robot.status()
         if status.state is State.READY and self._options.enables:
             if not self._may_enable:
                 message = "the drives were disabled by a stop or by robot_disable: call robot_enable"
@@ -286,7 +290,7 @@ class Commander:
         async with self._connecting:
             if self._robot is None or not self._robot.is_open:
                 await self._closing.aclose()  # a connection that was lost
-                self._robot = await self._closing.enter_async_context(self._connect())
+                self._robot, self._status = await self._closing.enter_async_context(self._connect()), None
             return self._robot
 
     def _report(self, motion: asyncio.Task[Arrival]) -> None:

@@ -14,10 +14,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-import rtcp
 from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Vector
+from rtcp import api
 from rtcp.api import ControlMode, NotRunning, State
 from rtcp.api.feed import Feed, Records
 from rtcp.motion.planning.interpolation import Quaternion, quaternion
@@ -123,7 +123,7 @@ def robot_status(record: Any, age_ns: int, stamp_ns: int, is_held_by_others: boo
         stamp_ns: its instant, CLOCK_REALTIME.
         is_held_by_others: another commander has the arm, so that a motion would be refused.
     """
-    found, state = rtcp.RobotStatus.of_record(record), State(record["state"])
+    found, state = api.RobotStatus.of_record(record), State(record["state"])
     is_fresh = age_ns < _STALE_NS
     # A drive that was last seen without torque does not get it back while no frame reaches it.
     powered = TriState.UNKNOWN if found.drives_powered and not is_fresh else TriState(found.drives_powered)

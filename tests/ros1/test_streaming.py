@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
@@ -106,3 +108,16 @@ def test_whoever_goes_on_streaming_after_stop_motion_moves_nothing(ros: Ros, arm
     # Its next stream begins anew.
     command(ros, "point", t=0.0, q=[0.05, *[0.0] * 5])
     until(lambda: is_at(arm, [0.05, *[0.0] * 5]), "the point")
+
+
+def test_the_latency_of_topic_and_service_is_measured_in_the_frames(ros_on_the_path: None, platform: Platform) -> None:
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the last stream's lease")
+    platform.restore()
+    platform.call("enable")
+    command = [sys.executable, "-m", "rtcp.ros.ros1_latency", "10"]
+    done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert sorted(found) == ["service", "topic"]
+    # At least the cycle in which a command is taken: how much more depends on the host.
+    assert all(len(seconds) >= 5 and min(seconds) > 0.0 for seconds in found.values())

@@ -182,6 +182,7 @@ class LatencyExperiment(Experiment):
             rows += self._parts(setup, robot)
             rows += self._to_frame(robot)
             rows += _by_ros2(setup)
+            rows += self._by_ros(setup, robot)
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
@@ -289,6 +290,24 @@ class LatencyExperiment(Experiment):
         cycles = (records["time_ns"][at[known]] - np.array(sent_at)[known]) / period_ns
         return [
             Row(f"Python API: command to frame, p{p}", "cycles", float(np.percentile(cycles, p)), None, 0.0, AIM_CYCLES)
+            for p in (50, 99)
+        ]
+
+    @staticmethod
+    def _by_ros(setup: Setup, robot: Robot) -> list[Row]:
+        """Measure commands of a ROS 1 client until the frame has left, where ROS 1 is installed."""
+        until = time.monotonic() + _REST_S
+        while robot.status().holder and time.monotonic() < until:  # the lease of the last stream
+            time.sleep(0.05)
+        period_s = 1e-6 * setup.arm.cycle.period_us
+        command = [sys.executable, "-m", "rtcp.ros.ros1_latency", str(_PROBES // 2)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        if done.returncode:
+            setup.note(f"no figures for ROS 1: {done.stderr.strip()}")
+            return []
+        return [
+            Row(f"ROS 1 {way}: command to frame, p{p}", "cycles", float(np.percentile(seconds, p)) / period_s)
+            for way, seconds in json.loads(done.stdout).items()
             for p in (50, 99)
         ]
 

@@ -1,0 +1,103 @@
+"""How long commands of a ROS 1 client take until the frame has left, on the platform that runs.
+
+`python -m rtcp.ros.ros1_latency PROBES` runs a master, a node and, by itself again, a client: processes as a user's. It
+prints JSON: s from the call of rospy to the frame, for `topic` joint_command and `service` joint_path_command. The arm
+is enabled, at rest, and nobody commands it; it stays where it is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rtcp.api import Feed, State
+from rtcp.ros import ros1_messages
+
+_MASTER = "/usr/bin/rosmaster"
+_INTERVAL_S = {"topic": 0.08, "service": 0.3}
+"""In which what was sent before has come to rest."""
+_STEP_RAD, _MOVE_S = 1e-5, 0.1
+_PAUSE_S = 2.0
+"""After which a stream has ended."""
+
+
+def _measure(probes: str) -> str:
+    """Return what the client prints; exit with one sentence where ROS 1 is missing or the client fails."""
+    if problem := ros1_messages.missing():
+        raise SystemExit(problem)
+    if not os.path.exists(_MASTER):
+        raise SystemExit(f"there is no ROS master ({_MASTER} is missing): apt install python3-rosmaster")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = str(free.getsockname()[1])
+    environment = {**os.environ, "ROS_MASTER_URI": f"http://127.0.0.1:{port}", "ROS_IP": "127.0.0.1"}
+    with contextlib.ExitStack() as running:
+        for command in ([_MASTER, "--core", "-p", port], [sys.executable, "-m", "rtcp.cli", "ros"]):
+            begun = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            running.callback(begun.wait)
+            running.callback(begun.terminate)
+        client = [sys.executable, "-m", "rtcp.ros.ros1_latency", probes, "client"]
+        done = subprocess.run(client, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"the ROS client failed: {done.stderr.strip().rpartition(chr(10))[2]}")
+    return done.stdout.strip().rpartition("\n")[2]
+
+
+def _probe(count: int) -> dict[str, list[float]]:
+    ros1_messages.make_importable()
+    import rospy
+    from industrial_msgs.srv import CmdJointTrajectory
+    from sensor_msgs.msg import JointState
+    from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+    rospy.init_node("latency", anonymous=True)
+    publisher = rospy.Publisher("joint_command", JointTrajectoryPoint, queue_size=10, tcp_nodelay=True)
+    rospy.wait_for_service("joint_path_command")
+    call = rospy.ServiceProxy("joint_path_command", CmdJointTrajectory, persistent=True)
+    names = rospy.wait_for_message("joint_states", JointState).name
+    while publisher.get_num_connections() == 0:
+        time.sleep(0.05)
+    feed = Feed()
+    feed.wait(_PAUSE_S)
+    here = feed.records()[0]["commanded_position"][-1].tolist()
+    rest = [JointTrajectoryPoint(positions=here, time_from_start=rospy.Duration(t)) for t in (0.0, _MOVE_S)]
+    path = JointTrajectory(joint_names=names, points=rest)
+    beside = [here[0] + _STEP_RAD, *here[1:]]
+    points = itertools.cycle([JointTrajectoryPoint(positions=beside), rest[0]])
+
+    def latencies(way: str, send: Callable[[], object], has_begun: Callable[[Any], Any]) -> list[float]:
+        found = []
+        for _ in range(count):
+            feed.records()
+            sent_ns = time.monotonic_ns()
+            send()
+            time.sleep(_INTERVAL_S[way])
+            records, _ = feed.records()
+            begun = np.flatnonzero(has_begun(records))
+            # What a cycle computes leaves with the beginning of the next one.
+            if begun.size and begun[0] + 1 < len(records):
+                found.append(1e-9 * float(records["time_ns"][begun[0] + 1] - sent_ns))
+        return found
+
+    def moves(records: Any) -> Any:
+        return records["commanded_position"][:, 0] != records["commanded_position"][0, 0]
+
+    publisher.publish(rest[0])  # opens the stream
+    time.sleep(0.5)
+    found = {"topic": latencies("topic", lambda: publisher.publish(next(points)), moves)}
+    time.sleep(_PAUSE_S)
+    found["service"] = latencies("service", lambda: call(path), lambda records: records["state"] == State.MOVING)
+    return found
+
+
+if __name__ == "__main__":
+    print(json.dumps(_probe(int(sys.argv[1]))) if sys.argv[2:] else _measure(sys.argv[1]))
