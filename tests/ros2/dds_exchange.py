@@ -12,7 +12,7 @@ from rtcp.ros.ros2_dds import DdsWire
 from rtcp.ros.ros2_node import Commands, Publications
 from rtcp.ros.ros2_types import encode
 from tests.ros.test_commands import FakeArm
-from tests.ros2.node import CONFIG, OPTIONS, SAMPLE, point, trajectory, until
+from tests.ros2.node import CONFIG, OPTIONS, SAMPLE, commanded, point, trajectory, until
 
 
 class FastDds:
@@ -71,16 +71,16 @@ def main(program: str) -> None:
         ):
             name = f"trajectory_msgs::msg::dds_::{kind.rpartition('/')[2]}_"
             for quality in ("reliable", "best_effort"):
-                arm.calls.clear()
+                before = len(commanded(arm, topic))
                 writer = FastDds(program, "write", f"rt/{topic}", name, quality)
 
                 def command(writer: FastDds = writer, data: bytes = encode(kind, message)) -> list[Any]:
                     writer.put(data)
-                    return arm.calls
+                    return commanded(arm, topic)[before:]  # noqa: B023  called in this turn alone
 
                 found[f"{topic}, {quality}"] = until(command, topic)[0][:2]
                 writer.put(b"\x00\x01\x00\x00\xff\xff\xff\xff")  # no message: the next one is taken
-                arm.calls.clear()
+                before = len(commanded(arm, topic))
                 until(command, topic)
                 writer.end()
         commands.loop.call_soon_threadsafe(arm.end)

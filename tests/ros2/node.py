@@ -47,6 +47,13 @@ def trajectory(names: Any = NAMES) -> Any:
     return make("trajectory_msgs/msg/JointTrajectory", joint_names=list(names), points=points)
 
 
+def commanded(arm: FakeArm, topic: str) -> list[Any]:
+    """What has reached the arm from a topic: (`stream`, joint positions) of each setpoint, or its calls."""
+    if topic == "joint_command":
+        return [("stream", sent[0]) for stream in arm.streams for sent in stream.sent]
+    return list(arm.calls)
+
+
 def arrive(arm: FakeArm, commands: Commands) -> None:
     """End the motion under way."""
 

@@ -105,7 +105,7 @@ def test_fast_dds_is_told_the_hash_of_each_type(exchange: dict[str, Any]) -> Non
 
 @pytest.mark.parametrize("quality", ["reliable", "best_effort"])
 def test_commands_written_by_fast_dds_reach_the_arm(exchange: dict[str, Any], quality: str) -> None:
-    assert exchange[f"joint_command, {quality}"] == ["move", [0.1, 0.2, 0.3]]
+    assert exchange[f"joint_command, {quality}"] == ["stream", [0.1, 0.2, 0.3]]
     assert exchange[f"joint_path_command, {quality}"] == ["run", [[0.1, 0.2, 0.3], [0.0, 0.0, 0.0]]]
 
 

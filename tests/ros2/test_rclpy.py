@@ -19,7 +19,7 @@ from rtcp.ros.state import Diagnostics, RobotStatus
 from tests.ros.test_commands import HERE, NAMES, FakeArm
 
 from . import rclpy_stand_in
-from .node import CONFIG, OPTIONS, SAMPLE, arrive, until
+from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, until
 
 TIMEOUT_S = 100.0
 
@@ -119,7 +119,7 @@ def test_commands_reach_the_arm(ros: Ros, arm: FakeArm, topic: str) -> None:
 
     def publish() -> list[Any]:
         publisher.publish(trajectory.points[0] if topic == "joint_command" else trajectory)
-        return arm.calls
+        return commanded(arm, topic)
 
     assert until(publish, "the command")[0][1] == (HERE if topic == "joint_command" else [list(HERE), [0.0, 0.0, 0.0]])
 

@@ -19,7 +19,7 @@ from rtcp.ros.ros2_types import FOLLOW, decode, encode, type_hash
 from rtcp.ros.ros2_zenoh import ZenohWire, open_session
 from tests.ros.test_commands import HERE, FakeArm
 
-from .node import CONFIG, OPTIONS, SAMPLE, arrive, point, trajectory, until
+from .node import CONFIG, OPTIONS, SAMPLE, arrive, commanded, point, trajectory, until
 from .zenoh_client import GID, JOINT_STATES, Goal, Router, call, tokens
 
 
@@ -119,7 +119,7 @@ def test_commands_reach_the_arm_and_bytes_that_are_none_do_not(
 
     def command() -> list[Any]:
         put(encode(kind, message))
-        return arm.calls
+        return commanded(arm, topic)
 
     call = until(command, "the command")[0]
     assert call[1] == (HERE if topic == "joint_command" else [list(HERE), [0.0, 0.0, 0.0]])
