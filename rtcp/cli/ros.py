@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -60,6 +61,7 @@ def _ros(
         bool,
         option("--joint-feedback", "Send velocities too (JOINT_FEEDBACK), which the reference client complains of."),
     ] = False,
+    until: Annotated[int, typer.Option("--until", hidden=True, help="End with this process; 0: with none.")] = 0,
 ) -> None:
     """Serve the arm to ROS until Ctrl-C: a node of ROS 1 (docs/ros.md) or ROS 2, or a Simple Message server.
 
@@ -80,7 +82,7 @@ def _ros(
         orders = {"auto": None, "little": ByteOrder.LITTLE, "big": ByteOrder.BIG}
         if byte_order not in orders:
             raise CommandError(f"--byte-order {byte_order} is not known: {', '.join(orders)}", ExitCode.USAGE)
-        asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback)))
+        asyncio.run(_serve(ServerOptions(bind, motion_port, state_port, orders[byte_order], joint_feedback), until))
     elif wires:
         if remappings and not ros2:
             raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
@@ -145,8 +147,8 @@ def _log_to_stderr() -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler])
 
 
-async def _serve(options: ServerOptions) -> None:
-    """Serve Simple Message until a signal comes; the arm stops then as if its client was lost."""
+async def _serve(options: ServerOptions, until: int) -> None:
+    """Serve Simple Message until a signal comes or a process ends; the arm stops then as if its client was lost."""
     import asyncio
 
     from rtcp.ros.simple_message.robot_arm import RobotArm
@@ -156,6 +158,11 @@ async def _serve(options: ServerOptions) -> None:
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         asyncio.get_running_loop().add_signal_handler(number, ended.set)
+    if until:
+        try:
+            asyncio.get_running_loop().add_reader(os.pidfd_open(until), ended.set)
+        except ProcessLookupError:
+            return
     arm = RobotArm()
     connection = asyncio.create_task(arm.run())
     try:

@@ -25,13 +25,19 @@ class RosServer:
         self._directory = directory
         self._file = directory / "ros-server.json"
 
-    async def start_once(self, options: SimpleMessageConfig) -> None:
-        """Start it, unless an earlier gateway has; it writes into the gateway's log, also why it ends."""
+    async def start_once(self, options: SimpleMessageConfig, loop: int) -> None:
+        """Start it, unless an earlier gateway has; it writes into the gateway's log and ends with the process `loop`."""
         if is_running(self._pid()):
             return
         command = ["-m", "rtcp.cli", "ros", "--simple-message", "--bind", options.bind]
         command += ["--motion-port", str(options.motion_port), "--state-port", str(options.state_port)]
-        command += ["--byte-order", options.byte_order, *(["--joint-feedback"] if options.joint_feedback else [])]
+        command += [
+            "--until",
+            str(loop),
+            "--byte-order",
+            options.byte_order,
+            *(["--joint-feedback"] if options.joint_feedback else []),
+        ]
         process = await asyncio.create_subprocess_exec(
             sys.executable,
             *command,

@@ -235,7 +235,7 @@ class Gateway:
         recording = asyncio.create_task(self._record())
         ready()
         if self._ros is not None:
-            await self._ros_server.start_once(self._ros.simple_message)
+            await self._ros_server.start_once(self._ros.simple_message, self._observer.loop_pid)
         await self._ended.wait()
         # Not waiting for clients that are still there (`status --watch`): they learn it by the closed connection.
         server.close()

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import re
-import socket
 import time
 from collections.abc import Callable, Iterator
 from math import cos, pi
@@ -128,7 +128,8 @@ def test_the_arms_file_starts_the_server_once_and_it_ends_with_the_platform(plat
         return reply.reply_code
 
     assert asyncio.run(answers()) is ReplyCode.SUCCESS
+    server = json.loads((platform.directory / "ros-server.json").read_text())["pid"]
     assert len(re.findall(r"motion at ", platform.logs())) == 1
+    kill(platform.pids()["gateway"])
     platform.rtcp("stop")
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", int(found[1])))
+    gone(server)
