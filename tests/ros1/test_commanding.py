@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Iterator
 from typing import Any
 
@@ -215,35 +214,6 @@ def test_a_goal_that_is_cancelled_ends_and_the_arm_holds_on_the_way(ros: Ros, ar
     assert [have / want for have, want in zip(rest, THERE, strict=True) if want] == pytest.approx(
         [rest[0] / THERE[0]] * 5, abs=0.02
     )
-
-
-@pytest.mark.parametrize("kind", ["path", "stream"])
-def test_after_the_loss_of_its_node_the_arm_stops_and_the_drives_are_disabled(
-    ros: Ros, platform: Platform, kind: str
-) -> None:
-    platform.until(lambda status: not status["lease"]["holder"], "the end of the last lease")
-    platform.restore()
-    platform.call("enable")
-    node = begin_node(ros, platform, "--name", "short_lived", "joint_command:=/mine", "joint_path_command:=/my_path")
-    given = {"topic": "/mine", "velocities": True, "radius": 0.3, "period_s": 20.0, "rate_hz": 50, "count": 500}
-    sent = path(platform, THERE, 20.0) | {"topic": "/my_path"} if kind == "path" else given
-    client = ros.begin_client(kind, **sent)
-    try:
-        platform.until_moving(0.01)
-        node.send_signal(signal.SIGKILL)
-        platform.until(lambda status: status["state"] == "ready", "drives without torque")
-    finally:
-        client.kill()
-        client.communicate()
-        ros.stop(node)
-    rest = platform.status()["joints"]["actual_position"]
-    another = begin_node(ros, platform, "--name", "short_lived")
-    try:
-        assert command(ros, "robot_enable")["success"]
-        # Nothing moves by itself.
-        assert platform.status()["joints"]["actual_position"] == pytest.approx(rest, abs=2e-3)
-    finally:
-        ros.stop(another)
 
 
 def test_a_goal_during_which_the_platform_dies_ends(ros: Ros, arm: Platform) -> None:

@@ -1,0 +1,43 @@
+"""What the arm does where its node is lost: a module of its own, since a service belongs to the node that came last."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from tests.e2e.conftest import Platform
+
+from .conftest import Ros, begin_node, command
+from .test_commanding import path
+
+pytestmark = pytest.mark.alone
+
+
+@pytest.mark.parametrize("kind", ["path", "stream"])
+def test_after_the_loss_of_its_node_the_arm_stops_and_the_drives_are_disabled(
+    ros: Ros, platform: Platform, kind: str
+) -> None:
+    platform.until(lambda status: not status["lease"]["holder"], "the end of the last lease")
+    platform.restore()
+    platform.call("enable")
+    node = begin_node(ros, platform)
+    given = {"topic": "joint_command", "velocities": True, "radius": 0.3, "period_s": 20.0, "rate_hz": 50, "count": 500}
+    sent = path(platform, [0.3, *[0.0] * 5], 20.0) if kind == "path" else given
+    client = ros.begin_client(kind, **sent)
+    try:
+        platform.until_moving(0.01)
+        node.send_signal(signal.SIGKILL)
+        platform.until(lambda status: status["state"] == "ready", "drives without torque")
+    finally:
+        client.kill()
+        client.communicate()
+        ros.stop(node)
+    rest = platform.status()["joints"]["actual_position"]
+    another = begin_node(ros, platform)
+    try:
+        assert command(ros, "robot_enable")["success"]
+        # Nothing moves by itself.
+        assert platform.status()["joints"]["actual_position"] == pytest.approx(rest, abs=2e-3)
+    finally:
+        ros.stop(another)
