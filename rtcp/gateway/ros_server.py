@@ -26,7 +26,7 @@ class RosServer:
         self._file = directory / "ros-server.json"
 
     async def start_once(self, options: SimpleMessageConfig, loop: int) -> None:
-        """Start it, unless an earlier gateway has; it writes into the gateway's log and ends with the process `loop`."""
+        """Start it, unless an earlier gateway has; it writes into the gateway's log, and ends with `loop`."""
         if is_running(self._pid()):
             return
         command = ["-m", "rtcp.cli", "ros", "--simple-message", "--bind", options.bind]
