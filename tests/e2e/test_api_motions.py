@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -27,12 +27,10 @@ def at(first: float) -> list[float]:
 
 
 @pytest.fixture
-def robot(shared: Platform) -> Robot:
-    robot = rtcp.connect("a program", control_socket(shared.directory))
-    if robot.state is State.READY:
-        robot.enable()
-    robot.move_joints(HOME)
-    return robot
+def robot(enabled: Platform) -> Iterator[Robot]:
+    with rtcp.connect("a program", control_socket(enabled.directory)) as robot:
+        robot.move_joints(HOME)
+        yield robot
 
 
 def run(shared: Platform, work: Callable[[AsyncRobot], Coroutine[Any, Any, Any]]) -> Any:
