@@ -174,7 +174,6 @@ class _Open:
 
     def __init__(self, plan: OpenPlan, lease: int, slot: int) -> None:
         self.plan, self.lease, self.slot = plan, lease, slot
-        self.accepted = asyncio.Event()
         self.motion: asyncio.Task[Json] | None = None
         self.turn = asyncio.Lock()
         self.ends = False
@@ -271,7 +270,11 @@ class MotionActions:
         accepted: asyncio.Future[_Open] = asyncio.get_running_loop().create_future()
         task = asyncio.create_task(self._run_open(caller, points, accepted))
         either: list[asyncio.Future[Any]] = [task, accepted]
-        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        try:
+            await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        except asyncio.CancelledError:
+            task.cancel()  # nobody would know of it, and it would keep the lease
+            raise
         if not accepted.done():
             task.result()  # raises why
         opened = accepted.result()
@@ -288,8 +291,13 @@ class MotionActions:
             opened = _Open(plan, lease, channel.observer.write_plan(rows))
             resting: asyncio.Task[None] | None = None
 
+            arrival: Callable[[], Json | None] | None = None
+
             def arrived() -> Json | None:
-                return self._arrival(plan.end, _SAME_PLANNED_RAD, "the trajectory")()
+                nonlocal arrival
+                if arrival is None:  # once: where it ends is known only now, and its patience counts from now
+                    arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, "the trajectory")
+                return arrival()
 
             def begun() -> None:
                 nonlocal resting
@@ -323,7 +331,7 @@ class MotionActions:
         await self._extend(opened, (), rest=True, ends=True)
         assert opened.motion is not None
         try:
-            return await asyncio.shield(opened.motion)
+            return await opened.motion  # cancelled, it ends the motion too
         finally:
             self._open.pop(caller.connection, None)
 
