@@ -182,6 +182,22 @@ def test_more_points_than_fit_are_refused_and_the_trajectory_goes_on(robot: Robo
     robot.close()
 
 
+def test_an_open_trajectory_whose_finish_is_cancelled_stops_and_gives_its_lease_back(
+    shared: Platform, robot: Robot
+) -> None:
+    async def begin_and_cancel(arm: AsyncRobot) -> None:
+        await arm.open_trajectory([{"t": 1.0, "q": at(0.01)}, {"t": 60.0, "q": at(0.5)}])
+        finish = asyncio.create_task(arm.finish_trajectory())
+        await asyncio.sleep(0.5)
+        finish.cancel()
+        await asyncio.gather(finish, return_exceptions=True)
+        while (await arm.status()).state is not State.HOLDING:
+            await asyncio.sleep(0.02)
+        robot.move_joints(HOME)  # of another connection, while this one stands
+
+    run(shared, begin_and_cancel)
+
+
 def test_a_trajectory_outside_its_tolerances_brakes_and_says_by_how_much(robot: Robot) -> None:
     points = [{"t": 0.0, "q": HOME}, {"t": 1.0, "q": at(0.2)}, {"t": 2.0, "q": HOME}]
     with pytest.raises(rtcp.Faulted) as ended:
