@@ -413,7 +413,7 @@ class Methods:
         """Run straight lines to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s."""
         return await self._motion.run_path(caller, stops, speed, approach)
 
-    @method(streams=True)
+    @method()
     async def open_stream(self, caller: Caller) -> Json:
         """Begin a stream of setpoints through shared memory. Returns what `rtcp.Stream` needs for it.
 

@@ -133,6 +133,17 @@ def test_a_setpoint_that_cannot_be_followed_ends_the_stream_and_the_next_send_sa
     robot.close()
 
 
+def test_a_stream_that_follows_another_is_opened_when_the_arm_rests(robot: Robot) -> None:
+    with robot.open_stream() as stream:
+        for number in range(100):
+            stream.send(at(0.4 * number / 100), [0.4, *[0.0] * 5])
+            time.sleep(0.01)
+    with robot.open_stream() as stream:  # the arm brakes still
+        stream.send(robot.status().commanded_positions)
+        assert stream.is_open
+    robot.close()
+
+
 def test_a_stream_ends_with_a_halt_of_anyone_and_moves_nothing_after_it(shared: Platform, robot: Robot) -> None:
     with robot.open_stream() as stream:
         stream.send(HOME)
