@@ -40,7 +40,7 @@ ROS_2 = {
     "rtcp/ros/ros2_zenoh.py": {"zenoh"},
     "rtcp/ros/ros2_dds.py": {"cyclonedds"},
     "rtcp/ros/ros2_rclpy.py": {"rclpy", "rosidl_runtime_py"},
-    "rtcp/ros/ros2_latency.py": {"cyclonedds"},
+    "rtcp/ros/latency.py": {"cyclonedds"},
 }
 """Modules of optional dependencies, and of a ROS 2 that is installed otherwise: by the files that import them."""
 

@@ -365,7 +365,7 @@ class _Points:
                 async with self._turn:
                     await self._append(point)
             elif self._stream is not None:
-                self._send(self._stream, point)
+                await self._send(self._stream, point)
             elif not self._turn.locked():  # else whoever opens the stream sends the newest
                 async with self._turn:
                     await self._open()
@@ -390,22 +390,32 @@ class _Points:
         self.status = status
         await self._commander.end_motions()
         robot = await self._commander.connected()
-        while (await robot.status()).state is State.STOPPING:
-            await asyncio.sleep(_LOOK_S)
         stream = await robot.open_stream()
         if self._newest is None or self._has_ended:
             stream.close()
             return
         self._stream = stream
-        self._send(stream, self._newest)
-        self._attending = asyncio.create_task(self._attend(robot))
+        if self._attending is None or self._attending.done():
+            self._attending = asyncio.create_task(self._attend(robot))
+        await self._send(stream, self._newest)
 
-    def _send(self, stream: Stream, point: TrajectoryPoint) -> None:
+    async def _send(self, stream: Stream, point: TrajectoryPoint, rests: bool = False) -> None:
         # At a low rate the arm has to rest at a target: how long it would keep the speed nobody knows.
-        has_speed = point.velocities and self._came_s - self._before_s < _REPEAT_S
-        velocity = point.velocities if has_speed else None
+        has_speed = point.velocities and self._came_s - self._before_s < _REPEAT_S and not rests
+        velocity = (0.0,) * len(point.positions) if rests else point.velocities if has_speed else None
         self._sent_s = time.monotonic()
-        stream.send(point.positions, velocity, (has_speed and point.accelerations) or None, self._stamp(point))
+        try:
+            stream.send(point.positions, velocity, (has_speed and point.accelerations) or None, self._stamp(point))
+        except RtcpError as error:
+            if error.reason != "stream_ended":
+                raise
+            # Nobody has stopped the arm: this process was held up for too long. It goes on as after a pause.
+            self._log("joint_command: no setpoint reached the platform for 0.2 s: the stream is opened again")
+            stream.close()
+            self._stream = self._anchor_s = None
+            if not self._turn.locked():
+                async with self._turn:
+                    await self._open()
 
     async def _attend(self, robot: AsyncRobot) -> None:
         """Keep the stream open until the arm is at its last point."""
@@ -419,8 +429,8 @@ class _Points:
                     if max(abs(a - b) for a, b in zip(commanded, point.positions, strict=True)) < _THERE_RAD:
                         self._close()
                         return
-                self._anchor_s, self._sent_s = None, time.monotonic()
-                stream.send(point.positions, (0.0,) * len(point.positions))
+                self._anchor_s = None
+                await self._send(stream, point, rests=True)
             except RtcpError as error:
                 self._log(f"joint_command: {error}")
                 self._attending = None

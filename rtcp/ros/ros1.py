@@ -46,7 +46,8 @@ from rtcp.ros.commands import (
     Trajectory,
     TrajectoryPoint,
 )
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState, transforms_of
+from rtcp.ros.simple_message.messages import TriState
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, transforms_of
 
 T = TypeVar("T")
 
@@ -253,7 +254,7 @@ class Commands:
         async def logged() -> None:
             try:
                 await carry_out(message)
-            except Exception as error:  # also a mistake of ours: without this nobody would hear of it
+            except Exception as error:  # a programming error too: nothing else would report it
                 rospy.logerr("%s: %s", topic, error)
 
         asyncio.run_coroutine_threadsafe(logged(), self._loop)

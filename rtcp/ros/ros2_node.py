@@ -35,7 +35,8 @@ from rtcp.ros.commands import (
     TrajectoryPoint,
 )
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, PATH_COMMAND, STOP_MOTION, TRIGGER
-from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, TriState
+from rtcp.ros.simple_message.messages import TriState
+from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher
 
 Make = Callable[..., Any]
 """Makes a message from the name of its type and its fields."""
@@ -155,7 +156,7 @@ class Commands:
         async def logged() -> None:
             try:
                 await command
-            except Exception as error:  # also a mistake of ours: without this nobody would hear of it
+            except Exception as error:  # a programming error too: nothing else would report it
                 _LOG.error("%s: %s", topic, error)
 
         self.submit(logged())

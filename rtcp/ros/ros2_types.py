@@ -27,7 +27,7 @@ class Field:
     type: str
     """A basic type, as `float64`, or a message, whose name has slashes."""
     length: int | None
-    """None: one value; 0: a sequence; else an array of so many."""
+    """Length of an array; 0: a sequence, None: a single value."""
 
     @property
     def has_numbers(self) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, Protocol
 
 import numpy as np
@@ -21,6 +20,7 @@ from rtcp import api
 from rtcp.api import ControlMode, NotRunning, State
 from rtcp.api.feed import Feed, Records
 from rtcp.motion.planning.interpolation import Quaternion, quaternion
+from rtcp.ros.simple_message.messages import RobotMode, TriState
 
 TOOL_FRAME = "tool0_controller"
 """As other drivers name it: `tool0` itself hangs at the last link of the URDF."""
@@ -40,22 +40,6 @@ _AT_REST_STATES = (State.READY, State.ENABLING, State.HOLDING, State.STOPPED_BY_
 _TAKES_MOTIONS = (ControlMode.JOINT, ControlMode.CARTESIAN)
 
 Numbers = tuple[float, ...]
-
-
-class TriState(IntEnum):
-    """A truth that may be unknown (industrial_msgs/TriState)."""
-
-    UNKNOWN = -1
-    FALSE = 0
-    TRUE = 1
-
-
-class RobotMode(IntEnum):
-    """Who moves the arm (industrial_msgs/RobotMode)."""
-
-    UNKNOWN = -1
-    MANUAL = 1
-    AUTO = 2
 
 
 @dataclass(frozen=True)

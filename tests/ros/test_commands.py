@@ -515,6 +515,24 @@ def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
     assert carry_out(arm, test) == []
 
 
+@pytest.mark.parametrize("by", ["the next setpoint", "the repeated setpoint"])
+def test_a_stream_that_ran_out_while_its_node_was_held_up_is_opened_again(arm: FakeArm, by: str) -> None:
+    async def test(commander: Commander) -> None:
+        await commander.command_point(point(1.0))
+        arm.streams[0].error = RtcpError("fault", "the stream has ended", "stream_ended")
+        arm.commanded = HERE
+        if by == "the next setpoint":
+            await commander.command_point(point(2.0))
+        while len(arm.streams) < 2 or len(arm.streams[1].sent) < 3:  # and it is attended to
+            arm.commanded = HERE
+            await asyncio.sleep(0.01)
+
+    (line,) = carry_out(arm, test)
+    assert "opened again" in line
+    assert arm.streams[0].is_closed
+    assert {sent[0][0] for sent in arm.streams[1].sent} == {2.0 if by == "the next setpoint" else 1.0}
+
+
 def test_a_joint_command_takes_the_place_of_a_trajectory(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         await commander.begin_trajectory(PATH)

@@ -300,7 +300,7 @@ def test_under_the_joystick_the_mode_is_manual() -> None:
 
 def test_not_running_is_the_only_error_that_is_waited_out(heard: Heard) -> None:
     def fail() -> Feed:
-        raise RuntimeError("a mistake of ours")
+        raise RuntimeError("a programming error")
 
     assert issubclass(NotRunning, RtcpError)
     with pytest.raises(RuntimeError):

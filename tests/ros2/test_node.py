@@ -14,7 +14,8 @@ from kinematics.forward import forward
 from rtcp.ros.ros2_action import ActionServer
 from rtcp.ros.ros2_node import ACTION_TOPICS, OUT, Commands, Publications
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, encode, make
-from rtcp.ros.state import Diagnostics, RobotMode, RobotStatus, TriState
+from rtcp.ros.simple_message.messages import RobotMode, TriState
+from rtcp.ros.state import Diagnostics, RobotStatus
 from tests.ros.test_commands import FakeArm
 
 from .node import CONFIG, SAMPLE, arrive, trajectory, until

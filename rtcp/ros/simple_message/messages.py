@@ -73,7 +73,7 @@ class ValidFields(IntFlag):
 
 
 class TriState(IntEnum):
-    """A yes or no that may be unknown."""
+    """A yes or no that may be unknown (industrial_msgs/TriState too)."""
 
     UNKNOWN = -1
     FALSE = 0
@@ -81,7 +81,7 @@ class TriState(IntEnum):
 
 
 class RobotMode(IntEnum):
-    """Who may command the arm."""
+    """Who may command the arm (industrial_msgs/RobotMode too)."""
 
     UNKNOWN = -1
     MANUAL = 1

@@ -46,7 +46,7 @@ STATE_PORT = 11002
 STATE_PERIOD_S = 0.01
 STALE_S = 0.5
 """A sample older than this says nothing on the arm: all of RobotStatus is unknown."""
-_MOST_UNREAD = 1 << 16
+_UNREAD_LIMIT = 1 << 16
 """Bytes: a client that reads nothing is dropped."""
 _KEEPALIVE_IDLE_S, _KEEPALIVE_INTERVAL_S, _KEEPALIVE_PROBES = 1, 1, 3
 _USER_TIMEOUT_MS = 4000
@@ -109,7 +109,7 @@ class _Client:
     async def serve(self, reader: asyncio.StreamReader, answer: Callable[[Frame, ByteOrder], Frame | None]) -> str:
         """Answer frames until the connection ends; return why it did."""
         try:
-            while (data := await reader.read(_MOST_UNREAD)) and not self._writer.is_closing():
+            while (data := await reader.read(_UNREAD_LIMIT)) and not self._writer.is_closing():
                 for frame in self._decoder.feed(data):
                     order = self._decoder.order or ByteOrder.LITTLE
                     if (reply := answer(frame, order)) is not None:
@@ -124,7 +124,7 @@ class _Client:
 
     def send(self, data: bytes) -> None:
         """Send bytes, or close the connection of a client that does not read."""
-        if self._writer.transport.get_write_buffer_size() > _MOST_UNREAD:
+        if self._writer.transport.get_write_buffer_size() > _UNREAD_LIMIT:
             self.close("it does not read")
         elif not self._writer.is_closing():
             self._writer.write(data)

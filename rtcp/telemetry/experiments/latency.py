@@ -181,8 +181,8 @@ class LatencyExperiment(Experiment):
                     rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
             rows += self._parts(setup, robot)
             rows += self._to_frame(robot)
-            rows += _by_ros2(setup)
             rows += self._by_ros(setup, robot)
+            rows += _by_node(setup)
         return rows
 
     def _stream(self, setup: Setup, robot: Robot, way: str, rate: float, amplitude: float) -> list[Row]:
@@ -326,13 +326,12 @@ class LatencyExperiment(Experiment):
         setup.draw(f"latency-{name}", figure)
 
 
-def _by_ros2(setup: Setup) -> list[Row]:
-    """Measure how long a joint_command of ROS 2 takes until the frame has left, over each wire that is installed."""
+def _by_node(setup: Setup) -> list[Row]:
+    """Measure commands of ROS 2 and Simple Message until the frame has left, over each wire that is installed."""
     rows: list[Row] = []
-    for wire in ("DDS", "Zenoh"):
-        done = subprocess.run(
-            [sys.executable, "-m", "rtcp.ros.ros2_latency", wire.lower()], capture_output=True, text=True, check=False
-        )
+    for wire in ("DDS", "Zenoh", "Simple Message"):  # the last one leaves the drives disabled
+        command = [sys.executable, "-m", "rtcp.ros.latency", wire.lower().replace(" ", "-")]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             setup.note(f"{wire} was not measured: {done.stderr.strip().rpartition(chr(10))[2]}")
             continue

@@ -1,7 +1,8 @@
-"""The latency of a joint_command of ROS 2, from its publishing until the frame has left.
+"""The latency of a joint_command of ROS 2, or a real-time point of Simple Message, until its frame has left.
 
-`python -m rtcp.ros.ros2_latency dds|zenoh` measures it on the platform that runs, whose drives are enabled: with the
-node in a process of its own, over the loopback interface. It prints the cycles of each command as JSON.
+`python -m rtcp.ros.latency dds|zenoh|simple-message` measures it on the platform that runs, whose drives are enabled:
+with the node in a process of its own, over the loopback interface. It prints the cycles of each command as JSON. At the
+end of Simple Message the drives are disabled, since its link is lost.
 """
 
 from __future__ import annotations
@@ -21,9 +22,11 @@ import numpy as np
 
 from rtcp.api import connect
 from rtcp.api.feed import Feed
+from rtcp.ros.simple_message.framing import Frame
+from rtcp.ros.simple_message.messages import ByteOrder, JointPosition
 
 Publish = Callable[[Sequence[float]], None]
-"""Publishes joint positions, rad, as joint_command."""
+"""Sends joint positions, rad."""
 
 _DOMAIN = 77
 _ON_LOOPBACK = (
@@ -59,13 +62,37 @@ def _by_zenoh() -> Iterator[tuple[Publish, list[str]]]:
     from rtcp.ros.ros2_types import encode, make
     from rtcp.ros.ros2_zenoh import key_of, open_session
 
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        router = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    router = f"tcp/127.0.0.1:{_free_ports(1)[0]}"
     with open_session(router, is_router=True), open_session(router) as session:
         publisher = session.declare_publisher(key_of(_DOMAIN, "joint_command", _POINT))
         arguments = ["--zenoh", "--router", router, "--domain", str(_DOMAIN)]
         yield lambda q: publisher.put(encode(_POINT, make(_POINT, positions=q))), arguments
+
+
+@contextlib.contextmanager
+def _by_simple_message() -> Iterator[tuple[Publish, list[str]]]:
+    ports = [str(port) for port in _free_ports(2)]
+    with contextlib.ExitStack() as connected:
+        connection: socket.socket | None = None
+
+        def send(q: Sequence[float]) -> None:
+            nonlocal connection
+            if connection is None:
+                with contextlib.suppress(ConnectionRefusedError):  # the server is not there yet
+                    connection = socket.create_connection(("127.0.0.1", int(ports[0])))
+                    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    connected.enter_context(connection)
+            if connection is not None:
+                point = JointPosition(0, tuple(q))
+                connection.sendall(Frame.topic(point, ByteOrder.LITTLE).pack(ByteOrder.LITTLE))
+
+        yield send, ["--simple-message", "--motion-port", ports[0], "--state-port", ports[1]]
+
+
+def _free_ports(count: int) -> list[int]:
+    with contextlib.ExitStack() as bound:
+        free = [bound.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [int(one.getsockname()[1]) for one in free]
 
 
 def measure(wire: str) -> list[float]:
@@ -75,10 +102,13 @@ def measure(wire: str) -> list[float]:
         SystemExit: with a sentence, where the library is missing or the node passes nothing on.
     """
     try:
-        with {"dds": _by_dds, "zenoh": _by_zenoh}[wire]() as (publish, arguments):
+        with _WIRES[wire]() as (publish, arguments):
             return _measure(publish, arguments)
     except ImportError as error:
         raise SystemExit(f"{error}: pip install 'rtcp[{wire}]'") from None
+
+
+_WIRES = {"dds": _by_dds, "zenoh": _by_zenoh, "simple-message": _by_simple_message}
 
 
 def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
@@ -97,7 +127,7 @@ def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
                 if len(cycles) == _PROBES:
                     break
                 if not cycles and time.monotonic() > until:
-                    raise SystemExit(f"the node has passed on no joint_command within {_BEGIN_S:g} s")
+                    raise SystemExit(f"the node has passed on no command within {_BEGIN_S:g} s")
                 target = [here[0] + (_STEP_RAD if number % 2 else 0.0), *here[1:]]
                 cycles += _cycles_until_it_moves(feed, partial(publish, target))
     finally:
