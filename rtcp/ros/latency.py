@@ -37,8 +37,8 @@ _ON_LOOPBACK = (
 _PROBES, _PROBE_INTERVAL_S = 100, 0.15
 _STEP_RAD = 1e-5
 """Way of each command, there and back: the arm rests again long before the next."""
-_BEGIN_S = 30.0
-"""Longest wait for the node's first command."""
+_SILENCE_S = 30.0
+"""Longest wait for a command that the node passes on."""
 _POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
 
 
@@ -122,14 +122,16 @@ def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
     cycles: list[float] = []
     try:
         with contextlib.closing(Feed()) as feed:
-            until = time.monotonic() + _BEGIN_S
+            until = time.monotonic() + _SILENCE_S
             for number in count(1):
                 if len(cycles) == _PROBES:
                     break
-                if not cycles and time.monotonic() > until:
-                    raise SystemExit(f"the node has passed on no command within {_BEGIN_S:g} s")
+                if time.monotonic() > until:
+                    raise SystemExit(f"the node has passed on no command for {_SILENCE_S:g} s")
                 target = [here[0] + (_STEP_RAD if number % 2 else 0.0), *here[1:]]
-                cycles += _cycles_until_it_moves(feed, partial(publish, target))
+                if measured := _cycles_until_it_moves(feed, partial(publish, target)):
+                    cycles += measured
+                    until = time.monotonic() + _SILENCE_S
     finally:
         node.terminate()
         node.wait()

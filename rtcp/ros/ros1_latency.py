@@ -27,6 +27,7 @@ _MASTER = "/usr/bin/rosmaster"
 _INTERVAL_S = {"topic": 0.08, "service": 0.3}
 """In which what was sent before has come to rest."""
 _STEP_RAD, _MOVE_S = 1e-5, 0.1
+_LONGEST_S = 180.0
 _PAUSE_S = 2.0
 """After which a stream has ended."""
 
@@ -46,7 +47,12 @@ def _measure(probes: str) -> str:
             running.callback(begun.wait)
             running.callback(begun.terminate)
         client = [sys.executable, "-m", "rtcp.ros.ros1_latency", probes, "client"]
-        done = subprocess.run(client, env=environment, capture_output=True, text=True, check=False)
+        try:
+            done = subprocess.run(
+                client, env=environment, capture_output=True, text=True, check=False, timeout=_LONGEST_S
+            )
+        except subprocess.TimeoutExpired:
+            raise SystemExit(f"the ROS client has not ended within {_LONGEST_S:g} s") from None
     if done.returncode:
         raise SystemExit(f"the ROS client failed: {done.stderr.strip().rpartition(chr(10))[2]}")
     return done.stdout.strip().rpartition("\n")[2]
