@@ -16,6 +16,7 @@ from rtcp.cli.output import CommandError, ExitCode, report
 from rtcp.ipc.runtime_directory import log_format
 
 if TYPE_CHECKING:
+    from rtcp.ros.commands import CommandOptions
     from rtcp.ros.simple_message.server import ServerOptions
 
 commands = typer.Typer()
@@ -73,8 +74,11 @@ def _ros(
     wires = [wire for wire, chosen in (("zenoh", zenoh), ("dds", dds), ("ros2", ros2)) if chosen]
     if len(wires) + simple_message > 1:
         raise CommandError("choose one of --zenoh, --dds, --ros2, --simple-message", ExitCode.USAGE)
+    from rtcp.ros.commands import CommandOptions  # here: it loads slowly, as what follows
+
+    options = CommandOptions(enable, partial, buffer)
     if simple_message:
-        import asyncio  # here: it loads slowly, as what follows
+        import asyncio
 
         from rtcp.ros.simple_message.messages import ByteOrder
         from rtcp.ros.simple_message.server import ServerOptions
@@ -86,14 +90,12 @@ def _ros(
     elif wires:
         if remappings and not ros2:
             raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
-        _run_ros2(wires[0], router, name, rate, domain, enable, partial, remappings or ())
+        _run_ros2(wires[0], router, name, rate, domain, options, remappings or ())
     else:
-        _run_node(name, rate, remappings or (), tf, enable, partial, buffer)
+        _run_node(name, rate, remappings or (), tf, options)
 
 
-def _run_node(
-    name: str, rate: float, remappings: Sequence[str], tf: bool, enable: bool, partial: bool, buffer_s: float
-) -> None:
+def _run_node(name: str, rate: float, remappings: Sequence[str], tf: bool, options: CommandOptions) -> None:
     """Run a ROS 1 node."""
     from rtcp.ros import ros1_messages
 
@@ -102,14 +104,13 @@ def _run_node(
     except ros1_messages.RosMissing as error:
         raise CommandError(str(error)) from None
     from rtcp.ros import ros1
-    from rtcp.ros.commands import CommandOptions
 
     report(f"node {name}: Ctrl-C ends it")
-    ros1.run(ros1.NodeOptions(name, rate, tf, remappings, CommandOptions(enable, partial, buffer_s)))
+    ros1.run(ros1.NodeOptions(name, rate, tf, remappings, options))
 
 
 def _run_ros2(
-    wire: str, router: str, name: str, rate: float, domain: int, enable: bool, partial: bool, remappings: Sequence[str]
+    wire: str, router: str, name: str, rate: float, domain: int, options: CommandOptions, remappings: Sequence[str]
 ) -> None:
     """Run a ROS 2 node."""
     try:
@@ -134,11 +135,9 @@ def _run_ros2(
         else:
             how = f"pip install 'rtcp[{wire}]'" + (" (x86_64)" if wire == "dds" else "")
         raise CommandError(f"--{wire} cannot run here, {error}: {how}") from None
-    from rtcp.ros.commands import CommandOptions
-
     _log_to_stderr()
     report(f"node {name}: Ctrl-C ends it")
-    run(Ros2Options(name, rate, domain, CommandOptions(enable, partial), remappings), open_wire)
+    run(Ros2Options(name, rate, domain, options, remappings), open_wire)
 
 
 def _log_to_stderr() -> None:

@@ -1,8 +1,8 @@
 """The latency of a joint_command of ROS 2, or a real-time point of Simple Message, until its frame has left.
 
-`python -m rtcp.ros.latency dds|zenoh|simple-message` measures it on the platform that runs, whose drives are enabled:
-with the node in a process of its own, over the loopback interface. It prints the cycles of each command as JSON. At the
-end of Simple Message the drives are disabled, since its link is lost.
+`python -m rtcp.ros.latency dds|zenoh|simple-message [COUNT]` measures it on the platform that runs, whose drives are
+enabled: with the node in a process of its own, over the loopback interface. It prints the cycles of each command as
+JSON. At the end of Simple Message the drives are disabled, since its link is lost.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from itertools import count
 
 import numpy as np
 
@@ -34,7 +33,7 @@ _ON_LOOPBACK = (
     "<Discovery><ParticipantIndex>auto</ParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
     "</Domain></CycloneDDS>"
 )
-_PROBES, _PROBE_INTERVAL_S = 100, 0.15
+_PROBE_INTERVAL_S = 0.15
 _STEP_RAD = 1e-5
 """Way of each command, there and back: the arm rests again long before the next."""
 _SILENCE_S = 30.0
@@ -95,15 +94,15 @@ def _free_ports(count: int) -> list[int]:
         return [int(one.getsockname()[1]) for one in free]
 
 
-def measure(wire: str) -> list[float]:
-    """Return the cycles of each command.
+def measure(wire: str, count: int) -> list[float]:
+    """Return the cycles of so many commands.
 
     Raises:
         SystemExit: with a sentence, where the library is missing or the node passes nothing on.
     """
     try:
         with _WIRES[wire]() as (publish, arguments):
-            return _measure(publish, arguments)
+            return _measure(publish, arguments, count)
     except ImportError as error:
         raise SystemExit(f"{error}: pip install 'rtcp[{wire}]'") from None
 
@@ -111,7 +110,7 @@ def measure(wire: str) -> list[float]:
 _WIRES = {"dds": _by_dds, "zenoh": _by_zenoh, "simple-message": _by_simple_message}
 
 
-def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
+def _measure(publish: Publish, arguments: Sequence[str], count: int) -> list[float]:
     with connect() as robot:
         here = robot.status().commanded_positions
     node = subprocess.Popen(
@@ -123,12 +122,12 @@ def _measure(publish: Publish, arguments: Sequence[str]) -> list[float]:
     try:
         with contextlib.closing(Feed()) as feed:
             until = time.monotonic() + _SILENCE_S
-            for number in count(1):
-                if len(cycles) == _PROBES:
-                    break
+            is_beside = False
+            while len(cycles) < count:
                 if time.monotonic() > until:
                     raise SystemExit(f"the node has passed on no command for {_SILENCE_S:g} s")
-                target = [here[0] + (_STEP_RAD if number % 2 else 0.0), *here[1:]]
+                is_beside = not is_beside
+                target = [here[0] + (_STEP_RAD if is_beside else 0.0), *here[1:]]
                 if measured := _cycles_until_it_moves(feed, partial(publish, target)):
                     cycles += measured
                     until = time.monotonic() + _SILENCE_S
@@ -158,4 +157,4 @@ def _cycles_until_it_moves(feed: Feed, publish: Callable[[], None]) -> list[floa
 
 
 if __name__ == "__main__":
-    print(json.dumps(measure(sys.argv[1])))
+    print(json.dumps(measure(sys.argv[1], int(sys.argv[2]) if sys.argv[2:] else 100)))

@@ -44,6 +44,7 @@ Make = Callable[..., Any]
 ACTION = "joint_trajectory_action"
 _FEEDBACK = f"{FOLLOW}_Feedback"
 _POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+_TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 OUT: Mapping[str, str] = {
     "joint_states": "sensor_msgs/msg/JointState",
     "feedback_states": _FEEDBACK,
@@ -53,7 +54,11 @@ OUT: Mapping[str, str] = {
     "robot_description": "std_msgs/msg/String",
 }
 """Topics that are published, with their types."""
-IN: Mapping[str, str] = {"joint_command": _POINT, "joint_path_command": "trajectory_msgs/msg/JointTrajectory"}
+IN: Mapping[str, str] = {
+    "joint_command": _POINT,
+    "joint_path_command": _TRAJECTORY,
+    "joint_trajectory": _TRAJECTORY,
+}
 """Topics that are taken."""
 SERVICES: Mapping[str, str] = {
     "joint_path_command": PATH_COMMAND,
@@ -150,6 +155,8 @@ class Commands:
         """Carry out a message on a topic of `IN`; nobody waits for the outcome, so a refusal is logged."""
         if topic == "joint_command":
             command = self.commander.command_point(point_of(message))
+        elif topic == "joint_trajectory":
+            command = self.commander.command_joints(trajectory_of(message))
         else:
             command = self.commander.begin_trajectory(trajectory_of(message))
 

@@ -17,7 +17,7 @@ import rclpy
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rosidl_runtime_py.utilities import get_interface
 
@@ -29,6 +29,8 @@ _THREADS = 8
 """Goals and services under way at the same time: each waits in one."""
 _TURN_S = 0.01
 """Interval between two looks whether a goal is to be cancelled."""
+_TAKEN = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""It matches reliable writers too."""
 _LOG = logging.getLogger("rtcp.ros")
 
 
@@ -88,7 +90,7 @@ class RclpyWire:
         }
         self.topics = tuple(self._publishers)
         for topic, kind in _known(IN).items():
-            node.create_subscription(class_of(kind), topic, partial(commands.receive, topic), _qos(topic), **together)
+            node.create_subscription(class_of(kind), topic, partial(commands.receive, topic), _TAKEN, **together)
         for service, kind in _known(SERVICES).items():
             node.create_service(class_of(kind), service, partial(self._respond, service), **together)
         if _known({ACTION: FOLLOW}):

@@ -18,7 +18,7 @@ from typing import Any
 from rtcp.ros import ros2_node, ros2_types
 
 TOPICS: dict[str, list[Any]] = {}
-SUBSCRIPTIONS: dict[str, list[Callable[[Any], None]]] = {}
+SUBSCRIPTIONS: dict[str, list[tuple[Callable[[Any], None], QoSProfile]]] = {}
 SERVICES: dict[str, Callable[[Any, Any], Any]] = {}
 ACTIONS: dict[str, ActionServer] = {}
 
@@ -51,24 +51,26 @@ def _class(name: str) -> type:
 
 
 class Publisher:
-    def __init__(self, topic: str, is_latched: bool) -> None:
-        self._topic, self._is_latched = topic, is_latched
+    def __init__(self, topic: str, qos: QoSProfile) -> None:
+        self._topic, self._qos = topic, qos
 
     def publish(self, message: Any) -> None:
-        if self._is_latched:
+        if self._qos.durability is DurabilityPolicy.TRANSIENT_LOCAL:
             TOPICS[self._topic] = [message]
-        for callback in SUBSCRIPTIONS.get(self._topic, ()):
-            callback(message)
+        for callback, qos in SUBSCRIPTIONS.get(self._topic, ()):
+            # A reliable subscription does not match a best-effort publisher.
+            if self._qos.reliability in (ReliabilityPolicy.RELIABLE, qos.reliability):
+                callback(message)
 
 
 class Node:
     def create_publisher(self, kind: type, topic: str, qos: Any) -> Publisher:
-        return Publisher(topic, qos.durability is DurabilityPolicy.TRANSIENT_LOCAL)
+        return Publisher(topic, qos)
 
     def create_subscription(
         self, kind: type, topic: str, callback: Callable[[Any], None], qos: Any, callback_group: Any = None
     ) -> None:
-        SUBSCRIPTIONS.setdefault(topic, []).append(callback)
+        SUBSCRIPTIONS.setdefault(topic, []).append((callback, qos))
         if qos.durability is DurabilityPolicy.TRANSIENT_LOCAL:
             for message in TOPICS.get(topic, ()):
                 callback(message)
@@ -93,9 +95,19 @@ class DurabilityPolicy(Enum):
     TRANSIENT_LOCAL = 1
 
 
+class ReliabilityPolicy(Enum):
+    RELIABLE = 1
+    BEST_EFFORT = 2
+
+
 class QoSProfile:
-    def __init__(self, depth: int, durability: DurabilityPolicy = DurabilityPolicy.VOLATILE) -> None:
-        self.depth, self.durability = depth, durability
+    def __init__(
+        self,
+        depth: int,
+        durability: DurabilityPolicy = DurabilityPolicy.VOLATILE,
+        reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
+    ) -> None:
+        self.depth, self.durability, self.reliability = depth, durability, reliability
 
 
 class ActionServer:
@@ -195,7 +207,7 @@ def modules() -> dict[str, ModuleType]:
         "rclpy.action": {"ActionServer": ActionServer, "ActionClient": ActionClient, "CancelResponse": CancelResponse},
         "rclpy.callback_groups": {"ReentrantCallbackGroup": SimpleNamespace},
         "rclpy.executors": {"MultiThreadedExecutor": MultiThreadedExecutor},
-        "rclpy.qos": {"DurabilityPolicy": DurabilityPolicy, "QoSProfile": QoSProfile},
+        "rclpy.qos": {one.__name__: one for one in (DurabilityPolicy, QoSProfile, ReliabilityPolicy)},
         "rclpy.signals": {"SignalHandlerOptions": SimpleNamespace(NO=0)},
         "rosidl_runtime_py": {},
         "rosidl_runtime_py.utilities": {"get_interface": _interface},

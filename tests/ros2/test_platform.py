@@ -1,8 +1,11 @@
-"""`rtcp ros --zenoh` on a real platform with its virtual arm."""
+"""`rtcp ros` over each wire on a real platform with its virtual arm."""
 
 from __future__ import annotations
 
+import json
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -66,3 +69,15 @@ def test_without_a_router_the_node_waits_and_ends_when_it_is_asked_to(platform: 
     node.send_signal(signal.SIGTERM)
     node.communicate()
     assert node.returncode == 0
+
+
+@pytest.mark.parametrize("wire", ["dds", "zenoh", "simple-message"])
+def test_the_latency_of_each_wire_is_measured_in_the_frames(platform: Platform, wire: str) -> None:
+    if wire == "dds":
+        pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: pip install 'rtcp[dds]' (x86_64)")
+    platform.call("enable")
+    command = [sys.executable, "-m", "rtcp.ros.latency", wire, "5"]
+    done = subprocess.run(command, env=platform.environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    # At least the cycle in which a command is taken: how much more depends on the host.
+    assert [cycles for cycles in json.loads(done.stdout) if cycles < 1.0] == []

@@ -112,9 +112,13 @@ def test_a_late_subscriber_receives_the_robot_description(ros: Ros) -> None:
     assert received[0].data.startswith("<?xml")
 
 
+@pytest.mark.parametrize("quality", ["RELIABLE", "BEST_EFFORT"])
 @pytest.mark.parametrize("topic", IN)
-def test_commands_reach_the_arm(ros: Ros, arm: FakeArm, topic: str) -> None:
-    publisher = ros.node.create_publisher(ros.skin.class_of(IN[topic]), topic, ros.skin._qos(topic))
+def test_commands_reach_the_arm(ros: Ros, arm: FakeArm, topic: str, quality: str) -> None:
+    from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+    qos = QoSProfile(depth=10, reliability=ReliabilityPolicy[quality])
+    publisher = ros.node.create_publisher(ros.skin.class_of(IN[topic]), topic, qos)
     trajectory = ros.trajectory()
 
     def publish() -> list[Any]:
