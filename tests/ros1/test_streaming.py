@@ -6,6 +6,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ import pytest
 
 from rtcp.api import Feed
 from tests.e2e.conftest import Platform
+from tests.e2e.wire import COUNTS_PER_RAD, outputs
 
 from .conftest import Ros, begin_node, command, is_at, until
 
@@ -40,12 +43,21 @@ def largest_step(records: Any, feed: Feed) -> float:
     return float((change[whole] / most).max())
 
 
+def frames_of(path: Path) -> list[list[int]]:
+    """Return the target positions in each frame, counts."""
+    return [[drive.position for drive in drives] for _, drives in outputs(path)]
+
+
+def changes(targets: list[list[int]]) -> list[list[int]]:
+    """Return each target that differs from the one before."""
+    return [after for before, after in pairwise(targets) if after != before]
+
+
 def stream(ros: Ros, arm: Platform, **given: Any) -> tuple[list[float], Any, float]:
     """Stream; return the last target, the records until the arm is there, and the largest step in them."""
-    feed = Feed(arm.directory)
+    feed, frames = Feed(arm.directory), arm.directory / "frames"
     taken = []
     asked = {"topic": "joint_command", "velocities": True, "radius": RADIUS_RAD, "period_s": PERIOD_S, **given}
-    client = ros.begin_client("stream", **asked)
 
     def ended() -> bool:
         records, missing = feed.records()
@@ -53,10 +65,14 @@ def stream(ros: Ros, arm: Platform, **given: Any) -> tuple[list[float], Any, flo
         taken.append(records)
         return client.poll() is not None
 
-    until(ended, "the end of the stream")
-    last: list[float] = json.loads((client.communicate()[0]).partition("answer ")[2])["last"]
-    until(lambda: ended() and is_at(arm, last), "the last target")
+    with arm.capture(frames):
+        client = ros.begin_client("stream", **asked)
+        until(ended, "the end of the stream")
+        last: list[float] = json.loads((client.communicate()[0]).partition("answer ")[2])["last"]
+        until(lambda: ended() and is_at(arm, last), "the last target")
     records = np.concatenate(taken)
+    sent = np.rint(records["sent_position"] * COUNTS_PER_RAD).astype(int).tolist()
+    assert changes(frames_of(frames)) == changes(sent)
     step = largest_step(records, feed)
     feed.close()
     return last, records, step
