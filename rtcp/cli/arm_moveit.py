@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from math import isfinite
+from itertools import combinations
+from math import isfinite, pi
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
+import numpy as np
+import numpy.typing as npt
 
 from kinematics.c_source import VERSION, to_c
+from kinematics.forward import frames
+from kinematics.model import ArmModel
+from kinematics.pose import IDENTITY
 from kinematics.urdf import to_urdf
 from rtcp.config import load_kinematics
 from rtcp.config.loader import joints_of
 
 GROUP = "manipulator"
 """Planning group, named as ROS-Industrial does."""
+_SAMPLES = 1000
+"""Random configurations in which links are looked at."""
+_BALLS = 8
+"""By which a cylinder is filled."""
+
+Array = npt.NDArray[np.float64]
 
 
 class MoveItPackage(NamedTuple):
@@ -36,16 +48,18 @@ def moveit_package(arm: Path) -> MoveItPackage:
     solver = to_c(model)
     urdf = to_urdf(model, [joint.torque for joint in settings] or None)
     package = f"{solver.prefix}_moveit_config"
+    home = [min(max(0.0, limit.lower), limit.upper) for limit in model.limits]
     joints = [
         {
             "name": name,
-            "home": min(max(0.0, limit.lower), limit.upper),
+            "home": home[number],
             "velocity": limit.velocity if isfinite(limit.velocity) else None,
             "acceleration": settings[number].acceleration if settings else None,
             "jerk": settings[number].jerk if settings else None,
         }
         for number, (name, limit) in enumerate(zip(model.joint_names, model.limits, strict=True))
     ]
+    tree = ET.fromstring(urdf)
     values = {
         "package": package,
         "prefix": solver.prefix,
@@ -54,13 +68,59 @@ def moveit_package(arm: Path) -> MoveItPackage:
         "group": GROUP,
         "joints": joints,
         "names": model.joint_names,
-        "links": [link.get("name") for link in ET.fromstring(urdf).findall("link")],
+        "links": [link.get("name") for link in tree.findall("link")],
+        "touching": _touching(model, tree, home),
     }
     files = {f"src/{name}": text for name, text in solver.files.items()}
     files[f"config/{solver.prefix}.urdf"] = urdf
     for name, text in _rendered(values).items():
         files[name.replace("config/arm.", f"config/{solver.prefix}.")] = text
     return MoveItPackage(package, dict(sorted(files.items())))
+
+
+def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tuple[str, str, str]]:
+    """Return links that are no neighbours and overlap in every configuration (Always) or at home (Default).
+
+    MoveIt would find every plan in collision with them. Pairs that never touch are looked at by MoveIt all the same.
+    """
+    names = [link.get("name", "") for link in urdf.findall("link")]
+    balls = [_balls(link) for link in urdf.findall("link")]
+    low = [max(limit.lower, -pi) for limit in model.limits]
+    high = [min(limit.upper, pi) for limit in model.limits]
+    sampled = np.random.default_rng(0).uniform(low, high, (_SAMPLES, len(low)))
+    pairs = [(i, j) for i, j in combinations(range(len(names)), 2) if j > i + 1 and len(balls[i]) and len(balls[j])]
+
+    def overlapping(q: list[float]) -> set[tuple[int, int]]:
+        placed = []
+        for pose, own in zip((IDENTITY, *frames(model, q)), balls, strict=True):
+            placed.append((own[:, :3] @ np.reshape(pose.rotation, (3, 3)).T + pose.position, own[:, 3]))
+        found = set()
+        for i, j in pairs:
+            (a, a_radius), (b, b_radius) = placed[i], placed[j]
+            if np.any(np.linalg.norm(a[:, None] - b, axis=2) < a_radius[:, None] + b_radius):
+                found.add((i, j))
+        return found
+
+    at_home, always = overlapping(home), set(pairs)
+    for q in sampled.tolist():
+        always &= overlapping(q)
+    return [(names[i], names[j], "Always" if (i, j) in always else "Default") for i, j in sorted(at_home | always)]
+
+
+def _balls(link: ET.Element) -> Array:
+    """Return balls inside the cylinders of a link: centre in its frame and radius, m, shape (n, 4)."""
+    found = []
+    for body in link.findall("collision"):
+        origin, cylinder = body.find("origin"), body.find("geometry/cylinder")
+        assert origin is not None
+        assert cylinder is not None
+        centre = np.array(origin.get("xyz", "").split(), float)
+        _, pitch, yaw = map(float, origin.get("rpy", "").split())
+        axis = np.array([np.cos(yaw) * np.sin(pitch), np.sin(yaw) * np.sin(pitch), np.cos(pitch)])  # no roll
+        radius, length = float(cylinder.get("radius", "")), float(cylinder.get("length", ""))
+        along = (np.arange(_BALLS) + 0.5) * length / _BALLS - length / 2
+        found += [(*(centre + z * axis), min(radius, length / 2 - abs(z))) for z in along]
+    return np.reshape(found, (-1, 4))
 
 
 def _rendered(values: dict[str, Any]) -> dict[str, str]:

@@ -78,9 +78,26 @@ def test_the_srdf_names_what_is_in_the_urdf(package: Path) -> None:
         (joint.find("parent").get("link"), joint.find("child").get("link"))  # type: ignore[union-attr]
         for joint in urdf.findall("joint")
     }
-    assert {(pair.get("link1"), pair.get("link2")) for pair in srdf.findall("disable_collisions")} == neighbours
+    unchecked = srdf.findall("disable_collisions")
+    assert {
+        (pair.get("link1"), pair.get("link2")) for pair in unchecked if pair.get("reason") == "Adjacent"
+    } == neighbours
     revolute = [joint.get("name") for joint in urdf.findall("joint") if joint.get("type") == "revolute"]
     assert [joint.get("name") for joint in srdf.findall("group_state/joint")] == revolute
+
+
+@pytest.mark.parametrize(
+    ("arm", "wrist"), [("assistive_arm", "Default"), ("abb_irb120", "Always")]
+)  # whose tool leaves the wrist's cylinder, or does not
+def test_links_that_always_overlap_are_not_checked_for_collisions(arm: str, wrist: str) -> None:
+    files = moveit_package(find_arm(arm)).files
+    [srdf] = [ET.fromstring(text) for name, text in files.items() if name.endswith(".srdf")]
+    pairs = {tuple(pair.attrib.values()) for pair in srdf.findall("disable_collisions")}
+    assert {pair for pair in pairs if pair[2] != "Adjacent"} == {
+        ("base_link", "link2", "Always"),  # the first two axes meet
+        ("link3", "link5", "Always"),  # so do those of the wrist
+        ("link4", "link6", wrist),
+    }
 
 
 def test_the_limits_are_those_of_the_joints(package: Path) -> None:
