@@ -288,6 +288,9 @@ class MotionActions:
             moving = channel.state is State.MOVING
             plan = self._planner.open_plan(self._start(), moving)
             rows = await asyncio.to_thread(_append, plan, points)
+            if plan.waits and plan.times[-1] < _AHEAD_S:
+                # No point after the second could come in time to give it a velocity.
+                rows += await asyncio.to_thread(_append, plan, (), True)
             opened = _Open(plan, lease, channel.observer.write_plan(rows))
             resting: asyncio.Task[None] | None = None
 

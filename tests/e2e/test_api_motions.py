@@ -154,6 +154,13 @@ def test_a_stream_ends_with_a_halt_of_anyone_and_moves_nothing_after_it(shared: 
     robot.close()
 
 
+def test_an_open_trajectory_whose_first_point_is_where_the_arm_is_goes_to_its_second(robot: Robot) -> None:
+    robot.open_trajectory([{"t": 0.0, "q": HOME}, {"t": 1.0, "q": at(0.1)}])
+    time.sleep(0.5)
+    robot.append([{"t": 2.0, "q": at(0.2)}])
+    assert robot.finish_trajectory().positions[0] == pytest.approx(0.2, abs=1e-3)
+
+
 def test_points_are_appended_while_the_trajectory_runs(shared: Platform, robot: Robot) -> None:
     feed = rtcp.Feed(shared.directory)
     robot.open_trajectory([{"t": 0.5 * k, "q": at(0.2 * (1 - math.cos(0.5 * k)))} for k in (1, 2)])

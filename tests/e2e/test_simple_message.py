@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import os
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from math import cos, pi
@@ -107,6 +111,76 @@ def test_a_lost_client_leaves_an_arm_at_rest_and_disabled(enabled: Platform, por
         running.cancel()
 
     asyncio.run(test())
+
+
+CLIENT = """
+import socket, sys, time
+from rtcp.ros.simple_message.framing import Frame
+from rtcp.ros.simple_message.messages import ByteOrder, JointTrajPt
+connection = socket.create_connection(("10.0.0.1", 11000))
+first, *rest = map(float, sys.argv[1:])
+while True:
+    for sequence, (q1, duration) in enumerate([(first, 0.0), (first + 1.0, 20.0)]):
+        point = JointTrajPt(sequence, (q1, *rest), 0.1, duration)
+        connection.sendall(Frame.request(point, ByteOrder.LITTLE).pack(ByteOrder.LITTLE))
+        reply = connection.recv(4096)
+    if reply[12:16] == bytes([1, 0, 0, 0]):
+        break
+    time.sleep(0.05)
+print("moving", flush=True)
+time.sleep(3600)
+"""
+"""A client of the network that goes silent: it starts a motion of 20 s."""
+
+
+@contextlib.contextmanager
+def namespace() -> Iterator[str]:
+    """A network namespace, by the process id that holds it."""
+    with subprocess.Popen(["unshare", "--net", "sh", "-c", "echo; exec cat"], stdin=-1, stdout=-1) as holder:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        yield str(holder.pid)
+        holder.terminate()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="two network namespaces with a cable between them need root")
+def test_a_pulled_cable_stops_and_disables_the_arm_and_nothing_moves_when_it_is_back(enabled: Platform) -> None:
+    with namespace() as near, namespace() as far, contextlib.ExitStack() as running:
+
+        def inside(pid: str, *command: str) -> list[str]:
+            return ["nsenter", "--net", "--target", pid, *command]
+
+        def begin(pid: str, *command: str) -> str:
+            made = subprocess.Popen(
+                inside(pid, *command), env=enabled.environment, stdout=-1, stderr=subprocess.DEVNULL, text=True
+            )
+            running.enter_context(made)
+            running.callback(made.terminate)
+            assert made.stdout is not None
+            return made.stdout.readline()
+
+        def cable(is_in: bool) -> None:
+            subprocess.run(inside(far, "ip", "link", "set", "far", "up" if is_in else "down"), check=True)
+
+        ip = inside(near, "ip")
+        subprocess.run([*ip, "link", "add", "near", "type", "veth", "peer", "far", "netns", far], check=True)
+        subprocess.run([*ip, "address", "add", "10.0.0.1/24", "dev", "near"], check=True)
+        subprocess.run([*ip, "link", "set", "near", "up"], check=True)
+        subprocess.run(inside(far, "ip", "address", "add", "10.0.0.2/24", "dev", "far"), check=True)
+        cable(True)
+        server = (sys.executable, "-m", "rtcp.cli", "ros", "--simple-message", "--bind", "10.0.0.1")
+        assert "motion at 10.0.0.1" in begin(near, *server)
+        start = enabled.status()["joints"]["commanded_position"]
+        assert begin(far, sys.executable, "-c", CLIENT, *map(str, start)) == "moving\n"
+        enabled.until(lambda status: status["state"] == "moving", "motion")
+        cable(False)
+        enabled.until(lambda status: status["state"] == "ready", "the end of the connection")
+        rest = enabled.status()["joints"]["actual_position"]
+        assert rest[0] < start[0] + 0.9
+        cable(True)
+        time.sleep(2.0)  # in which the client's side would send again
+        assert enabled.status()["state"] == "ready"
+        assert enabled.status()["joints"]["actual_position"] == pytest.approx(rest, abs=1e-3)
 
 
 def test_the_arms_file_starts_the_server_once_and_it_ends_with_the_platform(platform: Platform) -> None:
