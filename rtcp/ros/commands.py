@@ -28,6 +28,8 @@ _LOOK_S = 0.05
 _THERE_RAD = 1e-6
 _RAN_OUT = ("out_of_points", "not_open")
 """An open trajectory that came to rest at its last point."""
+_LONGEST_WAIT_S = 60.0
+"""Longest wait for the stamp of a trajectory."""
 START_RAD = 0.01
 """Largest distance of a trajectory's first point from where the arm is commanded; MoveIt allows as much."""
 GOAL_RAD = 0.01
@@ -127,6 +129,8 @@ class Commander:
         self._closing = contextlib.AsyncExitStack()
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Arrival]] = set()
+        self._newest = 0
+        """Number of the newest trajectory, stop or stream: one that waits for its stamp gives way to it."""
         self._may_enable = True
         self._points = _Points(self, options.buffer_s, log)
 
@@ -143,6 +147,7 @@ class Commander:
     def note_stop(self) -> None:
         """An emergency stop or a fault was seen: only `enable` enables after it."""
         self._may_enable = False
+        self._newest += 1
 
     # -- motions ------------------------------------------------------------------------------------------------------
 
@@ -211,7 +216,8 @@ class Commander:
         await self._points.take(TrajectoryPoint(time_s, ordered["q"], ordered.get("v", ()), ordered.get("a", ())))
 
     async def stop(self) -> None:
-        """stop_motion: stop whatever moves; return when the arm holds."""
+        """stop_motion: stop whatever moves, or waits for its stamp; return when the arm holds."""
+        self._newest += 1
         self._points.end()
         robot = await self.connected()
         await robot.halt()
@@ -233,6 +239,7 @@ class Commander:
     async def disable(self) -> str:
         """robot_disable: stop, remove the torque; return a sentence."""
         self._may_enable = False
+        self._newest += 1
         self._points.end()
         robot = await self.connected()
         await robot.disable()
@@ -246,13 +253,19 @@ class Commander:
         status = await self.enabled()
         points = points_of(trajectory, status, self._options.allows_partial)
         limits = {} if tolerances is None else tolerances_of(tolerances, status.joint_names)
-        if trajectory.begin_s > 0.0:
-            wait_s = trajectory.begin_s - time.time()
-            if wait_s + trajectory.points[-1].time_s < 0.0:
-                raise refusal("old_stamp", f"the trajectory ended {-wait_s:.3f} s ago by its stamp: send it in time")
-            await asyncio.sleep(max(wait_s, 0.0))
-
         robot = await self.connected()
+        wait_s = trajectory.begin_s - time.time() if trajectory.begin_s > 0.0 else 0.0
+        if wait_s + trajectory.points[-1].time_s < 0.0:
+            raise refusal("old_stamp", f"the trajectory ended {-wait_s:.3f} s ago by its stamp: send it in time")
+        if wait_s > _LONGEST_WAIT_S:
+            message = (
+                f"its stamp is {wait_s:.0f} s ahead, at most {_LONGEST_WAIT_S:g} s are allowed: compare the clocks"
+            )
+            raise refusal("far_stamp", message)
+        self._newest = number = self._newest + 1
+        await asyncio.sleep(max(wait_s, 0.0))
+        if number != self._newest or not robot.is_open:
+            raise refusal("superseded", "another command or a stop came before the instant of its stamp")
         self._points.end()
 
         def report(progress: Progress) -> None:
@@ -266,7 +279,8 @@ class Commander:
         return motion
 
     async def end_motions(self) -> None:
-        """Stop the trajectory under way along its path."""
+        """Stop the trajectory under way along its path; one that waits for its stamp does not begin."""
+        self._newest += 1
         if self._motions:
             await (await self.connected()).halt()
             await asyncio.gather(*self._motions, return_exceptions=True)

@@ -81,7 +81,9 @@ def open_wire(router: str) -> OpenWire:
                 break
             except zenoh.ZError as error:
                 if not has_failed:
-                    _LOG.warning("%s: waiting for the router: %s", router, error)
+                    # Behind " at " zenoh names its own source files.
+                    reason = str(error).partition(" at ")[0].strip()
+                    _LOG.warning("%s: waiting for the router (`rmw_zenohd`): %s", router, reason)
                 has_failed = True
             if ends.wait(RETRY_S):
                 raise SystemExit(0)

@@ -288,6 +288,41 @@ def test_a_trajectory_begins_at_its_stamp(arm: FakeArm) -> None:
     carry_out(arm, test)
 
 
+@pytest.mark.parametrize("by", ["stop", "robot_disable", "a fault", "a trajectory", "a joint_command", "its platform"])
+def test_a_trajectory_that_waits_for_its_stamp_gives_way_to_what_comes_after_it(arm: FakeArm, by: str) -> None:
+    async def test(commander: Commander) -> None:
+        waiting = asyncio.create_task(commander.begin_trajectory(Trajectory(NAMES, PATH.points, time.time() + 0.3)))
+        await asyncio.sleep(0.1)
+        if by == "stop":
+            await commander.stop()
+        elif by == "robot_disable":
+            await commander.disable()
+        elif by == "a fault":
+            commander.note_stop()
+        elif by == "a trajectory":
+            await commander.begin_trajectory(PATH)
+        elif by == "a joint_command":
+            await commander.command_point(point(1.0))
+        else:
+            arm.is_open = False
+        with pytest.raises(RtcpError) as refused:
+            await waiting
+        assert refused.value.reason == "superseded"
+        arm.end()
+
+    carry_out(arm, test)
+    assert sum(call[0] == "run" for call in arm.calls) == (by == "a trajectory")
+
+
+def test_a_trajectory_whose_stamp_is_far_ahead_is_refused(arm: FakeArm) -> None:
+    async def test(commander: Commander) -> None:
+        with pytest.raises(RtcpError) as refused:
+            await commander.begin_trajectory(Trajectory(NAMES, PATH.points, time.time() + 3600.0))
+        assert refused.value.reason == "far_stamp"
+
+    carry_out(arm, test)
+
+
 def test_a_trajectory_that_was_over_before_it_came_is_refused(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         with pytest.raises(RtcpError) as refused:
