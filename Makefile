@@ -24,10 +24,10 @@ run: setup ## run the demonstration: virtual segment, master, a move, the figure
 panel: setup ## run the virtual arm with the panel: http://127.0.0.1:8080 in a browser
 	@$(BIN)/rtcp start --panel
 
-test: setup ## run the tests, but those in a browser
+test: setup ## run the tests, but those in a browser and on ROS 1
 	@status=0; \
 	$(BIN)/python -m pytest -m 'not alone and not slow' --numprocesses auto || status=1; \
-	$(BIN)/python -m pytest -m 'alone and not slow and not browser' --numprocesses 2 --dist loadfile || status=1; \
+	$(BIN)/python -m pytest -m 'alone and not slow and not browser' --ignore=tests/ros1 --numprocesses 2 --dist loadfile || status=1; \
 	exit $$status
 
 test-all: oracles ## run all tests: every sample, systemd as PID 1, in a browser

@@ -417,9 +417,10 @@ class _Points:
         # At a low rate the arm has to rest at a target: how long it would keep the speed nobody knows.
         has_speed = point.velocities and self._came_s - self._before_s < _REPEAT_S and not rests
         velocity = (0.0,) * len(point.positions) if rests else point.velocities if has_speed else None
+        stamp = None if rests else self._stamp(point)
         self._sent_s = time.monotonic()
         try:
-            stream.send(point.positions, velocity, (has_speed and point.accelerations) or None, self._stamp(point))
+            stream.send(point.positions, velocity, (has_speed and point.accelerations) or None, stamp)
         except RtcpError as error:
             if error.reason != "stream_ended":
                 raise
