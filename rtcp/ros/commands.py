@@ -25,6 +25,10 @@ _PAUSE_S = 1.0
 _REPEAT_S = 0.1
 """A target is sent again after so long: the platform takes 0.2 s without one for the end of a stream."""
 _LOOK_S = 0.05
+_HELD_UP_S = 1.0
+"""A process that did not run for longer than this (suspended, swapped out) has commands of then in its queues."""
+_DRAINED_S = 0.5
+"""Time after that in which these arrive, and are refused."""
 _THERE_RAD = 1e-6
 _RAN_OUT = ("out_of_points", "not_open")
 """An open trajectory that came to rest at its last point."""
@@ -133,6 +137,10 @@ class Commander:
         """Number of the newest trajectory, stop or stream: one that waits for its stamp gives way to it."""
         self._may_enable = True
         self._points = _Points(self, options.buffer_s, log)
+        self._ran_s = time.monotonic()
+        """When this process was last seen to run."""
+        self._drained_s = -math.inf
+        self._beating: asyncio.Task[None] | None = None
 
     @property
     def is_moving(self) -> bool:
@@ -141,6 +149,8 @@ class Commander:
 
     async def close(self) -> None:
         """Close the connection: what it moves comes to a controlled stop."""
+        if self._beating is not None:
+            self._beating.cancel()
         self._robot = None
         await self._closing.aclose()
 
@@ -148,6 +158,31 @@ class Commander:
         """An emergency stop or a fault was seen: only `enable` enables after it."""
         self._may_enable = False
         self._newest += 1
+
+    async def _beat(self) -> None:
+        while True:
+            self._look_for_a_gap()
+            await asyncio.sleep(_LOOK_S)
+
+    def _look_for_a_gap(self) -> None:
+        now = time.monotonic()
+        if self._beating is None:
+            self._beating = asyncio.create_task(self._beat())
+        elif now - self._ran_s > _HELD_UP_S:
+            self._drained_s = now + _DRAINED_S
+            self._newest += 1
+            self._points.end()
+            self._log(f"this node did not run for {now - self._ran_s:.1f} s: commands of that time are refused")
+        self._ran_s = now
+
+    def is_timely(self) -> bool:
+        """Whether a command that comes now did not wait while this process did not run: its sender may be gone."""
+        self._look_for_a_gap()
+        return time.monotonic() >= self._drained_s
+
+    def _require_timely(self) -> None:
+        if not self.is_timely():
+            raise refusal("held_up", "the command waited while this node did not run: send it again")
 
     # -- motions ------------------------------------------------------------------------------------------------------
 
@@ -226,6 +261,7 @@ class Commander:
 
     async def enable(self) -> str:
         """robot_enable: leave a fault or an emergency stop, enable the drives; return a sentence."""
+        self._require_timely()
         robot = await self.connected()
         if (await robot.status()).state in _NEEDS_RESET:
             left = await robot.reset()
@@ -250,6 +286,7 @@ class Commander:
     async def _begin(
         self, trajectory: Trajectory, tolerances: Tolerances | None, accepted: Callable[[], None]
     ) -> asyncio.Task[Arrival]:
+        self._require_timely()
         status = await self.enabled()
         points = points_of(trajectory, status, self._options.allows_partial)
         limits = {} if tolerances is None else tolerances_of(tolerances, status.joint_names)
@@ -360,6 +397,9 @@ class _Points:
     async def take(self, point: TrajectoryPoint) -> None:
         """Follow a point; while the stream is being opened the newest counts."""
         now = time.monotonic()
+        if not self._commander.is_timely():
+            self._came_s = now  # the pause that makes a new beginning counts from here
+            return
         is_first = now - self._came_s > _PAUSE_S
         self._before_s, self._came_s = self._came_s, now
         if is_first:

@@ -133,7 +133,8 @@ class Commands:
         threading.Thread(target=self.loop.run_forever, daemon=True).start()
 
         async def commander() -> Commander:
-            return Commander(connect or (lambda: connect_async(options.name)), options.commands, _LOG.error)
+            to_platform = connect or (lambda: connect_async(options.name, disable_when_lost=True))
+            return Commander(to_platform, options.commands, _LOG.error)
 
         self.commander = self.submit(commander()).result()
 

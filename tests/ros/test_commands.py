@@ -527,6 +527,7 @@ def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
     async def test(commander: Commander) -> None:
         nonlocal now
         monkeypatch.setattr(commands, "time", clock)
+        monkeypatch.setattr(commands, "_HELD_UP_S", math.inf)
         await commander.command_point(point(1.0))
         if by == "stop":
             await commander.stop()
@@ -549,6 +550,29 @@ def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
         assert len(arm.streams) == 2
 
     assert carry_out(arm, test) == []
+
+
+def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(commands, "_HELD_UP_S", 0.3)
+
+    async def test(commander: Commander) -> None:
+        await commander.command_point(point(1.0))
+        time.sleep(0.4)  # nothing of the process runs
+        await commander.command_point(point(2.0))
+        for command in (commander.begin_trajectory(PATH), commander.enable()):
+            with pytest.raises(RtcpError) as refused:
+                await command
+            assert refused.value.reason == "held_up"
+        for _ in range(7):  # a sender that goes on
+            await asyncio.sleep(0.1)
+            await commander.command_point(point(3.0))
+        assert len(arm.streams) == 1
+        await commander.begin_trajectory(PATH)
+        arm.end()
+
+    (line,) = carry_out(arm, test)
+    assert "did not run" in line
+    assert {sent[0][0] for sent in arm.streams[0].sent} == {1.0}
 
 
 @pytest.mark.parametrize("by", ["the next setpoint", "the repeated setpoint"])
