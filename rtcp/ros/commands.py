@@ -17,6 +17,7 @@ from typing import Any
 
 from rtcp.api import Arrival, AsyncRobot, Progress, Replaced, RtcpError, State, Status, Stream
 from rtcp.config.model import MOST_POINTS
+from rtcp.ros.held_up import HeldUp
 
 Numbers = Sequence[float]
 _NEEDS_RESET = (State.FAULT, State.EMERGENCY_STOP, State.STOPPED_BY_LIMIT)
@@ -25,10 +26,6 @@ _PAUSE_S = 1.0
 _REPEAT_S = 0.1
 """A target is sent again after so long: the platform takes 0.2 s without one for the end of a stream."""
 _LOOK_S = 0.05
-_HELD_UP_S = 1.0
-"""A process that did not run for longer than this (suspended, swapped out) has commands of then in its queues."""
-_DRAINED_S = 0.5
-"""Time after that in which these arrive, and are refused."""
 _THERE_RAD = 1e-6
 _RAN_OUT = ("out_of_points", "not_open")
 """An open trajectory that came to rest at its last point."""
@@ -137,10 +134,8 @@ class Commander:
         """Number of the newest trajectory, stop or stream: one that waits for its stamp gives way to it."""
         self._may_enable = True
         self._points = _Points(self, options.buffer_s, log)
-        self._ran_s = time.monotonic()
-        """When this process was last seen to run."""
-        self._drained_s = -math.inf
-        self._beating: asyncio.Task[None] | None = None
+        self._held_up = HeldUp(self._was_held_up)
+        self._looking = asyncio.get_running_loop().create_task(self._look())
 
     @property
     def is_moving(self) -> bool:
@@ -149,8 +144,7 @@ class Commander:
 
     async def close(self) -> None:
         """Close the connection: what it moves comes to a controlled stop."""
-        if self._beating is not None:
-            self._beating.cancel()
+        self._looking.cancel()
         self._robot = None
         await self._closing.aclose()
 
@@ -159,26 +153,19 @@ class Commander:
         self._may_enable = False
         self._newest += 1
 
-    async def _beat(self) -> None:
+    async def _look(self) -> None:
         while True:
-            self._look_for_a_gap()
+            self._held_up.look()
             await asyncio.sleep(_LOOK_S)
 
-    def _look_for_a_gap(self) -> None:
-        now = time.monotonic()
-        if self._beating is None:
-            self._beating = asyncio.create_task(self._beat())
-        elif now - self._ran_s > _HELD_UP_S:
-            self._drained_s = now + _DRAINED_S
-            self._newest += 1
-            self._points.end()
-            self._log(f"this node did not run for {now - self._ran_s:.1f} s: commands of that time are refused")
-        self._ran_s = now
+    def _was_held_up(self, gap_s: float) -> None:
+        self._newest += 1
+        self._points.end()
+        self._log(f"this node did not run for {gap_s:.1f} s: commands of that time are refused")
 
     def is_timely(self) -> bool:
-        """Whether a command that comes now did not wait while this process did not run: its sender may be gone."""
-        self._look_for_a_gap()
-        return time.monotonic() >= self._drained_s
+        """Whether a command that comes now did not wait while this process did not run."""
+        return self._held_up.is_timely()
 
     def _require_timely(self) -> None:
         if not self.is_timely():

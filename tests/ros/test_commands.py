@@ -15,7 +15,7 @@ import pytest
 
 from rtcp.api import Arrival, Progress, RtcpError, State, Status
 from rtcp.config.model import MOST_POINTS
-from rtcp.ros import commands
+from rtcp.ros import commands, held_up
 from rtcp.ros.commands import (
     GOAL_RAD,
     START_RAD,
@@ -527,7 +527,7 @@ def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
     async def test(commander: Commander) -> None:
         nonlocal now
         monkeypatch.setattr(commands, "time", clock)
-        monkeypatch.setattr(commands, "_HELD_UP_S", math.inf)
+        monkeypatch.setattr(held_up, "HELD_UP_S", math.inf)
         await commander.command_point(point(1.0))
         if by == "stop":
             await commander.stop()
@@ -553,7 +553,7 @@ def test_a_stream_that_was_ended_stays_ended_until_its_sender_pauses(
 
 
 def test_what_waited_while_the_node_did_not_run_moves_nothing(arm: FakeArm, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commands, "_HELD_UP_S", 0.3)
+    monkeypatch.setattr(held_up, "HELD_UP_S", 0.3)
 
     async def test(commander: Commander) -> None:
         await commander.command_point(point(1.0))

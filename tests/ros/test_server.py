@@ -7,11 +7,13 @@ import contextlib
 import logging
 import socket
 import struct
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable
 
 import pytest
 
 from rtcp.api import RtcpError
+from rtcp.ros import held_up
 from rtcp.ros.simple_message.arm import Point
 from rtcp.ros.simple_message.framing import Frame, FrameDecoder
 from rtcp.ros.simple_message.messages import (
@@ -518,6 +520,28 @@ def test_a_lost_client_stops_the_arm_and_disables_its_drives_and_nothing_moves_a
         rig.arm.set_status(drives_powered=TriState.TRUE)
         assert await again.codes(point(1), point(0), point(1)) == [NO, OK, OK]
         await rig.arm.until("disable", "open_trajectory")
+
+    run(client)
+
+
+def test_points_that_waited_while_the_server_did_not_run_are_a_lost_link(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_up, "HELD_UP_S", 0.3)
+
+    async def client(rig: Rig) -> None:
+        peer = await rig.motion()
+        await peer.codes(point(0), point(1))
+        await rig.arm.until("open_trajectory")
+        peer.send(point(2), point(0, 0.7), JointPosition(0, THERE))
+        await peer.writer.drain()
+        time.sleep(0.4)  # nothing of the process runs
+        with pytest.raises((EOFError, OSError)):
+            await peer.frame()
+        await rig.arm.until("halt", "disable")
+        assert "the server did not run for 0.4 s" in lines(caplog)[0]
+        assert rig.arm.names.count("open_trajectory") == 1
+        assert "append" not in rig.arm.names
 
     run(client)
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from rtcp import __version__
+from rtcp.ros.held_up import HeldUp
 from rtcp.ros.simple_message.arm import Arm, ArmState
 from rtcp.ros.simple_message.execution import MotionExecutor
 from rtcp.ros.simple_message.framing import Frame, FrameDecoder, FrameError
@@ -222,6 +223,7 @@ class SimpleMessageServer:
         """Byte order of the last motion client at each address."""
         self._turned_away = ""
         """Whom the log has named already."""
+        self._held_up = HeldUp(self._was_held_up)
         self._servers: list[asyncio.Server] = []
         self._serving: set[asyncio.Task[None]] = set()
 
@@ -255,6 +257,10 @@ class SimpleMessageServer:
         motion, state = (int(server.sockets[0].getsockname()[1]) for server in self._servers)
         return motion, state
 
+    def _was_held_up(self, gap_s: float) -> None:
+        if self._motion is not None:
+            self._motion.client.close(f"the server did not run for {gap_s:.1f} s")
+
     def _close_servers(self) -> None:
         for server in self._servers:
             server.close()
@@ -277,6 +283,8 @@ class SimpleMessageServer:
 
     async def _serve_motion(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with self._connected("motion", writer) as client:
+            if not self._held_up.is_timely():
+                return  # what it has sent may be old: it connects again
             before = self._motion
             if before is not None and before.client.host != client.host:
                 if client.host != self._turned_away:
@@ -292,6 +300,9 @@ class SimpleMessageServer:
             session = self._motion = _MotionSession(client, self._arm, self._executor)
 
             def answer(frame: Frame, order: ByteOrder) -> Frame | None:
+                self._held_up.look()
+                if client.why_closed:
+                    return None
                 self._orders[client.host] = order
                 return session.answer(frame, order)
 
@@ -324,6 +335,7 @@ class SimpleMessageServer:
         """Send state at a fixed rate: positions once a sample, the status always."""
         stamp, begin, fresh_at = 0, 0, -math.inf
         while True:
+            self._held_up.look()
             state, now = self._arm.state, time.monotonic()
             messages: list[Message] = []
             if state is not None and state.stamp_ns != stamp:
