@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 from rtcp.config.model import ArmConfig
 from rtcp.gateway.status_snapshot import StatusSnapshot
-from rtcp.ipc.commands import Command, OpenStream
+from rtcp.ipc.commands import Command, Disable, ExtendTrajectory, Halt, MotionCommand, OpenStream
 from rtcp.ipc.errors import ErrorKind, RtcpError
 from rtcp.ipc.events import Event, LeaseExpired, MotionEnded, PermissionWithdrawn
 from rtcp.ipc.observer import BlackboardError, EventRecord, LeaseRefused, Observer
@@ -73,6 +73,12 @@ class _Waiter(Generic[T]):
                 self.outcome.set_result(found)
 
 
+class Lease(int):
+    """The id of a lease, for one request: `request` counts these, so that what is older than a stop begins nothing."""
+
+    request: int
+
+
 class CommandChannel:
     """Sends commands to the loop and waits for what comes of them, on behalf of all methods.
 
@@ -91,6 +97,8 @@ class CommandChannel:
         self.names = snapshot.names
         self._ring = asyncio.Lock()
         self._answer_poll_s = min(0.2e-6 * config.cycle.period_us, _POLL_S)
+        self._requests = self._barrier = 0
+        """Requests that have asked to move the arm; those before the barrier came before a stop or a newer motion."""
         self._shared: dict[int, tuple[int, int]] = {}
         """Lease, and how many calls hold it, by connection."""
         self._waiters: list[_Waiter[Any]] = []
@@ -146,7 +154,7 @@ class CommandChannel:
     # -- the lease ----------------------------------------------------------------------------------------------------
 
     @contextlib.asynccontextmanager
-    async def lease(self, caller: Caller) -> AsyncIterator[int]:
+    async def lease(self, caller: Caller) -> AsyncIterator[Lease]:
         """Hold the lease, renewed, until the block ends; report progress meanwhile.
 
         A motion that replaces another of its connection shares the lease with it. It is not renewed for a caller that
@@ -157,8 +165,10 @@ class CommandChannel:
             lease = self.acquire(caller)
         self._shared[caller.connection] = lease, users + 1
         renewing = asyncio.create_task(self._renew(lease, caller))
+        held = Lease(lease)
+        held.request = self._requests = self._requests + 1
         try:
-            yield lease
+            yield held
         finally:
             renewing.cancel()
             _, users = self._shared.pop(caller.connection)
@@ -166,6 +176,10 @@ class CommandChannel:
                 self._shared[caller.connection] = lease, users - 1
             else:
                 self.observer.release(lease)
+
+    def is_shared(self, lease: int) -> bool:
+        """Whether another request of the connection holds this lease too, so that its end does not stop the arm."""
+        return any(held == lease and users > 1 for held, users in self._shared.values())
 
     def acquire(self, caller: Caller) -> int:
         """Acquire the lease and return its id; the caller renews and releases it."""
@@ -202,8 +216,18 @@ class CommandChannel:
         return await self.wait(look, timeout_s, timed_out)
 
     async def accept(self, lease: int, command: Command) -> int:
-        """Send a command; return, once the loop has accepted it, the number of the last record without it."""
+        """Send a command; return, once the loop has accepted it, the number of the last record without it.
+
+        A motion that was planned while a stop or a newer motion was sent is refused, reason `superseded`.
+        """
         async with self._ring:
+            if isinstance(command, Halt | Disable | OpenStream):
+                self._barrier = self._requests = self._requests + 1
+            elif isinstance(lease, Lease) and isinstance(command, MotionCommand):
+                if lease.request < self._barrier and not isinstance(command, ExtendTrajectory):
+                    message = f"{command.name}: a stop or another motion came while it was planned: nothing moves"
+                    raise RtcpError("refused", message, "superseded")
+                self._barrier = max(self._barrier, lease.request)
             try:
                 number = self.observer.command(lease, command)
             except BlackboardError as error:

@@ -269,6 +269,7 @@ class MotionActions:
         """Begin a trajectory to which points are appended; return when the loop has accepted it."""
         accepted: asyncio.Future[_Open] = asyncio.get_running_loop().create_future()
         task = asyncio.create_task(self._run_open(caller, points, accepted))
+        task.add_done_callback(lambda task: task.cancelled() or task.exception())  # nobody may ask how it ended
         either: list[asyncio.Future[Any]] = [task, accepted]
         try:
             await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
@@ -563,6 +564,10 @@ class MotionActions:
 
         try:
             return await channel.run(lease, command, outcome, timeout_s, what)
+        except asyncio.CancelledError:
+            if self._motion is motion and channel.is_shared(lease):
+                await channel.accept(0, Halt())  # the lease does not end, with which it would stop
+            raise
         finally:
             if self._motion is motion:
                 self.goal = None

@@ -249,3 +249,39 @@ def test_limits_and_robot_status_are_typed(robot: Robot) -> None:
     assert limits[0].min < limits[0].max
     assert (status.robot.mode, status.robot.motion_possible, status.robot.in_error) == ("auto", True, False)
     robot.close()
+
+
+def slow_plan() -> list[dict[str, Any]]:
+    """A trajectory that takes the planner a while: three turns of 20 s."""
+    w = math.tau / 20.0
+    times = [0.05 * k for k in range(1201)]
+    return [{"t": t, "q": at(0.2 * (1 - math.cos(w * t))), "v": [0.2 * w * math.sin(w * t), *[0.0] * 5]} for t in times]
+
+
+def test_a_stop_that_comes_while_a_motion_is_planned_is_the_end_of_it(shared: Platform, robot: Robot) -> None:
+    robot.close()
+
+    async def moves(arm: AsyncRobot) -> Any:
+        motion = asyncio.create_task(arm.run_trajectory(slow_plan()))
+        await asyncio.sleep(0.01)
+        await arm.halt()
+        with pytest.raises(rtcp.Refused) as refused:
+            await motion
+        return refused.value.reason
+
+    assert run(shared, moves) == "superseded"
+    assert shared.status()["joints"]["commanded_position"] == pytest.approx(HOME, abs=1e-6)
+
+
+def test_an_older_motion_that_is_planned_longer_does_not_replace_a_newer_one(shared: Platform, robot: Robot) -> None:
+    robot.close()
+
+    async def moves(arm: AsyncRobot) -> Any:
+        older = asyncio.create_task(arm.run_trajectory(slow_plan(), replace=True))
+        await asyncio.sleep(0.01)
+        arrival = await arm.move_joints(at(0.1), replace=True)
+        with pytest.raises(rtcp.Refused) as refused:
+            await older
+        return refused.value.reason, arrival.positions[0]
+
+    assert run(shared, moves) == ("superseded", pytest.approx(0.1, abs=1e-3))
