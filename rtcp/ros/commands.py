@@ -29,6 +29,8 @@ _LOOK_S = 0.05
 _THERE_RAD = 1e-6
 _RAN_OUT = ("out_of_points", "not_open")
 """An open trajectory that came to rest at its last point."""
+_LATEST_S = 0.5
+"""Largest age of a trajectory's stamp: what is later would run on as planned for then."""
 _LONGEST_WAIT_S = 60.0
 """Longest wait for the stamp of a trajectory."""
 START_RAD = 0.01
@@ -130,8 +132,10 @@ class Commander:
         self._closing = contextlib.AsyncExitStack()
         self._connecting = asyncio.Lock()
         self._motions: set[asyncio.Task[Arrival]] = set()
-        self._newest = 0
-        """Number of the newest trajectory, stop or stream: one that waits for its stamp gives way to it."""
+        self._asked = self._barrier = 0
+        """Trajectories, stops and streams that were asked for; of those before the barrier none begins any more."""
+        self._disabled = 0
+        """How often robot_disable was called: an enabling under way gives way to it."""
         self._may_enable = True
         self._points = _Points(self, options.buffer_s, log)
         self._held_up = HeldUp(self._was_held_up)
@@ -151,7 +155,16 @@ class Commander:
     def note_stop(self) -> None:
         """An emergency stop or a fault was seen: only `enable` enables after it."""
         self._may_enable = False
-        self._newest += 1
+        self._bar()
+
+    def _bar(self) -> int:
+        """End what was asked for and has not begun; return the number of what takes its place."""
+        self._asked = self._barrier = self._asked + 1
+        return self._asked
+
+    def _require_newest(self, number: int, robot: AsyncRobot) -> None:
+        if number < self._barrier or not robot.is_open:
+            raise refusal("superseded", "another command, a stop or the end of the platform came before it began")
 
     async def _look(self) -> None:
         while True:
@@ -159,7 +172,7 @@ class Commander:
             await asyncio.sleep(_LOOK_S)
 
     def _was_held_up(self, gap_s: float) -> None:
-        self._newest += 1
+        self._bar()
         self._points.end()
         self._log(f"this node did not run for {gap_s:.1f} s: commands of that time are refused")
 
@@ -233,13 +246,13 @@ class Commander:
             await self.begin_trajectory(trajectory)
             return
         status = self._points.status or await (await self.connected()).status()
-        (ordered,) = points_of(trajectory, status, self._options.allows_partial)
+        (ordered,) = points_of(trajectory, status, self._options.allows_partial, self._points.target)
         time_s = trajectory.begin_s + ordered["t"] if trajectory.begin_s else 0.0
         await self._points.take(TrajectoryPoint(time_s, ordered["q"], ordered.get("v", ()), ordered.get("a", ())))
 
     async def stop(self) -> None:
         """stop_motion: stop whatever moves, or waits for its stamp; return when the arm holds."""
-        self._newest += 1
+        self._bar()
         self._points.end()
         robot = await self.connected()
         await robot.halt()
@@ -249,12 +262,15 @@ class Commander:
     async def enable(self) -> str:
         """robot_enable: leave a fault or an emergency stop, enable the drives; return a sentence."""
         self._require_timely()
-        robot = await self.connected()
+        before, robot = self._disabled, await self.connected()
         if (await robot.status()).state in _NEEDS_RESET:
             left = await robot.reset()
             if left is State.STOPPED_BY_LIMIT:
                 return "the arm holds again"
-        if (await robot.status()).state is not State.HOLDING:
+        state = (await robot.status()).state
+        if self._disabled != before:
+            raise refusal("superseded", "robot_disable was called meanwhile")
+        if state is not State.HOLDING:
             await robot.enable()
         self._may_enable = True
         return "the drives are enabled"
@@ -262,7 +278,8 @@ class Commander:
     async def disable(self) -> str:
         """robot_disable: stop, remove the torque; return a sentence."""
         self._may_enable = False
-        self._newest += 1
+        self._disabled += 1
+        self._bar()
         self._points.end()
         robot = await self.connected()
         await robot.disable()
@@ -274,46 +291,64 @@ class Commander:
         self, trajectory: Trajectory, tolerances: Tolerances | None, accepted: Callable[[], None]
     ) -> asyncio.Task[Arrival]:
         self._require_timely()
-        status = await self.enabled()
+        self._asked = number = self._asked + 1
+        if not trajectory.points:
+            raise refusal("no_points", "the trajectory has no points")
+        robot = await self.connected()
+        status = await self._known()
         points = points_of(trajectory, status, self._options.allows_partial)
         limits = {} if tolerances is None else tolerances_of(tolerances, status.joint_names)
-        robot = await self.connected()
         wait_s = trajectory.begin_s - time.time() if trajectory.begin_s > 0.0 else 0.0
-        if wait_s + trajectory.points[-1].time_s < 0.0:
-            raise refusal("old_stamp", f"the trajectory ended {-wait_s:.3f} s ago by its stamp: send it in time")
+        if wait_s < -_LATEST_S:
+            raise refusal("old_stamp", f"its stamp is {-wait_s:.3f} s old, at most {_LATEST_S:g} s are allowed")
         if wait_s > _LONGEST_WAIT_S:
-            message = (
-                f"its stamp is {wait_s:.0f} s ahead, at most {_LONGEST_WAIT_S:g} s are allowed: compare the clocks"
-            )
+            message = f"its stamp is {wait_s:.0f} s ahead, allowed are {_LONGEST_WAIT_S:g} s: compare the clocks"
             raise refusal("far_stamp", message)
-        self._newest = number = self._newest + 1
+        self._require_newest(number, robot)
+        self._barrier = number
         await asyncio.sleep(max(wait_s, 0.0))
-        if number != self._newest or not robot.is_open:
-            raise refusal("superseded", "another command or a stop came before the instant of its stamp")
-        self._points.end()
+        self._require_newest(number, robot)
+        status = await self.enabled()
+        if len(trajectory.joint_names) < len(status.joint_names):
+            if status.state is State.MOVING:
+                raise refusal("moving", "joints that are not named hold only where the arm rests")
+            points = points_of(trajectory, status, self._options.allows_partial)
 
         def report(progress: Progress) -> None:
             if progress.accepted:
                 accepted()
 
-        run = robot.run_trajectory(points, progress=report, replace=True, start_tolerance=START_RAD, **limits)
-        motion = asyncio.ensure_future(run)
+        async def run() -> Arrival:
+            self._require_newest(number, robot)
+            self._points.end()
+            return await robot.run_trajectory(
+                points, progress=report, replace=True, start_tolerance=START_RAD, **limits
+            )
+
+        motion = asyncio.ensure_future(run())
         self._motions.add(motion)
         motion.add_done_callback(self._motions.discard)
         return motion
 
     async def end_motions(self) -> None:
         """Stop the trajectory under way along its path; one that waits for its stamp does not begin."""
-        self._newest += 1
+        self._bar()
         if self._motions:
             await (await self.connected()).halt()
             await asyncio.gather(*self._motions, return_exceptions=True)
 
+    async def _known(self) -> Status:
+        """Return a status, which may be old: for the names of the joints."""
+        robot = await self.connected()
+        if self._status is None:
+            self._status = await robot.status()
+        return self._status
+
     async def enabled(self) -> Status:
         """Return a status, which may be old, the drives enabled where that is asked for and allowed."""
         robot = await self.connected()
-        if self._status is not None and not (self._options.enables or self._options.allows_partial):
-            return self._status  # for the names of the joints: a request less before a motion
+        if not (self._options.enables or self._options.allows_partial):
+            return await self._known()  # a request less before a motion
         status = self._status = await robot.status()
         if status.state is State.READY and self._options.enables:
             if not self._may_enable:
@@ -369,6 +404,11 @@ class _Points:
         lasts_s = self._buffer_s + _PAUSE_S if self._buffer_s else math.inf
         return self.status is not None and time.monotonic() - self._came_s < lasts_s
 
+    @property
+    def target(self) -> Numbers | None:
+        """The newest target while the arm follows them, rad."""
+        return self._newest.positions if self.status is not None and self._newest is not None else None
+
     def end(self) -> None:
         """End the stream: something else moves or stops the arm."""
         self._has_ended = True
@@ -404,7 +444,8 @@ class _Points:
         try:
             if self._buffer_s:
                 async with self._turn:
-                    await self._append(point)
+                    if not self._has_ended:
+                        await self._append(point)
             elif self._stream is not None:
                 await self._send(self._stream, point)
             elif not self._turn.locked():  # else whoever opens the stream sends the newest
@@ -471,6 +512,8 @@ class _Points:
                     if max(abs(a - b) for a, b in zip(commanded, point.positions, strict=True)) < _THERE_RAD:
                         self._close()
                         return
+                if self._newest is not point or self._stream is not stream:
+                    continue  # a newer one came meanwhile
                 self._anchor_s = None
                 await self._send(stream, point, rests=True)
             except RtcpError as error:
@@ -491,17 +534,26 @@ class _Points:
             try:
                 await robot.append([made | {"t": self._stamp(point) - self._began_s}])
             except RtcpError as error:
+                if self._has_ended:
+                    return
                 if error.reason not in _RAN_OUT:
                     raise
                 self.status = self._anchor_s = None
         if self.status is None:
-            self.status = await self._commander.enabled()
+            status = await self._commander.enabled()
+            if self._has_ended:
+                return
+            self.status = status
             self._began_s = self._stamp(point) - self._buffer_s
             await robot.open_trajectory([made | {"t": self._buffer_s}], replace=True)
 
 
-def points_of(trajectory: Trajectory, status: Status, allows_partial: bool = False) -> list[dict[str, Any]]:
+def points_of(
+    trajectory: Trajectory, status: Status, allows_partial: bool = False, held: Numbers | None = None
+) -> list[dict[str, Any]]:
     """Return the points in the robot's order of joints, as `Robot.run_trajectory` takes them; it checks the values.
+
+    `held`: where joints that are not named hold, rad; None: where they are commanded.
 
     Raises:
         RtcpError: `refused`; reasons too_many_points, unknown_joint, missing_joint, wrong_count.
@@ -525,7 +577,7 @@ def points_of(trajectory: Trajectory, status: Status, allows_partial: bool = Fal
             raise refusal("wrong_count", message)
         return [other if at is None else float(values[at]) for at, other in zip(place, others, strict=True)]
 
-    holds, rests = status.commanded_positions, [0.0] * len(names)
+    holds, rests = status.commanded_positions if held is None else held, [0.0] * len(names)
     has_velocities = all(point.velocities for point in trajectory.points)
     has_accelerations = has_velocities and all(point.accelerations for point in trajectory.points)
     points = []
@@ -556,6 +608,8 @@ def tolerances_of(tolerances: Tolerances, names: Sequence[str]) -> dict[str, Any
             if one.velocity > 0.0 or one.acceleration > 0.0:
                 message = f"the tolerance of {one.name} has a velocity or acceleration: only positions are supervised"
                 raise refusal("unsupported_tolerance", message)
+            if not math.isfinite(one.position):
+                raise refusal("not_finite", f"the tolerance of {one.name} is {one.position}: a number is needed")
             if one.position:
                 found[one.name] = max(one.position, 0.0)
         return list(found.values())

@@ -185,7 +185,7 @@ class Publications:
     def status(self, status: RobotStatus) -> None:
         """Publish robot_status."""
         if status.in_error is TriState.TRUE:
-            self._commands.commander.note_stop()
+            self._commands.note_stop()
         message = RobotStatusMessage(error_code=status.error_code)
         message.header.stamp = _time(status.stamp_ns)
         for name in ("mode", "e_stopped", "drives_powered", "motion_possible", "in_motion", "in_error"):
@@ -234,6 +234,10 @@ class Commands:
         with contextlib.suppress(concurrent.futures.TimeoutError, RtcpError):
             asyncio.run_coroutine_threadsafe(self.commander.close(), self._loop).result(_CLOSE_S)
         self._loop.call_soon_threadsafe(self._loop.stop)
+
+    def note_stop(self) -> None:
+        """See `Commander`; from any thread."""
+        self._loop.call_soon_threadsafe(self.commander.note_stop)
 
     def publish_feedback(self, feedback: Any) -> None:
         """Publish it to the clients of the goals under way."""

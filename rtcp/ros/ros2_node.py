@@ -148,6 +148,10 @@ class Commands:
             self.submit(self.commander.close()).result(_CLOSE_S)
         self.loop.call_soon_threadsafe(self.loop.stop)
 
+    def note_stop(self) -> None:
+        """See `Commander`; from any thread."""
+        self.loop.call_soon_threadsafe(self.commander.note_stop)
+
     def submit(self, coroutine: Coroutine[Any, Any, Any]) -> concurrent.futures.Future[Any]:
         """Run it on the loop."""
         return asyncio.run_coroutine_threadsafe(coroutine, self.loop)
@@ -324,7 +328,7 @@ def run(options: Ros2Options, open_wire: OpenWire) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda *_: ends.set())
     with Commands(options) as commands, open_wire(options, commands, ends) as wire:
-        publications = Publications(wire, options.name, commands.commander.note_stop)
+        publications = Publications(wire, options.name, commands.note_stop)
         publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=options.name)
         while not ends.is_set():
             publisher.step(_STEP_S)

@@ -314,6 +314,108 @@ def test_a_trajectory_that_waits_for_its_stamp_gives_way_to_what_comes_after_it(
     assert sum(call[0] == "run" for call in arm.calls) == (by == "a trajectory")
 
 
+def test_a_stop_that_comes_while_a_trajectory_waits_for_the_drives_is_the_end_of_it(arm: FakeArm) -> None:
+    arm.state = State.READY
+    is_enabling, may_go_on = asyncio.Event(), asyncio.Event()
+
+    async def enable() -> None:
+        is_enabling.set()
+        await may_go_on.wait()
+        arm.state = State.HOLDING
+
+    arm.enable = enable  # type: ignore[method-assign]
+
+    async def test(commander: Commander) -> None:
+        beginning = asyncio.create_task(commander.begin_trajectory(PATH))
+        await is_enabling.wait()
+        stopping = asyncio.create_task(commander.stop())
+        await asyncio.sleep(0.01)
+        may_go_on.set()
+        with pytest.raises(RtcpError) as refused:
+            await beginning
+        assert refused.value.reason == "superseded"
+        await stopping
+
+    carry_out(arm, test, enables=True)
+    assert "run" not in [call[0] for call in arm.calls]
+
+
+def test_a_trajectory_that_is_refused_enables_nothing(arm: FakeArm) -> None:
+    arm.state = State.READY
+
+    async def test(commander: Commander) -> None:
+        for refused in (Trajectory(("a", "b", "z"), PATH.points), Trajectory(NAMES, PATH.points, time.time() - 2.0)):
+            with pytest.raises(RtcpError):
+                await commander.begin_trajectory(refused)
+        code, text = await commander.follow(Trajectory(NAMES, ()), Tolerances(), lambda: None)
+        assert (code, text) == (FollowCode.INVALID_GOAL, "the trajectory has no points")
+
+    carry_out(arm, test, enables=True)
+    assert arm.calls == []
+
+
+def test_points_that_wait_in_a_buffered_stream_open_no_trajectory_after_a_stop(arm: FakeArm) -> None:
+    may_go_on = asyncio.Event()
+    opened = arm.open_trajectory
+
+    async def open_trajectory(points: Sequence[dict[str, Any]], replace: bool) -> None:
+        await may_go_on.wait()
+        await opened(points, replace)
+
+    arm.open_trajectory = open_trajectory  # type: ignore[method-assign]
+
+    async def test(commander: Commander) -> None:
+        sent = [asyncio.create_task(commander.command_point(point(number, 0.1 * number))) for number in (1, 2, 3)]
+        await asyncio.sleep(0.05)
+        stopping = asyncio.create_task(commander.stop())
+        await asyncio.sleep(0.01)
+        may_go_on.set()
+        await asyncio.gather(*sent, stopping)
+
+    carry_out(arm, test, buffer_s=0.5)
+    assert arm.calls.count("open") == 1
+    assert len(arm.appended) == 1
+
+
+def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm) -> None:
+    status = arm.status
+
+    async def test(commander: Commander) -> None:
+        async def slow_status() -> Status:
+            await commander.command_point(point(2.0))  # comes just while the node looks whether the arm is there
+            arm.status = status  # type: ignore[method-assign]
+            return await status()
+
+        await commander.command_point(point(1.0))
+        arm.commanded = HERE
+        await asyncio.sleep(1.02)
+        arm.status = slow_status  # type: ignore[method-assign]
+        await asyncio.sleep(0.4)
+
+    carry_out(arm, test)
+    targets = [sent[0][0] for stream in arm.streams for sent in stream.sent]
+    assert targets == sorted(targets)
+    assert targets[-1] == 2.0
+
+
+def test_joints_that_are_not_named_hold_at_the_newest_target_and_not_where_the_stream_began(arm: FakeArm) -> None:
+    def one(name: str, q: float) -> Trajectory:
+        return Trajectory((name,), (TrajectoryPoint(0.0, (q,)),))
+
+    async def test(commander: Commander) -> None:
+        await commander.command_joints(one("a", 0.5))
+        await commander.command_joints(one("b", 0.7))
+        arm.state = State.MOVING
+        with pytest.raises(RtcpError) as refused:
+            await commander.begin_trajectory(
+                Trajectory(("a",), (TrajectoryPoint(1.0, (0.1,)), TrajectoryPoint(2.0, (0.2,))))
+            )
+        assert refused.value.reason == "moving"
+
+    carry_out(arm, test, allows_partial=True)
+    assert arm.streams[0].sent[1][0][:2] == (0.5, 0.7)
+
+
 def test_a_trajectory_whose_stamp_is_far_ahead_is_refused(arm: FakeArm) -> None:
     async def test(commander: Commander) -> None:
         with pytest.raises(RtcpError) as refused:

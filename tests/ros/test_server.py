@@ -9,6 +9,7 @@ import socket
 import struct
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from math import nan
 
 import pytest
 
@@ -549,7 +550,7 @@ def test_points_that_waited_while_the_server_did_not_run_are_a_lost_link(
 def test_a_client_that_never_moved_the_arm_leaves_it_alone() -> None:
     async def client(rig: Rig) -> None:
         peer = await rig.motion()
-        await peer.codes(Ping())
+        assert await peer.codes(Ping(), point(7), JointTrajPt(0, (nan, *HOME[1:]), 0.1, 0.0)) == [OK, NO, NO]
 
     assert run(client).calls == []
 

@@ -169,7 +169,6 @@ class _MotionSession:
         self._executor.halt_own()
 
     def _receive(self, frame: Frame, order: ByteOrder) -> ReplyCode:
-        self.has_commanded = True
         try:
             message = frame.message(order)
             assert isinstance(message, JointPosition | JointTrajPt | JointTrajPtFull | JointPoint)  # _POINTS
@@ -177,6 +176,7 @@ class _MotionSession:
                 if self._executor.is_releasing and not isinstance(step, Halt):
                     raise PointRefused("the arm is stopping, because the client before was lost: send it again then")
                 self._executor.carry_out(step)
+                self.has_commanded = self.has_commanded or not isinstance(step, Halt)
         except PointIgnored:
             return ReplyCode.FAILURE
         except PointRefused as error:
