@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import time
 from collections.abc import Mapping, Sequence
@@ -40,7 +41,7 @@ class Stream:
         self._renew_ns = round(config.lease_s * 0.2e9)
         self._renewed_ns = time.monotonic_ns()
         self._taken_before = self._observer.setpoints_taken
-        self._is_closed = False
+        self._is_closed, self._taken = False, 0
         self.sent = 0
         """How many setpoints were sent."""
 
@@ -60,12 +61,12 @@ class Stream:
     @property
     def is_open(self) -> bool:
         """Whether the joints follow it."""
-        return self._observer.open_stream == self._stream
+        return not self._is_closed and self._observer.open_stream == self._stream
 
     @property
     def taken(self) -> int:
-        """How many of its setpoints the loop has taken."""
-        return self._observer.setpoints_taken - self._taken_before
+        """How many of its setpoints the loop has taken; once it is closed, up to then."""
+        return self._taken if self._is_closed else self._observer.setpoints_taken - self._taken_before
 
     def send(
         self,
@@ -83,9 +84,11 @@ class Stream:
             t: time stamp, s, of any clock of the sender, rising; None: now.
 
         Raises:
-            Invalid: not a number a joint, or an acceleration without a velocity.
+            Invalid: not a number a joint, an acceleration without a velocity, or the stream was closed.
             Faulted: the stream has ended: `reason` and `fields` say by what.
         """
+        if self._is_closed:
+            raise RtcpError("invalid", "the stream is closed: open another one")
         now_ns = time.monotonic_ns()
         if now_ns - self._renewed_ns > self._renew_ns:
             self._renewed_ns = now_ns
@@ -135,6 +138,8 @@ class Stream:
     def close(self) -> None:
         """Bring the arm to rest and end the stream; a second time is harmless. It waits for nothing."""
         if not self._is_closed:
+            self._taken = self.taken
             self._is_closed = True
-            self._observer.setpoint(self._stream, SETPOINT_ENDS, 0.0, _NOTHING)
+            with contextlib.suppress(BlackboardError):  # of a loop that hangs, and takes nothing
+                self._observer.setpoint(self._stream, SETPOINT_ENDS, 0.0, _NOTHING)
             self._observer.close()

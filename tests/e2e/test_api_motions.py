@@ -130,6 +130,9 @@ def test_a_setpoint_that_cannot_be_followed_ends_the_stream_and_the_next_send_sa
             stream.send(HOME)
     with robot.open_stream() as stream, pytest.raises(rtcp.Invalid, match="q: found 2 numbers"):
         stream.send([0.0, 0.0])
+    with pytest.raises(rtcp.Invalid, match="the stream is closed"):
+        stream.send(HOME)
+    assert (stream.is_open, stream.taken) == (False, 0)
     robot.close()
 
 
