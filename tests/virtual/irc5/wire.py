@@ -145,6 +145,10 @@ def pc(*, egm: dict[str, float] | None = None, controller: dict[str, Any] | None
     unit.setdefault("initial_position", (0.0,) * axes)
     external = ExternalJoint(-100.0, 100.0, 180.0) if axes == 7 else None
     settings = UnitConfig(
-        "ROB_1", 6511, external_joint=external, egm=EgmConfig(**FREE | (egm or {})), **unit  # type: ignore[arg-type]
+        "ROB_1",
+        6511,
+        external_joint=external,
+        egm=EgmConfig(**FREE | (egm or {})),
+        **unit,  # type: ignore[arg-type]
     )
     return Pc(Controller(Irc5Config((settings,), **controller or {})))
