@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from rtcp.config.model import ConfigError
 from rtcp.virtual.irc5.config import load_irc5
 from rtcp.virtual.irc5.controller import Controller

@@ -6,6 +6,8 @@ from math import exp, pi
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from tests.virtual.irc5.wire import PERIOD, pc
 
 DEAD_TIME = 4 * PERIOD

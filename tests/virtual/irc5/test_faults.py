@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from rtcp.virtual.irc5.controller import RequestRefused
 from rtcp.virtual.irc5.faults import DatagramFaults
 from tests.virtual.irc5.wire import Pc, pc

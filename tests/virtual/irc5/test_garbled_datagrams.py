@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
 from tests.virtual.irc5.wire import PERIOD, Pc, pc, sensor
 

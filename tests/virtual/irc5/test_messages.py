@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import pytest
+
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from google.protobuf import descriptor_pool
 
 from rtcp.virtual.irc5.geometry import FlangePose
@@ -20,10 +23,20 @@ SPEED = f"1a38 0a36 09{HALF} 09{ZERO} 09{ZERO} 09{ZERO} 09{TWO} 09{ZERO}"
 JOINTS = (1.0, 2.0, -0.5, 0.0, 30.0, 1.0)
 
 STATE = UnitState(
-    seqno=300, clock_s=12.25, actual=JOINTS, planned=JOINTS, actual_pose=FlangePose((1.0, 2.0, 30.0), (1.0, 0.0, 0.0, 0.0)),
-    planned_pose=FlangePose((2.0, 2.0, 2.0), (0.0, 1.0, 0.0, 0.0)), motors_on=True, rapid_running=True,
-    mci=MciState.RUNNING, converged=True, utilization=30.0, move_index=1, collision=False,
-)  # fmt: skip
+    seqno=300,
+    clock_s=12.25,
+    actual=JOINTS,
+    planned=JOINTS,
+    actual_pose=FlangePose((1.0, 2.0, 30.0), (1.0, 0.0, 0.0, 0.0)),
+    planned_pose=FlangePose((2.0, 2.0, 2.0), (0.0, 1.0, 0.0, 0.0)),
+    motors_on=True,
+    rapid_running=True,
+    mci=MciState.RUNNING,
+    converged=True,
+    utilization=30.0,
+    move_index=1,
+    collision=False,
+)
 _BODY = f"0a36 09{ONE} 09{TWO} 09{HALF} 09{ZERO} 09{THIRTY} 09{ONE}"
 _TIME = "2206 080c 1090a10f"
 """12 s, 250000 us."""

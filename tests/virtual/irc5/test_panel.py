@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from rtcp.virtual.irc5.controller import RequestRefused
 from rtcp.virtual.irc5.mechanical_unit import HAND_SPEED
 from rtcp.virtual.irc5.panel import STOPPING_TIME_S

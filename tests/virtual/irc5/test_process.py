@@ -16,6 +16,8 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from tests.virtual.irc5.wire import Robot, sensor
 
 pytestmark = pytest.mark.alone

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
 from rtcp.virtual.irc5.mechanical_unit import QUEUE, RapidRefused
 from tests.virtual.irc5.wire import PERIOD, Robot, pc, sensor
 
