@@ -23,14 +23,14 @@ class ControlLaw:
         self._ramp_in = config.ramp_in_s
         self._limits = tuple(min(limit, config.max_speed_deviation) for limit in speed_limits)
         self._speed_limits = tuple(speed_limits)
-        self.filtered = [0.0] * len(speed_limits)
+        self._filtered = [0.0] * len(speed_limits)
         self.utilization = 0.0
         """Largest share of a joint's speed limit that was asked for in the last step, %."""
         self._elapsed = 0.0
 
-    def restart(self) -> None:
-        """Begin at rest, with the ramp."""
-        self.filtered = [0.0] * len(self.filtered)
+    def restart(self, speeds: Sequence[float]) -> None:
+        """Begin at these speeds, degrees/s, with the ramp."""
+        self._filtered = list(speeds)
         self.utilization = 0.0
         self._elapsed = 0.0
 
@@ -45,7 +45,7 @@ class ControlLaw:
         self._elapsed += dt
         ramp = 1.0 if self._elapsed >= self._ramp_in else self._elapsed / self._ramp_in
         share = 1.0 if self._cutoff == 0.0 else 1.0 - exp(-self._cutoff * dt)
-        filtered, scale, used = self.filtered, 1.0, 0.0
+        filtered, scale, used = self._filtered, 1.0, 0.0
         for i, limit in enumerate(self._limits):
             speed = 0.0
             if position_reference is not None:

@@ -7,22 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import cos, radians, sin, sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 MM_PER_M = 1000.0
-
-
-class DhRow(Protocol):
-    """A row of modified (Craig) parameters: T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d); rad and m."""
-
-    @property
-    def alpha(self) -> float: ...  # noqa: D102
-    @property
-    def a(self) -> float: ...  # noqa: D102
-    @property
-    def d(self) -> float: ...  # noqa: D102
-    @property
-    def offset(self) -> float: ...  # noqa: D102
 
 
 class FlangePose(NamedTuple):
@@ -35,8 +22,9 @@ class FlangePose(NamedTuple):
 class Geometry:
     """An arm of six joints."""
 
-    def __init__(self, rows: Sequence[DhRow]) -> None:
-        self._rows = tuple((cos(row.alpha), sin(row.alpha), row.a, row.d, row.offset) for row in rows)
+    def __init__(self, rows: Sequence[tuple[float, float, float, float]]) -> None:
+        """`rows`: alpha (rad), a, d (m), offset (rad) of T(i-1, i) = Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
+        self._rows = tuple((cos(alpha), sin(alpha), a, d, offset) for alpha, a, d, offset in rows)
 
     def flange(self, joints: Sequence[float]) -> FlangePose:
         """Return the pose at joint angles in degrees; axes beyond the sixth do not count."""

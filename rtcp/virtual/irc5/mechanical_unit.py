@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from rtcp.config.find import find_arm
 from rtcp.config.loader import load_kinematics
+from rtcp.config.model import ConfigError
 from rtcp.virtual.irc5.config import UnitConfig
 from rtcp.virtual.irc5.control_law import ControlLaw
 from rtcp.virtual.irc5.geometry import Geometry
@@ -45,7 +46,7 @@ class MechanicalUnit:
         """Build the unit at rest with RAPID stopped.
 
         Raises:
-            ConfigError: the arm's file does not exist or is wrong.
+            ConfigError: the arm's file does not exist or is wrong, or the initial position is outside its ranges.
         """
         arm = load_kinematics(find_arm(config.arm))
         self.config = config
@@ -54,6 +55,10 @@ class MechanicalUnit:
         if config.external_joint is not None:
             self.ranges.append((config.external_joint.min, config.external_joint.max))
             self.speed_limits.append(config.external_joint.velocity)
+        for i, (position, (low, high)) in enumerate(zip(config.initial_position, self.ranges, strict=True)):
+            if not low <= position <= high:
+                found = f"found {position:g} for joint {i + 1}, allowed is a number from {low:g} to {high:g}"
+                raise ConfigError([f"initial_position of {config.name}: {found}"])
         self.planned = list(config.initial_position)
         self.speeds = [0.0] * len(self.planned)
         """Planned speeds of the last period, degrees/s."""
@@ -68,7 +73,7 @@ class MechanicalUnit:
         """%, a fault; None: as computed."""
         self._panel = panel
         self._resumes = resume_after_motors_off
-        self._geometry = Geometry(arm.rows)
+        self._geometry = Geometry([(row.alpha, row.a, row.d, row.offset) for row in arm.rows])
         self._codec = EgmCodec(config.robotware)
         self._law = ControlLaw(config.egm, self.speed_limits)
         self._queue: deque[bytes] = deque()
@@ -108,25 +113,32 @@ class MechanicalUnit:
         """
         if self._panel.motors is not Motors.ON:
             raise RapidRefused(f"the motors of {self.config.name} are {self._panel.motors.value}: switch them on first")
+        if self.rapid_running:
+            return
         self.rapid_running = True
         self._suspended = False
-        if self._in_instruction and self.mci is not MciState.ERROR:
+        if self._in_instruction:
             self._run()
         else:
-            self.restart_session()
+            self._begin_session()
 
     def stop_rapid(self) -> None:
         """Stop the program: motion ends in the default ramp time; program start resumes it."""
-        self.rapid_running = self._suspended = False
-        self._leave(MciState.STOPPED, self.config.egm.ramp_s)
+        self._suspended = False
+        if self.rapid_running:
+            self.rapid_running = False
+            self._leave(MciState.STOPPED, self.config.egm.ramp_s)
 
     def restart_session(self) -> None:
-        """EGMReset, EGMSetupUC, EGMActJoint, EGMRunJoint: seqno counts from 0, the queue is empty."""
-        self._seqno = 0
-        self._queue.clear()
-        self.collision = False
-        self._start = tuple(self.planned)
-        self._run()
+        """Let RAPID go back to EGMReset and EGMSetupUC.
+
+        Raises:
+            RapidRefused: RAPID is stopped.
+        """
+        if not self.rapid_running:
+            raise RapidRefused(f"RAPID of {self.config.name} is stopped: start it first")
+        self._leave(MciState.STOPPED, self.config.egm.ramp_s)
+        self._begin_session()
 
     def end_by_convergence(self) -> None:
         """End EGMRunJoint as if all joints had been within the window for CondTime.
@@ -170,7 +182,7 @@ class MechanicalUnit:
             if self.rapid_running and self._pause_s > 0.0:
                 self._pause_s -= dt
                 if self._pause_s <= 0.0:
-                    self._run() if self._in_instruction else self.restart_session()
+                    self._run() if self._in_instruction else self._begin_session()
         self._servo.append(tuple(self.planned))
         if self.mci is not MciState.RUNNING and not self.config.stream:
             return None
@@ -206,6 +218,9 @@ class MechanicalUnit:
             self.counts["unused"] += 1
             return
         self.counts["used"] += 1
+        if self._reference is None:
+            self._law.restart(self.speeds)
+            self._stop_left = 0.0
         self._reference = reference
 
     def _follow_motors(self) -> None:
@@ -222,15 +237,20 @@ class MechanicalUnit:
             self.events.append("motors are off: RAPID stopped")
 
     def _run(self) -> None:
-        """Enter EGMRunJoint at rest; what an earlier run asked for is not used."""
+        """Enter EGMRunJoint; earlier references are not used, and a stop goes on until a new one comes."""
         self.mci = MciState.RUNNING
         self._in_instruction = True
         self._reference = None
-        self._stop_left = 0.0
         self._silence_s = self._converged_s = self._pause_s = 0.0
         self._move_index += 1
-        self.speeds = [0.0] * self.axes
-        self._law.restart()
+
+    def _begin_session(self) -> None:
+        """EGMReset, EGMSetupUC, EGMActJoint, EGMRunJoint: seqno counts from 0, the queue is empty."""
+        self._seqno = 0
+        self._queue.clear()
+        self.collision = False
+        self._start = tuple(self.planned)
+        self._run()
 
     def _leave(self, state: MciState, time_s: float) -> None:
         """Leave MCI_RUNNING and come to rest within `time_s`."""
@@ -256,6 +276,7 @@ class MechanicalUnit:
             self._in_instruction = False
             return
         if reference is None:
+            self._slow_down(dt)
             return
         target = reference.position
         if target is not None:

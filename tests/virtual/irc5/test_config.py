@@ -48,5 +48,11 @@ def test_seven_joints_need_the_range_of_the_seventh(tmp_path: Path) -> None:
     assert problems(tmp_path, text) == ["2: units[0].initial_position: found 7 joints, allowed are the unit's 6"]
 
 
+def test_an_initial_position_outside_the_range_is_named(tmp_path: Path) -> None:
+    text = "units:\n  - {name: A, port: 1, initial_position: [0, 120, 0, 0, 0, 0]}\n"
+    sentence = "initial_position of A: found 120 for joint 2, allowed is a number from -110 to 110"
+    assert problems(tmp_path, text) == [sentence]
+
+
 def test_an_arm_that_is_not_there_is_named(tmp_path: Path) -> None:
     assert "irb_9000" in problems(tmp_path, "units:\n  - {name: A, port: 1, arm: irb_9000}\n")[0]

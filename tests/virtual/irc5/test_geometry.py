@@ -14,7 +14,7 @@ from rtcp.config.loader import load_kinematics
 from rtcp.virtual.irc5.geometry import Geometry
 
 ARM = load_kinematics(find_arm("abb_irb120"))
-GEOMETRY = Geometry(ARM.rows)
+GEOMETRY = Geometry([(row.alpha, row.a, row.d, row.offset) for row in ARM.rows])
 
 
 def test_the_flange_of_an_irb_120_at_zero_is_where_its_data_sheet_says() -> None:

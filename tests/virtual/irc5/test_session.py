@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
@@ -170,3 +172,29 @@ def test_seven_axes_are_reported_six_and_one() -> None:
     state = pc(axes=7, initial_position=(0, 0, 0, 0, 30.0, 0, -45.0)).read()
     assert len(state.part(2, 1)[1]) == 6
     assert state.part(2, 3)[1] == state.part(3, 3)[1] == [-45.0]
+
+
+def test_a_new_session_in_motion_brings_the_arm_to_rest_without_a_jump() -> None:
+    robot = pc(egm={"ramp_s": 0.5})
+    robot.wait(0.2, None, (20.0, 0, 0, 0, 0, 0))
+    robot.unit.restart_session()
+    speeds = [robot.unit.speeds[0]]
+    for _ in range(40):
+        robot.read()
+        speeds.append(robot.unit.speeds[0])
+    steps = [before - after for before, after in itertools.pairwise(speeds)]
+    assert max(steps) <= 20.0 * PERIOD / 0.5 + 1e-9
+
+
+def test_an_error_is_not_cleared_by_a_rapid_stop() -> None:
+    robot = pc()
+    robot.unit.fail("a test")
+    robot.unit.stop_rapid()
+    assert robot.read().mci == "error"
+
+
+def test_a_session_does_not_restart_while_rapid_is_stopped() -> None:
+    robot = pc()
+    robot.unit.stop_rapid()
+    with pytest.raises(RapidRefused, match="RAPID of ROB_1 is stopped: start it first"):
+        robot.unit.restart_session()
