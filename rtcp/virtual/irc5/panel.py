@@ -101,7 +101,6 @@ class Panel:
         if mode is not self.mode:
             self.mode = mode
             self._stop(1)
-            self.latched = self.latched or bool(self._active())
 
     def hold_enabling(self, position: Enabling) -> None:
         """Move the enabling device: in Hand motors are on while it is held; pressed through it must be released."""

@@ -198,3 +198,21 @@ def test_a_session_does_not_restart_while_rapid_is_stopped() -> None:
     robot.unit.stop_rapid()
     with pytest.raises(RapidRefused, match="RAPID of ROB_1 is stopped: start it first"):
         robot.unit.restart_session()
+
+
+def test_a_reference_in_a_new_session_takes_over_from_the_speed_that_is_left() -> None:
+    robot = pc(egm={"low_pass_hz": 5.0})
+    speed = (20.0, 0, 0, 0, 0, 0)
+    robot.wait(0.5, None, speed)
+    robot.unit.restart_session()
+    robot.read(None, speed)
+    assert robot.unit.speeds[0] == pytest.approx(20.0, abs=0.5)
+
+
+def test_datagrams_for_the_last_session_are_not_used_in_the_next() -> None:
+    robot = pc()
+    robot.cycle(None, None, *[sensor(i, None, (50.0,) * 6) for i in range(10)])
+    robot.unit.restart_session()
+    used = robot.unit.counts["used"]
+    robot.wait(0.05)
+    assert robot.unit.counts["used"] == used
