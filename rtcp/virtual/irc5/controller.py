@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any
 
 from rtcp.config.document import shown
 from rtcp.virtual.irc5.config import Irc5Config, UnitConfig
@@ -12,7 +12,6 @@ from rtcp.virtual.irc5.faults import SHARES, DatagramFaults
 from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit, RapidRefused
 from rtcp.virtual.irc5.panel import Enabling, Mode, Panel, PanelRefused, Stop
 
-E = TypeVar("E", bound=Enum)
 _LONGEST_DELAY = 250
 """Cycles that a datagram may be late: 1 s."""
 _HIGHEST_UTILIZATION = 1000.0
@@ -26,12 +25,17 @@ _ONCE: dict[str, Callable[[MechanicalUnit], None]] = {
 }
 """Faults that happen and are over."""
 _FAULTS = (*_ONCE, "utilization", "silent", "late", *SHARES)
-_KEYS = {
-    "status": (), "mode": ("mode",), "enabling": ("position",), "motors_on": (), "motors_off": (),
-    "stop": ("circuit",), "release": ("circuit",), "start_rapid": ("unit",), "stop_rapid": ("unit",),
-    "fault": ("unit", "fault", "value", "direction"), "clear": ("unit",),
-}  # fmt: skip
-"""Requests and the keys that they may have; without `unit` they concern all units."""
+_BUTTONS: dict[str, Callable[[Panel], None]] = {
+    "motors_on": Panel.press_motors_on,
+    "motors_off": Panel.switch_motors_off,
+}
+_SWITCHES: dict[str, tuple[str, type[Enum], Callable[[Panel, Any], None]]] = {
+    "mode": ("mode", Mode, Panel.select_mode),
+    "enabling": ("position", Enabling, Panel.hold_enabling),
+    "stop": ("circuit", Stop, Panel.open_circuit),
+    "release": ("circuit", Stop, Panel.close_circuit),
+}
+"""Request -> its key, the values that the key may have, and what does it."""
 
 
 class RequestRefused(Exception):
@@ -52,6 +56,71 @@ class Unit:
         sent = self.mechanical.step(clock_s)
         return self.to_pc.cycle(() if sent is None else (sent,))
 
+    def start_rapid(self, request: dict[str, Any]) -> None:
+        """Press Start."""
+        self.mechanical.start_rapid()
+
+    def stop_rapid(self, request: dict[str, Any]) -> None:
+        """Press Stop."""
+        self.mechanical.stop_rapid()
+
+    def clear(self, request: dict[str, Any]) -> None:
+        """End the faults that last."""
+        self.to_pc.clear()
+        self.from_pc.clear()
+        self.mechanical.utilization_override = None
+
+    def fault(self, request: dict[str, Any]) -> None:
+        """Let a fault happen or begin.
+
+        Raises:
+            RequestRefused, RapidRefused: with a sentence.
+        """
+        kind, direction = request.get("fault"), request.get("direction", "to_pc")
+        if not isinstance(kind, str) or kind not in _FAULTS:
+            raise RequestRefused(f"fault: found {shown(kind)}, allowed is one of {', '.join(_FAULTS)}")
+        if direction not in ("to_pc", "from_pc"):
+            raise RequestRefused(f"direction: found {shown(direction)}, allowed is one of to_pc, from_pc")
+        datagrams = self.to_pc if direction == "to_pc" else self.from_pc
+        if kind in _ONCE:
+            _ONCE[kind](self.mechanical)
+        elif kind == "utilization":
+            self.mechanical.utilization_override = _number(request, _HIGHEST_UTILIZATION)
+        elif kind == "silent":
+            datagrams.silent = True
+        elif kind == "late":
+            datagrams.late = int(_number(request, _LONGEST_DELAY))
+        else:
+            datagrams.shares[kind] = _number(request, 1.0)
+
+    def status(self) -> dict[str, Any]:
+        """Return what the unit does, as plain values."""
+        unit = self.mechanical
+        return {
+            "mci": unit.mci.name.lower(),
+            "rapid_running": unit.rapid_running,
+            "position_deg": list(unit.actual),
+            "velocity_deg_s": unit.speeds,
+            "collision": unit.collision,
+            "counts": dict(unit.counts),
+            "events": list(unit.events),
+        }
+
+
+_OF_UNITS: dict[str, tuple[tuple[str, ...], Callable[[Unit, dict[str, Any]], None]]] = {
+    "start_rapid": (("unit",), Unit.start_rapid),
+    "stop_rapid": (("unit",), Unit.stop_rapid),
+    "clear": (("unit",), Unit.clear),
+    "fault": (("unit", "fault", "value", "direction"), Unit.fault),
+}
+"""Request -> its keys, and what does it; without `unit` it concerns all units."""
+_KEYS: dict[str, tuple[str, ...]] = (
+    {"status": ()}
+    | dict.fromkeys(_BUTTONS, ())
+    | {verb: (switch[0],) for verb, switch in _SWITCHES.items()}
+    | {verb: keys for verb, (keys, _) in _OF_UNITS.items()}
+)
+
 
 class Controller:
     """An IRC5 in simulated time: `panel.advance` and each unit's `step` let time pass."""
@@ -60,7 +129,7 @@ class Controller:
         """Build the controller; with `autostart`, in Auto, its motors are on and RAPID runs.
 
         Raises:
-            ConfigError: the file of an arm does not exist or is wrong.
+            ConfigError: the file of an arm does not exist or is wrong, or a unit begins outside its ranges.
         """
         self.panel = Panel(Mode(config.mode), config.emergency_stop_category)
         resume = not config.do_not_restart_after_motors_off
@@ -83,53 +152,26 @@ class Controller:
             if key != "do" and key not in _KEYS[verb]:
                 raise RequestRefused(f"{key}: {verb} has no such key; allowed are {', '.join(('do', *_KEYS[verb]))}")
         try:
-            return self._do(verb, request)
+            if verb in _BUTTONS:
+                _BUTTONS[verb](self.panel)
+            elif verb in _SWITCHES:
+                key, kind, switch = _SWITCHES[verb]
+                switch(self.panel, _choice(kind, request, key))
+            elif verb in _OF_UNITS:
+                for unit in self._named(request.get("unit")):
+                    _OF_UNITS[verb][1](unit, request)
+            else:
+                return self._status()
         except (PanelRefused, RapidRefused) as error:
             raise RequestRefused(str(error)) from error
-
-    def _do(self, verb: str, request: dict[str, Any]) -> Any:
-        panel = self.panel
-        match verb:
-            case "status":
-                return self._status()
-            case "mode":
-                panel.select_mode(_choice(Mode, request, "mode"))
-            case "enabling":
-                panel.hold_enabling(_choice(Enabling, request, "position"))
-            case "motors_on":
-                panel.press_motors_on()
-            case "motors_off":
-                panel.switch_motors_off()
-            case "stop":
-                panel.open_circuit(_choice(Stop, request, "circuit"))
-            case "release":
-                panel.close_circuit(_choice(Stop, request, "circuit"))
-            case _:
-                for unit in self._named(request):
-                    self._do_to(unit, verb, request)
         return None
 
-    def _named(self, request: dict[str, Any]) -> list[Unit]:
-        name = request.get("unit")
+    def _named(self, name: object) -> list[Unit]:
         if name is None:
             return list(self.units.values())
         if not isinstance(name, str) or name not in self.units:
             raise RequestRefused(f"unit: found {shown(name)}, allowed is one of {', '.join(self.units)}")
         return [self.units[name]]
-
-    @staticmethod
-    def _do_to(unit: Unit, verb: str, request: dict[str, Any]) -> None:
-        match verb:
-            case "start_rapid":
-                unit.mechanical.start_rapid()
-            case "stop_rapid":
-                unit.mechanical.stop_rapid()
-            case "clear":
-                unit.to_pc.clear()
-                unit.from_pc.clear()
-                unit.mechanical.utilization_override = None
-            case "fault":
-                _begin(unit, request)
 
     def _status(self) -> dict[str, Any]:
         panel = self.panel
@@ -139,42 +181,8 @@ class Controller:
             "enabling": panel.enabling.value,
             "open": sorted(stop.value for stop in panel.open),
             "latched": panel.latched,
-            "units": {name: _status_of(unit.mechanical) for name, unit in self.units.items()},
+            "units": {name: unit.status() for name, unit in self.units.items()},
         }
-
-
-def _status_of(unit: MechanicalUnit) -> dict[str, Any]:
-    return {
-        "mci": unit.mci.name.lower(),
-        "rapid_running": unit.rapid_running,
-        "position_deg": list(unit.actual),
-        "velocity_deg_s": unit.speeds,
-        "collision": unit.collision,
-        "counts": dict(unit.counts),
-        "events": list(unit.events),
-    }
-
-
-def _begin(unit: Unit, request: dict[str, Any]) -> None:
-    kind = request.get("fault")
-    if not isinstance(kind, str) or kind not in _FAULTS:
-        raise RequestRefused(f"fault: found {shown(kind)}, allowed is one of {', '.join(_FAULTS)}")
-    if kind in _ONCE:
-        _ONCE[kind](unit.mechanical)
-        return
-    if kind == "utilization":
-        unit.mechanical.utilization_override = _number(request, _HIGHEST_UTILIZATION)
-        return
-    direction = request.get("direction", "to_pc")
-    if direction not in ("to_pc", "from_pc"):
-        raise RequestRefused(f"direction: found {shown(direction)}, allowed is one of to_pc, from_pc")
-    faults = unit.to_pc if direction == "to_pc" else unit.from_pc
-    if kind == "silent":
-        faults.silent = True
-    elif kind == "late":
-        faults.late = int(_number(request, _LONGEST_DELAY))
-    else:
-        faults.shares[kind] = _number(request, 1.0)
 
 
 def _number(request: dict[str, Any], most: float) -> float:
@@ -184,7 +192,7 @@ def _number(request: dict[str, Any], most: float) -> float:
     return float(value)
 
 
-def _choice(kind: type[E], request: dict[str, Any], key: str) -> E:
+def _choice(kind: type[Enum], request: dict[str, Any], key: str) -> Enum:
     found = request.get(key)
     for choice in kind:
         if choice.value == found:

@@ -134,7 +134,7 @@ def test_a_collision_is_an_error_which_robotware_7_also_names(robotware: int, re
 @pytest.mark.parametrize(
     ("request_", "sentence"),
     [
-        ({}, "do: found nothing, allowed is one of status, mode,"),
+        ({}, "do: found nothing, allowed is one of status, motors_on,"),
         ({"do": ["stop"]}, "do: found a list, allowed is one of"),
         ({"do": "stop"}, "circuit: found nothing, allowed is one of emergency, automatic, general, superior"),
         ({"do": "stop", "circuit": ["emergency"]}, "circuit: found a list"),

@@ -160,9 +160,8 @@ def test_a_mistake_in_the_file_is_a_sentence_without_a_traceback(tmp_path: Path)
 
 
 @pytest.mark.skipif(not PEERS.exists(), reason="no environment with abb-robot-client and ABBRobotEGM (RTCP_EGM_PEERS)")
-@pytest.mark.parametrize(
-    ("client", "robotware"), [("foreign_abb_robot_client.py", 6), ("foreign_abbrobotegm.py", 7)], ids=["client", "egm"]
-)
+@pytest.mark.parametrize("robotware", [6, 7])
+@pytest.mark.parametrize("client", ["foreign_abb_robot_client.py", "foreign_abbrobotegm.py"])
 def test_a_client_that_others_wrote_connects_and_moves_a_joint(client: str, robotware: int, tmp_path: Path) -> None:
     port = free_port()
     command = [str(PEERS), str(Path(__file__).with_name(client)), str(port), "10"]
