@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from math import exp, pi
+from cmath import exp as exp_complex
+from math import cos, exp, pi, sin
 
 import pytest
 
@@ -97,3 +98,28 @@ def test_the_seventh_joint_follows_the_same_law() -> None:
     robot = pc(axes=7, egm={"position_gain": 5.0, "low_pass_hz": 0.0})
     state = robot.wait(50 * PERIOD, (0, 0, 0, 0, 0, 0, 10.0))
     assert state.planned[6] == pytest.approx(10.0 * (1.0 - (1.0 - 5.0 * PERIOD) ** 50))
+
+
+def sine_response(gain: float, with_speed: bool, period: float = 2.0) -> complex:
+    """Actual position over reference for a sine of joint 1 (10 degrees), by least squares over the last two periods."""
+    omega = 2.0 * pi / period
+    robot = pc(egm={"position_gain": gain})
+    fit, cycles = 0j, round(2 * period / PERIOD)
+    for cycle in range(3 * cycles):
+        angle = omega * cycle * PERIOD
+        speed = (10.0 * omega * cos(angle), 0, 0, 0, 0, 0) if with_speed else None
+        state = robot.read((10.0 * sin(angle), 0, 0, 0, 0, 0), speed)
+        if cycle >= 2 * cycles:
+            fit += state.actual[0] * complex(cos(angle), -sin(angle))
+    return fit * 2.0j / (10.0 * cycles)
+
+
+@pytest.mark.parametrize("gain", [5.0, 20.0])
+@pytest.mark.parametrize("with_speed", [False, True])
+def test_a_sine_comes_out_as_the_transfer_function_says(gain: float, with_speed: bool) -> None:
+    s = 1j * pi  # of a period of 2 s
+    low_pass = 1.0 / (1.0 + s / (2.0 * pi * 20.0))
+    closed_loop = (gain + (s if with_speed else 0.0)) * low_pass / (s + gain * low_pass)
+    # Low pass and integrator each take a reference for the whole of its cycle: half a period early.
+    expected = closed_loop * exp_complex(-s * (DEAD_TIME - PERIOD))
+    assert sine_response(gain, with_speed) == pytest.approx(expected, abs=0.004)
