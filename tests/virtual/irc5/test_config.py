@@ -1,0 +1,58 @@
+"""The file of a virtual IRC5."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
+from rtcp.config.model import ConfigError
+from rtcp.virtual.irc5.config import load_irc5
+from rtcp.virtual.irc5.controller import Controller
+from rtcp.virtual.irc5.panel import Motors
+
+SHIPPED = Path(__file__).parents[3] / "config" / "irc5.yaml"
+
+
+def problems(tmp_path: Path, text: str) -> list[str]:
+    path = tmp_path / "irc5.yaml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        Controller(load_irc5(path))
+    return [problem.removeprefix(f"{path}:") for problem in error.value.problems]
+
+
+def test_the_shipped_file_is_an_irb_120_that_waits_for_references() -> None:
+    controller = Controller(load_irc5(SHIPPED))
+    assert controller.panel.motors is Motors.ON
+    assert controller.units["ROB_1"].mechanical.ranges[5] == pytest.approx((-400.0, 400.0))
+
+
+def test_names_and_ports_are_the_units_own(tmp_path: Path) -> None:
+    text = "units:\n  - {name: A, port: 1}\n  - {name: A, port: 1}\n"
+    assert problems(tmp_path, text) == [
+        "3: units[1].name: found A, which units[0] has; each needs its own",
+        "3: units[1].port: found 1, which units[0] has; each needs its own",
+    ]
+
+
+def test_there_are_four_units_at_most(tmp_path: Path) -> None:
+    text = "units:\n" + "".join(f"  - {{name: A{i}, port: {i + 1}}}\n" for i in range(5))
+    assert problems(tmp_path, text) == ["1: units: found a list of 5, allowed is a list of 1 to 4 entries"]
+
+
+def test_seven_joints_need_the_range_of_the_seventh(tmp_path: Path) -> None:
+    text = "units:\n  - {name: A, port: 1, initial_position: [0, 0, 0, 0, 0, 0, 0]}\n"
+    assert problems(tmp_path, text) == ["2: units[0].initial_position: found 7 joints, allowed are the unit's 6"]
+
+
+def test_an_initial_position_outside_the_range_is_named(tmp_path: Path) -> None:
+    text = "units:\n  - {name: A, port: 1, initial_position: [0, 120, 0, 0, 0, 0]}\n"
+    sentence = "initial_position of A: found 120 for joint 2, allowed is a number from -110 to 110"
+    assert problems(tmp_path, text) == [sentence]
+
+
+def test_an_arm_that_is_not_there_is_named(tmp_path: Path) -> None:
+    assert "irb_9000" in problems(tmp_path, "units:\n  - {name: A, port: 1, arm: irb_9000}\n")[0]
