@@ -390,6 +390,8 @@ class _Points:
         self._newest: TrajectoryPoint | None = None
         self._last_s = 0.0
         """Time of the last point, on its sender's clock."""
+        self._is_dropping = False
+        """Whether the points since then are of the past."""
         self._came_s = self._before_s = -math.inf
         """When it came, and the one before."""
         self._sent_s = 0.0
@@ -434,9 +436,12 @@ class _Points:
         elif self._has_ended:
             return
         if point.time_s > 0.0 and not is_first and point.time_s <= self._last_s:
+            if self._is_dropping:
+                return  # said once
+            self._is_dropping = True
             message = f"its time {point.time_s:g} s is not after {self._last_s:g} s: dropped"
             raise refusal("point_in_the_past", message)
-        self._last_s = point.time_s
+        self._last_s, self._is_dropping = point.time_s, False
         for what, values in vars(point).items():
             if what != "time_s" and not all(map(math.isfinite, values)):
                 raise refusal("not_finite", f"{what} has a number that is not finite: dropped")

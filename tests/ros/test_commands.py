@@ -591,6 +591,7 @@ def test_a_joint_command_from_the_past_is_dropped(arm: FakeArm) -> None:
         with pytest.raises(RtcpError) as refused:
             await commander.command_point(point(2.0, 1.5))
         assert refused.value.reason == "point_in_the_past"
+        await commander.command_point(point(2.0, 1.6))  # said once
         await commander.command_point(point(3.0, 2.5))
 
     carry_out(arm, test)
