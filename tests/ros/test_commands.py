@@ -381,16 +381,21 @@ def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm) -> None:
     status = arm.status
 
     async def test(commander: Commander) -> None:
+        await commander.command_point(point(1.0))
+        has_come = False
+
         async def slow_status() -> Status:
-            await commander.command_point(point(2.0))  # comes just while the node looks whether the arm is there
-            arm.status = status  # type: ignore[method-assign]
+            nonlocal has_come
+            if not has_come:
+                has_come = True
+                await commander.command_point(point(2.0))  # just while the node looks whether the arm is there
+            arm.commanded = HERE
             return await status()
 
-        await commander.command_point(point(1.0))
-        arm.commanded = HERE
-        await asyncio.sleep(1.02)
         arm.status = slow_status  # type: ignore[method-assign]
-        await asyncio.sleep(0.4)
+        while not has_come:
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.3)
 
     carry_out(arm, test)
     targets = [sent[0][0] for stream in arm.streams for sent in stream.sent]
