@@ -94,12 +94,12 @@ def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tupl
         placed = []
         for pose, own in zip((IDENTITY, *frames(model, q)), balls, strict=True):
             placed.append((own[:, :3] @ np.reshape(pose.rotation, (3, 3)).T + pose.position, own[:, 3]))
-        found = set()
-        for i, j in pairs:
+
+        def overlap(i: int, j: int) -> bool:
             (a, a_radius), (b, b_radius) = placed[i], placed[j]
-            if np.any(np.linalg.norm(a[:, None] - b, axis=2) < a_radius[:, None] + b_radius):
-                found.add((i, j))
-        return found
+            return bool(np.any(np.linalg.norm(a[:, None] - b, axis=2) < a_radius[:, None] + b_radius))
+
+        return {pair for pair in pairs if overlap(*pair)}
 
     at_home, always = overlapping(home), set(pairs)
     for q in sampled.tolist():
@@ -109,7 +109,7 @@ def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tupl
 
 def _balls(link: ET.Element) -> Array:
     """Return balls inside the cylinders of a link: centre in its frame and radius, m, shape (n, 4)."""
-    found = []
+    balls: list[tuple[float, ...]] = []
     for body in link.findall("collision"):
         origin, cylinder = body.find("origin"), body.find("geometry/cylinder")
         assert origin is not None
@@ -119,8 +119,8 @@ def _balls(link: ET.Element) -> Array:
         axis = np.array([np.cos(yaw) * np.sin(pitch), np.sin(yaw) * np.sin(pitch), np.cos(pitch)])  # no roll
         radius, length = float(cylinder.get("radius", "")), float(cylinder.get("length", ""))
         along = (np.arange(_BALLS) + 0.5) * length / _BALLS - length / 2
-        found += [(*(centre + z * axis), min(radius, length / 2 - abs(z))) for z in along]
-    return np.reshape(found, (-1, 4))
+        balls += [(*(centre + z * axis), min(radius, length / 2 - abs(z))) for z in along]
+    return np.reshape(balls, (-1, 4))
 
 
 def _rendered(values: dict[str, Any]) -> dict[str, str]:

@@ -165,10 +165,10 @@ class CommandChannel:
             lease = self.acquire(caller)
         self._shared[caller.connection] = lease, users + 1
         renewing = asyncio.create_task(self._renew(lease, caller))
-        held = Lease(lease)
-        held.request = self._requests = self._requests + 1
+        numbered = Lease(lease)
+        numbered.request = self._requests = self._requests + 1
         try:
-            yield held
+            yield numbered
         finally:
             renewing.cancel()
             _, users = self._shared.pop(caller.connection)

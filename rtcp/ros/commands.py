@@ -157,10 +157,9 @@ class Commander:
         self._may_enable = False
         self._bar()
 
-    def _bar(self) -> int:
-        """End what was asked for and has not begun; return the number of what takes its place."""
+    def _bar(self) -> None:
+        """End what was asked for and has not begun."""
         self._asked = self._barrier = self._asked + 1
-        return self._asked
 
     def _require_newest(self, number: int, robot: AsyncRobot) -> None:
         if number < self._barrier or not robot.is_open:
@@ -391,7 +390,7 @@ class _Points:
         self._last_s = 0.0
         """Time of the last point, on its sender's clock."""
         self._is_dropping = False
-        """Whether the points since then are of the past."""
+        """Whether points are dropped, whose times do not rise; it is logged once."""
         self._came_s = self._before_s = -math.inf
         """When it came, and the one before."""
         self._sent_s = 0.0

@@ -91,11 +91,11 @@ def _by_simple_message() -> Iterator[tuple[Publish, list[str]]]:
 def _free_ports(count: int) -> list[int]:
     with contextlib.ExitStack() as bound:
         free = [bound.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [int(one.getsockname()[1]) for one in free]
+        return [int(listener.getsockname()[1]) for listener in free]
 
 
 def measure(wire: str, count: int) -> list[float]:
-    """Return the cycles of so many commands.
+    """Measure `count` commands; return the latency of each, cycles.
 
     Raises:
         SystemExit: with a sentence, where the library is missing or the node passes nothing on.

@@ -314,7 +314,9 @@ def test_a_trajectory_that_waits_for_its_stamp_gives_way_to_what_comes_after_it(
     assert sum(call[0] == "run" for call in arm.calls) == (by == "a trajectory")
 
 
-def test_a_stop_that_comes_while_a_trajectory_waits_for_the_drives_is_the_end_of_it(arm: FakeArm) -> None:
+def test_a_stop_that_comes_while_a_trajectory_waits_for_the_drives_is_the_end_of_it(
+    arm: FakeArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     arm.state = State.READY
     is_enabling, may_go_on = asyncio.Event(), asyncio.Event()
 
@@ -323,7 +325,7 @@ def test_a_stop_that_comes_while_a_trajectory_waits_for_the_drives_is_the_end_of
         await may_go_on.wait()
         arm.state = State.HOLDING
 
-    arm.enable = enable  # type: ignore[method-assign]
+    monkeypatch.setattr(arm, "enable", enable)
 
     async def test(commander: Commander) -> None:
         beginning = asyncio.create_task(commander.begin_trajectory(PATH))
@@ -354,7 +356,9 @@ def test_a_trajectory_that_is_refused_enables_nothing(arm: FakeArm) -> None:
     assert arm.calls == []
 
 
-def test_points_that_wait_in_a_buffered_stream_open_no_trajectory_after_a_stop(arm: FakeArm) -> None:
+def test_points_that_wait_in_a_buffered_stream_open_no_trajectory_after_a_stop(
+    arm: FakeArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     may_go_on = asyncio.Event()
     opened = arm.open_trajectory
 
@@ -362,7 +366,7 @@ def test_points_that_wait_in_a_buffered_stream_open_no_trajectory_after_a_stop(a
         await may_go_on.wait()
         await opened(points, replace)
 
-    arm.open_trajectory = open_trajectory  # type: ignore[method-assign]
+    monkeypatch.setattr(arm, "open_trajectory", open_trajectory)
 
     async def test(commander: Commander) -> None:
         sent = [asyncio.create_task(commander.command_point(point(number, 0.1 * number))) for number in (1, 2, 3)]
@@ -377,7 +381,7 @@ def test_points_that_wait_in_a_buffered_stream_open_no_trajectory_after_a_stop(a
     assert len(arm.appended) == 1
 
 
-def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm) -> None:
+def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm, monkeypatch: pytest.MonkeyPatch) -> None:
     status = arm.status
 
     async def test(commander: Commander) -> None:
@@ -392,7 +396,7 @@ def test_a_new_target_is_never_followed_by_the_old_one(arm: FakeArm) -> None:
             arm.commanded = HERE
             return await status()
 
-        arm.status = slow_status  # type: ignore[method-assign]
+        monkeypatch.setattr(arm, "status", slow_status)
         while not has_come:
             await asyncio.sleep(0.01)
         await asyncio.sleep(0.3)

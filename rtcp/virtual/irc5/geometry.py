@@ -28,7 +28,7 @@ class Geometry:
 
     def flange(self, joints: Sequence[float]) -> FlangePose:
         """Return the pose at joint angles in degrees; axes beyond the sixth do not count."""
-        # Rotation by columns (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) and position (m) of the frame so far.
+        # Orientation, by columns (xx, xy, xz), (yx, yy, yz), (zx, zy, zz), and position, m, of the current frame.
         xx = yy = zz = 1.0
         xy = xz = yx = yz = zx = zy = px = py = pz = 0.0
         for (ca, sa, a, d, offset), joint in zip(self._rows, joints, strict=False):

@@ -142,7 +142,7 @@ class EgmCodec:
         return encoded
 
     def decode(self, datagram: bytes, axes: int) -> Reference:
-        """Return the reference that a datagram holds for a unit of so many axes.
+        """Return the reference in a datagram for a unit with `axes` joints.
 
         Raises:
             GarbledDatagram, ForeignDatagram: it holds none.
