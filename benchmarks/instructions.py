@@ -1,4 +1,4 @@
-"""What a cycle of the loop executes: `python benchmarks/instructions.py [hold joint cartesian joystick] [--source]`.
+"""What a cycle executes: `python benchmarks/instructions.py [hold joint cartesian joystick cell] [--source]`.
 
 Instructions, counted by callgrind (Debian: apt install valgrind gcc) over 1000 cycles on the bus `inprocess`: the same
 in every run, whatever else the host does. `loop` is a whole cycle less bus and device models; `probe` is the least that
@@ -18,13 +18,22 @@ import struct
 import subprocess
 import sys
 import tempfile
-from math import cos, sin
+from collections.abc import Callable
+from functools import cache
+from math import cos, pi, sin
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.compute import ACTIVITIES, PERIOD_US, activity
+from kinematics.capsules import Placed, capsules, distance, from_box, self_pairs
 from kinematics.compiled import BUILD
+from kinematics.forward import frames
+from kinematics.model import ArmModel
+from kinematics.pose import Pose
+from rtcp.config import find_arm, load_kinematics
+from rtcp.ipc.states import State
+from tests.cell.random_steps import Pair, cell_of
 
 CYCLES = 1000
 _WARM_UP = 100
@@ -62,14 +71,60 @@ def probe(cycles: int) -> None:
             outputs.pack_into(out, i * outputs.size, 15, *counts, 8)
 
 
+@cache
+def _two_arms() -> tuple[ArmModel, Placed, Placed, tuple[tuple[int, int], ...]]:
+    """The model of an IRB 120, two of them facing each other, and the pairs of bodies of one that may collide."""
+    model = load_kinematics(find_arm("abb_irb120"))
+    one, other = Placed(capsules(model)), Placed(capsules(model))
+    one.place(frames(model, [0.1, 0.2, 0.1, 0.3, 0.4, 0.5]))
+    other.place(frames(model, [-0.1, 0.3, 0.2, 0.3, -0.4, 0.5]), Pose.from_xyzrpy(0.9, 0.0, 0.0, 0.0, 0.0, pi))
+    return model, one, other, self_pairs(model)
+
+
+def place(cycles: int) -> None:
+    """frames and five bodies placed"""
+    model, placed = _two_arms()[:2]
+    q = [0.1, 0.2, 0.1, 0.3, 0.4, 0.5]
+    for _ in range(cycles):
+        placed.place(frames(model, q))
+
+
+def between(cycles: int) -> None:
+    """least distance of two arms, 25 pairs"""
+    _, one, other, _ = _two_arms()
+    for _ in range(cycles):
+        distance(one, other)
+
+
+def within(cycles: int) -> None:
+    """least distance of one arm's bodies from each other, 5 pairs"""
+    _, one, _, pairs = _two_arms()
+    for _ in range(cycles):
+        distance(one, one, pairs)
+
+
+def box(cycles: int) -> None:
+    """distance of a body from a box"""
+    one = _two_arms()[1]
+    for _ in range(cycles):
+        from_box(one, 3, (0.4, -0.3, 0.2, 0.9, 0.3, 0.5))
+
+
+CAPSULES: dict[str, Callable[[int], None]] = {"place": place, "between": between, "within": within, "box": box}
+"""What `capsules.py` counts."""
+
+
 def run_counted(name: str, library: str) -> None:
     """Warm up, switch counting on, run the cycles and switch it off."""
-    marks = ctypes.CDLL(library)
-    if name == "probe":
-        probe(_WARM_UP)
-        marks.start()
-        probe(CYCLES)
-        marks.stop()
+    counting = ctypes.CDLL(library)
+    if run := {"probe": probe, **CAPSULES}.get(name):
+        run(_WARM_UP)
+        counting.start()
+        run(CYCLES)
+        counting.stop()
+        return
+    if name == "cell":
+        count_in_a_cell(counting)
         return
     with activity("hold" if name == "bus" else name) as running:
         for _ in range(_WARM_UP):
@@ -77,20 +132,41 @@ def run_counted(name: str, library: str) -> None:
         gc.collect()
         gc.disable()
         if name != "bus":
-            marks.start()
+            counting.start()
             for _ in range(CYCLES):
                 running.step()
-            marks.stop()
+            counting.stop()
             return
         simulation = running.simulation
         data, now_ns = simulation.data, simulation.now_ns
-        marks.start()
+        counting.start()
         for _ in range(CYCLES):
             now_ns += round(PERIOD_US * 1000)
             simulation.bus.advance_to(now_ns)
             data.send()
             data.receive()
-        marks.stop()
+        counting.stop()
+
+
+def count_in_a_cell(counting: ctypes.CDLL) -> None:
+    """Count the cycles of one of two arms that move in step, 2 m apart."""
+    pair = Pair(1, cell_of((PERIOD_US, PERIOD_US)))
+    for arm in pair.simulation.arms.values():
+        arm.on_frame = None
+    motion = pair.begin()
+    while motion.duration_s < 2.0 * CYCLES * PERIOD_US * 1e-6:
+        pair.follow(motion, lambda: pair.rests_after(motion))  # noqa: B023
+        motion = pair.begin()
+    pair.simulation.until(lambda: pair.simulation.now_ns > motion.start_ns + 100_000_000, 5.0)
+    left, right = pair.arm("left"), pair.arm("right")
+    gc.collect()
+    gc.disable()
+    for _ in range(CYCLES):
+        counting.start()
+        left.cycle()
+        counting.stop()
+        right.cycle()
+    assert left.state is right.state is State.MOVING
 
 
 def thousands(name: str, source: bool, library: Path) -> float:
@@ -111,6 +187,17 @@ def thousands(name: str, source: bool, library: Path) -> float:
     return int(counted[1]) / CYCLES / 1000
 
 
+def marks(folder: Path) -> Path:
+    """Return the library that switches counting on and off; raises NotCounted."""
+    library = folder / "mark.so"
+    compiler = ["cc", "-O1", "-shared", "-fPIC", "-x", "c", "-", "-o", str(library)]
+    try:
+        subprocess.run(compiler, input=_MARKS, text=True, check=True)
+    except subprocess.CalledProcessError as error:
+        raise NotCounted(str(error)) from error
+    return library
+
+
 def main() -> int:
     """Count, and print a line a number."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -122,13 +209,11 @@ def main() -> int:
     if given.worker:
         run_counted(given.worker, given.library)
         return 0
-    if unknown := set(given.activities) - set(ACTIVITIES):
-        parser.error(f"found {', '.join(unknown)}, allowed are {', '.join(ACTIVITIES)}")
+    if unknown := set(given.activities) - {*ACTIVITIES, "cell"}:
+        parser.error(f"found {', '.join(unknown)}, allowed are {', '.join((*ACTIVITIES, 'cell'))}")
     try:
         with tempfile.TemporaryDirectory() as folder:
-            library = Path(folder) / "mark.so"
-            compiler = ["cc", "-O1", "-shared", "-fPIC", "-x", "c", "-", "-o", str(library)]
-            subprocess.run(compiler, input=_MARKS, text=True, check=True)
+            library = marks(Path(folder))
             least = thousands("probe", True, library)
             print(f"probe {least:.0f} thousand instructions", flush=True)
             ways = ["source"] if given.source or not BUILD.is_used else ["source", "compiled"]
@@ -138,7 +223,7 @@ def main() -> int:
                 for name in given.activities or ACTIVITIES:
                     loop = thousands(name, way == "source", library) - bus
                     print(f"{way:9s} {name:10s} loop {loop:.0f} = {loop / least:.1f} x the probe", flush=True)
-    except (NotCounted, OSError, subprocess.CalledProcessError) as error:
+    except (NotCounted, OSError) as error:
         print(error, file=sys.stderr)
         return 1
     return 0

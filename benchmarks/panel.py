@@ -7,8 +7,8 @@ and draw nothing, like tablets elsewhere; the same while somebody sends 12 000 r
 browser, the panel or the operator's attention to the arm's standstill, while it is jogged and while it moves. Exit
 code 1 where a figure misses its aim.
 
-`--pictures DIR` writes a picture of every page at 400 and 1600 px instead. Needs Chromium, and what
-`pip install -e .[dev]` brings.
+`--pictures DIR` writes a picture of every page at 400 and 1600 px instead, and of a cell that moves in
+step. Needs Chromium, and what `pip install -e .[dev]` brings.
 """
 
 from __future__ import annotations
@@ -295,6 +295,8 @@ def pictures(playwright: Playwright, directory: Path) -> None:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
         for width in (400, 1600):
             for path, (name, _, _) in PAGES.items():
+                if path == "/cell":
+                    continue
                 page = opened(browser, url, path, width)
                 with moved_by_another() if path == "/arm" else contextlib.nullcontext():
                     time.sleep(2.5)
@@ -302,6 +304,29 @@ def pictures(playwright: Playwright, directory: Path) -> None:
                     page.screenshot(path=directory / f"panel-{name.lower()}-{width}.png", full_page=True)
                 page.context.close()
         browser.close()
+
+
+def cell_picture(playwright: Playwright, directory: Path) -> None:
+    """Write a picture of the page Cell while two virtual IRB 120 move in step."""
+    directory.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "rtcp.cli", "cell"]
+    subprocess.run([*command, "start", "--detach"], check=True)
+    os.environ["RTCP_NAME"] = "left"
+    try:
+        subprocess.run([*command, "enable"], check=True)
+        with panel() as (_, url), contextlib.closing(
+            playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        ) as browser:  # fmt: skip
+            page = opened(browser, url, "/cell")
+            for name, q in {"left": "0.6, 0.3, 0.1, 0, 0.5, 0", "right": "-0.6, 0.3, 0.1, 0, 0.5, 0"}.items():
+                page.get_by_label(f"Joints of {name}, rad").fill(q)
+            page.get_by_label("Speed, rad/s").fill("0.1")
+            page.get_by_role("button", name="Move in step").click()
+            time.sleep(4.0)
+            page.screenshot(path=directory / "cell.png")
+    finally:
+        del os.environ["RTCP_NAME"]
+        subprocess.run([*command, "stop"], check=True)
 
 
 def running_cpu() -> int:
@@ -393,6 +418,8 @@ def main() -> int:
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="rtcp-bench-") as name, sync_playwright() as playwright:
         os.environ["RTCP_RUNTIME_DIR"] = os.environ["RTCP_STATE_DIR"] = name
+        if given.pictures:
+            cell_picture(playwright, given.pictures)
         running = start(StartOptions(), lambda sentence: None)
         try:
             with connect("benchmark") as robot:

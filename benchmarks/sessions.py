@@ -4,7 +4,8 @@
 what came of them and exits with 1 on a failure. A failing seed runs again by `--seed N --sessions 1`.
 
 `python benchmarks/sessions.py --bus virtual --minutes 3 --seed 1` runs one on a real platform: its processes, its
-control socket, and the frames that reached its segment, captured there and checked afterwards.
+control socket, and the frames that reached its segment, captured there and checked afterwards. `--bus egm` does the
+same with a virtual IRC5 and its datagrams.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from pathlib import Path
 # The sessions are the tests' own.
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from tests.sessions.egm_session import EgmOutcome, run_on_egm
 from tests.sessions.session import Outcome, run_session
 from tests.sessions.wire_session import run_on_the_wire
 
@@ -57,12 +59,15 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the first session; the others follow")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
     parser.add_argument("--stop", type=int, default=10, help="end after so many failures")
-    parser.add_argument("--bus", choices=("inprocess", "virtual"), default="inprocess")
-    parser.add_argument("--minutes", type=float, default=3.0, help="of the session on the bus virtual")
+    parser.add_argument("--bus", choices=("inprocess", "virtual", "egm"), default="inprocess")
+    parser.add_argument("--minutes", type=float, default=3.0, help="of the session on the bus virtual or egm")
     parser.add_argument("--period", type=int, default=2000, help="its cycle, us")
     parser.add_argument("--keep", type=Path, help="file in which its frames are kept")
     given = parser.parse_args()
     began = time.monotonic()
+    if given.bus == "egm":
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        return show_egm(run_on_egm(given.seed, 60.0 * given.minutes, given.keep))
     if given.bus == "virtual":
         # However it ends, no platform stays behind.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -71,6 +76,17 @@ def main() -> int:
         total = run_inprocess(given)
     show(total, time.monotonic() - began)
     return 1 if total.failures else 0
+
+
+def show_egm(outcome: EgmOutcome) -> int:
+    """Print what came of a session on the virtual IRC5; return 1 on a failure."""
+    for name in ("taken", "refused", "requests", "states"):
+        counts = getattr(outcome, name)
+        print(f"{name:<20}{', '.join(f'{key} {count}' for key, count in counts.most_common())}")
+    print(f"replies             {outcome.replies}, the largest speed {outcome.largest_speed:.3f} of its limit")
+    for failure in outcome.failures:
+        print(f"FAILED: {failure}")
+    return 1 if outcome.failures else 0
 
 
 def run_inprocess(given: argparse.Namespace) -> Outcome:

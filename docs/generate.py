@@ -20,6 +20,8 @@ sys.path.insert(0, str(FOLDER.parent))
 
 from rtcp.config import model, segment  # noqa: E402
 from rtcp.config.validation import allowed, bare_type  # noqa: E402
+from rtcp.processes.shape_setting import interlocks  # noqa: E402
+from rtcp.processes.shape_setting.config import ShapeSettingConfig  # noqa: E402
 
 _PART = re.compile(r"(<!-- generated: ([^\n]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 _FILES: dict[str, tuple[type, str]] = {
@@ -27,6 +29,7 @@ _FILES: dict[str, tuple[type, str]] = {
     "device": (model.DeviceDescription, ""),
     "segment": (segment.SegmentSlave, "slaves[]."),
     "motion": (model.MotionFile, ""),
+    "shape_setting": (ShapeSettingConfig, "processes[]."),
 }
 
 
@@ -57,6 +60,8 @@ def keys_of(kind: Any, above: str = "") -> Iterator[Key]:
     hints = get_type_hints(kind, include_extras=True)
     for entry in fields(kind):
         path, bare = above + entry.name, bare_type(hints[entry.name])
+        # The other kinds of bus have a page of their own.
+        bare = model.EthercatBus if bare is model.BusConfig else bare
         inner = bare_type(get_args(bare)[0]) if get_origin(bare) is tuple else None
         if is_dataclass(inner):
             yield from keys_of(inner, f"{path}[].")
@@ -149,7 +154,12 @@ def _line(text: str | None) -> str:
     return " ".join(inspect.cleandoc(text or "").split()).replace("|", "\\|")
 
 
-PARTS: dict[str, Callable[..., str]] = {"keys": keys, "machine": machine, "methods": methods}
+PARTS: dict[str, Callable[..., str]] = {
+    "keys": keys,
+    "machine": machine,
+    "methods": methods,
+    "interlocks": interlocks.markdown,
+}
 
 
 def generated(text: str) -> str:

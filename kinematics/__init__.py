@@ -9,12 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import kinematics.compiled  # noqa: F401  first: it says whether the others are imported compiled
+from kinematics.capsules import Placed, capsules, distance, self_pairs
 from kinematics.damped_least_squares import NumericResult, solve_numeric
 from kinematics.forward import forward, forward_batch, frames
 from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
 from kinematics.jacobian import JointVelocity, jacobian, joint_velocity, manipulability, singularity_distances
-from kinematics.model import ArmModel, DhRow, JointLimit, LinkMass
+from kinematics.model import ArmModel, Capsule, DhRow, JointLimit, LinkMass
 from kinematics.pose import IDENTITY, Pose
 from kinematics.solution import Branch, Near, Singularity, Solution, Solutions
 
@@ -25,6 +26,7 @@ __all__ = [
     "IDENTITY",
     "ArmModel",
     "Branch",
+    "Capsule",
     "DhRow",
     "InverseKinematics",
     "JointLimit",
@@ -32,10 +34,13 @@ __all__ = [
     "LinkMass",
     "Near",
     "NumericResult",
+    "Placed",
     "Pose",
     "Singularity",
     "Solution",
     "Solutions",
+    "capsules",
+    "distance",
     "forward",
     "forward_batch",
     "frames",
@@ -43,6 +48,7 @@ __all__ = [
     "jacobian",
     "joint_velocity",
     "manipulability",
+    "self_pairs",
     "singularity_distances",
     "solve_numeric",
     "to_urdf",

@@ -1,4 +1,4 @@
-"""The model of an arm: six rows of modified Denavit-Hartenberg parameters, joint limits, link masses, a tool."""
+"""The model of an arm: rows of modified Denavit-Hartenberg parameters, joint limits, link masses, a tool, bodies."""
 
 from __future__ import annotations
 
@@ -67,12 +67,38 @@ class LinkMass:
 
 
 @dataclass(frozen=True)
+class Capsule:
+    """A body: all that is nearer than `radius` to the segment from `start` to `end`, m in the frame of its link.
+
+    Link 0 is the base, link i moves with frame i. Raises ValueError for a link that no arm has, a point that is not
+    three finite numbers and a radius that is not positive.
+    """
+
+    link: int
+    start: Vector
+    end: Vector
+    radius: float
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.link <= JOINTS:
+            raise ValueError(f"link is {self.link}; 0 (the base) to {JOINTS} are allowed")
+        for name in ("start", "end"):
+            point = getattr(self, name)
+            if len(point) != 3:
+                raise ValueError(f"{name} has {len(point)} numbers; 3 are required")
+            require_finite(point, (f"{name} x", f"{name} y", f"{name} z"))
+        if not 0.0 < self.radius < math.inf:
+            raise ValueError(f"radius is {self.radius}; a positive number is required")
+
+
+@dataclass(frozen=True)
 class ArmModel:
     """A six-joint arm, base to tool.
 
     `rows` and `limits` have six entries; `links` has six, or none when the masses are unknown; `tool` is the transform
-    from frame 6 (the flange) to the tool. Raises ValueError for a wrong count, a value that is not finite, a tool
-    without a proper rotation, and joint names that are empty or repeated.
+    from frame 6 (the flange) to the tool; `bodies` are its shape, none when it is unknown (`kinematics.capsules`).
+    Raises ValueError for a wrong count, a value that is not finite, a tool without a proper rotation, and joint names
+    that are empty or repeated.
     """
 
     name: str
@@ -81,6 +107,7 @@ class ArmModel:
     links: tuple[LinkMass, ...] = ()
     tool: Pose = IDENTITY
     joint_names: tuple[str, ...] = tuple(f"joint{number}" for number in range(1, JOINTS + 1))
+    bodies: tuple[Capsule, ...] = ()
 
     def __post_init__(self) -> None:
         for what in ("rows", "limits", "joint_names"):

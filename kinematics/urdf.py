@@ -6,13 +6,13 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from math import atan2, cos, hypot, isfinite, sin
 
-from kinematics.model import ArmModel, LinkMass
+from kinematics.capsules import JOINT_LENGTH, SLIM, THICK, extent, rods
+from kinematics.model import ArmModel, Capsule, LinkMass
 from kinematics.pose import Pose, Rotation, Vector, require_finite, turned
 
 UNKNOWN = 1e6  # Nm or rad/s: the format requires a number, and for a simulator zero means a fixed joint
 
 _RADIUS = 0.05  # m, of the solid ball that stands in for a link's unknown inertia
-_SLIM, _THICK = 0.03, 0.045  # radii of the drawn links and joints, relative to the arm's length
 _COLOURS = {"grey": "0.75 0.75 0.75 1", "blue": "0.2 0.35 0.6 1"}  # of links and of joints
 
 
@@ -24,7 +24,8 @@ def to_urdf(model: ArmModel, effort: Sequence[float] | None = None) -> str:
 
     Links have the masses and centres of mass of the model, if it has any. Moments of inertia are unknown; those of a
     solid ball of 50 mm radius let simulators accept the file: gravity is right, dynamics are not. Links are
-    cylinders, without meshes, for drawing and for collisions: pad them to the real covers in the planner.
+    cylinders, without meshes, for drawing and for collisions: pad them to the real covers in the planner; where the
+    model names bodies, links are these.
 
     Raises ValueError for a count of efforts other than six, and for one that is negative or not finite.
     Format: http://wiki.ros.org/urdf/XML
@@ -39,21 +40,21 @@ def to_urdf(model: ArmModel, effort: Sequence[float] | None = None) -> str:
     robot = ET.Element("robot", name=model.name)
     for colour, rgba in _COLOURS.items():
         ET.SubElement(ET.SubElement(robot, "material", name=colour), "color", rgba=rgba)
-    size = sum(abs(row.a) + abs(row.d) for row in model.rows) or 1.0
+    slim, thick = SLIM * extent(model), THICK * extent(model)
     links = ["base_link", *(f"link{number}" for number in range(1, len(model.rows) + 1))]
     for number, name in enumerate(links):
         link = ET.SubElement(robot, "link", name=name)
         if number and model.links:
             _inertial(link, model.links[number - 1])
+        if model.bodies:
+            for body in model.bodies:
+                if body.link == number:
+                    _capsule(link, body)
+            continue
         if number:
-            _cylinder(link, _THICK * size, 2.5 * _THICK * size, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "blue")
-        if number < len(model.rows):
-            # the common normal to the next axis, then the offset along that axis
-            corner = (model.rows[number].a, 0.0, 0.0)
-            _rod(link, (0.0, 0.0, 0.0), corner, size)
-            _rod(link, corner, _joint_pose(model, number).position, size)
-        else:
-            _rod(link, (0.0, 0.0, 0.0), model.tool.position, size)
+            _cylinder(link, thick, JOINT_LENGTH * thick, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), "blue")
+        for _, start, end in (rod for rod in rods(model) if rod[0] == number):
+            _rod(link, start, end, slim)
     ET.SubElement(robot, "link", name="tool0")
 
     for number, limit in enumerate(model.limits):
@@ -109,23 +110,33 @@ def _inertial(link: ET.Element, body: LinkMass) -> None:
     ET.SubElement(inertial, "inertia", ixx=moment, ixy="0", ixz="0", iyy=moment, iyz="0", izz=moment)
 
 
-def _rod(link: ET.Element, start: Vector, end: Vector, size: float) -> None:
+def _rod(link: ET.Element, start: Vector, end: Vector, radius: float) -> None:
     """Draw a cylinder from one point of the link to another."""
     x, y, z = (b - a for a, b in zip(start, end, strict=True))
-    length = hypot(x, y, z)
-    if length:
-        middle = tuple(0.5 * (a + b) for a, b in zip(start, end, strict=True))
-        _cylinder(link, _SLIM * size, length, middle, (0.0, atan2(hypot(x, y), z), atan2(y, x)), "grey")
+    middle = tuple(0.5 * (a + b) for a, b in zip(start, end, strict=True))
+    _cylinder(link, radius, hypot(x, y, z), middle, (0.0, atan2(hypot(x, y), z), atan2(y, x)), "grey")
+
+
+def _capsule(link: ET.Element, body: Capsule) -> None:
+    """Draw a cylinder with a ball at each end."""
+    radius = f"{body.radius:.4g}"
+    if body.start != body.end:
+        _rod(link, body.start, body.end, body.radius)
+        _body(link, body.end, (0.0, 0.0, 0.0), "blue", "sphere", radius=radius)
+    _body(link, body.start, (0.0, 0.0, 0.0), "blue", "sphere", radius=radius)
 
 
 def _cylinder(
     link: ET.Element, radius: float, length: float, centre: Sequence[float], rpy: Vector, colour: str
 ) -> None:
+    _body(link, centre, rpy, colour, "cylinder", radius=f"{radius:.4g}", length=f"{length:.4g}")
+
+
+def _body(link: ET.Element, centre: Sequence[float], rpy: Vector, colour: str, shape: str, **size: str) -> None:
     for use in ("visual", "collision"):
         body = ET.SubElement(link, use)
         _origin(body, centre, rpy)
-        geometry = ET.SubElement(body, "geometry")
-        ET.SubElement(geometry, "cylinder", radius=f"{radius:.4g}", length=f"{length:.4g}")
+        ET.SubElement(ET.SubElement(body, "geometry"), shape, dict(size))
         if use == "visual":
             ET.SubElement(body, "material", name=colour)
 

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 __all__ = [
     "AsyncRobot",
+    "Cell",
     "ConnectionLost",
     "Faulted",
     "Feed",
@@ -53,6 +54,7 @@ __all__ = [
     "TimedOut",
     "connect",
     "connect_async",
+    "connect_cell",
 ]
 
 

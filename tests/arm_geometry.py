@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from math import cos, pi, sin
+from collections.abc import Callable, Sequence
+from math import cos, dist, hypot, pi, sin, sqrt
 
 L1, L2, L3, L4, L5 = 0.170, 0.440, 0.450, 0.100, 0.140
 TABLE = (
@@ -15,6 +15,10 @@ TABLE = (
     (pi / 2, 0.0, L5, 0.0),
 )
 """alpha, a, d, offset of each row: T = Rx(alpha) Tx(a) Rz(q + offset) Tz(d)."""
+RADIUS = 0.045 * (L1 + L2 + L3 + L4 + L5) * hypot(1.0, 1.25)
+"""m, of all bodies: the circumscribed sphere of a joint's cylinder in the arm's URDF."""
+CLEARANCE = 0.01
+"""`cartesian.clearance` where the file does not say otherwise, m."""
 Point = tuple[float, float, float]
 Matrix = list[list[float]]
 
@@ -39,3 +43,58 @@ def points(q: Sequence[float]) -> tuple[Point, Point, Point]:
 def depth(point: Point, box: Sequence[float]) -> float:
     """Return how deep, m, a point is inside a box (lower corner, upper corner); negative: outside."""
     return min(min(x - a, b - x) for x, a, b in zip(point, box[:3], box[3:], strict=True))
+
+
+def axes(q: Sequence[float]) -> tuple[tuple[Point, Point], ...]:
+    """Return the axes of base, upper arm, forearm and hand, m."""
+    tool, wrist, elbow = points(q)
+    shoulder = (0.0, 0.0, L1)
+    return ((0.0, 0.0, 0.0), shoulder), (shoulder, elbow), (elbow, wrist), (wrist, tool)
+
+
+def own_gap(q: Sequence[float]) -> float:
+    """Return how far the arm's bodies are from each other at least, beyond their clearance, m."""
+    base, upper, forearm, hand = axes(q)
+    pairs = (base, forearm), (base, hand), (upper, hand)
+    found = min(_least(lambda u, a=a, b=b: _from_segment(_along(a, u), b)) for a, b in pairs)  # type: ignore[misc]
+    return found - 2.0 * RADIUS - CLEARANCE
+
+
+def box_gaps(q: Sequence[float], box: Sequence[float]) -> list[float]:
+    """Return how far upper arm, forearm and hand are from a box, beyond their clearance, m; negative: too near."""
+    return [_least(lambda u, a=axis: _outside(_along(a, u), box)) - RADIUS - CLEARANCE for axis in axes(q)[1:]]  # type: ignore[misc]
+
+
+def _least(of: Callable[[float], float]) -> float:
+    """The least value of a convex function between 0 and 1, by golden section."""
+    part = 0.5 * (sqrt(5.0) - 1.0)
+    low, high = 0.0, 1.0
+    one, other = high - part, low + part
+    a, b = of(one), of(other)
+    for _ in range(45):
+        if a < b:
+            high, other, b = other, one, a
+            one = high - part * (high - low)
+            a = of(one)
+        else:
+            low, one, a = one, other, b
+            other = low + part * (high - low)
+            b = of(other)
+    return min(a, b, of(0.0), of(1.0))
+
+
+def _along(axis: tuple[Point, Point], u: float) -> Point:
+    (a, b, c), (d, e, f) = axis
+    return a + u * (d - a), b + u * (e - b), c + u * (f - c)
+
+
+def _outside(point: Point, box: Sequence[float]) -> float:
+    beyond = [max(a - x, x - b) for x, a, b in zip(point, box[:3], box[3:], strict=True)]
+    return hypot(*(max(one, 0.0) for one in beyond)) if max(beyond) > 0.0 else max(beyond)
+
+
+def _from_segment(point: Point, axis: tuple[Point, Point]) -> float:
+    start, end = axis
+    along = [b - a for a, b in zip(start, end, strict=True)]
+    part = sum((x - a) * n for x, a, n in zip(point, start, along, strict=True)) / sum(n * n for n in along)
+    return dist(point, _along(axis, min(max(part, 0.0), 1.0)))

@@ -17,6 +17,7 @@ from random import Random
 from typing import Any
 
 from kinematics import InverseKinematics
+from kinematics.capsules import from_box
 from kinematics.compiled import BUILD
 from kinematics.forward import forward, frames
 from kinematics.gravity import gravity_torques
@@ -24,7 +25,7 @@ from kinematics.jacobian import jacobian, joint_velocity
 from rtcp.config import default_config, load
 from rtcp.control.cycle import make_drives
 from rtcp.control.part import make_devices
-from rtcp.devices.cia402 import TargetState
+from rtcp.devices.drive import TargetState
 from rtcp.devices.io_box import IoBox
 from rtcp.motion.controllers.jog import ScaledTwist, TwistRamp
 from rtcp.motion.controllers.jog_inverse import JogInverse
@@ -33,7 +34,7 @@ from rtcp.motion.guards.braking import fastest_stoppable, travel
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.guards.zones import Zones, inside, outside
+from rtcp.motion.guards.zones import Zones, inside
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning.interpolation import cubic, quaternion, quintic, turn_between, turned_by, value
 from rtcp.motion.state import ArmState, Setpoint
@@ -129,7 +130,7 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
         OutputLimiter(limits, DT),
         Supervision(CONFIG, limits),
     )
-    zones = Zones(ARM, limits)
+    zones = Zones(ARM, limits, 0.01)
     ramp, scaled = TwistRamp(CONFIG.cartesian), ScaledTwist(limits)
     writers = CspWriter(), CsvWriter(CONFIG.joints, DT), CstWriter(CONFIG.joints, DT)
     drives = [drive for _, drive in make_drives(CONFIG)]
@@ -140,7 +141,7 @@ def motions(inputs: Inputs) -> Iterator[tuple[str, Callable[[], Any]]]:
         box = tuple(inputs.number(0.5) for _ in range(6))
         yield "fastest_stoppable", lambda: fastest_stoppable(a, b, c)
         yield "travel", lambda: travel(v, limits.acceleration, zones.reach, DT)
-        yield "outside", lambda: outside(a, b, c, box)
+        yield "from_box", lambda: [from_box(zones.before, body, box) for body in range(4)]
         yield "inside", lambda: inside(a, b, c, box)
         yield "zones", lambda: zones.distance(frames(ARM, q))
         yield "clearances", lambda: zones.clearances(frames(ARM, q), 0.3)

@@ -51,7 +51,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if item.get_closest_marker("alone"):
             item.add_marker(pytest.mark.flaky(reruns=2))
         if BUILD.is_used and item.get_closest_marker("interpreted"):
-            item.add_marker(pytest.mark.skip(reason="it replaces a method, which compiled code does not allow"))
+            item.add_marker(
+                pytest.mark.skip(reason="it does what compiled code does not allow: replace a method, or pickle")
+            )
 
 
 @pytest.fixture(scope="session", autouse=True)

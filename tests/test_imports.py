@@ -16,8 +16,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ORDER = (
-    ("kinematics",), ("config",), ("virtual",), ("fieldbus",), ("ipc",), ("devices",), ("api",), ("motion",),
-    ("realtime",), ("control",), ("gateway",), ("launch",), ("telemetry",), ("panel", "ros"), ("cli",),
+    ("kinematics",), ("config",), ("virtual",), ("ipc",), ("fieldbus",), ("devices",), ("api",), ("motion",),
+    ("realtime",), ("control",), ("processes",), ("gateway",), ("launch",), ("telemetry",), ("panel", "ros"), ("cli",),
 )  # fmt: skip
 """The folders from the top of the list down; each imports itself and what stands above it, and not its neighbour."""
 EXCEPTIONS: dict[tuple[str, str], str] = {}
@@ -44,7 +44,7 @@ ROS_2 = {
 }
 """Modules of optional dependencies, and of a ROS 2 that is installed otherwise: by the files that import them."""
 
-ABB = {"rtcp/virtual/irc5/messages.py": {"google"}}
+ABB = {"rtcp/virtual/irc5/messages.py": {"google"}, "rtcp/fieldbus/egm.py": {"google"}}
 """Modules of the optional dependency `abb`, by the files that import them."""
 
 PACKAGES = {
@@ -233,9 +233,13 @@ def test_what_is_imported_from_outside_is_a_declared_dependency() -> None:
 
 
 def test_ros_is_a_client_of_the_api() -> None:
-    """What it reads besides are files, configuration and geometry; of `motion` it has the quaternion of a rotation."""
+    """What it reads besides are files, configuration and geometry; of `motion` it has the quaternion of a rotation.
+
+    The messages of Simple Message are the bus's, which speaks it to controllers.
+    """
     imported = {found.module for found in IMPORTS if found.importer == "ros" and is_ours(found)} - {"rtcp"}
-    allowed = ("rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.runtime_directory")
+    messages = "rtcp.fieldbus.simple_message"
+    allowed = ("rtcp.ros", "rtcp.api", "rtcp.config", "kinematics", "rtcp.ipc.runtime_directory", messages)
     others = {module for module in imported if not module.startswith(allowed)}
     assert others == {"rtcp.motion.planning.interpolation"}
 

@@ -25,6 +25,7 @@ from rtcp.ipc.states import ControlMode, DriveMode, JogFrame, State
 
 if TYPE_CHECKING:
     from rtcp.api.async_robot import AsyncRobot, connect_async
+    from rtcp.api.cell import Cell, connect_cell
     from rtcp.api.feed import Feed
     from rtcp.api.stream import Stream
 
@@ -32,6 +33,7 @@ __all__ = [
     "Arrival",
     "AsyncRobot",
     "Buffered",
+    "Cell",
     "ConnectionLost",
     "ControlMode",
     "DriveMode",
@@ -60,6 +62,7 @@ __all__ = [
     "Zero",
     "connect",
     "connect_async",
+    "connect_cell",
 ]
 
 
@@ -69,6 +72,10 @@ def __getattr__(name: str) -> Any:
         from rtcp.api import async_robot
 
         return getattr(async_robot, name)
+    if name in ("Cell", "connect_cell"):
+        from rtcp.api import cell
+
+        return getattr(cell, name)
     if name == "Feed":
         from rtcp.api.feed import Feed
 

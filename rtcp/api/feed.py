@@ -46,7 +46,8 @@ class Feed:
     def __init__(self, directory: Path | None = None) -> None:
         directory = runtime_directory() if directory is None else directory
         try:
-            self.config = read_session(directory).config
+            session = read_session(directory)
+            self.config = session.config
             self._observer = Observer(blackboard_file(directory))
         except (BlackboardError, SessionError) as error:
             raise _not_running(directory, str(error)) from error
@@ -62,7 +63,7 @@ class Feed:
         self._loop.register(self._process, select.POLLIN)
         with contextlib.suppress(PluginError):
             load_messages()
-        self._names = Names(self.config)
+        self._names = Names(self.config, session.partners)
         self._at, self._event = self._observer.head, self._observer.last_event
         self._texts_read_ns = time.monotonic_ns()
         self._text = max((text.number for text in self._observer.texts_since(0)), default=0)
@@ -107,6 +108,15 @@ class Feed:
             instant = int(records["time_ns"][0]) if len(records) else time.monotonic_ns()
             self._gaps.append(_gap("cycles", first, self._at, missing, instant))
         return records, missing
+
+    def latest(self) -> Records | None:
+        """Return the newest cycle record, shape (1,), whether it was read before or not; None before the first."""
+        return self._observer.latest()
+
+    def last_event(self) -> str:
+        """Return the newest event in words, also one from before; empty before the first."""
+        events = self._observer.events_since(self._observer.last_event - 1)
+        return self._names.message(events[-1].event) if events else ""
 
     def messages(self) -> Iterator[LogLine]:
         """Yield new events and sentences, and a warning for all that was overwritten before it was read."""

@@ -625,8 +625,51 @@ class Robot(Methods):
         """State of the machine now."""
         return self.status().state
 
+    @property
+    def processes(self) -> dict[str, Process]:
+        """The processes beside motion, by their names."""
+        found = self.status().raw["processes"]
+        return {name: Process(self, name, one["kind"], tuple(one["commands"])) for name, one in found.items()}
+
     def _carry_out(self, call: Call[T]) -> T:
         return call.result(self._client.call(call.method, call.params, _reader(call)))
+
+
+class Process:
+    """A process of the platform: `robot.processes["heater"]`.
+
+    Args:
+        robot: the connection to its platform.
+        name: of the process.
+        kind: of the process.
+        commands: names of the commands that it accepts.
+    """
+
+    def __init__(self, robot: Robot, name: str, kind: str, commands: tuple[str, ...]) -> None:
+        self._robot = robot
+        self.name = name
+        self.kind = kind
+        self.commands = commands
+
+    @property
+    def state(self) -> str:
+        """Its state in words; empty: it has none."""
+        return str(self._robot.status().raw["processes"][self.name]["state"] or "")
+
+    @property
+    def fields(self) -> Mapping[str, Any]:
+        """What it publishes in the newest cycle record, in the units of `rtcp status --json`."""
+        published = self._robot.status().raw["devices"].get(self.name, {})
+        return {name: shown["value"] for name, shown in published.items()}
+
+    def command(self, name: str, **fields: Any) -> Any:
+        """Send one of its commands; one that lasts returns when the process has finished.
+
+        Raises:
+            Refused: the process does not accept it now.
+            Faulted: it ended early; `reason` and `fields` say by what.
+        """
+        return self._robot.command(name, **fields)
 
 
 def _reader(call: Call[Any]) -> Callable[[Mapping[str, Any]], None] | None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import select
 import struct
 import time
 from collections.abc import Mapping, Sequence
@@ -33,8 +35,16 @@ class Stream:
 
     def __init__(self, directory: Path, stream: int, lease: int, since: int) -> None:
         self._observer = Observer(blackboard_file(directory))
-        config = read_session(directory).config
-        self._names = Names(config)
+        self._loop = select.poll()
+        try:
+            self._process = os.pidfd_open(self._observer.loop_pid)
+        except OSError:
+            self._observer.close()
+            raise self._loop_has_ended() from None
+        self._loop.register(self._process, select.POLLIN)
+        session = read_session(directory)
+        config = session.config
+        self._names = Names(config, session.partners)
         self._count = len(config.joints)
         self._rest = (0.0,) * (MOST_AXES - self._count)
         self._stream, self._lease, self._since = stream, lease, since
@@ -61,7 +71,7 @@ class Stream:
     @property
     def is_open(self) -> bool:
         """Whether the joints follow it."""
-        return not self._is_closed and self._observer.open_stream == self._stream
+        return not self._is_closed and self._observer.open_stream == self._stream and not self._loop.poll(0)
 
     @property
     def taken(self) -> int:
@@ -85,40 +95,55 @@ class Stream:
 
         Raises:
             Invalid: not a number a joint, an acceleration without a velocity, or the stream was closed.
-            Faulted: the stream has ended: `reason` and `fields` say by what.
+            Faulted: the stream has ended, and `reason` and `fields` say by what; or the loop has ended: a platform that
+                was started since needs another stream.
         """
         if self._is_closed:
             raise RtcpError("invalid", "the stream is closed: open another one")
-        now_ns = time.monotonic_ns()
-        if now_ns - self._renewed_ns > self._renew_ns:
-            self._renewed_ns = now_ns
-            self._observer.renew(self._lease)
+        if self._loop.poll(0):
+            raise self._loop_has_ended()
         bits, n, rest = 0, self._count, self._rest
+        given: Any
         for name, given, bit in (
             ("q", q, 0),
             ("velocity", velocity, SETPOINT_HAS_VELOCITY),
             ("acceleration", acceleration, SETPOINT_HAS_ACCELERATION),
         ):
-            if given is not None:
-                bits |= bit
-                if len(given) != n:
-                    raise RtcpError("invalid", f"{name}: found {len(given)} numbers, allowed are {n}: one a joint")
+            if given is None and bit:
+                continue
+            bits |= bit
+            try:
+                count = len(given)
+            except TypeError:
+                raise RtcpError(
+                    "invalid", f"{name}: found {given!r:.40}, allowed are {n} numbers: one a joint"
+                ) from None
+            if count != n:
+                raise RtcpError("invalid", f"{name}: found {count} numbers, allowed are {n}: one a joint")
         if bits == SETPOINT_HAS_ACCELERATION:
             raise RtcpError("invalid", "velocity: it is missing, and an acceleration is given")
         zero = _NOTHING[:n]
         v, a = zero if velocity is None else velocity, zero if acceleration is None else acceleration
-        self._put(bits, now_ns * 1e-9 if t is None else t, (*q, *rest, *v, *rest, *a, *rest))
+        self._put(bits, time.monotonic_ns() * 1e-9 if t is None else t, (*q, *rest, *v, *rest, *a, *rest))
         self.sent += 1
 
     def _put(self, bits: int, t: float, numbers: Sequence[float]) -> None:
+        now_ns = time.monotonic_ns()
         try:
+            if now_ns - self._renewed_ns > self._renew_ns:
+                self._renewed_ns = now_ns
+                self._observer.renew(self._lease)
             followed = self._observer.setpoint(self._stream, bits, t, numbers)
-        except struct.error as error:
+        except (struct.error, TypeError, OverflowError) as error:
             raise RtcpError("invalid", f"a setpoint cannot be sent: {error}") from None
         except BlackboardError as error:
             raise RtcpError("fault", str(error)) from None
         if not followed:
             raise self._ended()
+
+    def _loop_has_ended(self) -> RtcpError:
+        loop = f"the loop (process {self._observer.loop_pid})"
+        return RtcpError("fault", f"{loop} has ended: start the platform, then open another stream")
 
     def _ended(self) -> RtcpError:
         """Return the error for what has ended the stream."""
@@ -142,4 +167,5 @@ class Stream:
             self._is_closed = True
             with contextlib.suppress(BlackboardError):  # of a loop that hangs, and takes nothing
                 self._observer.setpoint(self._stream, SETPOINT_ENDS, 0.0, _NOTHING)
+            os.close(self._process)
             self._observer.close()

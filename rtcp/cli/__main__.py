@@ -15,10 +15,12 @@ from rtcp.api import RtcpError
 from rtcp.cli import (
     arm,
     bus,
+    cell,
     demo,
     doctor,
     experiment,
     faults,
+    irc5,
     jog,
     live,
     motion,
@@ -29,9 +31,11 @@ from rtcp.cli import (
     ros,
     segment,
     service,
+    shape_set,
     soak,
     status,
 )
+from rtcp.cli.arguments import PlatformName, choose_platform
 from rtcp.cli.output import CommandError, ExitCode, code_of, complain, emit, interruption_code, mute
 from rtcp.config.model import ConfigError
 
@@ -57,7 +61,9 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", help="Show the version.", callback=_version, is_eager=True)
     ] = False,
+    name: PlatformName = None,
 ) -> None:
+    choose_platform(name)
     if context.invoked_subcommand is None:
         text = context.get_help()  # with rich this call prints, and returns nothing
         if text.strip():
@@ -65,8 +71,8 @@ def _root(
 
 
 _GROUPS = (
-    platform, status, motion, jog, arm, bus, segment, demo, service, doctor, soak, faults, record, recorded, live,
-    experiment, panel, ros,
+    platform, status, cell, motion, jog, arm, bus, segment, irc5, demo, service, doctor, soak, faults, record, recorded,
+    live, experiment, panel, ros, shape_set,
 )  # fmt: skip
 for _group in _GROUPS:
     app.add_typer(_group.commands)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import ipaddress
 import math
+import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from rtcp.cli.output import CommandError
+from rtcp.config.cell import is_platform_name
 from rtcp.config.numbers import angle, plain_number
 
 
@@ -21,6 +23,19 @@ def option(name: str, metavar_or_help: str = "", help: str = "") -> Any:
     if not help:
         return typer.Option(name, help=metavar_or_help)
     return typer.Option(name, metavar=metavar_or_help or None, help=help)
+
+
+def choose_platform(name: str | None) -> None:
+    """Let this process start or reach the platform with this name; None: as the environment says.
+
+    Raises:
+        CommandError: no platform may have this name.
+    """
+    chosen = os.environ.get("RTCP_NAME", "") if name is None else name
+    if (chosen or name) and not is_platform_name(chosen):
+        raise CommandError(f'--name: found the text "{chosen}", allowed is a letter, then letters, digits, - and _')
+    if chosen:
+        os.environ["RTCP_NAME"] = chosen
 
 
 def as_written(metavar: str, help: str = "") -> Any:
@@ -56,6 +71,9 @@ ConfigFile = Annotated[
 BusName = Annotated[
     str | None,
     option("--bus", "virtual|NAME", "virtual, or a network interface. Default: the running one's, the configured one."),
+]
+PlatformName = Annotated[
+    str | None, option("--name", "NAME", "Name of the platform, as of an arm of a cell. Default: $RTCP_NAME, none.")
 ]
 Poll = Annotated[bool, option("--poll", "The virtual segment polls: it answers faster and keeps one CPU busy.")]
 AsJson = Annotated[bool, option("--json", "Print JSON, SI units.")]

@@ -20,6 +20,7 @@ from rtcp.cli.arguments import (
     pose_values,
 )
 from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report, show, table
+from rtcp.config.model import UNLIMITED_TORQUE
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -115,7 +116,9 @@ def _urdf(
     from rtcp.config.loader import joints_of
 
     file = find_arm(arm)
-    text = to_urdf(load_kinematics(file), [joint.torque for joint in joints_of(file)] or None)
+    text = to_urdf(
+        load_kinematics(file), [joint.torque for joint in joints_of(file) if joint.torque < UNLIMITED_TORQUE] or None
+    )
     if out is None:
         emit(text.rstrip("\n"))
     else:

@@ -19,6 +19,7 @@ from kinematics.pose import IDENTITY
 from kinematics.urdf import to_urdf
 from rtcp.config import load_kinematics
 from rtcp.config.loader import joints_of
+from rtcp.config.model import UNLIMITED_TORQUE
 
 GROUP = "manipulator"
 """Planning group, named as ROS-Industrial does."""
@@ -46,7 +47,7 @@ def moveit_package(arm: Path) -> MoveItPackage:
     """
     model, settings = load_kinematics(arm), joints_of(arm)
     solver = to_c(model)
-    urdf = to_urdf(model, [joint.torque for joint in settings] or None)
+    urdf = to_urdf(model, [joint.torque for joint in settings if joint.torque < UNLIMITED_TORQUE] or None)
     package = f"{solver.prefix}_moveit_config"
     home = [min(max(0.0, limit.lower), limit.upper) for limit in model.limits]
     joints = [
@@ -108,13 +109,16 @@ def _touching(model: ArmModel, urdf: ET.Element, home: list[float]) -> list[tupl
 
 
 def _balls(link: ET.Element) -> Array:
-    """Return balls inside the cylinders of a link: centre in its frame and radius, m, shape (n, 4)."""
+    """Return balls inside the cylinders and spheres of a link: centre in its frame and radius, m, shape (n, 4)."""
     balls: list[tuple[float, ...]] = []
     for body in link.findall("collision"):
-        origin, cylinder = body.find("origin"), body.find("geometry/cylinder")
+        origin, cylinder, sphere = body.find("origin"), body.find("geometry/cylinder"), body.find("geometry/sphere")
         assert origin is not None
-        assert cylinder is not None
         centre = np.array(origin.get("xyz", "").split(), float)
+        if sphere is not None:
+            balls.append((*centre, float(sphere.get("radius", ""))))
+            continue
+        assert cylinder is not None
         _, pitch, yaw = map(float, origin.get("rpy", "").split())
         axis = np.array([np.cos(yaw) * np.sin(pitch), np.sin(yaw) * np.sin(pitch), np.cos(pitch)])  # no roll
         radius, length = float(cylinder.get("radius", "")), float(cylinder.get("length", ""))

@@ -110,7 +110,10 @@ def _wait_for_clocks(robot: Robot) -> None:
     """Return when the master is locked to the reference clock; raises CommandError."""
     deadline = time.monotonic() + LOCK_TIMEOUT_S
     while True:
-        if robot.status().raw["dc"]["locked"]:
+        clocks = robot.status().raw["dc"]
+        if clocks is None:
+            return
+        if clocks["locked"]:
             report("clocks locked")
             return
         if time.monotonic() > deadline:
@@ -134,8 +137,9 @@ def figures(status: Mapping[str, Any], started_s: float, mean_ns: float) -> Tabl
     rows.add_row("cycles, missed", f"{status['cycles']}, {status['missed']}")
     for label, key in CYCLE_TIMES:
         rows.add_row(f"{label} p50 / p99 / max", f"{' / '.join(quantiles(status[key]))} us")
-    filtered, raw = (quantiles(clocks[key])[1] for key in ("filtered_us", "offset_us"))
-    rows.add_row("clock offset", f"{clock_state(clocks)}, filtered p99 {filtered} us, raw p99 {raw} us")
+    if clocks is not None:
+        filtered, raw = (quantiles(clocks[key])[1] for key in ("filtered_us", "offset_us"))
+        rows.add_row("clock offset", f"{clock_state(clocks)}, filtered p99 {filtered} us, raw p99 {raw} us")
     rows.add_row("start to OP", f"{status['start_to_op_s'] or started_s:.2f} s")
     rows.add_row("real time", realtime_line(status["realtime"]))
     if skipped := status.get("skipped_ticks"):

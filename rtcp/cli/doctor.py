@@ -66,7 +66,7 @@ def _case(bus: str | None, config: Path | None) -> Case:
         priority=arm.cycle.priority,
         interface=None if name == VIRTUAL else name,
         blackboard=blackboard_file(runtime_directory()),
-        wait_us=arm.bus.receive_fraction * arm.cycle.period_us,
+        wait_us=arm.ethercat.receive_fraction * arm.cycle.period_us,
     )
 
 

@@ -22,6 +22,7 @@ from rtcp.cli.arguments import (
 )
 from rtcp.cli.output import CommandError, emit_json, progress, report, show, table
 from rtcp.cli.platform import connect, stoppable
+from rtcp.config.model import UNLIMITED_TORQUE
 
 Joint = Annotated[str, typer.Argument(metavar="JOINT", help="Configured name, as joint2, or number from 1.")]
 COLUMNS = (
@@ -49,8 +50,10 @@ def _disable() -> None:
     """Disable the drives; returns when they report no torque."""
     with connect("disable") as robot:
         unconfirmed = robot.disable()
+        by_controller = "power" in robot.status().raw["lacks"]
     others = f"; also disabled, but not observed in the cycle: {', '.join(unconfirmed)}" if unconfirmed else ""
-    report(f"disabled: the drives are without torque{others}")
+    stands = "the arm stands, held by its robot controller with the motors on"
+    report(f"disabled: {stands if by_controller else 'the drives are without torque'}{others}")
 
 
 @commands.command("reset")
@@ -274,4 +277,6 @@ def _tables(found: Mapping[str, Any]) -> list[Any]:
 
 
 def _marked(value: float, configured: float) -> str:
+    if value >= UNLIMITED_TORQUE:
+        return "none"
     return f"{value:g}" if value == configured else f"{value:g} *"

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rtcp.api import NotRunning, Robot, RtcpError, State
-from rtcp.cli.arguments import BusName, ConfigFile, Poll, option, positive
+from rtcp.cli.arguments import BusName, ConfigFile, PlatformName, Poll, choose_platform, option, positive
 from rtcp.cli.output import (
     SUSPENDING,
     CommandError,
@@ -27,7 +27,7 @@ from rtcp.cli.output import (
     signals_raise,
 )
 from rtcp.cli.panel import require_panel
-from rtcp.ipc.runtime_directory import runtime_directory
+from rtcp.ipc.runtime_directory import platform_name, runtime_directory
 from rtcp.ipc.session import is_running, read_processes
 
 if TYPE_CHECKING:
@@ -59,8 +59,15 @@ def _start(
         int | None,
         typer.Option("--port", min=0, max=65535, help="With --panel: its port; 0: a free one. Default: 8080."),
     ] = None,
+    name: PlatformName = None,
+    cell: Annotated[Path | None, option("--cell", "FILE", "File of the cell to which the arm --name belongs.")] = None,
 ) -> None:
     """Start the platform: bring the slaves to OP and wait for commands."""
+    choose_platform(name)
+    if cell is not None and config is not None:
+        raise CommandError("--cell says which file the arm has: leave --config out")
+    if cell is not None and not platform_name():
+        raise CommandError("--cell needs --name NAME: which of its arms this is")
     mode = None if mode is None else mode.lower()
     if mode is not None and mode not in MODES:
         raise CommandError(f"--mode {mode} is not known: {', '.join(MODES)}")
@@ -73,7 +80,12 @@ def _start(
         require_panel()
     from rtcp.launch.launcher import StartOptions
 
-    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll)
+    found = None
+    if cell is not None:
+        from rtcp.config.cell_file import load_cell
+
+        found = load_cell(cell)
+    options = StartOptions(config=config, bus=bus, mode=mode, cycle_us=cycle_us, poll=poll, cell=found)
     if detach:
         launch(options)  # the processes have sessions of their own and outlive this command
         message, ready = _wait_ready("`rtcp enable` and `rtcp move` command it, `rtcp status` shows it, `rtcp stop`")

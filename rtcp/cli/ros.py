@@ -13,10 +13,11 @@ import typer
 
 from rtcp.cli.arguments import is_loopback, option
 from rtcp.cli.output import CommandError, ExitCode, report
-from rtcp.ipc.runtime_directory import log_format
+from rtcp.ipc.runtime_directory import log_format, platform_name
 
 if TYPE_CHECKING:
     from rtcp.ros.commands import CommandOptions
+    from rtcp.ros.ros2_node import Ros2Options
     from rtcp.ros.simple_message.server import ServerOptions
 
 commands = typer.Typer()
@@ -31,6 +32,9 @@ def _ros(
         float, typer.Option("--rate", min=1.0, max=10_000.0, help="Joint states a second, at most one a cycle.")
     ] = 100.0,
     name: Annotated[str, option("--name", "NAME", "Of the node.")] = "rtcp",
+    group: Annotated[
+        bool, option("--cell", "All arms of the cell as one group of joints, in step: left_joint_1, ...")
+    ] = False,
     enable: Annotated[
         bool, option("--auto-enable", "A motion enables the drives, but not after a stop, a fault or robot_disable.")
     ] = False,
@@ -77,10 +81,12 @@ def _ros(
     from rtcp.ros.commands import CommandOptions  # here: it loads slowly, as what follows
 
     options = CommandOptions(enable, partial, buffer)
+    # The name of a platform is its namespace; the group has that of no arm.
+    space = "" if group else platform_name().replace("-", "_")
     if simple_message:
         import asyncio
 
-        from rtcp.ros.simple_message.messages import ByteOrder
+        from rtcp.fieldbus.simple_message.messages import ByteOrder
         from rtcp.ros.simple_message.server import ServerOptions
 
         orders = {"auto": None, "little": ByteOrder.LITTLE, "big": ByteOrder.BIG}
@@ -90,12 +96,17 @@ def _ros(
     elif wires:
         if remappings and not ros2:
             raise CommandError(f"--{wires[0]} knows no remappings: leave out {remappings[0]}", ExitCode.USAGE)
-        _run_ros2(wires[0], router, name, rate, domain, options, remappings or ())
+        from rtcp.ros.ros2_node import Ros2Options
+
+        _run_ros2(wires[0], router, Ros2Options(name, rate, domain, options, remappings or (), group, space))
     else:
-        _run_node(name, rate, remappings or (), tf, options)
+        spaces = [f"__ns:=/{space}"] if space and not any(one.startswith("__ns:=") for one in remappings or ()) else []
+        _run_node(name, rate, [*(remappings or ()), *spaces], tf, options, group)
 
 
-def _run_node(name: str, rate: float, remappings: Sequence[str], tf: bool, options: CommandOptions) -> None:
+def _run_node(
+    name: str, rate: float, remappings: Sequence[str], tf: bool, options: CommandOptions, group: bool
+) -> None:  # fmt: skip
     """Run a ROS 1 node."""
     from rtcp.ros import ros1_messages
 
@@ -106,15 +117,13 @@ def _run_node(name: str, rate: float, remappings: Sequence[str], tf: bool, optio
     from rtcp.ros import ros1
 
     report(f"node {name}: Ctrl-C ends it")
-    ros1.run(ros1.NodeOptions(name, rate, tf, remappings, options))
+    ros1.run(ros1.NodeOptions(name, rate, tf, remappings, options, group))
 
 
-def _run_ros2(
-    wire: str, router: str, name: str, rate: float, domain: int, options: CommandOptions, remappings: Sequence[str]
-) -> None:
+def _run_ros2(wire: str, router: str, options: Ros2Options) -> None:
     """Run a ROS 2 node."""
     try:
-        from rtcp.ros.ros2_node import OpenWire, Ros2Options, run
+        from rtcp.ros.ros2_node import OpenWire, run
 
         open_wire: OpenWire
         if wire == "zenoh":
@@ -136,8 +145,8 @@ def _run_ros2(
             how = f"pip install 'rtcp[{wire}]'" + (" (x86_64)" if wire == "dds" else "")
         raise CommandError(f"--{wire} cannot run here, {error}: {how}") from None
     _log_to_stderr()
-    report(f"node {name}: Ctrl-C ends it")
-    run(Ros2Options(name, rate, domain, options, remappings), open_wire)
+    report(f"node {options.name}: Ctrl-C ends it")
+    run(options, open_wire)
 
 
 def _log_to_stderr() -> None:

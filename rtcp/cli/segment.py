@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import signal
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import MISSING, asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -14,15 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 from rtcp.cli.arguments import AsJson, Poll, option, refuse_old_name
-from rtcp.cli.output import CommandError, ExitCode, emit, emit_json, report
-from rtcp.ipc.runtime_directory import (
-    RuntimeDirectoryError,
-    free_segment_control,
-    is_listening,
-    make_runtime_directory,
-    runtime_directory,
-    segment_control,
-)
+from rtcp.cli.control_socket import connected, free_path, settle
+from rtcp.cli.output import CommandError, emit, emit_json, report
+from rtcp.ipc.runtime_directory import runtime_directory, segment_control
 
 if TYPE_CHECKING:
     from rtcp.virtual.faults.control import SegmentClient
@@ -67,18 +59,15 @@ def _segment(
 
 
 def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, script: Path | None) -> None:
-    from rtcp.realtime.scheduling import available_cpus, choose_cpu
     from rtcp.virtual.network import NetworkError
     from rtcp.virtual.server import run
 
     users_before = _user_namespace()
-    control = _control()
+    usual = segment_control(runtime_directory())
+    control = free_path(usual)
 
     def ready(started: dict[str, int | str | bool]) -> None:
-        if cpu is None and (others := set(available_cpus()) - {choose_cpu(None)}):
-            os.sched_setaffinity(0, others)
-        # The segment has its own handler of SIGTERM by now; a terminal that closes ends it in the same way.
-        signal.signal(signal.SIGHUP, signal.getsignal(signal.SIGTERM))
+        settle(cpu)
         count, name, pid = started["slaves"], started["interface"], started["pid"]
         report(f"segment of {count} {'slave' if count == 1 else 'slaves'} (process {pid})")
         if not started["namespace"]:
@@ -87,7 +76,7 @@ def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, scrip
             users = "" if _user_namespace() == users_before else " -U --preserve-credentials"
             report(f"the master's interface is {name} in the network namespace of process {pid}; start a master with")
             report(f"  nsenter -t {pid}{users} -n COMMAND {name}")
-        where = "" if control == segment_control(runtime_directory()) else f" --segment {control}"
+        where = "" if control == usual else f" --segment {control}"
         report(f"inject faults with `rtcp segment fault NAME{where}`; control socket {control}")
         report("Ctrl-C ends it")
 
@@ -96,16 +85,6 @@ def _run(config: Path, interface: str | None, poll: bool, cpu: int | None, scrip
     except (NetworkError, ValueError) as error:
         raise CommandError(str(error)) from error
     report("ended")
-
-
-def _control() -> Path:
-    """Return a free path for the control socket, in the runtime directory where that is possible."""
-    directory = runtime_directory()
-    try:
-        make_runtime_directory(directory)
-    except RuntimeDirectoryError:
-        return Path(tempfile.gettempdir()) / f"rtcp-segment-{os.getpid()}.sock"
-    return free_segment_control(directory)
 
 
 def _user_namespace() -> str:
@@ -257,30 +236,7 @@ def _value(written: str) -> int | float | str:
     return written
 
 
-@contextmanager
-def _client(path: Path | None) -> Iterator[SegmentClient]:
-    """Connect to the segment at `path`, or to the running one.
+def _client(path: Path | None) -> AbstractContextManager[SegmentClient]:
+    from rtcp.virtual.faults.control import SegmentClient
 
-    Raises:
-        CommandError: no segment runs, several run, or the segment refuses.
-    """
-    from rtcp.virtual.faults.control import SegmentAway, SegmentClient, SegmentRefused
-
-    try:
-        with SegmentClient(path or _running()) as client:
-            yield client
-    except SegmentAway as error:
-        raise CommandError(str(error), ExitCode.NOT_RUNNING) from error
-    except SegmentRefused as error:
-        raise CommandError(str(error), ExitCode.REFUSED) from error
-
-
-def _running() -> Path:
-    directory = runtime_directory()
-    usual = segment_control(directory)
-    found = [path for path in (usual, *sorted(directory.glob("segment-*.sock"))) if is_listening(path)]
-    if not found:
-        raise CommandError(f"no virtual segment is running: nothing listens at {usual}", ExitCode.NOT_RUNNING)
-    if len(found) > 1:
-        raise CommandError(f"several segments are running: choose by --segment {' or '.join(map(str, found))}")
-    return found[0]
+    return connected(SegmentClient, path, segment_control(runtime_directory()), "virtual segment")

@@ -122,7 +122,8 @@ def picture(status: Json) -> RenderableType:
     from rich.text import Text
 
     gap = Text()
-    parts = (_headline(status), _joints(status), gap, _slaves(status), gap, _times(status), gap, _facts(status))
+    slaves = (_slaves(status), gap) if status["slaves"] else ()
+    parts = (_headline(status), _joints(status), gap, *slaves, _times(status), gap, _facts(status))
     return Group(*parts, *_messages(status))
 
 
@@ -133,7 +134,8 @@ def _headline(status: Json) -> Panel:
 
     state = status["state"].replace("_", " ")
     line = Text.assemble((state.upper(), STATE_STYLES.get(state, "bold")))
-    line.append(f"   {status['control_mode']}, {status['drive_mode']} on {status['bus']}")
+    kind = "" if status["bus_kind"] == "ethercat" else f" ({status['bus_kind']})"
+    line.append(f"   {status['control_mode']}, {status['drive_mode']} on {status['bus']}{kind}")
     line.append(f"   every {status['cycle_ns'] / 1000:g} us   {status['cycles']:,} cycles, ".replace(",", " ", 1))
     line.append(f"{status['missed']:,} missed".replace(",", " "), "yellow" if status["missed"] else "")
     if status["message"]:
@@ -209,8 +211,12 @@ def _facts(status: Json) -> Table:
     if status["control_mode"] == "joystick":
         joystick = status["joystick"]
         rows.add_row("joystick", f"{joystick['mode']}, controls the {'arm' if joystick['controls_arm'] else 'chair'}")
+    rows.add_row("drives", _drives(status))
     rows.add_row("frames", _frames(status))
-    rows.add_row("clocks", _clocks(status))
+    if status["dc"] is not None:
+        rows.add_row("clocks", _clocks(status))
+    for name, process in status["processes"].items():
+        rows.add_row(Text(name), Text(process["state"] or process["kind"]))
     for device, fields in status["devices"].items():
         for name, shown in fields.items():
             rows.add_row(Text(f"{device} {name}"), Text(_value(name, **shown)))
@@ -221,6 +227,14 @@ def _facts(status: Json) -> Table:
         rows.add_row("lease", Text(status["lease"]["holder"]))
     rows.add_row("processes", ", ".join(f"{name} {pid}" for name, pid in status["pids"].items() if pid))
     return rows
+
+
+def _drives(status: Json) -> str:
+    """Return the states of the drives: one for all, or each by the name of its joint."""
+    states = status["drive_states"]
+    if len(set(states)) == 1:
+        return str(states[0])
+    return ", ".join(f"{name} {state}" for name, state in zip(status["joint_names"], states, strict=True))
 
 
 def _value(name: str, value: Any, unit: str) -> str:
@@ -238,7 +252,8 @@ def _frames(status: Json) -> Text:
     expected, actual, second = status["wkc"]["expected"], status["wkc"]["actual"], status["last_second"]
     if actual <= 0:  # 0: no slave took part; -1: no frame came back
         return Text(f"no answer in the last second, {expected} expected", "bold red")
-    line = Text(f"working counter {actual} of {expected}", "" if actual == expected else "bold red")
+    counter = f"working counter {actual} of {expected}" if status["slaves"] else "answered"
+    line = Text(counter, "" if actual == expected else "bold red")
     for what in ("unanswered", "incomplete"):
         if second[what]:
             style = "yellow" if second[what] > _LOST_SHARE * second["cycles"] else ""

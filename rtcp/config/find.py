@@ -111,6 +111,19 @@ def registered(group: str) -> dict[str, EntryPoint]:
     return found
 
 
+def class_of_kind(base: type[T], group: str, kind: str) -> type[T]:
+    """Return the class that is registered in a group of entry points for a kind.
+
+    Raises:
+        ConfigError: no installed package has this kind.
+        PluginError: what is registered does not extend `base`.
+    """
+    kinds = registered(group)
+    if kind not in kinds:
+        raise ConfigError([f'kind: found the text "{kind}", allowed is one of {", ".join(sorted(kinds))}'])
+    return load_class(kinds[kind], base)
+
+
 def load_messages() -> None:
     """Import the controllers and drivers of other packages: that registers their commands, refusals and events.
 

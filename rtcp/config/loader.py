@@ -4,33 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from kinematics.model import ArmModel, DhRow, JointLimit, LinkMass
+from kinematics.model import ArmModel, Capsule, DhRow, JointLimit, LinkMass
 from kinematics.pose import Pose
 from rtcp.config import rules
-from rtcp.config.document import Document, Finding, KeyPath, read, sentence
-from rtcp.config.find import exists
+from rtcp.config.buses import bus_class
+from rtcp.config.document import Document, Finding, KeyPath, read, sentence, shown
+from rtcp.config.find import class_of_kind, exists
 from rtcp.config.model import (
     JOINTS,
+    MOST_AXES,
+    UNLIMITED_TORQUE,
     VIRTUAL,
     ArmConfig,
     ArmFile,
     ArmSettings,
+    BusConfig,
     ConfigError,
     ControlModeName,
     CycleConfig,
     DeviceDescription,
+    EthercatBus,
     Joint,
     Kinematics,
     MechanicalLimit,
+    PluginError,
+    ProcessConfig,
     SlaveConfig,
 )
 from rtcp.config.numbers import Name
-from rtcp.config.validation import Checker, FileRule, allowed, keys, rule
+from rtcp.config.validation import EVERY_KEY, Checker, FileRule, allowed, keys, rule
 
 RENAMED = {
     "mode": "drive_mode",
@@ -60,8 +67,29 @@ def _limits(file: KinematicsFile) -> Iterator[Finding]:
         yield ("kinematics",), f"the key limits is missing; in a file without joints it must be {wanted}"
 
 
-_ARM = Checker(ArmFile, RENAMED)
+@cache
+def _arm_checker(bus: Any) -> Checker[ArmFile]:
+    """Return what checks the file of an arm on this kind of bus."""
+    keys_of_bus = [("bus", bus, field(default_factory=bus))]
+    return Checker(make_dataclass(ArmFile.__name__, keys_of_bus, bases=(ArmFile,), frozen=True), RENAMED)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """The first word of `bus`, which decides what its other keys are."""
+
+    kind: Name = "ethercat"
+
+
+@dataclass(frozen=True)
+class _NamedKind:
+    """The first word of a process."""
+
+    kind: Name
+
+
 _KINEMATICS, _DEVICE, _CYCLE = Checker(KinematicsFile), Checker(DeviceDescription), Checker(CycleConfig)
+_NAMED_KIND = Checker(_NamedKind)
 
 
 def load(path: Path) -> ArmConfig:
@@ -73,11 +101,15 @@ def load(path: Path) -> ArmConfig:
     """
     document = read(path)
     cycle, _ = _CYCLE.check(document.data.get("cycle", {}))
-    devices: dict[str, DeviceDescription] = {}
-    missing: list[Finding] = []
+    kind, bus, missing = _bus_of(document)
+    nodes = _nodes(document.data, bus, cycle)
+    missing += _complete(document.data, bus, nodes)
+    devices = {slave.device.name: slave.device for slave in nodes}
     in_devices: list[str] = []
     for key, where in _devices_named(document.data):
         file = device_path(path, key)
+        if key in devices:
+            continue
         if not exists(file):
             missing.append((where, _no_device(key, file)))
             continue
@@ -87,19 +119,129 @@ def load(path: Path) -> ArmConfig:
             in_devices += error.problems
     drives = FileRule(("slaves", "joints", "gripper"), partial(rules.drive_findings, devices=devices))
     terminals = FileRule(("slaves", "inputs", "outputs", "gripper"), partial(rules.terminal_findings, devices=devices))
-    arm, findings = _ARM.check(document.data, drives, terminals)
-    findings += missing
+    suits = FileRule((EVERY_KEY,), lambda arm: arm.bus.findings(arm))
+    checker: Checker[ArmFile] = _arm_checker(kind)  # type: ignore[arg-type]
+    processes, wrong = _processes_of(document)
+    data = {key: value for key, value in document.data.items() if key != "processes"}
+    arm, findings = checker.check(data, drives, terminals, suits)
+    findings += missing + wrong
+    if "joints" not in data and not document.data.get("processes"):
+        wanted = f"a list of 1 to {MOST_AXES} mappings with the keys {', '.join(keys(Joint))}"
+        findings.append(((), f"the key joints is missing; it must be {wanted}; a platform of processes has none"))
+    elif data.get("joints") == [] and not document.data.get("processes"):
+        findings.append((("joints",), f"found a list of 0, allowed are 1 to {MOST_AXES} joints"))
+    if arm is not None:
+        described = {slave.name: slave.device for slave in nodes} or {
+            slave.name: devices[slave.device] for slave in arm.slaves if slave.device in devices
+        }
+        findings += [
+            (("processes", number, *where), text)
+            for number, process in enumerate(processes)
+            for where, text in process.findings(described)
+        ]
+        findings += _shared_channels(processes)
     if findings or in_devices or arm is None:
         raise ConfigError(document.sentences(findings) + in_devices)
     return ArmConfig(
-        **{field.name: getattr(arm, field.name) for field in fields(ArmSettings)},
-        slaves=tuple(
+        **{entry.name: getattr(arm, entry.name) for entry in fields(ArmSettings) if entry.name != "processes"},
+        slaves=nodes
+        or tuple(
             SlaveConfig(slave.name, devices[slave.device], str(device_path(path, slave.device))) for slave in arm.slaves
         ),
+        processes=processes,
         arm=None if arm.kinematics is None else _arm_model(document, arm.name, arm.kinematics, arm.joints),
         source=path,
         warnings=tuple(document.sentences(rules.implausible(arm))),
     )
+
+
+def _bus_of(document: Document) -> tuple[type[BusConfig], BusConfig, list[Finding]]:
+    """Return the kind of bus that a file names, its keys where they are valid, and what is wrong with the kind."""
+    data = document.data.get("bus", {})
+    kind: type[BusConfig] = EthercatBus
+    findings: list[Finding] = []
+    if isinstance(data, dict) and "kind" in data:
+        named, findings = Checker(_Kind).check({"kind": data["kind"]})
+        findings = [(("bus", *where), text) for where, text in findings]
+        if named is not None:
+            try:
+                kind = bus_class(named.kind)
+            except PluginError:
+                raise
+            except ConfigError as error:
+                findings = [(("bus", "kind"), error.problems[0].partition(": ")[2])]
+    bus, _ = Checker(kind).check(data)
+    return kind, bus or kind(), findings
+
+
+def _processes_of(document: Document) -> tuple[tuple[ProcessConfig, ...], list[Finding]]:
+    """Return the processes of a file, where they are valid, and what is wrong with them."""
+    entries = document.data.get("processes", [])
+    if not isinstance(entries, list):
+        return (), [(("processes",), f"found {shown(entries)}, allowed is a list of mappings with the key kind")]
+    made: list[ProcessConfig] = []
+    findings: list[Finding] = []
+    for number, entry in enumerate(entries):
+        where = ("processes", number)
+        named, wrong = _NAMED_KIND.check({"kind": entry.get("kind")} if isinstance(entry, dict) else entry)
+        findings += [((*where, *at), text) for at, text in wrong]
+        if named is None:
+            continue
+        try:
+            kind = class_of_kind(ProcessConfig, ProcessConfig.ENTRY_POINTS, named.kind)
+        except PluginError:
+            raise
+        except ConfigError as error:
+            findings.append(((*where, "kind"), error.problems[0].partition(": ")[2]))
+            continue
+        process, wrong = Checker(kind).check(entry)
+        findings += [((*where, *at), text) for at, text in wrong]
+        if process is not None:
+            if process.name in [other.name for other in made]:
+                findings.append(((*where, "name"), f'found the text "{process.name}" twice, allowed is a name each'))
+            made.append(process)
+    return tuple(made), findings
+
+
+def _shared_channels(processes: Sequence[ProcessConfig]) -> Iterator[Finding]:
+    """Yield what two processes would write, and a second one of a kind: its commands would be the first one's."""
+    written: dict[str, int] = {}
+    kinds: dict[str, int] = {}
+    for number, process in enumerate(processes):
+        if (first := kinds.setdefault(process.kind, number)) != number:
+            text = f'found the text "{process.kind}", the kind of processes[{first}]; allowed is one of a kind'
+            yield ("processes", number, "kind"), text
+        for key, image, channel in process.channels():
+            if image == "rpdo" and (first := written.setdefault(channel, number)) != number:
+                text = f'found the text "{channel}", which processes[{first}] writes; allowed is a channel each'
+                yield ("processes", number, key), text
+
+
+def _nodes(data: Any, bus: BusConfig, cycle: CycleConfig | None) -> tuple[SlaveConfig, ...]:
+    joints = data.get("joints")
+    names = [joint.get("name") for joint in joints if isinstance(joint, dict)] if isinstance(joints, list) else []
+    period_us = (cycle or CycleConfig()).period_us
+    return bus.nodes([name for name in names if isinstance(name, str)], period_us)
+
+
+def _complete(data: Any, bus: BusConfig, nodes: Sequence[SlaveConfig]) -> list[Finding]:
+    """Add to the file of an arm on a bus without slaves what its bus says: slaves, and which of them moves a joint."""
+    if not nodes:
+        return []
+    findings: list[Finding] = []
+    if "slaves" in data:
+        findings.append((("slaves",), f"a bus of kind {bus.kind} has no slaves: leave it out"))
+    data["slaves"] = [{"name": slave.name, "device": slave.device.name} for slave in nodes]
+    for i, joint in enumerate(data["joints"] if isinstance(data.get("joints"), list) else ()):
+        if isinstance(joint, dict):
+            if "slave" in joint:
+                findings.append((("joints", i, "slave"), f"a bus of kind {bus.kind} has no slaves: leave it out"))
+            joint["slave"] = joint.get("name")
+            if "torque" in bus.LACKS:
+                if "torque" in joint:
+                    findings.append((("joints", i, "torque"), f"{bus.LACKS['torque']}: leave it out"))
+                joint["torque"] = UNLIMITED_TORQUE
+    return findings
 
 
 def load_device(path: Path, period_us: float | None = None) -> DeviceDescription:
@@ -132,6 +274,17 @@ def load_kinematics(path: Path) -> ArmModel:
         return arm
     file = _KINEMATICS.read(document)
     return _arm_model(document, file.name, file.kinematics, ())
+
+
+def load_mechanics(path: Path) -> ArmModel:
+    """Read an arm's file and return its kinematics with the mechanical limits, where it has `kinematics.limits`.
+
+    Raises:
+        ConfigError: as `load_kinematics`.
+    """
+    model = load_kinematics(path)
+    part, _ = Checker(Kinematics).check(read(path).data["kinematics"])
+    return model if part is None or part.limits is None else replace(model, limits=_mechanical(part.limits))
 
 
 def joints_of(path: Path) -> tuple[Joint, ...]:
@@ -204,14 +357,14 @@ def widen(config: ArmConfig) -> ArmConfig:
         sdo = tuple(replace(e, value=0.0) if off else e for e, off in zip(device.sdo, unlimited, strict=True))
         return replace(device, watchdog_ms=min(device.watchdog_ms * scale, _LONGEST_WATCHDOG_MS), sdo=sdo)
 
+    bus = replace(config.bus, lost_cycles=round(config.bus.lost_cycles * scale))
+    if isinstance(bus, EthercatBus):
+        clock_lost_s = max(bus.clock_lost_s, min(bus.clock_lost_s * scale, _LONGEST_SCALED_UNLOCKED_S))
+        bus = replace(bus, clock_lost_s=clock_lost_s)
     return replace(
         config,
         lease_s=max(config.lease_s, min(config.lease_s * scale, _LONGEST_SCALED_LEASE_S)),
-        bus=replace(
-            config.bus,
-            lost_cycles=round(config.bus.lost_cycles * scale),
-            clock_lost_s=max(config.bus.clock_lost_s, min(config.bus.clock_lost_s * scale, _LONGEST_SCALED_UNLOCKED_S)),
-        ),
+        bus=bus,
         slaves=tuple(replace(slave, device=widened(slave.device)) for slave in config.slaves),
     )
 
@@ -235,22 +388,30 @@ def _devices_named(data: Any) -> Iterator[tuple[str, KeyPath]]:
 def _arm_model(document: Document, name: str, part: Kinematics, joints: Sequence[Joint]) -> ArmModel:
     """Return the model of an arm; where it has `joints`, their names, ranges and speeds are the model's."""
     try:
-        limits = [JointLimit(one.position.min, one.position.max, one.velocity) for one in joints] or [
-            JointLimit(one.min, one.max, one.velocity or math.inf) for one in part.limits or ()
-        ]
+        limits = tuple(JointLimit(one.position.min, one.position.max, one.velocity) for one in joints)
         x, y, z, rx, ry, rz = *part.tool.position, *part.tool.rpy
         return ArmModel(
             name=name,
             rows=tuple(DhRow(row.alpha, row.a, row.d, row.offset) for row in part.dh),
-            limits=tuple(limits),
-            links=tuple(
-                LinkMass(link.mass, (link.centre[0], link.centre[1], link.centre[2])) for link in part.links or ()
-            ),
+            limits=limits or _mechanical(part.limits or ()),
+            links=tuple(LinkMass(link.mass, _point(link.centre)) for link in part.links or ()),
             tool=Pose.from_xyzrpy(x, y, z, rx, ry, rz),
             joint_names=tuple(joint.name for joint in joints) or ArmModel.joint_names,
+            bodies=tuple(
+                Capsule(body.link, _point(body.start), _point(body.end), body.radius) for body in part.bodies or ()
+            ),
         )
     except ValueError as error:
         raise ConfigError(document.sentences([(("kinematics",), str(error))])) from error
+
+
+def _point(vector: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = vector
+    return x, y, z
+
+
+def _mechanical(limits: Sequence[MechanicalLimit]) -> tuple[JointLimit, ...]:
+    return tuple(JointLimit(one.min, one.max, one.velocity or math.inf) for one in limits)
 
 
 def _no_device(key: str, file: Path) -> str:

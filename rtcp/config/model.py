@@ -8,11 +8,12 @@ of the attribute docstrings here.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args, get_type_hints
 
 from annotated_types import Ge, Gt, Le, MaxLen, MinLen
 
@@ -52,6 +53,8 @@ JOINTS = 6
 """Joints of an arm that has `kinematics`."""
 MOST_AXES = 10
 """Joints, a gripper's among them: as many as commands, plans and recordings have room for."""
+UNLIMITED_TORQUE = 1e9
+"""Nm; the limit of joints whose torque nobody measures."""
 MOST_POINTS = 4096
 """Points or poses of a motion file."""
 
@@ -281,28 +284,66 @@ class CycleConfig:
     """Busy wait before the tick, us; removes the timer's jitter."""
 
 
+Capability = Literal["sdo", "states", "clocks", "torque", "homing", "power"]
+"""What a bus may offer beside process data: SDO, supervision of slaves by AL states, distributed clocks; and what its
+drives may: torque targets and measured torque, homing, switching their power on."""
+
+
 @dataclass(frozen=True)
 class BusConfig:
-    """The bus and its tolerances."""
+    """The bus and its tolerances. Each kind is a subclass, found by the entry point `rtcp.buses`."""
 
+    kind: Name = "ethercat"
+    """Kind of bus: `ethercat`, `egm` or `rapid`; further ones from installed packages."""
     interface: Name = VIRTUAL
     """`virtual`, or a network interface of at most 15 characters."""
     segment: str = "segment.yaml"
     """File of the virtual segment, relative to the arm's file."""
-    receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
-    """Receive timeout, fraction of the period."""
     lost_cycles: Annotated[int, Ge(1), Le(1000)] = 40
     """Lost cycles (wrong working counter) that are a fault: in a row, or more than good ones."""
     timeout_scale: Annotated[float, Ge(1), Le(100)] = 100.0
     """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    op_timeout_s: Positive = 5.0
+    """Timeout for all slaves from INIT to OP, s."""
+
+    MASTER: ClassVar[str] = ""
+    """Class of the loop's side, `module:name`; see `rtcp.fieldbus.master.Master`."""
+    VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ()
+    """Module and options of the process that is the other side where `interface` is `virtual`."""
+    VIRTUAL_CONTROL: ClassVar[str] = "segment"
+    """Name of that process's control socket: `segment` or `irc5`."""
+    LACKS: ClassVar[Mapping[Capability, str]] = {}
+    """Why the bus does not offer something, a sentence each."""
+
+    def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
+        """Return what is on a bus that has no slaves: each joint by its name, then others; none: the file lists slaves.
+
+        Args:
+            joints: names of the joints.
+            period_us: the cycle, us.
+        """
+        return ()
+
+    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        """Yield what of a whole file does not suit this bus: key path and the rest of the sentence."""
+        yield from ()
+
+
+@dataclass(frozen=True)
+class EthercatBus(BusConfig):
+    """EtherCAT: slaves on a cable."""
+
+    receive_fraction: Annotated[float, Gt(0), Le(0.6)] = 0.3
+    """Receive timeout, fraction of the period."""
     send_phase: Fraction = 0.5
     """Instant between two SYNC0 at which the frame passes the reference clock, fraction of the period."""
     clock_lost_s: Positive = 1.0
     """Time without lock to the reference clock that is a fault, s."""
-    op_timeout_s: Positive = 5.0
-    """Timeout for all slaves from INIT to OP, s."""
     watch_ms: Annotated[float, Ge(2), Le(1000)] = 10.0
     """Interval at which the slave watcher reads the slaves' states, ms."""
+
+    MASTER: ClassVar[str] = "rtcp.fieldbus.soem:SoemMaster"
+    VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ("rtcp.virtual",)
 
 
 @dataclass(frozen=True)
@@ -317,12 +358,12 @@ class Box:
 
 @dataclass(frozen=True)
 class KeepOut:
-    """A box that neither tool nor wrist nor elbow may enter: the user, the chair."""
+    """A box that no body of the arm may enter: the user, the chair."""
 
     name: Name
     """Name for messages and `rtcp limits set NAME.min.x`; unique, no dot, not `box`, `joints` or a joint's name."""
     min: Vector
-    """Corner x, y, z, m; tool, wrist and elbow stay outside."""
+    """Corner x, y, z, m; all bodies of the arm but the base stay outside: [bodies](kinematics.md#bodies)."""
     max: Vector
     """Opposite corner, m; greater in each coordinate."""
 
@@ -355,6 +396,8 @@ class CartesianConfig:
     """Tool rotation acceleration limit, rad/s²."""
     angular_jerk: Positive = 10.0
     """Tool rotation jerk limit, rad/s³."""
+    clearance: NotNegative = 0.01
+    """Distance that the arm's bodies keep from keep-out boxes and from each other, m."""
     box: Box | None = None
     keep_out: tuple[KeepOut, ...] = ()
     singularity: SingularityLimits = field(default_factory=SingularityLimits)
@@ -575,6 +618,20 @@ class Tool:
 
 
 @dataclass(frozen=True)
+class Body:
+    """A body of the arm: a cylinder with a ball at each end."""
+
+    link: Annotated[int, Ge(0), Le(JOINTS)]
+    """Link of the body: 0 the base, 6 the flange and the tool; `bodies` left out: made of `dh` and `tool`."""
+    start: Vector
+    """Start x, y, z of the axis in the frame of the link, m."""
+    end: Vector
+    """End of the axis, m; the same point: a ball."""
+    radius: Positive
+    """Radius, m."""
+
+
+@dataclass(frozen=True)
 class Kinematics:
     """The arm's geometry; `limits` may be left out beside `joints`, `links` where masses are not known."""
 
@@ -582,6 +639,76 @@ class Kinematics:
     limits: Annotated[tuple[MechanicalLimit, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
     links: Annotated[tuple[Link, ...], MinLen(JOINTS), MaxLen(JOINTS)] | None = None
     tool: Tool = field(default_factory=Tool)
+    bodies: Annotated[tuple[Body, ...], MinLen(1)] | None = None
+
+
+InputChannel = Annotated[str, "tpdo"]
+"""A channel that a slave sends, written SLAVE.CHANNEL."""
+OutputChannel = Annotated[str, "rpdo"]
+"""A channel that a slave receives, written SLAVE.CHANNEL."""
+
+
+@dataclass(frozen=True)
+class ProcessConfig:
+    """A process of the platform. Each kind is a subclass, found by the entry point `rtcp.processes`."""
+
+    kind: Name
+    """Kind of process, of an installed package: `shape_setting`, or another one."""
+    name: Name
+    """Name in records, status and commands; lower case letters, digits and underscores."""
+
+    ENTRY_POINTS: ClassVar[str] = "rtcp.processes"
+    PROCESS: ClassVar[str] = ""
+    """Class of the cycle's part, `module:name`: a `rtcp.processes.Process`."""
+    COMMANDS: ClassVar[tuple[type[Any], ...]] = ()
+    """Commands (`rtcp.ipc.commands.Command`) that it accepts; no other part of the platform does."""
+    STATES: ClassVar[type[IntEnum] | None] = None
+    """Meaning of its field `state`, where it has one; for status and panel."""
+    LAMPS: ClassVar[Mapping[str, str]] = {}
+    """Lamps on the panel: by their colour the key of the channel that each shows."""
+    PLOT: ClassVar[tuple[str, ...]] = ()
+    """Fields that the panel draws over time."""
+
+    def findings(self, devices: Mapping[str, DeviceDescription]) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        """Yield what does not suit the slaves, by name: key path and the rest of the sentence."""
+        used: dict[str, str] = {}
+        for key, image, text in self.channels():
+            slave, _, channel = text.partition(".")
+            if slave in devices and all(
+                channel in (entry.name for pdo in getattr(devices[slave], one) for entry in pdo.channels)
+                for one in ("rpdo", "tpdo")
+            ):
+                yield (
+                    (key,),
+                    f'found the text "{text}", a channel that {slave} both sends and receives: rename one of them',
+                )
+            mapped = [
+                entry.name
+                for pdo in (getattr(devices[slave], image) if slave in devices else ())
+                for entry in pdo.channels
+                if entry.index
+            ]
+            if slave not in devices:
+                yield (key,), f'found the text "{text}", allowed is SLAVE.CHANNEL with one of {", ".join(devices)}'
+            elif devices[slave].is_box:
+                yield (
+                    (key,),
+                    f'found the text "{text}", of an IO box: its terminals are those of `inputs` and `outputs`',
+                )
+            elif channel not in mapped:
+                known = ", ".join(mapped) or "none"
+                yield (key,), f'found the text "{text}", allowed are the channels in `{image}` of {slave}: {known}'
+            elif image == "rpdo" and text in used:
+                yield (key,), f'found the text "{text}", which {used[text]} writes already: allowed is a channel each'
+            used[text] = key
+
+    def channels(self) -> Iterator[tuple[str, Literal["tpdo", "rpdo"], str]]:
+        """Yield key, image and text of every channel that the keys name; an empty text names none."""
+        hints = get_type_hints(type(self), include_extras=True)
+        for entry in fields(self):
+            hint = hints[entry.name]
+            if hint in (InputChannel, OutputChannel) and (text := getattr(self, entry.name)):
+                yield entry.name, get_args(hint)[1], text
 
 
 @dataclass(frozen=True)
@@ -590,9 +717,9 @@ class ArmSettings:
 
     name: Name
     """Name of the arm, also of its file of zero offsets."""
-    joints: Annotated[tuple[Joint, ...], MinLen(1), MaxLen(MOST_AXES)]
+    joints: Annotated[tuple[Joint, ...], MinLen(0), MaxLen(MOST_AXES)] = ()
     cycle: CycleConfig = field(default_factory=CycleConfig)
-    bus: BusConfig = field(default_factory=BusConfig)
+    bus: BusConfig = field(default_factory=EthercatBus)
     drive_mode: DriveModeName = "csp"
     """Drive mode at the start: cyclic synchronous position, velocity or torque; `rtcp mode` changes it."""
     control_mode: ControlModeName = "joint"
@@ -610,6 +737,8 @@ class ArmSettings:
     gripper: GripperConfig | None = None
     recording: RecordingConfig | None = None
     ros: RosConfig | None = None
+    processes: tuple[ProcessConfig, ...] = ()
+    """Processes beside motion: [processes](processes.md)."""
 
     @property
     def axes(self) -> tuple[Joint, ...]:
@@ -639,6 +768,11 @@ class ArmConfig(ArmSettings):
     """The file it was read from."""
     warnings: tuple[str, ...] = ()
     """Values that are allowed and implausible: file, line, key, value and the likely mistake."""
+
+    @property
+    def ethercat(self) -> EthercatBus:
+        """The keys of an EtherCAT bus; on another kind their defaults."""
+        return self.bus if isinstance(self.bus, EthercatBus) else EthercatBus()
 
     @property
     def boxes(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from rtcp.config.model import (
     ArmFile,
     Box,
     DeviceDescription,
+    EthercatBus,
     GripperConfig,
     HasBox,
     Joint,
@@ -258,6 +259,8 @@ def _axis_names(arm: ArmFile) -> Iterator[Finding]:
 @rule(ArmFile, "bus")
 def _interface(arm: ArmFile) -> Iterator[Finding]:
     name = arm.bus.interface
+    if not isinstance(arm.bus, EthercatBus):
+        return
     if len(name) > LONGEST_INTERFACE or "/" in name or any(map(str.isspace, name)):
         wanted = f"{VIRTUAL}, or a network interface of at most {LONGEST_INTERFACE} characters without spaces and /"
         yield ("bus", "interface"), f'found the text "{name}", allowed is {wanted}'
@@ -518,6 +521,7 @@ def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
         ("wrist", least.wrist, "rad", _DEGREES),
     ):
         yield ("cartesian", "singularity", key), value, 1.0, unit, likely
+    yield ("cartesian", "clearance"), arm.cartesian.clearance, 1.0, "m", _MILLIMETRES
     if arm.kinematics is None:
         return
     for i, row in enumerate(arm.kinematics.dh):
@@ -531,6 +535,10 @@ def _magnitudes(arm: ArmFile) -> Iterator[Magnitude]:
         yield ("kinematics", "links", i, "mass"), link.mass, 200.0, "kg", _GRAMS
         yield ("kinematics", "links", i, "centre"), max(map(abs, link.centre)), 5.0, "m", _MILLIMETRES
     yield ("kinematics", "tool", "position"), max(map(abs, arm.kinematics.tool.position)), 5.0, "m", _MILLIMETRES
+    for i, body in enumerate(arm.kinematics.bodies or ()):
+        for key in ("start", "end"):
+            yield ("kinematics", "bodies", i, key), max(map(abs, getattr(body, key))), 5.0, "m", _MILLIMETRES
+        yield ("kinematics", "bodies", i, "radius"), body.radius, 1.0, "m", _MILLIMETRES
 
 
 # -- motion files ------------------------------------------------------------------------------------------------------

@@ -13,6 +13,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from rtcp.config.buses import bus_class
+from rtcp.config.find import class_of_kind
+from rtcp.config.model import BusConfig, ProcessConfig
+
 T = TypeVar("T")
 _hints = cache(get_type_hints)
 
@@ -42,6 +46,10 @@ def from_json(kind: type[T], data: object) -> T:
 
 def _typed(kind: Any, data: object, where: str) -> Any:
     if is_dataclass(kind):
+        if kind is BusConfig and isinstance(data, Mapping):
+            kind = bus_class(str(data.get("kind")))
+        if kind is ProcessConfig and isinstance(data, Mapping):
+            kind = class_of_kind(ProcessConfig, ProcessConfig.ENTRY_POINTS, str(data.get("kind")))
         return _dataclass(kind, data, where)
     origin, choices = get_origin(kind), get_args(kind)
     if hasattr(kind, "_fields") and isinstance(data, list) and len(data) == len(kind._fields):

@@ -131,7 +131,7 @@ class Checker(Generic[T]):
     def _file_findings(
         self, made: T | None, data: object, invalid: set[object], more: Iterable[FileRule]
     ) -> Iterator[Finding]:
-        rules = [*_FILE_RULES.get(self.kind, ()), *more]
+        rules = [*(rule for kind in self.kind.__mro__ for rule in _FILE_RULES.get(kind, ())), *more]
         if not rules or not isinstance(data, dict):
             return
         if made is None:

@@ -26,8 +26,12 @@ def state_directory() -> Path:
     """Return the directory of what outlives a restart, without making it.
 
     `RTCP_STATE_DIR` chooses it; else `/var/lib/rtcp` for root, `$XDG_STATE_HOME/rtcp` or `~/.local/state/rtcp` for
-    anyone else.
+    anyone else; in it one for each platform with a name (`RTCP_NAME`).
     """
+    return _unnamed() / os.environ.get("RTCP_NAME", "")
+
+
+def _unnamed() -> Path:
     if chosen := os.environ.get("RTCP_STATE_DIR"):
         return Path(chosen)
     if os.geteuid() == 0:

@@ -7,7 +7,7 @@ from typing import Any
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
-from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.drive import Drive
 from rtcp.ipc.commands import Command, Jog, MoveJoints
 from rtcp.ipc.schema import ARM_MODES, arm_fields
 from rtcp.ipc.states import ControlMode, DriveMode
@@ -16,6 +16,7 @@ from rtcp.motion.controllers.jog import JogController
 from rtcp.motion.drive_writers import CspWriter, CstWriter, CsvWriter, DriveWriter
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.state import Phase
+from rtcp.motion.step_group import StepGroup
 
 
 class Arm(JointGroup):
@@ -25,19 +26,23 @@ class Arm(JointGroup):
         config: joints, limits, cycle, the mode at the start.
         drives: one a joint, in the order of the joints, with the index of its slave.
         plan: returns a slot of the plan area, for controllers that run plans.
+        group: partners in a cell; None: there are none.
     """
 
     def __init__(
         self,
         config: ArmConfig,
-        drives: Sequence[tuple[int, Cia402Drive]],
+        drives: Sequence[tuple[int, Drive]],
         plan: Callable[[int], memoryview[float]],
+        group: StepGroup | None = None,
     ) -> None:
+        self.group = group or StepGroup()
+        """Partners in a cell, and the motion in step."""
         joints = config.joints
         super().__init__("arm", arm_fields(len(joints)), config, drives)
         self.trajectory_guard = TrajectoryGuard(config, self.limits, self.period_s)
         self.controllers: dict[type[Command], Controller] = load_controllers(
-            ControllerSetup(config, self.limits, self.trajectory_guard, self.period_s, plan)
+            ControllerSetup(config, self.limits, self.trajectory_guard, self.period_s, plan, self.group)
         )
         """By the commands that they accept."""
         self._holder = self.controllers[MoveJoints]
@@ -85,10 +90,11 @@ class Arm(JointGroup):
         n, at = len(self.drives), at + len(ARM_MODES)
         values[at : at + 4 * n] = (*state.actual, *state.actual_velocity, *state.actual_torque, *state.commanded)
         at += 4 * n
-        end = at + 4 * n
+        end = at + 5 * n
         for drive in self.drives:
-            sent = drive.target_position, drive.target_velocity, drive.target_torque, drive.statusword
-            values[at:end:n] = sent
+            values[at:end:n] = (
+                drive.target_position, drive.target_velocity, drive.target_torque, drive.state, drive.statusword,
+            )  # fmt: skip
             at += 1
 
     def stop(self) -> None:

@@ -18,14 +18,17 @@ from rtcp.control.sdo_requests import SdoRequests
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import SlaveState
 from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.recovery import MonitoredSlave
-from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
+from rtcp.fieldbus.supervision import SlaveWatcher
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.realtime.scheduling import cpu_hint, thread_beside
 
 _PUBLISH_S = 0.1
 """Interval at which slave states and counters are published and emergencies are read, s."""
 _LOCK_S = 15.0
+_SPEAKS_S = 1.0
+"""Time for a robot controller to speak, s; after it the start is reported, and what it waits for."""
 _MOST_COMPLAINTS, _MOST_EMERGENCIES = 8, 4
 """Different messages in 10 s: about failures of the bus, and about the emergencies of one slave."""
 _ERROR_BIT = 0x10
@@ -43,7 +46,7 @@ class BusService(threading.Thread):
     """Watches the slaves and does for the cycle what takes time.
 
     Args:
-        bus: the configured bus.
+        master: the bus, started.
         blackboard: where slave states and sentences go and requests come from.
         drive_positions: position on the cable of each joint's drive.
         joint_names: their names.
@@ -55,7 +58,7 @@ class BusService(threading.Thread):
 
     def __init__(
         self,
-        bus: SupervisedBus,
+        master: Master,
         blackboard: Blackboard,
         drive_positions: Sequence[int],
         joint_names: Sequence[str],
@@ -65,9 +68,11 @@ class BusService(threading.Thread):
         watch_s: float = 0.01,
     ) -> None:
         super().__init__(name="service", daemon=True)
-        self._bus = bus
+        self._master = master
+        self._bus = bus = master.supervised
         self._blackboard = blackboard
-        self._sdo_requests = SdoRequests(bus, blackboard)
+        self._sdo_requests = None if bus is None else SdoRequests(bus, blackboard)
+        self._waiting_for = ""
         self._watcher: SlaveWatcher | None = None
         self._drive_positions = drive_positions
         self._joint_names = joint_names
@@ -77,6 +82,8 @@ class BusService(threading.Thread):
         self._watch_s = watch_s
         self._publish_turns = max(round(_PUBLISH_S / watch_s), 1)
         self._op_wanted = False
+        self._is_reported = False
+        self._nodes = len(master.config.slaves)
         self._asked = 0
         """What the cycle asked last, counted up: odd to park, even to recover."""
         self._done = 0
@@ -97,6 +104,8 @@ class BusService(threading.Thread):
         """Temperature of the drive at a position, C."""
         self.on_op: Callable[[], None] = _nothing
         """Called once, from this thread, when all slaves are in OP for the first time."""
+        self.look_around: Callable[[], None] = _nothing
+        """Called in every turn, from this thread."""
         self.on_refused: Callable[[], None] = _nothing
         """Called once, from this thread, when the start has failed or the thread cannot go on."""
 
@@ -150,13 +159,17 @@ class BusService(threading.Thread):
             turn += 1
             # Each part by itself: an error in one does not stop the others.
             self._say_errors()
+            self.look_around()
             for part in (self._watch, self._serve_sdo_requests, self._listen):
                 try:
                     part(turn)
                 except BusError as error:
                     self._complain(error)
+        self._attempt_publishing()
+
+    def _attempt_publishing(self) -> None:
         try:
-            self._publish_states(self._bus.read_states())
+            self._publish_states(() if self._bus is None else self._bus.read_states())
         except BusError as error:
             self._complain(error)
 
@@ -173,6 +186,9 @@ class BusService(threading.Thread):
             self._complaints.report(sentence)
 
     def _watch(self, turn: int) -> None:
+        if self._bus is None:
+            self._watch_controller(turn)
+            return
         watcher = self._watcher
         if watcher is None:
             if not self.refused:
@@ -204,13 +220,33 @@ class BusService(threading.Thread):
         if turn % self._publish_turns == 0 or not (was_well and watcher.all_op):
             self._publish_health(watcher)
 
+    def _watch_controller(self, turn: int) -> None:
+        """Follow a bus without slaves: it may be used as soon as it is open; people are told what is missing."""
+        self.all_op = self._master.connected
+        if (missing := self._master.waiting_for()) != self._waiting_for:
+            self._waiting_for = missing
+            text = f"waiting for the robot: {missing}" if missing else "the robot is ready"
+            self._blackboard.text(text, is_problem=False)
+        if not self._is_reported and (self.all_op or turn * self._watch_s > _SPEAKS_S):
+            self._is_reported = True
+            for position in range(1, self._nodes + 1):
+                self._blackboard.slave(position, AlState.OP, 0)
+            self.on_op()
+        for axis, asked in enumerate(self._explain):
+            if asked:
+                self._explain[axis] = False
+                if words := self._master.explain(axis):
+                    self._complaints.report(words)
+
     def _start(self, turn: int) -> None:
+        bus = self._bus
+        assert bus is not None
         if self._op_wanted:
-            self._bus.request_state(AlState.OP)
-            self.refused = self._bus.wait_for_state(AlState.OP, self._op_timeout_s)
-            self._publish_states(self._bus.read_states())
+            bus.request_state(AlState.OP)
+            self.refused = bus.wait_for_state(AlState.OP, self._op_timeout_s)
+            self._publish_states(bus.read_states())
             if not self.refused:
-                self._watcher = self._bus.watcher(self._blackboard.text)
+                self._watcher = bus.watcher(self._blackboard.text)
                 self.all_op = True
                 self.on_op()
         elif turn * self._watch_s > _LOCK_S:
@@ -219,11 +255,13 @@ class BusService(threading.Thread):
                 f"or do not come back (see `rtcp status`, bus.send_phase){cpu_hint(self._cycle_cpu)}",
             )
         elif turn % self._publish_turns == 0:
-            self._publish_states(self._bus.read_states())
+            self._publish_states(bus.read_states())
         if self.refused:
             self.on_refused()
 
     def _serve_sdo_requests(self, turn: int) -> None:
+        if self._sdo_requests is None:
+            return
         if True in self._explain and not self._sdo_requests.explaining:
             axis = self._explain.index(True)
             self._explain[axis] = False
@@ -235,7 +273,7 @@ class BusService(threading.Thread):
             return
         for throttle in (self._complaints, *self._emergencies.values()):
             throttle.report_due()
-        if self._watcher is not None and self._watcher.silent:
+        if self._bus is None or (self._watcher is not None and self._watcher.silent):
             return
         for emergency in self._bus.emergencies():
             kind = emergency.position, emergency.is_problem

@@ -12,6 +12,8 @@ from typing import Any, Final
 
 from rtcp.config.model import ConfigError
 from rtcp.control.machine import StateMachine
+from rtcp.control.processes import ProcessPart
+from rtcp.devices.cia402 import Cia402Drive
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import (
     Command,
@@ -23,6 +25,7 @@ from rtcp.ipc.commands import (
     MoveGripper,
     OpenStream,
     Reset,
+    RunInStep,
     RunLines,
     RunTrajectory,
     SetControlMode,
@@ -39,10 +42,13 @@ from rtcp.ipc.refusals import (
     DriveModeChanging,
     DriveModeFixed,
     DriveModeUnsupported,
+    DriveNotReady,
     EmergencyStopPressed,
     GripperDisabled,
+    HomingUnsupported,
     JointOutsideRange,
     Malformed,
+    NoArm,
     NoGeometry,
     NoGripper,
     NoLease,
@@ -52,6 +58,8 @@ from rtcp.ipc.refusals import (
     NotInOp,
     NotPermitted,
     OffsetOutOfRange,
+    PartnerOfAnotherCell,
+    PartnerStopPressed,
     Refusal,
     ReservedOutput,
     TorqueLimitTooLow,
@@ -110,6 +118,7 @@ class CommandHandler:
         stream = self._arm.controllers[OpenStream]
         assert isinstance(stream, StreamController)
         self._stream = stream
+        self._processes = [part for part in machine.context.parts if isinstance(part, ProcessPart)]
         for part in machine.context.parts:
             for kind in part.commands:
                 if kind in self._handlers or issubclass(kind, MotionCommand):
@@ -165,21 +174,29 @@ class CommandHandler:
         active = self._arm.control_mode
         if active not in modes:
             return WrongControlMode(active, min(modes))
+        partners = self._machine.partners
+        if partners is not None and partners.group.foreign >= 0:
+            return PartnerOfAnotherCell(partners.group.foreign)
         return None if self._operator.permitted else NotPermitted()
 
     def _move(self, command: MotionCommand, lease: int) -> Refusal | None:
         arm, machine = self._arm, self._machine
         controller = arm.controllers.get(type(command))
+        if not self._joints.drives:
+            return NoArm()
         if controller is None:
             return NoGeometry()
         refusal = self._motion_refusal(controller.control_modes)
         if refusal is not None:
             return refusal
+        if arm.group.under_way:
+            # Nothing takes the place of a motion in step: its partners would go on.
+            return WrongState(command.number, State.MOVING)
         continues = machine.state is State.MOVING and arm.active is controller
         refusal = controller.accept(command, arm.state, continues)
         if refusal is not None:
             return refusal
-        if isinstance(command, (RunTrajectory, RunLines)):
+        if isinstance(command, (RunTrajectory, RunInStep, RunLines)):
             self._blackboard.use_plan(command.slot)
         elif isinstance(command, OpenStream):
             # Before the answer: whoever opened it may send at once.
@@ -193,6 +210,8 @@ class CommandHandler:
         arm = self._arm
         if not 0 <= command.axis < len(arm.drives):
             return UnknownAxis(command.axis, len(arm.drives) - 1)
+        if not isinstance(arm.drives[command.axis], Cia402Drive):
+            return HomingUnsupported(command.axis)
         refusal = self._motion_refusal(_AUTOMATIC)
         if refusal is None and arm.mode is not DriveMode.CSP:
             refusal = NotInCsp()
@@ -202,6 +221,8 @@ class CommandHandler:
 
     def _halt(self, command: Halt, lease: int) -> Refusal | None:
         self._joints.stop_others()
+        for process in self._processes:
+            process.safe()
         if self._machine.state is State.HOMING:
             self._context.homing.stop()
         else:
@@ -214,6 +235,11 @@ class CommandHandler:
         joints = self._joints
         if self._operator.emergency_stop:
             return EmergencyStopPressed()
+        if (refused := self._refused_by_partner()) is not None:
+            return refused
+        axis = joints.first_blocked()
+        if axis >= 0:
+            return DriveNotReady(axis, joints.drives[axis].missing)
         if not self._context.service.all_op:
             return NotInOp()
         if not self._context.clock_locked:
@@ -239,6 +265,14 @@ class CommandHandler:
             return EmergencyStopPressed()
         self._machine.change(command)
         return None
+
+    def _refused_by_partner(self) -> Refusal | None:
+        partners = self._machine.partners
+        if partners is None:
+            return None
+        if partners.stopped >= 0:
+            return PartnerStopPressed(partners.stopped)
+        return PartnerOfAnotherCell(partners.group.foreign) if partners.group.foreign >= 0 else None
 
     def _shut_down(self, command: Shutdown, lease: int) -> Refusal | None:
         self._machine.close()
@@ -310,6 +344,8 @@ class CommandHandler:
     def _move_gripper(self, command: MoveGripper, lease: int) -> Refusal | None:
         if self._operator.emergency_stop:
             return EmergencyStopPressed()
+        if (refused := self._refused_by_partner()) is not None:
+            return refused
         gripper = self._context.gripper
         if gripper is not None:
             if not self._operator.permitted:

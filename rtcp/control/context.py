@@ -12,7 +12,7 @@ from rtcp.control.homing import HomingSequence
 from rtcp.control.joint_group import Joints
 from rtcp.control.operator import Operator
 from rtcp.control.part import Device, Part, PartContext
-from rtcp.devices.cia402 import DriveState
+from rtcp.control.partners import Partners
 from rtcp.devices.io_box import IoBox
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import (
@@ -32,7 +32,7 @@ from rtcp.ipc.events import (
     ProcessDataLost,
     SlaveLost,
 )
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.states import DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.realtime.discipline import Discipline
@@ -52,6 +52,8 @@ class Context(PartContext):
         blackboard: where events go, and where the lease is.
         service: the thread beside the cycle.
         discipline: follows the reference clock, or None without distributed clocks.
+        partners: of the arm in a cell.
+        processes: beside motion.
     """
 
     def __init__(
@@ -64,6 +66,8 @@ class Context(PartContext):
         blackboard: Blackboard,
         service: BusService,
         discipline: Discipline | None,
+        partners: Partners | None = None,
+        processes: Sequence[Part] = (),
     ) -> None:
         super().__init__(config.cycle.period_us * 1e-6)
         self.config = config
@@ -71,8 +75,11 @@ class Context(PartContext):
         self.gripper = gripper
         self.joints = Joints(arm, [] if gripper is None else [gripper])
         self.operator = operator
-        self.parts: list[Part] = [*self.joints.groups, operator, *devices]
-        """The parts of the cycle; the operator's outputs are written before its boxes encode them."""
+        if partners is not None:
+            arm.trajectory_guard.neighbours = partners.watch(arm.state, arm.limits, self.period_s)
+        cell = () if partners is None else (partners,)
+        self.parts: list[Part] = [*self.joints.groups, operator, *processes, *devices, *cell]
+        """The parts of the cycle; the operator and processes write outputs before their slaves encode them."""
         self.boxes = [
             (device.slot + 1, device.driver if isinstance(device.driver, IoBox) else None)
             for device in devices
@@ -85,7 +92,7 @@ class Context(PartContext):
         self.reactions = reactions(config.stops)
         self._discipline = discipline
         self._lost_limit = config.bus.lost_cycles
-        self._clock_cycles = round(config.bus.clock_lost_s / self.period_s)
+        self._clock_cycles = round(config.ethercat.clock_lost_s / self.period_s)
         self._unlocked = 0
         self.entered = 0
         """Cycle in which the machine changed to its state."""
@@ -169,7 +176,7 @@ class Context(PartContext):
         self._unlocked = 0 if self.clock_locked else self._unlocked + 1
         if self._unlocked > self._clock_cycles and self.pending is None:
             self._unlocked = 0
-            return ClockLost(self.config.bus.clock_lost_s)
+            return ClockLost(self.config.ethercat.clock_lost_s)
         return None
 
     def lease_held(self, lease: int) -> bool:
@@ -195,7 +202,7 @@ class Context(PartContext):
         drive = self.joints.drives[axis]
         if drive.state in _IN_FAULT:
             kind = DriveFault
-        return kind(axis, drive.statusword)
+        return kind(axis, drive.state, drive.statusword)
 
     def wrong_drive_mode(self, axis: int) -> Event:
         """Return the event of a drive that does not change its mode."""

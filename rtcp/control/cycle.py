@@ -20,9 +20,12 @@ from rtcp.control.gripper import make_gripper
 from rtcp.control.machine import StateMachine
 from rtcp.control.operator import Operator
 from rtcp.control.part import make_devices
-from rtcp.devices.cia402 import Cia402Drive, drive_of
+from rtcp.control.partners import Partners
+from rtcp.control.processes import make_processes
+from rtcp.devices.drive import Drive, drive_of
 from rtcp.devices.io_box import IoBox
 from rtcp.fieldbus.bus import ProcessData
+from rtcp.fieldbus.master import PacedData
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.events import ClockLocked, ClockUnlocked
 from rtcp.ipc.schema import (
@@ -60,6 +63,7 @@ class Cycle:
         service: the thread beside the cycle; it need not run.
         discipline: follows the reference clock, or None without distributed clocks.
         now: the clock, ns; another one where time is simulated.
+        partners: of the arm in a cell.
 
     Raises:
         DeviceError: the description of a device does not suit its use.
@@ -73,15 +77,20 @@ class Cycle:
         service: BusService,
         discipline: Discipline | None,
         now: Callable[[], int] = monotonic_ns,
+        partners: Partners | None = None,
     ) -> None:
         self.devices = devices = make_devices(config)
         boxes = {device.name: device.driver for device in devices if isinstance(device.driver, IoBox)}
         gripper = make_gripper(config)
-        self.arm = Arm(config, make_drives(config), blackboard.plan)
+        group = None if partners is None else partners.group
+        self.arm = Arm(config, make_drives(config), blackboard.plan, group)
         self.operator = Operator(config, boxes, gripper)
-        context = Context(config, self.arm, gripper, self.operator, devices, blackboard, service, discipline)
+        context = Context(
+            config, self.arm, gripper, self.operator, devices, blackboard, service, discipline, partners,
+            make_processes(config, devices, partners),
+        )  # fmt: skip
         self.joints = context.joints
-        self.machine = StateMachine(context)
+        self.machine = StateMachine(context, partners)
         self.commands = CommandHandler(self.machine, blackboard)
         self.parts = context.parts
         self._context = context
@@ -121,6 +130,11 @@ class Cycle:
     def run(self) -> None:
         """Run until the end was asked for and the drives are disabled (or 2 s have passed)."""
         machine, cycle, spin = self.machine, self.cycle, self._spin_ns
+        if isinstance(self._data, PacedData):
+            planned = monotonic_ns() + self._period_ns
+            while not machine.closed:
+                planned = self.answer(self._data, planned)
+            return
         sleep = Sleeper().until
         planned = monotonic_ns() + self._period_ns
         while not machine.closed:
@@ -129,37 +143,28 @@ class Cycle:
                 pass
             planned = cycle(planned, woken)
 
+    def answer(self, data: PacedData, planned: int) -> int:
+        """Do one cycle of a bus that sets the pace: its message is due at `planned`; return when the next one is.
+
+        What does not come within half a period is lost. A message that comes later begins the next cycle.
+        """
+        period = self._period_ns
+        wkc = data.receive_until(planned + period // 2)
+        woken = self._now()
+        self._work(woken, wkc)
+        data.send()
+        self._publish(woken, planned, woken, wkc)
+        self._compute_ns = self._now() - woken
+        return (woken if wkc > 0 else max(planned, woken - period)) + period
+
     def cycle(self, planned: int, woken: int) -> int:
         """Do one cycle, planned at `planned` and begun at `woken` (ns of the clock); return when the next is due."""
-        data, machine, parts = self._data, self.machine, self.parts
+        data = self._data
         data.send()
         sent = self._now()
         wkc = data.receive()
         received = self._now()
-        good = wkc == self._expected
-        context = self._context
-        context.now_ns = self.arm.state.now_ns = woken
-        if good:
-            for part in parts:
-                part.decode(data)
-        elif wkc > 0 and self._stop_device is not None and context.stop_box_in_op:
-            # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
-            # fill in as it was, so these are the inputs of the box, of now or of before.
-            self._stop_device.decode(data)
-            self.operator.read_emergency_stop()
-        board, commands = self._blackboard, self.commands
-        if board.command_waits():
-            commands.handle()
-        if board.setpoint_waits():
-            commands.take_setpoints()
-        if self._shutdown:
-            machine.close()
-        machine.update(good)
-        if board.stream and not commands.open_stream:
-            board.open_stream(0)
-        for part in parts:
-            part.update(context)
-            part.encode(data)
+        self._work(woken, wkc)
         self._publish(woken, planned, received, wkc)
         discipline = self._discipline
         if discipline is None:
@@ -182,6 +187,35 @@ class Cycle:
             self.missed += skipped
             planned += skipped * period
         return planned
+
+    def _work(self, woken: int, wkc: int) -> None:
+        """Do what lies between an answer and the next outputs."""
+        data, machine, parts, context = self._data, self.machine, self.parts, self._context
+        good = wkc == self._expected
+        context.now_ns = self.arm.state.now_ns = woken
+        if good:
+            for part in parts:
+                part.decode(data)
+        elif wkc > 0 and self._stop_device is not None and context.stop_box_in_op:
+            # Another slave is missing, and which ones were in the frame is unknown. SOEM returns what a slave did not
+            # fill in as it was, so these are the inputs of the box, of now or of before.
+            self._stop_device.decode(data)
+            self.operator.read_emergency_stop()
+        if machine.partners is not None:
+            machine.partners.read(woken)
+        board, commands = self._blackboard, self.commands
+        if board.command_waits():
+            commands.handle()
+        if board.setpoint_waits():
+            commands.take_setpoints()
+        if self._shutdown:
+            machine.close()
+        machine.update(good)
+        if board.stream and not commands.open_stream:
+            board.open_stream(0)
+        for part in parts:
+            part.update(context)
+            part.encode(data)
 
     def _publish(self, woken: int, planned: int, received: int, wkc: int) -> None:
         """Publish the record of the cycle."""
@@ -232,8 +266,8 @@ class Cycle:
         self._blackboard.publish(values)
 
 
-def record_schema(config: ArmConfig) -> RecordSchema:
-    """Return what the records of the cycle of this platform hold.
+def record_schema(config: ArmConfig, partners: Partners | None = None) -> RecordSchema:
+    """Return what the records of the cycle of this platform hold; `partners`: of the arm in a cell.
 
     Raises:
         DeviceError: the description of a device does not suit its use.
@@ -241,10 +275,13 @@ def record_schema(config: ArmConfig) -> RecordSchema:
     """
     driven = config.gripper is not None and config.gripper.joint is not None
     arm = (arm_fields(len(config.joints)), GRIPPER_FIELDS if driven else (), OPERATOR_FIELDS)
-    return schema_of((*arm, *(device.fields for device in make_devices(config))))
+    cell = () if partners is None else (partners.fields,)
+    devices = make_devices(config)
+    parts = (*make_processes(config, devices, partners), *devices)
+    return schema_of((*arm, *(part.fields for part in parts), *cell))
 
 
-def make_drives(config: ArmConfig) -> list[tuple[int, Cia402Drive]]:
+def make_drives(config: ArmConfig) -> list[tuple[int, Drive]]:
     """Return the driver of each joint with the index of its slave; raises DeviceError."""
     zeros = config.zero_offsets or (0.0,) * len(config.axes)
     return [drive_of(config, joint, zero) for joint, zero in zip(config.joints, zeros, strict=False)]
@@ -254,7 +291,7 @@ def ahead_of_sync0(config: ArmConfig) -> int:
     """Return how long before the first SYNC0 of a drive a frame leaves that is in time, ns; half a period without."""
     period_ns = round(config.cycle.period_us * 1000)
     shifts = [round(slave.device.sync0_shift_us * 1000) for slave in config.slaves if slave.device.assign_activate]
-    sent = round(config.bus.send_phase * period_ns)
+    sent = round(config.ethercat.send_phase * period_ns)
     return min([(shift - shifts[0] - sent) % period_ns for shift in shifts], default=period_ns // 2)
 
 
@@ -264,7 +301,7 @@ def make_discipline(config: ArmConfig) -> Discipline | None:
     shifts = [slave.device.sync0_shift_us for slave in config.slaves if slave.device.assign_activate]
     if not shifts:
         return None
-    return Discipline(period_ns, round(shifts[0] * 1000 + config.bus.send_phase * period_ns))
+    return Discipline(period_ns, round(shifts[0] * 1000 + config.ethercat.send_phase * period_ns))
 
 
 def position_of(config: ArmConfig, joint: Joint) -> int:

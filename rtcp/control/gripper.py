@@ -9,9 +9,10 @@ from typing import Any
 from rtcp.config.model import ArmConfig
 from rtcp.control.joint_group import JointGroup
 from rtcp.control.part import PartContext
-from rtcp.devices.cia402 import DriveState, drive_of
+from rtcp.devices.drive import drive_of
 from rtcp.ipc.events import GripperAtRest
 from rtcp.ipc.schema import GRIPPER_FIELDS
+from rtcp.ipc.states import DriveState
 from rtcp.motion.controllers.gripper import GripperMotion
 from rtcp.motion.guards.trajectory_guard import GuardResult
 
@@ -52,7 +53,8 @@ class DrivenGripper(JointGroup):
         """Write what its drive measures and is sent."""
         drive, at = self.drive, self.at
         values[at : at + len(GRIPPER_FIELDS)] = (
-            drive.position, drive.velocity, drive.torque, drive.target_position, drive.statusword,
+            drive.position, drive.velocity, drive.torque, drive.target_position, drive.state,
+            drive.statusword,
         )  # fmt: skip
 
     def grip(self, close: bool, lease: int = 0) -> bool:

@@ -11,7 +11,8 @@ from typing import Final
 
 from rtcp.control.arm import Arm
 from rtcp.control.joint_group import Joints
-from rtcp.devices.cia402 import CSP, ENABLE_OPERATION, Cia402Drive
+from rtcp.devices.cia402 import ENABLE_OPERATION, Cia402Drive
+from rtcp.devices.drive import CSP
 from rtcp.ipc.events import Event, Homed, HomingFailed, Stopped
 
 HOMING: Final = 6
@@ -224,8 +225,10 @@ class HomingSequence:
 
     def begin(self, axis: int) -> None:
         """Let the drive of a joint begin."""
+        drive = self._arm.drives[axis]
+        assert isinstance(drive, Cia402Drive), "the command is refused for another"
         self.axis = axis
-        self._homing.start(self._arm.drives[axis])
+        self._homing.start(drive)
 
     def stop(self) -> None:
         """Bring the drive to rest and back to CSP."""

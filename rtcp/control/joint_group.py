@@ -7,17 +7,17 @@ from typing import Final
 
 from rtcp.config.model import ArmConfig
 from rtcp.control.part import Part
-from rtcp.devices.cia402 import Cia402Drive, DriveState, TargetState
+from rtcp.devices.drive import Drive, TargetState
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.events import EmergencyStop, PositionJumped
 from rtcp.ipc.schema import Field
+from rtcp.ipc.states import WITH_TORQUE, DriveState, Missing
 from rtcp.motion.guards.output_limiter import OutputLimiter
 from rtcp.motion.guards.supervision import Supervision
 from rtcp.motion.guards.trajectory_guard import GuardResult
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState
 
-WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
 RESTING = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON})
 """Drive states without torque and without a fault."""
 _ENABLED = DriveState.OPERATION_ENABLED
@@ -48,7 +48,7 @@ class JointGroup(Part):
         name: str,
         fields: Sequence[Field],
         config: ArmConfig,
-        drives: Sequence[tuple[int, Cia402Drive]],
+        drives: Sequence[tuple[int, Drive]],
         first: int = 0,
     ) -> None:
         super().__init__(name, fields)
@@ -79,6 +79,9 @@ class JointGroup(Part):
     def set_limits(self, new: Values) -> None:
         """Put other limits into force."""
         self.limits.apply(new)
+        for i, drive in enumerate(self.drives):
+            drive.low, drive.high = self.limits.low[i], self.limits.high[i]
+            drive.deceleration = self.limits.acceleration[i]
         self.output_limiter.take(self.limits)
         self.supervision.take(self.limits)
 
@@ -217,6 +220,13 @@ class Joints:
         """Return the first joint whose drive is in fault."""
         for axis, drive in enumerate(self.drives):
             if drive.state is DriveState.FAULT:
+                return axis
+        return -1
+
+    def first_blocked(self) -> int:
+        """Return the first joint whose drive cannot be enabled before people do something at its controller."""
+        for axis, drive in enumerate(self.drives):
+            if drive.missing is not Missing.NOTHING:
                 return axis
         return -1
 

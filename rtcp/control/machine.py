@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rtcp.control.context import Context
+from rtcp.control.partners import Partners
 from rtcp.control.states import (
     Cause,
     Closing,
@@ -31,6 +32,7 @@ from rtcp.ipc.events import (
     Event,
     LeaseExpired,
     MotionEnded,
+    PartnerEmergencyStop,
     PermissionWithdrawn,
     ResetDone,
 )
@@ -67,6 +69,9 @@ _ENDED_BY_EMERGENCY_STOP = frozenset(
 )
 """States that the input of the emergency stop ends: those with torque, and those after a fault. On the way to OP the
 inputs are not yet valid; while ready no drive has torque, and enabling is refused while it is pressed."""
+_ENDED_BY_PARTNER = _ENDED_BY_EMERGENCY_STOP - {State.FAULT, State.RESETTING}
+"""States that the emergency stop of a partner ends: those with torque. It keeps no arm from being reset: with both
+buttons pressed, or one at both boxes, none could be the first."""
 _SAFE = frozenset({State.FAULT, State.EMERGENCY_STOP, State.CLOSING})
 """States at whose beginning all outputs become safe. Inputs that are stale for too long lead to the fault."""
 _SLAVES_RETURN = frozenset({State.FAULT, State.RESETTING, State.EMERGENCY_STOP, State.CLOSING})
@@ -78,10 +83,12 @@ class StateMachine:
 
     Args:
         ctx: what the states share.
+        partners: of the arm in a cell.
     """
 
-    def __init__(self, ctx: Context) -> None:
+    def __init__(self, ctx: Context, partners: Partners | None = None) -> None:
         self.context = ctx
+        self.partners = partners
         reaction = FaultReaction(ctx)
         self._holding = Holding()
         self._states: dict[State, MachineState] = {
@@ -125,15 +132,17 @@ class StateMachine:
     @property
     def changing_mode(self) -> bool:
         """Whether the drives are changing their mode."""
-        return self.state is State.HOLDING and self._holding.changing_mode
+        return self.context.state is State.HOLDING and self._holding.changing_mode
 
     def update(self, good: bool) -> None:
         """Do one cycle; `good`: the exchange had the expected working counter."""
-        ctx = self.context
+        ctx, partners = self.context, self.partners
         ctx.begin_cycle(good)
         operator = ctx.operator
         if operator.emergency_stop and ctx.state in _ENDED_BY_EMERGENCY_STOP:
             self.change(EmergencyStopActivated())
+        if partners is not None and partners.pressed >= 0 and ctx.state in _ENDED_BY_PARTNER:
+            self.change(PartnerEmergencyStop(partners.pressed))
         event = self._active.update(ctx)
         if event is not None and self._handle(event):
             # The state ended before it commanded the arm: the next one does so in this cycle.

@@ -13,7 +13,7 @@ from typing import Any
 from mypy_extensions import mypyc_attr
 
 from rtcp.config.model import ArmConfig
-from rtcp.devices.cia402 import Cia402Drive
+from rtcp.devices.drive import Drive
 from rtcp.devices.driver import Driver, make_driver
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.ipc.commands import Command
@@ -47,6 +47,10 @@ class PartContext:
 
     def publish(self, event: Event) -> None:
         """Report an event that changes no state."""
+        raise NotImplementedError
+
+    def lease_held(self, lease: int) -> bool:
+        """Return whether the commander of `lease` still holds it."""
         raise NotImplementedError
 
     def explain(self, what: str, error: Exception) -> None:
@@ -208,4 +212,4 @@ def make_devices(config: ArmConfig) -> list[Device]:
     """Return a part for each slave that is no drive; raises DeviceError."""
     period_s = config.cycle.period_us * 1e-6
     made = [(slot, make_driver(slave, period_s)) for slot, slave in enumerate(config.slaves)]
-    return [Device(slot, driver) for slot, driver in made if not isinstance(driver, Cia402Drive)]
+    return [Device(slot, driver) for slot, driver in made if not isinstance(driver, Drive)]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import json
 import math
 import os
@@ -25,12 +24,14 @@ from rtcp.config.model import ArmConfig, ConfigError, DeviceDescription
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
 from rtcp.control.part import Device
-from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP, Cia402Drive, TargetState
+from rtcp.control.partners import Partners
+from rtcp.devices.cia402 import DISABLE_VOLTAGE, QUICK_STOP
+from rtcp.devices.drive import Drive, TargetState
 from rtcp.devices.driver import DeviceError, make_codec
 from rtcp.fieldbus.bus import ProcessData
 from rtcp.fieldbus.errors import BusError
+from rtcp.fieldbus.master import Master, master_of
 from rtcp.fieldbus.pdo import layout
-from rtcp.fieldbus.soem import SoemBus
 from rtcp.ipc.blackboard import Blackboard, BlackboardTooLarge
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import SchemaError
@@ -87,21 +88,22 @@ def main() -> int:
     # Until the cycle runs, SIGTERM unwinds what was opened; then it asks for a controlled stop.
     signal.signal(signal.SIGTERM, _leave)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    fraction = session.config.bus.receive_fraction
-    bus = SoemBus(session.interface, fraction, namespace_pid=session.segment_pid or None)
+    master: Master | None = None
     left: list[str] = []
     try:
-        bus.open()
-        _work(bus, session, given.directory, report)
+        config = session.config
+        master = master_of(config.bus)(config, session.interface, session.segment_pid)
+        _work(master, session, given.directory, report)
     except (BusError, DeviceError, ConfigError, SchemaError, BlackboardTooLarge) as error:
         sentences = list(error.sentences) if isinstance(error, BusError) else str(error).splitlines()
         report.tell("error", sentences=sentences)
         sys.stderr.write("\n".join(sentences) + "\n")
         return 2
     finally:
-        before = len(bus.notes)
-        bus.close()
-        left += bus.notes[before:]
+        if master is not None:
+            before = len(master.notes)
+            master.close()
+            left += master.notes[before:]
         write_exit_report(given.directory, os.getpid(), left)
         sys.stderr.write("".join(f"{sentence}\n" for sentence in left))
     return EXIT_INCOMPLETE if left else 0
@@ -111,31 +113,28 @@ def _leave(number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + number)
 
 
-def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> None:
+def _work(master: Master, session: Session, directory: Path, report: Report) -> None:
     config = session.config
     period_ns = round(config.cycle.period_us * 1000)
-    found = bus.scan()
-    report.tell("phase", text=f"{len(found)} slaves on {session.interface}")
-    (directory / "scan.json").write_text(json.dumps([dataclasses.asdict(slave) for slave in found]))
-    data = bus.configure(config.slaves, period_ns)
-    for note in bus.notes:
-        report.tell("phase", text=note)
-    report.tell("phase", text="all slaves in SAFE-OP")
+    data = master.start(directory, lambda sentence: report.tell("phase", text=sentence))
     discipline = make_discipline(config)
-    blackboard = Blackboard(blackboard_file(directory), record_schema(config), period_ns)
+    partners = None if session.cell is None else Partners(session.cell, session.name)
+    blackboard = Blackboard(blackboard_file(directory), record_schema(config, partners), period_ns)
     cpu = scheduling.choose_cpu(config.cycle.cpu)
     scheduling.share_interpreter_quickly()
     service = BusService(
-        bus,
+        master,
         blackboard,
         [position_of(config, joint) for joint in config.axes],
         [joint.name for joint in config.axes],
         config.bus.op_timeout_s,
         cpu,
         config.cycle.priority,
-        config.bus.watch_ms * 1e-3,
+        config.ethercat.watch_ms * 1e-3,
     )
-    cycle = Cycle(config, data, blackboard, service, discipline)
+    cycle = Cycle(config, data, blackboard, service, discipline, partners=partners)
+    if partners is not None:
+        service.look_around = partners.open
     realtime = scheduling.Realtime()
 
     def started() -> None:
@@ -151,7 +150,10 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
             "start_to_op_s": round((time.monotonic_ns() - session.began_ns) * 1e-9, 3),
         }
         (directory / "started.json").write_text(json.dumps(facts))
-        report.tell("ready", pid=os.getpid(), **facts)
+        waits = master.waiting_for()
+        ready = "all slaves in OP" if master.supervised is not None else "the robot is ready"
+        text = f"waiting for the robot: {waits}" if waits else ready
+        report.tell("ready", pid=os.getpid(), text=text, **facts)
         report.close()
 
     service.on_op = started
@@ -178,7 +180,7 @@ def _work(bus: SoemBus, session: Session, directory: Path, report: Report) -> No
 
 
 def stop_blindly(
-    data: ProcessData, config: ArmConfig, drives: Sequence[tuple[int, Cia402Drive]], devices: Sequence[Device] = ()
+    data: ProcessData, config: ArmConfig, drives: Sequence[tuple[int, Drive]], devices: Sequence[Device] = ()
 ) -> None:
     """Bring all drives to rest after a defect in the cycle: a quick stop for as long as it takes, then torque off.
 
@@ -204,7 +206,7 @@ def stop_blindly(
             time.sleep(max(due - time.monotonic(), 0.0))
 
 
-def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: TargetState, device: DeviceDescription) -> bytes:
+def _outputs(drive: Drive, data: ProcessData, slot: int, goal: TargetState, device: DeviceDescription) -> bytes:
     """Return a drive's outputs one step towards `goal`; where its driver raises: a controlword, and 0 in the rest."""
     try:
         drive.decode(data.input(slot))
@@ -212,7 +214,7 @@ def _outputs(drive: Cia402Drive, data: ProcessData, slot: int, goal: TargetState
         return drive.encode()
     except Exception:
         image = layout(device.rpdo)
-        control = image.find("controlword")
+        control = image.find("controlword")  # a node of another bus has none: zeros are its command to stand
         return make_codec(image).pack(*(_BLIND_WORDS[goal] if one is control else 0 for one in image.channels))
 
 

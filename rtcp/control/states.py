@@ -12,7 +12,7 @@ from math import ceil, nan
 from typing import ClassVar, Final
 
 from rtcp.control.context import Context
-from rtcp.devices.cia402 import DriveState, TargetState
+from rtcp.devices.drive import TargetState
 from rtcp.ipc.commands import Disable, Enable, Halt, Home, MotionCommand, Reset, Shutdown
 from rtcp.ipc.events import (
     Arrived,
@@ -42,6 +42,7 @@ from rtcp.ipc.events import (
     ResetDone,
     ResetTimeout,
     ResetWhileMoving,
+    ResetWithoutController,
     ResetWithoutFrames,
     ResetWithoutSlaves,
     ReturningToRange,
@@ -51,7 +52,7 @@ from rtcp.ipc.events import (
     TorqueRemoved,
 )
 from rtcp.ipc.message import Message
-from rtcp.ipc.states import DriveMode, State
+from rtcp.ipc.states import DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import StopReaction, quick_stop_s
 from rtcp.motion.guards.output_limiter import BACK_RAD_S
 from rtcp.motion.guards.trajectory_guard import GuardResult
@@ -215,7 +216,7 @@ class Enabling(MachineState):
             return None
         if axis >= 0:
             ctx.service.explain_drive(axis)
-            return EnableTimeout(axis, joints.drives[axis].statusword)
+            return EnableTimeout(axis, joints.drives[axis].state, joints.drives[axis].statusword)
         return ctx.wrong_drive_mode(wrong_mode)
 
     def _drive_problem(self, ctx: Context) -> Event | None:
@@ -449,7 +450,7 @@ class Disabling(MachineState):
             return Disabled() if self._commanded > SETTLE_CYCLES else None
         if ctx.cycle - self._since > ctx.cycles(ctx.config.enable_timeout_s):
             ctx.service.explain_drive(axis)
-            return DisableTimeout(axis, joints.drives[axis].statusword)
+            return DisableTimeout(axis, joints.drives[axis].state, joints.drives[axis].statusword)
         return None
 
 
@@ -739,8 +740,11 @@ class Resetting(MachineState):
         # Without the clock no drive was commanded to reset: that one is not at rest is not the reason.
         if axis >= 0 and all_op and ctx.clock_locked:
             ctx.service.explain_drive(axis)
-            return ResetTimeout(axis, joints.drives[axis].statusword)
-        return ResetWithoutFrames() if all_op else ResetWithoutSlaves()
+            return ResetTimeout(axis, joints.drives[axis].state, joints.drives[axis].statusword)
+        if all_op:
+            return ResetWithoutFrames()
+        axis = joints.first_blocked()
+        return ResetWithoutSlaves() if axis < 0 else ResetWithoutController(joints.drives[axis].missing)
 
 
 class Closing(MachineState):

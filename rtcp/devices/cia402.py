@@ -2,43 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from enum import Enum
-from typing import Final
+from typing import ClassVar, Final
 
-from rtcp.config.model import MODE_CHANNELS, ArmConfig, Joint, SlaveConfig
-from rtcp.devices.driver import DeviceError, Driver, integer_range, make_driver
+from rtcp.config.model import MODE_CHANNELS, SlaveConfig
+from rtcp.devices.drive import CSP, CST, CSV, Drive, TargetState
+from rtcp.devices.driver import DeviceError, integer_range
 from rtcp.fieldbus.pdo import ImageLayout
-
-
-class DriveState(Enum):
-    """States of the automaton; the value is the state's name in the standard."""
-
-    NOT_READY_TO_SWITCH_ON = "not ready to switch on"
-    SWITCH_ON_DISABLED = "switch on disabled"
-    READY_TO_SWITCH_ON = "ready to switch on"
-    SWITCHED_ON = "switched on"
-    OPERATION_ENABLED = "operation enabled"
-    QUICK_STOP_ACTIVE = "quick stop active"
-    FAULT_REACTION_ACTIVE = "fault reaction active"
-    FAULT = "fault"
-    UNKNOWN = "unknown"
-    """A statusword that the standard does not define."""
-
-
-class TargetState(Enum):
-    """State to which a drive is brought."""
-
-    DISABLED = "disabled"
-    QUICK_STOPPED = "stopped by quick stop"
-    """Ramps down by itself and holds (0x605A = 6) until DISABLED is requested; a drive without torque stays without."""
-    ENABLED = "enabled"
-    TORQUE_OFF = "without torque at once"
-    """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
-    RESET = "free of faults"
-    """Resets a fault and takes the drive no further than `switch on disabled`."""
-
+from rtcp.ipc.states import DriveState
 
 # (mask, value) of the statusword -> state (CiA 402-2, table 29)
 STATES: dict[tuple[int, int], DriveState] = {
@@ -98,13 +69,11 @@ _RESET_HOLD: Final = 5
 """Calls of `advance` for which the fault reset bit stays set before the next edge: a drive answers cycles later."""
 _OUTPUTS = ("controlword", "target_position", "target_velocity", "target_torque", "modes_of_operation")
 _INPUTS = ("statusword", "position", "velocity", "torque", "modes_of_operation_display")
-CSP, CSV, CST = 8, 9, 10
-"""Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
 _WITH_SPEED = (CSP, CSV)
 _NEEDED = {CSP: MODE_CHANNELS["csp"], CSV: MODE_CHANNELS["csv"], CST: MODE_CHANNELS["cst"]}
-_WINDOW_S: Final = 0.02
-"""Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
 _ENABLED = DriveState.OPERATION_ENABLED
+_WITH_TARGET = (ENABLE_OPERATION, QUICK_STOP)
+"""Controlwords with which the target stands."""
 
 
 def _slots(image: ImageLayout, names: Sequence[str]) -> tuple[int, ...]:
@@ -118,15 +87,11 @@ def state_of(statusword: int) -> DriveState:
     return _STATE_OF[statusword & STATE_BITS]
 
 
-class Cia402Drive(Driver):
+class Cia402Drive(Drive):
     """A drive in SI units: `decode`, `advance`, set targets, `encode`. Widths and factors are the description's.
 
-    Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm; 0 where it is not mapped),
-    `statusword`, `mode_display`, `state`, and `temperature` (C; not a number where no channel of that name is mapped).
-    A velocity that is not mapped is the mean one over 20 ms.
-    Attributes that `encode` takes: `controlword`, `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV),
-    `target_torque` (Nm, CST), `speed_limit` (rad/s, CSP: the drive takes it from the field of the target velocity).
-    `zero` (rad) is what the drive itself shows where the joint is at 0; `position` and `target_position` count from it.
+    `encode` also takes `controlword`. A velocity that is not mapped is the mean one over 20 ms. In CSP the drive takes
+    `speed_limit` from the field of the target velocity.
 
     Args:
         slave: the slave's name and description.
@@ -138,11 +103,12 @@ class Cia402Drive(Driver):
         DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
     """
 
+    HAS_STATUSWORD: ClassVar[bool] = True
     REQUIRED_OUTPUTS = ("controlword", "target_position", "modes_of_operation")
     REQUIRED_INPUTS = ("statusword", "position", "modes_of_operation_display")
 
     def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
-        super().__init__(slave, period_s)
+        super().__init__(slave, period_s, speed_limit=speed_limit, zero=zero)
         self._out, self._in = _slots(self.rpdo, _OUTPUTS), _slots(self.tpdo, _INPUTS)
         targets = [None if slot < 0 else self.rpdo.channels[slot] for slot in self._out[1:4]]
         if any(channel is not None and channel.factor == 0 for channel in targets):
@@ -156,38 +122,16 @@ class Cia402Drive(Driver):
         self._unpack, self._pack = self.codec_in.unpack, self.codec_out.pack
         self._fields: list[int] = [0] * len(self.rpdo.channels)
         self._position_slot, self._scale, self._range = self._out[1], self._scales[0], self._limits[0]
-        self.position = self.velocity = self.torque = 0.0
-        self.temperature = math.nan
-        self.statusword = self.mode_display = 0
-        self.state = DriveState.NOT_READY_TO_SWITCH_ON
         self.controlword = DISABLE_VOLTAGE
-        self.mode = CSP
-        self.speed_limit = speed_limit
-        self._zero = zero
-        self.target_position = self.target_velocity = self.target_torque = 0.0
         self._sent_mode, self._sent_word, self._changed = 0, -1, True
         """What the outputs but the position were filled in for; and whether the drive has shown something else."""
         self._was_enabled = False
         self._reset_calls = 0
-        self._past: list[float] = []
-        self._past_at = 0
 
     def supports(self, mode: int) -> bool:
         """Whether the process data has what a mode (CSP, CSV, CST) needs."""
         outputs, inputs = _NEEDED[mode]
         return all(map(self.rpdo.find, outputs)) and all(map(self.tpdo.find, inputs))
-
-    @property
-    def zero(self) -> float:
-        """What the drive shows where the joint is at 0, rad. Set anew, what is shown moves, what is sent does not."""
-        return self._zero
-
-    @zero.setter
-    def zero(self, zero: float) -> None:
-        moved = self._zero - zero
-        self._zero = zero
-        self.position += moved
-        self.target_position += moved
 
     def decode(self, data: bytes) -> None:
         """Decode the inputs of the cycle (`input_bytes` long). Until the drive is enabled the target follows them."""
@@ -210,18 +154,8 @@ class Cia402Drive(Driver):
             self._changed = True
         if self._temperature_slot >= 0:
             self.temperature = values[self._temperature_slot] * self.tpdo.channels[self._temperature_slot].factor
-        if self.controlword not in (ENABLE_OPERATION, QUICK_STOP):
+        if self.controlword not in _WITH_TARGET:
             self.target_position = here
-
-    def _measured_velocity(self, shown: float) -> float:
-        past = self._past
-        if not past:
-            past += [shown] * max(round(_WINDOW_S / self.period_s), 1)
-        at = self._past_at
-        moved = shown - past[at]
-        past[at] = shown
-        self._past_at = at + 1 if at + 1 < len(past) else 0
-        return moved / (len(past) * self.period_s)
 
     def advance(self, target: TargetState) -> bool:
         """Choose the controlword of the next step towards `target` by the state found; return whether it is reached."""
@@ -242,11 +176,6 @@ class Cia402Drive(Driver):
             self._reset_calls = 0
         self.controlword = word
         return state in REACHED[target]
-
-    def latch(self) -> None:
-        """Set the target position to the actual one, the other targets to zero: on enabling, on entering CSP."""
-        self.target_position = self.position
-        self.target_velocity = self.target_torque = 0.0
 
     def encode(self) -> bytes:
         """Return the outputs of the cycle.
@@ -291,19 +220,3 @@ class Cia402Drive(Driver):
             # Not a number, or infinite: the last counts that were sent.
             return last
         return low if value < low else high
-
-
-def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Cia402Drive]:
-    """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Cia402Drive`.
-
-    Raises:
-        DeviceError: its device's description cannot serve, or it is no drive.
-    """
-    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
-    slave = config.slaves[slot]
-    drive = make_driver(slave, config.cycle.period_us * 1e-6)
-    if not isinstance(drive, Cia402Drive):
-        raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
-    drive.speed_limit = joint.velocity
-    drive.zero = zero
-    return slot, drive

@@ -3,30 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import socket
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from pysoem import pysoem
 
-from rtcp.config.model import SlaveConfig
+from rtcp.config.model import ArmConfig, SlaveConfig
 from rtcp.fieldbus import al_state
 from rtcp.fieldbus.al_state import AlState
 from rtcp.fieldbus.bus import MailboxInfo, SlaveInfo, SlaveState, slave_label, station_of
 from rtcp.fieldbus.clocks import start_clocks
 from rtcp.fieldbus.emergency import Emergency
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.interface import PromiscuousMode, check_interface, claim, enter
+from rtcp.fieldbus.interface import PromiscuousMode, check_interface, check_name, claim, enter
 from rtcp.fieldbus.mailbox import Mailboxes, SdoClient
+from rtcp.fieldbus.master import Master
 from rtcp.fieldbus.pdo import RX_ASSIGN, TX_ASSIGN, layout, layout_faults
 from rtcp.fieldbus.process_data import FrameBarrier, SoemProcessData
 from rtcp.fieldbus.registers import PATIENT_TRIES, TRIES, Register, RegisterPort, attach_filter, finish
 from rtcp.fieldbus.scan import describe, name_of, parents, read_mailbox, read_serial
 from rtcp.fieldbus.slave_setup import SlaveRestorer, configure_slave, eeprom_to_device, identity_faults, read_set_up
-from rtcp.fieldbus.supervision import SlaveWatcher
+from rtcp.fieldbus.supervision import SlaveWatcher, SupervisedBus
 
 _LEAVE_OP_S, _INIT_S = 0.2, 1.0
 _BELOW_SAFEOP = 0x03
@@ -381,6 +384,44 @@ class SoemBus:
         port.write_all(Register.DC_ACTIVATION, b"\0")
         if left:
             raise BusError(*left)
+
+
+class SoemMaster(Master):
+    """A bus of kind `ethercat`."""
+
+    def __init__(self, config: ArmConfig, interface: str, namespace_pid: int) -> None:
+        super().__init__(config, interface, namespace_pid)
+        fraction = config.ethercat.receive_fraction
+        self._bus = SoemBus(interface, fraction, namespace_pid=namespace_pid or None)
+
+    @staticmethod
+    def check_interface(name: str) -> None:
+        """Raise BusError where no interface has this name, or the one that has it has no cable."""
+        check_name(name)
+
+    @property
+    def supervised(self) -> SupervisedBus:
+        """The slaves on the cable."""
+        return self._bus
+
+    def start(self, directory: Path, report: Callable[[str], None]) -> SoemProcessData:
+        """Find the slaves, compare them with the configuration, bring them to SAFE-OP."""
+        bus = self._bus
+        bus.open()
+        found = bus.scan()
+        report(f"{len(found)} slaves on {self.interface}")
+        (directory / "scan.json").write_text(json.dumps([asdict(slave) for slave in found]))
+        data = bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
+        for note in bus.notes:
+            report(note)
+        report("all slaves in SAFE-OP")
+        return data
+
+    def close(self) -> None:
+        """Bring the slaves back to INIT, close everything."""
+        before = len(self._bus.notes)
+        self._bus.close()
+        self.notes += self._bus.notes[before:]
 
 
 def open_master(interface: str) -> tuple[Any, socket.socket]:

@@ -130,7 +130,7 @@ class BlackBox:
         self._session = session
         self._directory = directory
         self._report = report
-        self._names = Names(session.config)
+        self._names = Names(session.config, session.partners)
         self._events = RecordingTrigger(self._names)
         self._event = 0
         self._since = 0.0

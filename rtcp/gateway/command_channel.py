@@ -34,7 +34,7 @@ _PROGRESS_S = 0.1
 """Longest interval between two progress reports, and between two renewals of the lease, s."""
 _REST_S = 10.0
 """Time for the arm to come to rest after its commander has released the lease, s."""
-_BROKEN = frozenset({State.FAULT, State.EMERGENCY_STOP})
+BROKEN = frozenset({State.FAULT, State.EMERGENCY_STOP})
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ class CommandChannel:
             return None
         if answer.refusal is None:
             return self.observer.head
-        fault = self.snapshot.fault if self.state in _BROKEN else ""
+        fault = self.snapshot.fault if self.state in BROKEN else ""
         raise self.error("refused", answer.refusal, after=f"; the fault: {fault}" if fault else "")
 
     async def end_loop(self, command: Command) -> None:
@@ -297,7 +297,7 @@ class CommandChannel:
             state = State(int(record["state"]))
             if state is wanted:
                 return None if int(record["flags"]) & FLAG_SWITCHING else state
-            if state in _BROKEN:
+            if state in BROKEN:
                 raise self.fault_since(since)
             if state in through:
                 return None
@@ -369,11 +369,11 @@ class StreamingCommands:
             raise
         return {"state": channel.state.name.lower(), "positions": channel.joints("actual_position")}
 
-    async def open(self, caller: Caller) -> Json:
+    async def open(self, caller: Caller, motion: int = 0, partners: int = 0) -> Json:
         """Begin a stream that the client feeds itself; return what it needs for that; it renews the lease."""
         lease, since = self._lease(caller)
         stream = monotonic_ns()
-        self._head = await self._channel.accept(lease, OpenStream(stream))
+        self._head = await self._channel.accept(lease, OpenStream(stream, motion, partners))
         return {"stream": stream, "lease": lease, "since": since}
 
     async def rest(self, caller: Caller) -> None:

@@ -59,6 +59,8 @@ class JoystickOverride:
         Raises:
             RtcpError: `refused` where another holds it.
         """
+        if self._bus == VIRTUAL and not self._boxes:
+            raise RtcpError("refused", "inputs are forced at an IO box: none is configured (slaves in the file)")
         if not self.possible:
             raise RtcpError("refused", f"inputs are forced on the virtual bus only, not on {self._bus}")
         if self._owner is not None and self._owner.connection != caller.connection:

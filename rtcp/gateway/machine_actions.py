@@ -9,8 +9,6 @@ import numpy as np
 
 from rtcp.config.model import ConfigError, Joint
 from rtcp.config.zero import read_zeros, store_zero
-from rtcp.control.joint_group import WITH_TORQUE
-from rtcp.devices.cia402 import DriveState, state_of
 from rtcp.fieldbus.al_state import AlState
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.ipc.commands import (
@@ -27,7 +25,7 @@ from rtcp.ipc.commands import (
 )
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.events import Disabled, GripperAtRest, GripperCloses, GripperOpens, Homed, HomingFailed, ZeroSet
-from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.ipc.states import WITH_TORQUE, ControlMode, DriveMode, DriveState, State
 from rtcp.ipc.stop_reactions import longest_s
 
 _ENABLING = frozenset({State.ENABLING})
@@ -115,7 +113,8 @@ class MachineActions:
     async def halt(self) -> Json:
         """Stop a motion; return when the arm holds. Needs no lease."""
         channel = self._channel
-        if channel.state is State.STOPPED_BY_LIMIT:
+        if channel.state in (State.STOPPED_BY_LIMIT, State.READY):
+            # Nothing moves; in state ready a process may work, which ends at once.
             await channel.send(0, Halt())
         else:
             halted = channel.reaching(State.HOLDING, _HALTING, "stopping", channel.observer.last_event)
@@ -248,6 +247,9 @@ class MachineActions:
 
     async def service(self, request: Json) -> Json:
         """Let the loop's service thread carry out an SDO access."""
+        bus = self._channel.config.bus
+        if why := bus.LACKS.get("sdo"):
+            raise RtcpError("refused", f"no SDO on a bus of kind {bus.kind}: {why}")
         # A client that goes away takes no request back: the next would be written over one that is being worked on.
         answer = await asyncio.shield(asyncio.ensure_future(self._serve(request)))
         if "error" in answer:
@@ -309,7 +311,7 @@ class _Confirmation:
         frames_return = self._parked or record["lost"] < self._config.bus.lost_cycles
         if self._shown is not None and frames_return:
             held = _with_torque(self._shown)
-            why = ", ".join(f"{_drive(joints[axis])} shows 0x{word:04X}, {state}" for axis, word, state in held)
+            why = ", ".join(f"{_drive(joints[axis])} shows {shown}" for axis, shown in held)
             why += "; the slaves are in PRE-OP since" if self._parked else ""
         elif record["wkc"] < 0:
             why = f"no frame returns, and nothing is known of {names}"
@@ -319,15 +321,14 @@ class _Confirmation:
         return f"drives were commanded to remove their torque, not confirmed: {why}"
 
 
-def _with_torque(record: np.void) -> list[tuple[int, int, str]]:
-    """Return the joints that a record does not show without torque: number, statusword, its state in words."""
+def _with_torque(record: np.void) -> list[tuple[int, str]]:
+    """Return the joints that a record does not show without torque: number, and what the drive shows."""
     held = []
-    for axis, word in enumerate(record["statusword"].tolist()):
-        state = state_of(word)
-        if state in WITH_TORQUE:
-            held.append((axis, word, state.value))
-        elif state is DriveState.UNKNOWN:
-            held.append((axis, word, "a state that the standard does not know"))
+    words = record["statusword"].tolist()
+    for axis, state in enumerate(map(DriveState, record["drive_state"].tolist())):
+        if state in WITH_TORQUE or state is DriveState.UNKNOWN:
+            known = "a state that the standard does not know" if state is DriveState.UNKNOWN else state.words
+            held.append((axis, f"0x{words[axis]:04X}, {known}" if words[axis] else known))
     return held
 
 

@@ -22,16 +22,18 @@ from annotated_types import Ge, Gt, Le
 from rtcp.config.find import load_messages
 from rtcp.config.model import Point, RecordingConfig, RecordingFormat, Stop
 from rtcp.config.validation import Checker
+from rtcp.gateway.cell_actions import CellActions, StepTarget
 from rtcp.gateway.command_channel import Caller, CommandChannel, Json, StreamingCommands
 from rtcp.gateway.joystick_override import LONGEST_HOLD_S, JoystickOverride
 from rtcp.gateway.limit_settings import LimitSettings
 from rtcp.gateway.machine_actions import MachineActions
 from rtcp.gateway.motion_actions import MotionActions, Planner
+from rtcp.gateway.process_actions import ProcessActions
 from rtcp.gateway.recordings import Recordings
 from rtcp.gateway.status_snapshot import StatusSnapshot
 from rtcp.gateway.tolerances import Tolerances
 from rtcp.ipc import commands
-from rtcp.ipc.commands import COMMANDS, Command, MotionCommand
+from rtcp.ipc.commands import COMMANDS, Command, MotionCommand, ProcessCommand
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.message import Joints
 from rtcp.ipc.observer import Observer
@@ -120,6 +122,8 @@ class Methods:
         self.recordings = Recordings(directory)
         self._limits = LimitSettings(channel, limits, directory)
         self._motion = MotionActions(channel, Planner(config, limits))
+        self._processes = ProcessActions(channel, config)
+        self._cell = CellActions(session, self._motion, limits)
         self.table = self._table()
 
     def _table(self) -> dict[str, Method]:
@@ -162,6 +166,9 @@ class Methods:
     @method(at_once=True)
     async def scan(self, caller: Caller) -> Json:
         """Return `slaves` as the start found them, with their AL states now."""
+        bus = self._snapshot.names.config.bus
+        if why := bus.LACKS.get("states"):
+            raise RtcpError("refused", f"no slaves on a bus of kind {bus.kind}: {why}")
         try:
             slaves = read_json(self._directory / "scan.json", list)
         except SessionError as error:
@@ -381,6 +388,36 @@ class Methods:
             )
         return await self._motion.run_trajectory(caller, points, approach, tolerances, start_tolerance)
 
+    @method(at_once=True)
+    async def plan_in_step(
+        self, caller: Caller, targets: tuple[StepTarget, ...], speed: Annotated[float, Gt(0)] | None = None
+    ) -> Json:
+        """Plan a motion of several arms of the cell that begin and end together; nothing moves.
+
+        Each target names an `arm` and has joint positions `q`, rad, or `points` of a trajectory; `speed`: of the
+        fastest joint, rad/s. Returns `points` of each arm, `duration_s`, and the table of the group's brakes: what
+        `run_in_step` of each arm takes.
+        """
+        return await self._cell.plan(targets, speed)
+
+    @method()
+    async def run_in_step(
+        self,
+        caller: Caller,
+        points: tuple[Point, ...],
+        motion: Annotated[int, Ge(1)],
+        start_ns: int,
+        brakes: Numbers,
+        brake_step_s: Annotated[float, Gt(0)],
+        partners: tuple[str, ...] = (),
+    ) -> Json:
+        """Run what `plan_in_step` returned for this arm, from `start_ns` on (CLOCK_MONOTONIC, ns).
+
+        It begins if all partners named have accepted the same number `motion` by then; it ends for all when it ends for
+        one. Returns as `move_joints`.
+        """
+        return await self._cell.run(caller, points, motion, partners, start_ns, brakes, brake_step_s)
+
     def _tolerance(self, name: str, given: Numbers) -> Numbers:
         count = len(self._config.joints)
         if given:
@@ -414,13 +451,19 @@ class Methods:
         return await self._motion.run_path(caller, stops, speed, approach)
 
     @method()
-    async def open_stream(self, caller: Caller) -> Json:
+    async def open_stream(
+        self, caller: Caller, motion: Annotated[int, Ge(0)] = 0, partners: tuple[str, ...] = ()
+    ) -> Json:
         """Begin a stream of setpoints through shared memory. Returns what `rtcp.Stream` needs for it.
+
+        With `motion` it is in step with `partners` of the cell that open one with the same number: none moves before
+        all have, and it ends for all when it ends for one.
 
         That is `stream`, its number, `lease`, which its sender renews, `since`, the last event before it, and the
         runtime `directory`.
         """
-        return {**await self._streaming.open(caller), "directory": str(self._directory)}
+        opened = await self._streaming.open(caller, motion, self._cell.mask_of(partners))
+        return {**opened, "directory": str(self._directory)}
 
     @method(streams=True)
     async def jog(
@@ -453,7 +496,7 @@ class Methods:
     # -- commands without a function of their own ---------------------------------------------------------------------
 
     def _command_method(self, kind: type[Command]) -> Method:
-        """Return the method of a command: it moves until the arm holds again, streams, or returns when accepted."""
+        """Return the method of a command: it lasts until arm or process rest, streams, or ends when accepted."""
         streams = issubclass(kind, MotionCommand) and kind.renewed
         hints = _fields_of(kind)
 
@@ -470,6 +513,8 @@ class Methods:
                 return await self._streaming.send(caller, command)
             if isinstance(command, MotionCommand):
                 return await self._motion.run_command(caller, command)
+            if isinstance(command, ProcessCommand):
+                return await self._processes.run(caller, command)
             if not kind.needs_lease:
                 await self.channel.send(0, command)
                 return {}

@@ -19,9 +19,19 @@ from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
-from rtcp.ipc.commands import Command, ExtendTrajectory, Halt, MotionCommand, MoveJoints, RunLines, RunTrajectory
+from rtcp.ipc.commands import (
+    Command,
+    ExtendTrajectory,
+    Halt,
+    MotionCommand,
+    MoveJoints,
+    RunInStep,
+    RunLines,
+    RunTrajectory,
+)
 from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.layout import PLAN_ROWS, PlanTooLong
+from rtcp.ipc.names import Names
 from rtcp.ipc.refusals import (
     NoLease,
     NoRoomForPoints,
@@ -33,12 +43,12 @@ from rtcp.ipc.refusals import (
     WrongState,
 )
 from rtcp.ipc.states import ControlMode, State
-from rtcp.motion.guards.zones import Zones
+from rtcp.motion.guards.zones import ITSELF, Zones
 from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import Plan, PlanRefused
+from rtcp.motion.planning.plan import COLUMNS, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import OpenPlan, plan_trajectory
 
 T = TypeVar("T")
@@ -74,7 +84,7 @@ class Planner:
     def __init__(self, config: ArmConfig, limits: Limits) -> None:
         self._config = config
         self.limits = limits
-        self._zones = None if config.arm is None else Zones(config.arm, limits)
+        self._zones = None if config.arm is None else Zones(config.arm, limits, config.cartesian.clearance)
 
     def _model(self) -> ArmModel:
         """Return the geometry with the limits in force."""
@@ -91,6 +101,9 @@ class Planner:
         distance, box = self._zones.distance(frames(self._config.arm, q))
         if distance >= 0.0:
             return None
+        if box >= ITSELF:
+            first, second = map(Names(self._config).link, self._zones.links(box))
+            return f"a collision with itself ({first} and {second})"
         boxes = self._config.cartesian.keep_out
         return f"the keep-out box {boxes[box].name}" if 0 <= box < len(boxes) else "the space outside the Cartesian box"
 
@@ -215,7 +228,7 @@ class MotionActions:
         if line or self._channel.control_mode is ControlMode.CARTESIAN:
             return await self.run_path(caller, [Stop(tuple(pose))], speed, False)
         async with self._channel.lease(caller) as lease:
-            q = await asyncio.to_thread(self._planner.joints_at, pose, self._start())
+            q = await asyncio.to_thread(self._planner.joints_at, pose, self.plan_start())
             return await self._move(lease, q, speed, True)
 
     async def run_file(self, caller: Caller, file: str, approach: bool) -> Json:
@@ -240,7 +253,7 @@ class MotionActions:
         """
         async with self._channel.lease(caller) as lease:
             moving = self._channel.state is State.MOVING and not approach
-            begin = self._joints(points[0].q) if approach and points else self._start()
+            begin = self._joints(points[0].q) if approach and points else self.plan_start()
             at_once = not moving and points and points[0].t == 0.0 and len(points[0].q) == len(begin)
             if at_once and max(abs(a - b) for a, b in zip(points[0].q, begin, strict=True)) <= start_rad:
                 points = [dataclasses.replace(points[0], q=tuple(begin)), *points[1:]]
@@ -255,6 +268,28 @@ class MotionActions:
             except Violation as violation:
                 await self._brake()
                 raise violation.error from None
+
+    async def run_in_step(
+        self,
+        caller: Caller,
+        points: Sequence[Point],
+        motion: int,
+        partners: int,
+        start_ns: int,
+        brakes: Sequence[float],
+        brake_step_s: float,
+    ) -> Json:
+        """Run a trajectory from `start_ns` on, in step with partners, a bit each (`RunInStep`)."""
+        async with self._channel.lease(caller) as lease:
+            plan = await asyncio.to_thread(self._planner.trajectory, points, self.plan_start())
+            table = tuple(tuple(brakes[at : at + COLUMNS]) for at in range(0, len(brakes), COLUMNS))
+            slot = self._write(dataclasses.replace(plan, rows=plan.rows + table))
+            command = RunInStep(slot, len(plan.rows), motion, partners, start_ns, len(brakes), brake_step_s)
+            what = "the motion in step"
+            arrival = self._arrival(plan.end, _SAME_PLANNED_RAD, what)
+            timeout_s = _TIMEOUT_S + 2 * plan.duration_s
+            found = await self._run(lease, command, timeout_s, what, arrival, plan.end, self._says_accepted(caller))
+            return found | {"duration_s": plan.duration_s, "length_m": plan.length_m, "slowed": plan.slowed}
 
     async def _brake(self) -> None:
         """Stop along the path and wait until the arm holds."""
@@ -287,7 +322,7 @@ class MotionActions:
         channel = self._channel
         async with channel.lease(dataclasses.replace(caller, report=lambda progress: None)) as lease:
             moving = channel.state is State.MOVING
-            plan = self._planner.open_plan(self._start(), moving)
+            plan = self._planner.open_plan(self.plan_start(), moving)
             rows = await asyncio.to_thread(_append, plan, points)
             if plan.waits and plan.times[-1] < _AHEAD_S:
                 # No point after the second could come in time to give it a velocity.
@@ -394,13 +429,13 @@ class MotionActions:
                 q = (
                     self._joints(first.q)
                     if first.q is not None
-                    else await asyncio.to_thread(self._planner.joints_at, first.pose or (), self._start())
+                    else await asyncio.to_thread(self._planner.joints_at, first.pose or (), self.plan_start())
                 )
                 arrival = await self._move(lease, q, None, True)
                 stops = stops[1:]
                 if not stops:
                     return arrival
-            plan = await asyncio.to_thread(self._planner.lines, stops, self._start(), speed)
+            plan = await asyncio.to_thread(self._planner.lines, stops, self.plan_start(), speed)
             return await self._run_plan(lease, RunLines, plan, self._write(plan), "the path")
 
     async def preview(
@@ -412,7 +447,7 @@ class MotionActions:
         synchronized: bool,
     ) -> Json:
         """Return the way of a motion to `q`, along lines, or of a trajectory, that would begin now."""
-        here = self._start()
+        here = self.plan_start()
         if q is not None:
             if len(q) != self._count:
                 raise RtcpError("invalid", f"q: found {len(q)} numbers, allowed are {self._count}: one a joint, rad")
@@ -433,7 +468,7 @@ class MotionActions:
         """Return the way of the tool to a pose: on a straight line, or by the joints."""
         if line or self._channel.control_mode is ControlMode.CARTESIAN:
             return await self.preview(None, [Stop(tuple(pose))], (), speed, True)
-        q = await asyncio.to_thread(self._planner.joints_at, pose, self._start())
+        q = await asyncio.to_thread(self._planner.joints_at, pose, self.plan_start())
         return await self.preview(q, (), (), speed, True)
 
     async def preview_file(self, file: str, approach: bool) -> Json:
@@ -443,7 +478,7 @@ class MotionActions:
             return await self.preview(None, stops, points, speed, True)
         first = points[0].q if points else stops[0].q
         if first is None:
-            first = tuple(await asyncio.to_thread(self._planner.joints_at, stops[0].pose or (), self._start()))
+            first = tuple(await asyncio.to_thread(self._planner.joints_at, stops[0].pose or (), self.plan_start()))
         way = await self.preview(first, (), (), None, True)
         rest = stops[1:]
 
@@ -473,8 +508,8 @@ class MotionActions:
             raise RtcpError("invalid", f"the first point has {len(q)} joint positions, the arm has {self._count}")
         return q
 
-    def _start(self) -> list[float]:
-        """Return where a plan begins."""
+    def plan_start(self) -> list[float]:
+        """Return where a plan begins, rad."""
         # What is refused anyway is refused by the loop: then the plan only has to begin somewhere.
         is_commanded = self._channel.state in (State.HOLDING, State.MOVING)
         return self._channel.joints("commanded_position" if is_commanded else "actual_position")

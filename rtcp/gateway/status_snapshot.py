@@ -24,13 +24,15 @@ from rtcp.ipc.schema import (
     FLAG_ARM_HAS_JOYSTICK,
     FLAG_DC_LOCKED,
     HELD_BOX_AT,
+    HELD_ITSELF,
     HELD_RANGE_AT,
     HELD_SHOULDER,
     HELD_SPEED_AT,
     PER_JOINT,
+    identifier,
 )
 from rtcp.ipc.session import Processes, Session, is_running
-from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
 from rtcp.realtime.statistics import SlidingPercentiles, diagnose
@@ -70,7 +72,7 @@ class StatusSnapshot:
         self._observer = observer
         self._session = session
         self._started = started
-        self.names = Names(session.config)
+        self.names = Names(session.config, session.partners)
         self.limits = Limits(session.config)
         """In force."""
         self._at = max(observer.head - 1, 0)
@@ -212,8 +214,9 @@ class StatusSnapshot:
                     f"(cartesian.singularity.{name} in {names.file}): jog away from it, or jog joints"
                 )
         if (box := (held >> HELD_BOX_AT) - 2) >= -1:
-            zones = Zones(model, self.limits).clearances(frames(model, q), math.inf)
-            distance = next((one.distance for one in zones if one.box == box), 0.0)
+            clearance = self._session.config.cartesian.clearance
+            near = Zones(model, self.limits, clearance).clearances(frames(model, q), math.inf)
+            distance = next((one.distance for one in near if min(one.zone, HELD_ITSELF) == box), 0.0)
             found["box"] = f"the arm is {distance:.3f} m from {names.box(box)}"
         return found
 
@@ -237,6 +240,8 @@ class StatusSnapshot:
         return ""
 
     def _slaves(self) -> list[dict[str, Any]]:
+        if "states" in self._session.config.bus.LACKS:
+            return []
         slaves = self._session.config.slaves
         found = zip(slaves, self._observer.slaves(len(slaves)), self._observer.health(len(slaves)), strict=True)
         return [
@@ -264,6 +269,18 @@ class StatusSnapshot:
             known = [one if math.isfinite(one) else None for one in numbers]  # no JSON has the others
             shown = {"value": known if field.shape else known[0], "unit": field.unit}
             found.setdefault(field.part, {})[field.local_name] = shown
+        return found
+
+    def _processes(self, record: np.void) -> dict[str, dict[str, Any]]:
+        """Return kind, state in words, and names of the commands of each process, by name."""
+        found: dict[str, dict[str, Any]] = {}
+        for process in self._session.config.processes:
+            words = None
+            if process.STATES is not None:
+                number = int(record[f"{identifier(process.name)}_state"])
+                words = next((one.name.lower().replace("_", " ") for one in process.STATES if one == number), "unknown")
+            commands = [command.name for command in process.COMMANDS]
+            found[process.name] = {"kind": process.kind, "state": words, "commands": commands}
         return found
 
     def _skipped_ticks(self, cycles: int, missed: int) -> dict[str, Any] | None:
@@ -299,6 +316,8 @@ class StatusSnapshot:
             },
             "robot": dataclasses.asdict(robot),
             "bus": self._session.bus,
+            "bus_kind": self._session.config.bus.kind,
+            "lacks": dict(self._session.config.bus.LACKS),
             "cycle_ns": self._observer.period_ns,
             "cycles": int(record["cycle"]),
             "time_ns": int(record["time_ns"]),
@@ -318,12 +337,16 @@ class StatusSnapshot:
             "goal": None
             if goal is None or problem or state is not State.MOVING
             else [round(value, 7) for value in goal],
+            "drive_states": [DriveState(state).words for state in record["drive_state"].tolist()],
             "statuswords": [int(word) for word in record["statusword"]],
             "devices": self._devices(record),
+            "processes": self._processes(record),
             "wakeup_us": figures["wakeup"],
             "exchange_us": figures["exchange"],
             "compute_us": figures["compute"],
-            "dc": {
+            "dc": None
+            if "clocks" in self._session.config.bus.LACKS
+            else {
                 "locked": not problem and bool(flags & FLAG_DC_LOCKED),
                 "offset_ns": int(record["dc_offset_ns"]),
                 "filtered_ns": int(record["dc_filtered_ns"]),

@@ -16,7 +16,6 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
-from rtcp.fieldbus.al_state import AlState
 from rtcp.ipc.commands import COMMANDS as COMMAND_KINDS
 from rtcp.ipc.commands import Command
 from rtcp.ipc.events import Event
@@ -71,6 +70,8 @@ from rtcp.ipc.message import MalformedMessage
 from rtcp.ipc.refusals import Malformed, Refusal
 from rtcp.ipc.schema import RecordSchema, SchemaError
 
+_OP: Final = 8
+"""AL state OP (ETG.1000.6, table 9)."""
 _HOTTEST: Final = 1e6
 _U16, _U24, _I63 = 0xFFFF, 0xFF_FFFF, (1 << 63) - 1
 _AL_STATE = 0x0F
@@ -180,7 +181,7 @@ class Blackboard:
     def in_op(self, position: int) -> bool:
         """Whether the slave at `position` was in OP when its state was last noted; beyond what is noted: always."""
         at = SLAVES_AT + (position - 1) * 8
-        return position > SLAVES_MAX or self._words[at] & _AL_STATE == AlState.OP
+        return position > SLAVES_MAX or self._words[at] & _AL_STATE == _OP
 
     def health(
         self, position: int, lost: int, recovered: int, temperature: float, ports: Iterable[tuple[int, int, int]]

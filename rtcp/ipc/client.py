@@ -180,4 +180,7 @@ def _who_runs(path: Path) -> str:
     loop = read_processes(path.parent).loop
     if is_running(loop):
         return f"the loop (process {loop}) runs without a gateway: `rtcp start` gives it one, `rtcp stop` ends it"
-    return f"no platform is running (nobody listens at {path}): start one with `rtcp start`"
+    # Of the platform that was asked, which may be another one than that of the environment.
+    name = path.parent.name if path.parent.parent.absolute() == runtime_directory("").absolute() else ""
+    how = f"`rtcp --name {name} start`, or `rtcp cell start`" if name else "`rtcp start`"
+    return f"no platform is running (nobody listens at {path}): start one with {how}"

@@ -42,6 +42,15 @@ class MotionCommand(Command, abstract=True):
     """Whether it lasts only for its hold time, or while more of its kind follow; else it ends by itself."""
 
 
+class ProcessCommand(Command, abstract=True):
+    """Base of what a process carries out over time (`rtcp.processes`).
+
+    It lasts while the process' field `busy` is not 0, and ends with its commander's lease.
+    """
+
+    states = AT_REST | {State.MOVING}
+
+
 COMMANDS = Command.kinds
 
 
@@ -81,9 +90,12 @@ class SetControlMode(Command):
 
 
 class Halt(Command):
-    """Bring what moves to rest; the drives stay enabled."""
+    """Bring what moves to rest and processes into their safe state; the drives stay enabled.
 
-    states = frozenset({State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
+    Without torque nothing moves, and it is no mistake.
+    """
+
+    states = frozenset({State.READY, State.HOLDING, State.MOVING, State.STOPPING, State.STOPPED_BY_LIMIT, State.HOMING})
     needs_lease = False
 
 
@@ -166,6 +178,22 @@ class ExtendTrajectory(MotionCommand):
     ends: bool
 
 
+class RunInStep(MotionCommand):
+    """Run the trajectory in a slot of the plan area from a common instant on, in step with partners of the cell."""
+
+    slot: int
+    rows: int
+    motion: int
+    """Number of the motion, the same for all its arms, greater than 0."""
+    partners: int
+    """The partners that take part, a bit each, in the order of the cell; 0: this arm alone."""
+    start_ns: int
+    """CLOCK_MONOTONIC at which it begins."""
+    brakes: int
+    """Numbers behind the rows: how long the whole group takes to brake, s, at every `brake_step_s` of the path."""
+    brake_step_s: float
+
+
 class RunLines(MotionCommand):
     """Run the straight lines in a slot of the plan area."""
 
@@ -190,6 +218,10 @@ class OpenStream(MotionCommand):
     renewed = True
     stream: int
     """Its number, greater than 0."""
+    motion: int = 0
+    """Number of the motion in step, the same for all its arms; 0: this arm alone."""
+    partners: int = 0
+    """The partners that take part, a bit each, in the order of the cell."""
 
 
 class Jog(MotionCommand):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from rtcp.ipc.message import Kinds, Message
-from rtcp.ipc.states import ControlMode, DriveMode
+from rtcp.ipc.states import ControlMode, DriveMode, DriveState, Missing
 
 JOYSTICK_MODES = ("X-Y", "Z-yaw", "roll-pitch", "gripper")
 
@@ -46,7 +46,7 @@ class EmergencyStop(FaultEvent, abstract=True):
 
 
 class Ready(Event, number=10):
-    """all slaves are in OP"""
+    """{all_in_op}"""
 
 
 class Enabled(Event, number=11):
@@ -201,7 +201,7 @@ class HomingInBox(Event, number=42):
 
 class ProcessDataLost(FaultEvent, number=1):
     """process data lost: {in_a_row} cycles in a row, and {allowed} more without than with the expected working counter
-    ({lost_cycles} in {file}): {reaction}; `rtcp reset` when the slaves answer"""
+    ({lost_cycles} in {file}): {reaction}; `rtcp reset` when answers come again"""
 
     stop_key = "lost_frames"
     in_a_row: int
@@ -209,35 +209,39 @@ class ProcessDataLost(FaultEvent, number=1):
 
 
 class DriveLeftEnabled(FaultEvent, number=2):
-    """{joint}: the drive left Operation Enabled by itself (statusword 0x{statusword:04X}): {reaction}; then `rtcp
+    """{joint}: the drive left Operation Enabled by itself ({drive_words}): {reaction}; then `rtcp
     reset`"""
 
     stop_key = "drive_fault"
     axis: int
+    state: DriveState
     statusword: int
 
 
 class DriveFault(FaultEvent, number=18):
-    """{joint}: the drive is in fault (statusword 0x{statusword:04X}): {reaction}; then `rtcp reset`"""
+    """{joint}: the drive is in fault ({drive_words}): {reaction}; then `rtcp reset`"""
 
     stop_key = "drive_fault"
     axis: int
+    state: DriveState
     statusword: int
 
 
 class EnableTimeout(FaultEvent, number=3):
-    """{joint}: the drive did not reach Operation Enabled within {enable_timeout:g} s (statusword 0x{statusword:04X};
+    """{joint}: the drive did not reach Operation Enabled within {enable_timeout:g} s ({drive_words};
     enable_timeout_s in {file}): {reaction}; then `rtcp reset`"""
 
     axis: int
+    state: DriveState
     statusword: int
 
 
 class DisableTimeout(FaultEvent, number=4):
-    """{joint}: the drive kept its torque for {enable_timeout:g} s (statusword 0x{statusword:04X}; enable_timeout_s in
+    """{joint}: the drive kept its torque for {enable_timeout:g} s ({drive_words}; enable_timeout_s in
     {file}): {reaction}; then `rtcp reset`"""
 
     axis: int
+    state: DriveState
     statusword: int
 
 
@@ -250,10 +254,11 @@ class SlaveLost(FaultEvent, number=5):
 
 
 class ResetTimeout(FaultEvent, number=6):
-    """{joint}: the drive remains in fault after the reset (statusword 0x{statusword:04X}): remove the cause, then `rtcp
+    """{joint}: the drive remains in fault after the reset ({drive_words}): remove the cause, then `rtcp
     reset`"""
 
     axis: int
+    state: DriveState
     statusword: int
 
 
@@ -264,6 +269,12 @@ class ResetWithoutSlaves(FaultEvent, number=49):
 
 class ResetWithoutFrames(FaultEvent, number=50):
     """reset failed within 3 s: no frames return, or the reference clock is not locked (`rtcp status`)"""
+
+
+class ResetWithoutController(FaultEvent, number=118):
+    """reset failed within 3 s: {missing_words}; then `rtcp reset`"""
+
+    missing: Missing
 
 
 class ResetWhileMoving(FaultEvent, number=22):
@@ -280,6 +291,14 @@ class DriverFailed(FaultEvent, number=113):
 
     slave: int
     """Position on the cable, from 1."""
+
+
+class ProcessFailed(FaultEvent, number=126):
+    """the process {process_name} raised an error, which the log names: its outputs are 0, {reaction}; then `rtcp
+    reset`"""
+
+    process: int
+    """Its place in the configuration, from 0."""
 
 
 class GeneratorFailed(FaultEvent, number=7):
@@ -350,6 +369,13 @@ class EmergencyStopActivated(EmergencyStop, number=23):
     stop_key = "emergency_stop"
 
 
+class PartnerEmergencyStop(EmergencyStop, number=52):
+    """the emergency stop of {partner_name}, which the cell shares, was pressed: {reaction}"""
+
+    stop_key = "emergency_stop"
+    partner: int
+
+
 class OverSpeed(EmergencyStop, number=24):
     """{joint}: measured speed {value:.6g} rad/s exceeded {limit:.6g} rad/s for {supervision}: {reaction}; then `rtcp
     reset`"""
@@ -390,6 +416,10 @@ class MotionEnded(Event, abstract=True):
     """Whether it leads to the state stopped by limit, which a reset leaves; else the arm holds and accepts commands."""
 
 
+class ProcessEnded(Event, abstract=True):
+    """Base of what ends a command of a process before it was carried out, without a fault of the machine."""
+
+
 class StreamEnded(MotionEnded, number=101):
     """the stream of targets ended: controlled stop"""
 
@@ -400,6 +430,56 @@ class OutOfPoints(MotionEnded, number=117):
     """the open trajectory came to its last point and no more had been appended: controlled stop"""
 
     by_limit = False
+
+
+class PartnerNotReady(MotionEnded, number=125):
+    """{partner_name} did not accept the motion in step, or is silent: the motion did not begin"""
+
+    by_limit = False
+    partner: int
+
+
+class PartnerStopped(MotionEnded, number=120):
+    """{partner_name} brakes, and this arm in step with it, along the path"""
+
+    by_limit = False
+    partner: int
+
+
+class PartnerLeft(MotionEnded, number=121):
+    """{partner_name} has left the motion in step, or has fallen behind: this arm brakes along its path"""
+
+    by_limit = False
+    partner: int
+
+
+class PartnerSilent(MotionEnded, number=122):
+    """{partner_name} publishes no records any more: this arm brakes along its path"""
+
+    by_limit = False
+    partner: int
+
+
+class PartnerNear(MotionEnded, number=124):
+    """the arm stopped {distance:.3g} m from {partner_name}; it holds, then `rtcp reset`, and move one of them away"""
+
+    partner: int
+    distance: float
+
+
+class PartnerForeign(MotionEnded, number=150):
+    """{partner_name} runs as part of another cell, of another state of its files, or of none, so that nothing keeps the
+    arms apart: controlled stop; `rtcp --name {partner_name} stop`, then `rtcp cell start`"""
+
+    by_limit = False
+    partner: int
+
+
+class OutOfStep(MotionEnded, number=123):
+    """this arm is {lag_s:.3g} s behind the others of the motion in step: its cycles were late; controlled stop"""
+
+    by_limit = False
+    lag_s: float
 
 
 class SetpointOutOfRange(MotionEnded, number=114):
@@ -482,6 +562,16 @@ class NotLeavingBox(MotionEnded, number=111):
 
     box: int
     depth: float
+
+
+class CollisionAhead(MotionEnded, number=119):
+    """the arm stopped {distance:.6g} m before {first_link} and {second_link} come as near to each other as
+    {clearance:g} m (cartesian.clearance in {file}); the arm holds, then `rtcp reset`, and move them apart"""
+
+    first: int
+    """Link of the one body, 0: the base."""
+    second: int
+    distance: float
 
 
 class SetpointJump(MotionEnded, number=108):

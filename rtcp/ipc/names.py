@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import inspect
 import string
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import IntEnum
 from typing import Any
 
-from rtcp.config.model import VIRTUAL, ArmConfig
+from rtcp.config.model import VIRTUAL, ArmConfig, Capability
 from rtcp.ipc.commands import COMMANDS, Reset
 from rtcp.ipc.events import JOYSTICK_MODES, EmergencyStop
 from rtcp.ipc.message import Message
-from rtcp.ipc.states import State
+from rtcp.ipc.states import DriveState, Missing, State
 from rtcp.ipc.stop_reactions import StopReaction, reactions
 
 SINGULARITIES = (("shoulder", "m"), ("elbow", "rad"), ("wrist", "rad"))
+MISSING_WORDS = {
+    Missing.NOTHING: "nothing is missing",
+    Missing.CONNECTION: "no message comes from the robot controller: check its cable, the address and port that it "
+    "sends to, and that its program runs",
+    Missing.MOTORS: "the motors are off: release the stops, then press Motors On (in Hand hold the enabling device)",
+    Missing.PROGRAM: "the controller's program is stopped: start it from its main routine",
+    Missing.CONTROL: "the controller's program takes no references now: let it run to where it does",
+    Missing.CLEARANCE: "the controller reports a fault: see its display, clear it there and start its program again",
+    Missing.PACE: "the controller sends at another interval than cycle.period_us says: correct that key, or "
+    "\\SampleRate in the controller's program",
+}
+"""What people have to do at a robot controller."""
 _DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -24,10 +36,12 @@ class Names:
 
     Args:
         config: the arm.
+        partners: the names of its partners in a cell.
     """
 
-    def __init__(self, config: ArmConfig) -> None:
+    def __init__(self, config: ArmConfig, partners: Sequence[str] = ()) -> None:
         self.config = config
+        self._partners = partners
         self.reactions = reactions(config.stops)
         """The stop reaction to each event that has one."""
         self.faults = frozenset(
@@ -51,17 +65,44 @@ class Names:
         """Return the key of an axis in the file."""
         return f"joints[{axis}]" if axis < len(self.config.joints) else "gripper.joint"
 
+    def lacks(self, capability: Capability) -> str:
+        """Return why the bus does not offer something; empty: it does."""
+        return self.config.bus.LACKS.get(capability, "")
+
+    def drive(self, about: Any) -> str:
+        """Return what the drive of an event's axis shows: its state, and the statusword where it has one."""
+        axes, slaves = self.config.axes, self.config.slaves
+        named = axes[about.axis].slave if 0 <= about.axis < len(axes) else ""
+        channels = (e.name for s in slaves if s.name == named for pdo in s.device.tpdo for e in pdo.channels)
+        word = f", statusword 0x{about.statusword:04X}" if "statusword" in channels else ""
+        return f"{DriveState(about.state).words}{word}"
+
     def slave(self, position: int) -> str:
         """Return the name of the slave at `position`, from 1."""
         slaves = self.config.slaves
         return slaves[position - 1].name if 1 <= position <= len(slaves) else "not configured"
 
+    def process(self, number: int) -> str:
+        """Return the name of a process by its place in the configuration, from 0."""
+        processes = self.config.processes
+        return processes[number].name if 0 <= number < len(processes) else "not configured"
+
     def box(self, which: int) -> str:
-        """Return the name of a keep-out box, or of the box that the tool stays in (-1), and its key."""
+        """Return the name and key of a keep-out box, of the box that the tool stays in (-1), else of the arm itself."""
         boxes = self.config.cartesian.keep_out
         if 0 <= which < len(boxes):
             return f"the keep-out box {boxes[which].name} (cartesian.keep_out[{which}] in {self.file})"
+        if which >= 0:
+            return f"the clearance of the arm's own bodies (cartesian.clearance in {self.file})"
         return f"the box that the tool stays in (cartesian.box in {self.file})"
+
+    def partner(self, which: int) -> str:
+        """Return the name of a partner in the cell."""
+        return self._partners[which] if 0 <= which < len(self._partners) else f"partner {which + 1}"
+
+    def link(self, number: int) -> str:
+        """Return what a link is called: by the joint that moves it."""
+        return f"the link of {self.joint(number - 1)}" if number else "the base"
 
     def lost_cycles(self) -> str:
         """Return the keys that set how many cycles may be lost."""
@@ -92,9 +133,23 @@ _WORDS: dict[str, Callable[[Names, Any], object]] = {
     "joint": lambda names, about: names.joint(about.axis),
     "joint_or_box": lambda names, about: names.joint(about.axis) if about.axis >= 0 else "the Cartesian limits",
     "key": lambda names, about: names.key(about.axis),
+    "drive_words": lambda names, about: names.drive(about),
+    "mode_reason": lambda names, about: (
+        names.lacks("torque") or "it has no process data for that (rpdo and tpdo in its device file)"
+    ),
+    "all_in_op": lambda names, about: "the controller sends" if names.lacks("states") else "all slaves are in OP",
+    "not_in_op": lambda names, about: (
+        "the robot controller sends nothing" if names.lacks("states") else "not all slaves are in OP"
+    ),
+    "missing_words": lambda names, about: MISSING_WORDS[about.missing],
     "low": lambda names, about: names.config.axes[about.axis].position.min,
     "high": lambda names, about: names.config.axes[about.axis].position.max,
     "box_name": lambda names, about: names.box(about.box),
+    "partner_name": lambda names, about: names.partner(about.partner),
+    "first_link": lambda names, about: names.link(about.first),
+    "second_link": lambda names, about: names.link(about.second),
+    "clearance": lambda names, about: names.config.cartesian.clearance,
+    "process_name": lambda names, about: names.process(about.process),
     "slave_name": lambda names, about: names.slave(about.slave),
     "reaction": Names.reaction,
     "lost_cycles": lambda names, about: names.lost_cycles(),

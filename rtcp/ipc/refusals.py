@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from rtcp.ipc.message import Kinds, Message
-from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, Missing, State
 
 
 class Refusal(Message, abstract=True):
@@ -37,7 +37,7 @@ class WrongState(Refusal):
 
 
 class NotInOp(Refusal):
-    """not all slaves are in OP: see `rtcp status`, then `rtcp reset`"""
+    """{not_in_op}: see `rtcp status`, then `rtcp reset`"""
 
 
 class ClockNotLocked(Refusal):
@@ -46,6 +46,19 @@ class ClockNotLocked(Refusal):
 
 class DriveModeChanging(Refusal):
     """the drives are changing their mode: retry when the change is done"""
+
+
+class DriveNotReady(Refusal):
+    """{joint} cannot be enabled: {missing_words}"""
+
+    axis: int
+    missing: Missing
+
+
+class HomingUnsupported(Refusal):
+    """{joint} has no homing here: its robot controller knows where it is; calibrate it there"""
+
+    axis: int
 
 
 class EmergencyStopPressed(Refusal):
@@ -143,10 +156,14 @@ class DriveModeFixed(Refusal):
 
 
 class DriveModeUnsupported(Refusal):
-    """the drive of {joint} has no process data for {mode} (rpdo and tpdo in its device file)"""
+    """the drive of {joint} cannot be used in {mode}: {mode_reason}"""
 
     axis: int
     mode: DriveMode
+
+
+class NoArm(Refusal):
+    """this platform has no arm: its processes alone can be commanded"""
 
 
 class NoGeometry(Refusal):
@@ -278,6 +295,61 @@ class PlanStartsElsewhere(Refusal):
     commanded: float
 
 
+class StartOutOfReach(Refusal):
+    """the motion was to begin {ahead_s:.3g} s from now; allowed is more than 0 and at most {most_s:g} s"""
+
+    ahead_s: float
+    most_s: float
+
+
+class UnknownPartner(Refusal):
+    """the motion names partner {partner}, this arm has {count}"""
+
+    partner: int
+    count: int
+
+
+class MotionNumberAhead(Refusal):
+    """motion: found {motion}, allowed are numbers up to CLOCK_MONOTONIC in ns, {now_ns}, and a minute more"""
+
+    motion: int
+    now_ns: int
+
+
+class MotionNumberUsed(Refusal):
+    """number {motion} of the motion in step was used: the last one was {last}, allowed is a greater one"""
+
+    motion: int
+    last: int
+
+
+class BrakesOutOfRange(Refusal):
+    """the table of the brakes has {value_s:.3g} s, allowed is more than 0 and at most {most_s:g} s"""
+
+    value_s: float
+    most_s: float
+
+
+class PartnerMissing(Refusal):
+    """{partner_name} does not run, or publishes no records: a motion in step needs all its arms"""
+
+    partner: int
+
+
+class PartnerOfAnotherCell(Refusal):
+    """{partner_name} runs as part of another cell, of another state of its files, or of none, so that nothing keeps the
+    arms apart: `rtcp --name {partner_name} stop`, then `rtcp cell start`"""
+
+    partner: int
+
+
+class PartnerStopPressed(Refusal):
+    """{partner_name}, whose emergency stop the cell shares, is in its emergency stop, or has its button pressed:
+    release it and reset that arm first"""
+
+    partner: int
+
+
 class PathStartsElsewhere(Refusal):
     """the path starts {distance:.6g} (m or rad) away from the tool: move there first (`rtcp run --approach`)"""
 
@@ -317,7 +389,7 @@ class LimitsExcludeJoint(Refusal):
 
 
 class LimitsExcludeArm(Refusal):
-    """tool, wrist or elbow would cross the new bounds of {box_name}: nothing was changed"""
+    """the arm would cross the new bounds of {box_name}: nothing was changed"""
 
     box: int
 
@@ -353,6 +425,13 @@ class DriverRaised(Refusal):
 
     slave: int
     """Position on the cable, from 1."""
+
+
+class ProcessRaised(Refusal):
+    """the process {process_name} raised an error, which the log names"""
+
+    process: int
+    """Its place in the configuration, from 0."""
 
 
 class NotOpen(Refusal):

@@ -29,12 +29,24 @@ class LockHeld(Exception):
     """Another process holds the lock of the runtime directory."""
 
 
-def runtime_directory() -> Path:
+def runtime_directory(name: str | None = None) -> Path:
     """Return the directory of the control socket and its companions; do not create it.
 
     `RTCP_RUNTIME_DIR` selects it; else `$XDG_RUNTIME_DIR/rtcp`, `/run/rtcp` for root, `rtcp-<uid>` in the temporary
-    directory for anyone else. One directory holds at most one running platform.
+    directory for anyone else. One directory holds at most one running platform; one with a name has a directory in it.
+
+    Args:
+        name: of the platform; empty: the one without a name; None: `RTCP_NAME` of the environment.
     """
+    return _unnamed() / (platform_name() if name is None else name)
+
+
+def platform_name() -> str:
+    """Return the name of the platform that the environment chooses by `RTCP_NAME`; empty: the one without a name."""
+    return os.environ.get("RTCP_NAME", "")
+
+
+def _unnamed() -> Path:
     if chosen := os.environ.get("RTCP_RUNTIME_DIR"):
         return Path(chosen)
     if os.geteuid() == 0:
@@ -81,10 +93,14 @@ def segment_control(directory: Path) -> Path:
     return directory / "segment.sock"
 
 
-def free_segment_control(directory: Path) -> Path:
-    """Return `segment_control`, or a path with this process's id where a running segment listens there already."""
-    usual = segment_control(directory)
-    return directory / f"segment-{os.getpid()}.sock" if is_listening(usual) else usual
+def irc5_control(directory: Path) -> Path:
+    """Return the path of the virtual IRC5's control socket."""
+    return directory / "irc5.sock"
+
+
+def free_control(usual: Path) -> Path:
+    """Return `usual`, or a path with this process's id where a running device listens there already."""
+    return usual.with_name(f"{usual.stem}-{os.getpid()}.sock") if is_listening(usual) else usual
 
 
 def is_listening(path: Path) -> bool:

@@ -49,7 +49,7 @@ class Field:
         for problem, bad in (
             ("its name is not of lower case letters, digits and underscores", not _NAME.fullmatch(self.name)),
             (f"its type {self.type} is none of {', '.join(CODES)}", self.type not in CODES),
-            (f"its shape is {self.shape}", len(self.shape) > 1 or not 0 < self.count <= MOST_NUMBERS),
+            (f"its shape is {self.shape}", len(self.shape) > 1 or not 0 <= self.count <= MOST_NUMBERS),
             (f"its unit {self.unit!r} has a comma or a colon", any(one in self.unit for one in ",:")),
             (f"its part {self.part!r} has a comma or a colon", any(one in self.part for one in ",:")),
             ("its texts are not of one line", not (self.unit + self.part + self.description).isprintable()),
@@ -225,7 +225,8 @@ _VECTORS = {
     "sent_position": ("float64", "rad", "Target position in the frame, after the output limiter."),
     "sent_velocity": ("float64", "rad/s", "Target velocity in the frame."),
     "sent_torque": ("float64", "Nm", "Target torque in the frame."),
-    "statusword": ("uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
+    "drive_state": ("uint8", "", "State of the drive (rtcp.ipc.states.DriveState)."),
+    "statusword": ("uint16", "", "Statusword of the drive (CiA 402, 0x6041); 0 where it has none."),
 }
 """One number a joint each; the drive mode decides which of the targets a drive follows."""
 PER_JOINT = tuple(_VECTORS)
@@ -243,6 +244,7 @@ GRIPPER_FIELDS = _fields_of(
     ("gripper_actual_velocity", "float64", "rad/s", "Measured velocity."),
     ("gripper_actual_torque", "float64", "Nm", "Measured torque."),
     ("gripper_sent_position", "float64", "rad", "Target position in the frame."),
+    ("gripper_drive_state", "uint8", "", "State of the drive (rtcp.ipc.states.DriveState)."),
     ("gripper_statusword", "uint16", "", "Statusword of the drive (CiA 402, 0x6041)."),
 )
 """Of a gripper with a drive of its own."""
@@ -279,4 +281,5 @@ the singularity of the shoulder; elbow and wrist are the next two bits."""
 HELD_RANGE_AT, HELD_SPEED_AT = 19, 23
 """4 bits each: 1 + the joint whose range, or whose speed, is the limit; 0: none."""
 HELD_BOX_AT = 27
-"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box, at most 31; 0: none."""
+HELD_ITSELF = 29
+"""5 bits: 1: the box that the tool stays in; 2 + the number of a keep-out box; 2 + 29: the arm itself; 0: none."""

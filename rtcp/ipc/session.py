@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 import rtcp
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.config.serialization import from_json, to_json
 
@@ -161,6 +162,15 @@ class Session:
     """Directory of persistent state, also for a gateway that is started later; None: from its environment."""
     segment_control: Path | None = None
     """Control socket of the virtual segment that was started with it; None: there is none."""
+    cell: CellConfig | None = None
+    """The cell that the arm belongs to."""
+    name: str = ""
+    """Name of the platform; that of the arm in the cell."""
+
+    @property
+    def partners(self) -> tuple[str, ...]:
+        """Names of the other arms of the cell."""
+        return () if self.cell is None else tuple(one.name for one in self.cell.members if one.name != self.name)
 
     def write(self, directory: Path) -> None:
         """Write the session file with mode 0600."""

@@ -29,6 +29,49 @@ class State(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+class DriveState(IntEnum):
+    """What a drive is doing: the states of CiA 402-2, clause 8, which drives of every kind show."""
+
+    NOT_READY_TO_SWITCH_ON = 0
+    """Also a drive from which nothing has come."""
+    SWITCH_ON_DISABLED = 1
+    READY_TO_SWITCH_ON = 2
+    SWITCHED_ON = 3
+    OPERATION_ENABLED = 4
+    QUICK_STOP_ACTIVE = 5
+    FAULT_REACTION_ACTIVE = 6
+    FAULT = 7
+    UNKNOWN = 8
+    """A statusword that the standard does not define."""
+
+    @property
+    def words(self) -> str:
+        """Return the name in words, as the standard has it."""
+        return self.name.lower().replace("_", " ")
+
+
+WITH_TORQUE = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
+"""States in which a drive gives torque."""
+
+
+class Missing(IntEnum):
+    """What keeps a drive behind a robot controller from following targets; only people at the controller can add it."""
+
+    NOTHING = 0
+    CONNECTION = 1
+    """No message comes from the controller."""
+    MOTORS = 2
+    """Its motors are off."""
+    PROGRAM = 3
+    """Its program does not run."""
+    CONTROL = 4
+    """Its program does not take references now."""
+    CLEARANCE = 5
+    """It reports a fault, as after a collision."""
+    PACE = 6
+    """Its messages come at another interval than configured."""
+
+
 class DriveMode(IntEnum):
     """Modes of operation that the cycle uses (CiA 402-2, object 0x6060)."""
 

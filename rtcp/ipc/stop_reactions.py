@@ -143,8 +143,10 @@ def _ramp(v: float, a: float, j: float) -> Bound:
 
 
 def _quick_stop_rate(config: ArmConfig, joint: Joint) -> float:
-    """Return what 0x6085 among the start-up SDOs of the joint's drive says, rad/s^2."""
+    """Return what 0x6085 among the start-up SDOs of the joint's drive says, rad/s^2; `joint` ramps at the limit."""
     device = next(slave.device for slave in config.slaves if slave.name == joint.slave)
+    if device.kind == "joint":
+        return joint.acceleration
     # A rate counts as a speed does, by the second.
     factors = [entry.factor for pdo in device.rpdo for entry in pdo.channels if entry.name == "target_velocity"]
     rates = [sdo.value for sdo in device.sdo if (sdo.index, sdo.sub_index) == _QUICK_STOP_DECELERATION]

@@ -248,6 +248,8 @@ class InProcessBus:
         self.offset_ns = _EPOCH_NS + self.random.randrange(_EPOCH_NS)
         """Reference clock less simulated time."""
         shown = now_ns + self.offset_ns
+        for device in devices:
+            device.join(devices)
         virtual = [Slave(device, b"", 0.0, shown, 0, None, now_ns) for device in devices]
         self.segment = Segment(virtual, now_ns)
         self.slaves = [InProcessSlave(slave, self, position) for position, slave in enumerate(virtual, 1)]

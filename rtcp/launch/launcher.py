@@ -9,15 +9,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
+from rtcp.config.cell import CellConfig
 from rtcp.config.find import find_config
 from rtcp.config.loader import load, segment_path, widen, with_control_mode, with_period
-from rtcp.config.model import VIRTUAL, ArmConfig, ControlModeName, DriveModeName
+from rtcp.config.model import VIRTUAL, ArmConfig, ControlModeName, DriveModeName, EthercatBus
 from rtcp.config.segment import load_segment
 from rtcp.config.zero import read_zeros, state_directory
 from rtcp.fieldbus.errors import BusError
-from rtcp.fieldbus.interface import check_name
+from rtcp.fieldbus.master import master_of
 from rtcp.gateway.black_box import BlackBox
 from rtcp.ipc.client import LONGEST_SOCKET_PATH
 from rtcp.ipc.errors import RtcpError
@@ -30,6 +31,7 @@ from rtcp.ipc.runtime_directory import (
     control_socket,
     exclusive,
     make_runtime_directory,
+    platform_name,
     runtime_directory,
     stop_marker,
 )
@@ -64,6 +66,8 @@ class StartOptions:
     cycle_us: float | None = None
     poll: bool = False
     """The virtual segment polls for frames instead of sleeping."""
+    cell: CellConfig | None = None
+    """The cell to which the arm belongs; the name of the platform says which of its arms it is."""
 
 
 def start(options: StartOptions, report: Report, check_segment: CheckSegment = load_segment) -> Platform:
@@ -88,6 +92,8 @@ def start(options: StartOptions, report: Report, check_segment: CheckSegment = l
             "are allowed: set RTCP_RUNTIME_DIR to a shorter one",
         )
     try:
+        if platform_name():
+            make_runtime_directory(directory.parent)
         make_runtime_directory(directory)
     except RuntimeDirectoryError as error:
         raise RtcpError("invalid", str(error)) from None
@@ -205,7 +211,8 @@ def _begin_gateway(directory: Path, found: Processes) -> tuple[Platform, int]:
 
 
 def _configure(options: StartOptions) -> ArmConfig:
-    config = load(find_config(options.config))
+    cell = options.cell
+    config = load(find_config(options.config)) if cell is None else cell.member(platform_name()).config
     if (mode := options.mode) is not None:
         control_modes: dict[str, ControlModeName] = {name: name for name in get_args(ControlModeName)}
         drive_modes: dict[str, DriveModeName] = {name: name for name in get_args(DriveModeName)}
@@ -223,13 +230,31 @@ def _configure(options: StartOptions) -> ArmConfig:
 
 
 def _check_bus(config: ArmConfig, check_segment: CheckSegment) -> None:
-    if config.bus.interface == VIRTUAL:
+    if config.bus.interface == VIRTUAL and isinstance(config.bus, EthercatBus):
         check_segment(segment_path(config))
         return
+    master = master_of(config.bus)
+    if config.bus.interface == VIRTUAL:
+        return
     try:
-        check_name(config.bus.interface)
+        master.check_interface(config.bus.interface)
     except BusError as error:
         raise RtcpError("invalid", str(error)) from None
+
+
+def _segment_words(facts: dict[str, Any]) -> str:
+    if "slaves" in facts:
+        return f"segment of {facts['slaves']} virtual slaves (process {facts['pid']})"
+    return f"virtual controller of {', '.join(facts['units'])} (process {facts['pid']})"
+
+
+def _placed(cell: CellConfig) -> CellConfig:
+    """Return the cell with the runtime directories of its arms."""
+    arms, processes = (
+        tuple(dataclasses.replace(one, directory=runtime_directory(one.name).absolute()) for one in group)
+        for group in (cell.arms, cell.processes)
+    )
+    return dataclasses.replace(cell, arms=arms, processes=processes)
 
 
 def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_ns: int, report: Report) -> Platform:
@@ -240,12 +265,15 @@ def _start_all(directory: Path, config: ArmConfig, options: StartOptions, began_
     for log in directory.glob("*.log"):
         log.replace(log.with_name(f"{log.name}.1"))  # kept until the next start
     try:
-        if interface == VIRTUAL:
+        if interface == VIRTUAL and config.bus.VIRTUAL_PROCESS:
             facts = platform.start_segment(segment_path(config), options.poll)
             interface, segment = str(facts["interface"]), int(facts["pid"])
-            report(f"segment of {facts['slaves']} virtual slaves (process {segment})")
+            report(_segment_words(facts))
         bus = config.bus.interface
-        Session(config, bus, interface, segment, began_ns, state, platform.segment_control).write(directory)
+        name, cell = platform_name(), options.cell
+        Session(
+            config, bus, interface, segment, began_ns, state, platform.segment_control, cell and _placed(cell), name
+        ).write(directory)  # fmt: skip
         platform.start_loop(report)
         platform.await_gateway(platform.begin_gateway())
     except BaseException:

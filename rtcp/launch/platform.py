@@ -23,7 +23,7 @@ from rtcp.ipc.errors import RtcpError
 from rtcp.ipc.runtime_directory import (
     blackboard_file,
     control_socket,
-    free_segment_control,
+    free_control,
     is_listening,
     limits_file,
     open_log,
@@ -103,7 +103,8 @@ class Platform:
         self.directory = directory
         self.processes = processes
         self._config = config
-        self._environment = None if state is None else {**os.environ, "RTCP_STATE_DIR": str(state)}
+        # Whole paths: what a child starts itself must not look for the platform's name in them again.
+        self._environment = None if state is None else {**os.environ, "RTCP_STATE_DIR": str(state), "RTCP_NAME": ""}
         self.segment_control: Path | None = None
         """Control socket of the segment that was started."""
         self.facts: dict[str, Any] = {}
@@ -136,9 +137,11 @@ class Platform:
 
     def start_segment(self, path: Path, poll: bool) -> dict[str, Any]:
         """Start the segment; return its ready line: pid, interface, slaves."""
-        self.segment_control = free_segment_control(self.directory)
-        arguments = ["--config", str(path), *(["--poll"] if poll else []), "--control", str(self.segment_control)]
-        child, reading = self._spawn("segment", "rtcp.virtual", *arguments)
+        self.segment_control = free_control(self.directory / f"{self._config.bus.VIRTUAL_CONTROL}.sock")
+        module, *options = self._config.bus.VIRTUAL_PROCESS
+        options += ["--poll"] if poll else []
+        arguments = ["--config", str(path), *options, "--control", str(self.segment_control)]
+        child, reading = self._spawn("segment", module, *arguments)
         for line in read_lines(reading, _READY_TIMEOUT_S):
             if "pid" in line:
                 return line
@@ -154,7 +157,7 @@ class Platform:
                 raise RtcpError("fault", "\n".join(line["sentences"]))
             elif line["event"] == "ready":
                 self.facts = line
-                report("all slaves in OP")
+                report(line["text"])
                 return
         raise self._not_ready("loop", child)
 
@@ -235,7 +238,8 @@ def clear(directory: Path, found: Processes) -> None:
     for pid in (found.gateway, newer, found.segment):
         terminate(pid, _END_TIMEOUT_S)
     processes_file(directory).unlink(missing_ok=True)
-    sockets = [path for path in directory.glob("segment*.sock") if not is_listening(path)]
+    controls = (*directory.glob("segment*.sock"), *directory.glob("irc5*.sock"))
+    sockets = [path for path in controls if not is_listening(path)]
     recorders = directory.glob("recorder-*.json")
     # Narrowed limits name their loop by its process id, which may come again.
     for path in (control_socket(directory), blackboard_file(directory), limits_file(directory), *sockets, *recorders):

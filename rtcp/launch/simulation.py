@@ -18,7 +18,11 @@ from rtcp.config.model import ArmConfig
 from rtcp.config.segment import SegmentConfig, load_segment
 from rtcp.control.bus_service import BusService
 from rtcp.control.cycle import Cycle, make_discipline, position_of, record_schema
+from rtcp.control.partners import Partners
 from rtcp.fieldbus.al_state import AlState
+from rtcp.fieldbus.bus import ProcessData
+from rtcp.fieldbus.master import Master
+from rtcp.fieldbus.supervision import SupervisedBus
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.commands import Command
 from rtcp.ipc.layout import LEASE_DURATION_AT, LEASE_ID_AT, LEASE_RENEWED_AT
@@ -59,6 +63,7 @@ class Simulation:
         positions: rad, shape (n,), where the joints stand at power-on; None: as the segment's file says.
         segment: the slaves; None: the segment that the configuration names.
         follow_clock: whether the loop follows the reference clock; without, the start is 0.3 s shorter at 1 ms.
+        partners: of the arm in a cell.
 
     Raises:
         ConfigError: of the segment's file.
@@ -73,6 +78,7 @@ class Simulation:
         positions: Sequence[float] | None = None,
         segment: SegmentConfig | None = None,
         follow_clock: bool = True,
+        partners: Partners | None = None,
     ) -> None:
         self.config = config = replace(config, bus=replace(config.bus, interface=NAME))
         self.period_ns = round(config.cycle.period_us * 1000)
@@ -82,16 +88,17 @@ class Simulation:
         self.box = next((s.device for s in self.bus.slaves if isinstance(s.device, DiewuIoBox)), None)
         memory = _SHARED_MEMORY if _SHARED_MEMORY.is_dir() else None
         self._directory = Path(tempfile.mkdtemp(prefix="rtcp-simulation-", dir=memory))
-        path = self._directory / "blackboard"
-        self.board = Blackboard(path, record_schema(config), self.period_ns)
+        self.path = path = self._directory / "blackboard"
+        """File of the blackboard."""
+        self.board = Blackboard(path, record_schema(config, partners), self.period_ns)
         self.observer = Observer(path)
         self.service = InlineService(self.bus, self.board, config)
         discipline = make_discipline(config) if follow_clock else None
         self.now_ns = _BEGIN_NS
-        self.loop = Cycle(config, self.data, self.board, self.service, discipline, lambda: self.now_ns)
+        self.loop = Cycle(config, self.data, self.board, self.service, discipline, lambda: self.now_ns, partners)
         # The instant in the cycle that the clock's discipline would have found.
         shown = self.now_ns + self.bus.offset_ns
-        self._planned = self.now_ns - shown % self.period_ns + round((1 + config.bus.send_phase) * self.period_ns)
+        self._planned = self.now_ns - shown % self.period_ns + round((1 + config.ethercat.send_phase) * self.period_ns)
         self._turn_at = self.now_ns + _TURN_NS
         self._turns = 0
         self._renew_at = 0
@@ -157,6 +164,11 @@ class Simulation:
         self._planned = self.loop.cycle(now, now)
         watcher(Frame(now, sent, data.heard, data.wkc, tuple(data.inputs)))
 
+    @property
+    def due_ns(self) -> int:
+        """When the next cycle is due."""
+        return self._planned
+
     def run(self, seconds: float) -> None:
         """Let so much time pass, in whole cycles."""
         until = self.now_ns + round(seconds * 1e9)
@@ -211,13 +223,38 @@ _ERROR_CODE = 0x603F
 _ERROR_BIT = 0x10
 
 
+class _InlineMaster(Master):
+    """The in-process bus, which the simulation starts itself."""
+
+    def __init__(self, config: ArmConfig, bus: InProcessBus) -> None:
+        super().__init__(config, NAME, 0)
+        self._bus = bus
+
+    @staticmethod
+    def check_interface(name: str) -> None:
+        """Accept every name: none is opened."""
+
+    @property
+    def supervised(self) -> SupervisedBus:
+        """The virtual slaves."""
+        return cast(SupervisedBus, self._bus)
+
+    def start(self, directory: Path, report: Callable[[str], None]) -> ProcessData:
+        """Bring the slaves to SAFE-OP."""
+        return self._bus.configure(self.config.slaves, round(self.config.cycle.period_us * 1000))
+
+    def close(self) -> None:
+        """Do nothing: the simulation keeps no wire open."""
+
+
 class InlineService(BusService):
     """Does in turns of simulated time what the service thread does: the way to OP, to PRE-OP and back, the watch."""
 
     def __init__(self, bus: InProcessBus, blackboard: Blackboard, config: ArmConfig) -> None:
         positions = [position_of(config, axis) for axis in config.axes]
         names = [axis.name for axis in config.axes]
-        super().__init__(cast(Any, bus), blackboard, positions, names, config.bus.op_timeout_s, 0, 1)
+        master = _InlineMaster(config, bus)
+        super().__init__(master, blackboard, positions, names, config.bus.op_timeout_s, 0, 1)
         self._segment = bus
         self._board = blackboard
         self._positions = positions

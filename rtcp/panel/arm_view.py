@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import nicegui
 from nicegui.element import Element
 
+from kinematics.pose import Pose
 from kinematics.urdf import to_urdf
+from rtcp.config.cell import Base, Member
 from rtcp.config.model import ArmConfig
 
 _THREE = Path(nicegui.__file__).parent / "elements" / "scene" / "dist"
@@ -17,21 +20,38 @@ Json = dict[str, Any]
 
 
 class ArmView(Element, component="static/arm_view.js", esm={"nicegui-scene": str(_THREE)}):
-    """The arm, live; `preview` shows a ghost.
+    """The arm, live, and its partners in a cell; `preview` shows a ghost.
 
     Args:
         config: the arm; its geometry must be known.
+        own: the arm in its cell; None: it is in none.
+        partners: the others; one whose geometry is not known is not drawn.
     """
 
-    def __init__(self, config: ArmConfig) -> None:
+    def __init__(self, config: ArmConfig, own: Member | None, partners: Sequence[Member]) -> None:
         super().__init__()
         assert config.arm is not None
-        self.config = config
+        self.shows = (config, own, partners)
         self._props["links"] = links(to_urdf(config.arm))
+        self._props["partners"] = [] if own is None else [
+            {"name": one.name, **_between(own.base, one.base), "links": links(to_urdf(one.config.arm))}
+            for one in partners
+            if one.config.arm is not None
+        ]  # fmt: skip
 
     def preview(self, path: list[list[float]], duration_s: float) -> None:
         """Move a ghost along joint positions, rad; none: remove it."""
         self.run_method("preview", path, duration_s)
+
+
+def _between(own: Base, other: Base) -> Json:
+    """Return where the other base stands, seen from the own one; R = Rx Ry Rz."""
+    pose = _pose(own).inverse() @ _pose(other)
+    return {"position": pose.position, "rpy": pose.rpy}
+
+
+def _pose(base: Base) -> Pose:
+    return Pose.from_xyzrpy(*base.position, *base.rpy)
 
 
 def links(urdf: str) -> list[Json]:

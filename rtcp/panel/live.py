@@ -17,7 +17,7 @@ import itertools
 import logging
 import math
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -27,8 +27,11 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from kinematics.forward import forward
 from kinematics.jacobian import singularity_distances
 from rtcp.api import AsyncRobot, Feed, RtcpError, Status
+from rtcp.api.async_cell import AsyncCell
+from rtcp.config.cell import CellConfig
 from rtcp.config.model import ArmConfig
 from rtcp.panel.access import Bucket, Visitor
+from rtcp.panel.partners import Partners, arm_state
 from rtcp.panel.scope import Scope
 
 T = TypeVar("T")
@@ -55,6 +58,11 @@ _SCOPE_TURNS = 2
 """The scopes are read in every second turn."""
 _LIMIT_TURNS = 10
 """The limits in every tenth."""
+_PARTNER_TURNS = 20
+"""Partners that have begun to run are looked for in every twentieth."""
+_MOST_HALTS = 16
+"""STOPs of the pages' sockets that wait for an answer; `/stop` takes them too."""
+_STOP = "panel: stop"
 _JOINTS = ("actual_position", "actual_velocity", "actual_torque", "commanded_position")
 log = logging.getLogger("rtcp.panel")
 
@@ -161,15 +169,31 @@ class Operator:
         return bool(self._motions)
 
     async def run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        """Carry out a command; leaving, or `end`, ends its motion.
+        """Carry out a command of the arm; leaving, or `end`, ends its motion.
 
         Raises:
             EndedOnPurpose: `end` was called.
             RtcpError: as the command; Refused while another one is carried out.
         """
+
+        async def run() -> T:
+            return await command(await self.robot())
+
+        return await self._carry_out(run())
+
+    async def run_in_cell(self, cell: CellConfig, command: Callable[[AsyncCell], Awaitable[T]]) -> T:
+        """Carry out a command of all arms of the cell, as `run`."""
+
+        async def run() -> T:
+            return await command(AsyncCell(cell, operator_name(str(self.page))))
+
+        return await self._carry_out(run())
+
+    async def _carry_out(self, command: Coroutine[Any, Any, T]) -> T:
         if self._motions:
+            command.close()
             raise RtcpError("refused", "the last command of this page is still carried out: wait, or STOP")
-        task = asyncio.ensure_future(self._run(command))
+        task = asyncio.ensure_future(command)
         self._motions.add(task)
         try:
             return await task
@@ -179,9 +203,6 @@ class Operator:
             raise EndedOnPurpose from None
         finally:
             self._motions.discard(task)
-
-    async def _run(self, command: Callable[[AsyncRobot], Awaitable[T]]) -> T:
-        return await command(await self.robot())
 
     def jog(self, velocity: Sequence[float], frame: str, token_ns: int) -> None:
         """Move with a velocity until `JOG_S` after `token_ns`; only the newest command waits for its turn."""
@@ -227,13 +248,14 @@ class Live:
         self.limits: Json | None = None
         """In force, as `Robot.limits` has them."""
         self.feed: Feed | None = None
+        self.partners = Partners()
         self.pages: dict[str, Page] = {}
         self.operator: Operator | None = None
         self._viewing: AsyncRobot | None = None
         self._retry_at = 0.0
         self._turn = 0
         self._scoped = False
-        self._halting: asyncio.Task[str] | None = None
+        self._halting: set[asyncio.Task[str]] = set()
         self._halted_ns = 0
         """When STOP was pressed last."""
         self._asking = False
@@ -289,8 +311,10 @@ class Live:
         if given.get("visible") is True:
             page.seen_ns = max(page.seen_ns, token_ns)
         if given.get("stop"):
-            if self._halting is None or self._halting.done():
-                self._halting = asyncio.create_task(self.halt())
+            if len(self._halting) < _MOST_HALTS:
+                halting = asyncio.create_task(self.halt())
+                self._halting.add(halting)
+                halting.add_done_callback(self._halting.discard)
         elif "jog" in given:
             self._jog(page, given, token_ns)
 
@@ -390,21 +414,40 @@ class Live:
 
     async def command(self, page: Page, command: Callable[[AsyncRobot], Awaitable[T]], instead: bool = False) -> T:
         """Carry out a command as `Operator.run`; raises HeldByAnother too. `instead`: what it moves stops first."""
+        return await (await self._operator(page, instead)).run(command)
+
+    async def command_cell(self, page: Page, command: Callable[[AsyncCell], Awaitable[T]], instead: bool = False) -> T:
+        """Carry out a command of all arms of the cell as `command`; raises Refused where there is none."""
+        operator = await self._operator(page, instead)
+        if self.partners.cell is None:
+            raise RtcpError("refused", "this arm is in no cell that runs")
+        return await operator.run_in_cell(self.partners.cell, command)
+
+    async def _operator(self, page: Page, instead: bool) -> Operator:
+        """Return the operator that a page which was clicked has become."""
         self.check_click(page)
         operator = self.claim(page)
         if instead and operator.moves:
             await self.leave(page)
             operator = self.claim(page)
-        return await operator.run(command)
+        return operator
 
     async def halt(self) -> str:
-        """Stop every motion and what waits, whoever asks; return why it was not, or an empty text."""
+        """Stop every motion and what waits, of all arms of the cell, whoever asks; return what was not stopped and why.
+
+        The arms are reached at once and each by itself.
+        """
         self._halted_ns = time.monotonic_ns()
         for page in self.pages.values():
             page.ended = page.press
         ending = None if self.operator is None else asyncio.create_task(self.leave(self.operator.page))
         try:
-            async with AsyncRobot("panel: stop") as robot:
+            if self.partners.cell is not None:
+                failed = await AsyncCell(self.partners.cell, _STOP).halt()
+                # Beside one that moves others may have no torque, and so nothing to stop.
+                told = {name: error for name, error in failed.items() if getattr(error, "reason", "") != "wrong_state"}
+                return "; ".join(f"{name}: {error}" for name, error in told.items())
+            async with AsyncRobot(_STOP) as robot:
                 await robot.halt()
         except RtcpError as error:
             return error.message
@@ -460,6 +503,7 @@ class Live:
                 if time.monotonic() < self._retry_at:
                     return
                 self._retry_at = time.monotonic() + _RETRY_S
+                self.partners.find_cell()
                 made = AsyncRobot("panel: view")
                 await made.__aenter__()
                 self._viewing = made
@@ -499,6 +543,8 @@ class Live:
     def _send_all(self) -> None:
         if not any(page.socket for page in self.pages.values()):
             return
+        if self._turn % _PARTNER_TURNS == 0:
+            self.partners.find()
         state = self.state()
         if self._turn % _SCOPE_TURNS == 0:
             self._read_scopes()
@@ -535,8 +581,15 @@ class Live:
 
     def state(self) -> Json:
         """Return what every page shows, SI units."""
+        cell: Json = {}
+        if self.partners.cell is not None:
+            cell = {
+                "partners": self.partners.state(),
+                "step": arm_state(self.feed).get("step"),
+                "rod": self.partners.rod,
+            }
         if self.status is None:
-            return {"state": "off", "message": self.problem}
+            return {"state": "off", "message": self.problem, **cell}
         raw = self.status.raw
         joints = raw["joints"]
         shown: Json = {
@@ -554,7 +607,10 @@ class Live:
             "missed": raw["missed"],
             "cycles": raw["cycles"],
             "limits": self.limits,
+            **cell,
         }
+        if raw["processes"]:
+            shown["processes"] = {name: self._process(name, raw) for name in raw["processes"]}
         if self.config is not None:
             temperatures = {slave["name"]: slave["temperature"] for slave in raw["slaves"]}
             shown["temperature"] = [temperatures.get(joint.slave) for joint in self.config.joints]
@@ -565,6 +621,22 @@ class Live:
             shown["tool"] = [round(one, 5) for one in (*pose.position, *pose.rpy)]
             shown["singular"] = [None if one is None else round(one, 4) for one in distances]
         return shown
+
+    def _process(self, name: str, raw: Mapping[str, Any]) -> Json:
+        """Return state, fields and lamps of a process."""
+        devices = raw["devices"]
+        lamps: Json = {}
+        for process in () if self.config is None else self.config.processes:
+            if process.name == name:
+                for key in process.LAMPS.values():
+                    slave, _, channel = str(getattr(process, key)).partition(".")
+                    lamps[key] = "on" if devices[slave][channel]["value"] else "off"
+        fields = {
+            field: None if one["value"] is None else _number(one["value"], 5)
+            for field, one in devices.get(name, {}).items()
+            if not isinstance(one["value"], list)
+        }
+        return {"state": raw["processes"][name]["state"] or "", "fields": fields, "lamps": lamps}
 
 
 def _number(value: float, digits: int) -> float | None:

@@ -49,9 +49,10 @@ class PlatformCollector(Collector):
         yield GaugeMetricFamily(
             "rtcp_expected_working_counter", "Expected working counter.", value=raw["wkc"]["expected"]
         )
-        yield GaugeMetricFamily(
-            "rtcp_dc_offset_seconds", "Offset from the reference clock.", value=raw["dc"]["offset_ns"] * 1e-9
-        )
+        if raw["dc"] is not None:
+            yield GaugeMetricFamily(
+                "rtcp_dc_offset_seconds", "Offset from the reference clock.", value=raw["dc"]["offset_ns"] * 1e-9
+            )
         in_op = GaugeMetricFamily("rtcp_slave_in_op", "Whether a slave is in OP.", labels=["position", "name"])
         errors = CounterMetricFamily(
             "rtcp_slave_errors", "What the ports of a slave have counted.", labels=["position", "name", "kind", "port"]

@@ -16,6 +16,7 @@ from nicegui.element import Element
 from nicegui.elements.mixins.text_element import TextElement
 
 from rtcp.api import AsyncRobot, RtcpError
+from rtcp.api.async_cell import AsyncCell
 from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import CLICK, TAKE_OVER_S, Click, EndedOnPurpose, HeldByAnother, Live, Page
 
@@ -222,9 +223,18 @@ class View:
         self, command: Callable[[AsyncRobot], Awaitable[T]], done: str = "", *, instead: bool = False
     ) -> T | None:
         """Carry out a command; show what becomes of it. `instead`: what this page moves is stopped first."""
+        return await self._act(self.live.command(self.page, command, instead), done)
+
+    async def act_in_cell(
+        self, command: Callable[[AsyncCell], Awaitable[T]], done: str = "", *, instead: bool = False
+    ) -> T | None:
+        """Carry out a command of all arms of the cell, as `act`."""
+        return await self._act(self.live.command_cell(self.page, command, instead), done)
+
+    async def _act(self, command: Awaitable[T], done: str) -> T | None:
         with self._visited():
             try:
-                found = await self.live.command(self.page, command, instead)
+                found = await command
             except HeldByAnother as held:
                 self._offer_to_take_over(held.holder)
             except EndedOnPurpose:
@@ -255,7 +265,7 @@ class View:
         if problem := await self.live.halt():
             self.warn(problem)
         else:
-            self.say("The arm holds")
+            self.say("The arm holds" if self.live.partners.cell is None else "All arms hold")
 
     def may_command(self) -> bool:
         """Return whether this person is an operator; else say that they are not."""

@@ -29,12 +29,14 @@ from rtcp.panel.arm_view import ArmView
 from rtcp.panel.live import Live
 from rtcp.panel.metrics import exposition
 from rtcp.panel.page import View, no_geometry, shown, text
-from rtcp.panel.pages import arm, health, jog, limits, recorder, scope, segment, start, targets
+from rtcp.panel.pages import arm, cell, health, jog, limits, processes, recorder, scope, segment, start, targets
 
 _STATIC = Path(__file__).parent / "static"
 PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
     "/": ("Start", start.build, False),
     "/arm": ("Arm", arm.build, True),
+    "/cell": ("Cell", cell.build, True),
+    "/processes": ("Processes", processes.build, False),
     "/targets": ("Targets", targets.build, True),
     "/jog": ("Jog", jog.build, True),
     "/limits": ("Limits", limits.build, False),
@@ -43,7 +45,9 @@ PAGES: dict[str, tuple[str, Callable[[View], Any], bool]] = {
     "/segment": ("Segment", segment.build, False),
     "/health": ("Health", health.build, False),
 }
-"""Path -> name, function that builds it, whether the arm in space stands beside it."""
+"""Path -> name, function that builds it, whether the arm in space stands beside it.
+
+The menu shows Cell where the arm is in one, and Processes where the platform has one."""
 _COLOURS = {"primary": "#1864ab", "positive": "#237032", "negative": "#c92a2a", "warning": "#9c4a00", "info": "#0b7285"}
 
 
@@ -217,8 +221,8 @@ class Panel:
 
     def _draw(self, view: View, space: Element) -> None:
         """Draw the arm that runs; it stays over all pages."""
-        config = self._live.config
-        if config is None or (view.arm is not None and view.arm.config == config):
+        config, own, partners = shows = (self._live.config, self._live.partners.own, self._live.partners.members)
+        if config is None or (view.arm is not None and view.arm.shows == shows):
             return
         space.clear()
         view.arm = None
@@ -226,7 +230,7 @@ class Panel:
             if config.arm is None:
                 no_geometry()
             else:
-                view.arm = ArmView(config)
+                view.arm = ArmView(config, own, partners)
 
 
 def _file(directory: Path, path: str, endings: tuple[str, ...]) -> Response:

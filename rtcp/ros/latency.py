@@ -21,8 +21,8 @@ import numpy as np
 
 from rtcp.api import connect
 from rtcp.api.feed import Feed
-from rtcp.ros.simple_message.framing import Frame
-from rtcp.ros.simple_message.messages import ByteOrder, JointPosition
+from rtcp.fieldbus.simple_message.framing import Frame
+from rtcp.fieldbus.simple_message.messages import ByteOrder, JointPosition
 
 Publish = Callable[[Sequence[float]], None]
 """Sends joint positions, rad."""

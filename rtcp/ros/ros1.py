@@ -35,8 +35,8 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from kinematics.model import ArmModel
 from kinematics.urdf import to_urdf
 from rtcp.api import Replaced, RtcpError
-from rtcp.api.async_robot import connect_async
 from rtcp.config.model import ArmConfig
+from rtcp.fieldbus.simple_message.messages import TriState
 from rtcp.ros.commands import (
     Commander,
     CommandOptions,
@@ -46,7 +46,7 @@ from rtcp.ros.commands import (
     Trajectory,
     TrajectoryPoint,
 )
-from rtcp.ros.simple_message.messages import TriState
+from rtcp.ros.group import GroupStates, connects
 from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher, transforms_of
 
 T = TypeVar("T")
@@ -71,6 +71,8 @@ class NodeOptions:
     arguments: Sequence[str] = ()
     """Remappings and private parameters as roslaunch passes them: `joint_states:=/left/joint_states`."""
     commands: CommandOptions = field(default_factory=CommandOptions)
+    group: bool = False
+    """Whether all arms of the cell are one group of joints."""
 
 
 def run(options: NodeOptions) -> None:
@@ -87,10 +89,13 @@ def run(options: NodeOptions) -> None:
     rospy.init_node(options.name, argv=[options.name, *options.arguments], disable_signals=True)
     watch = threading.Thread(target=master.wait_for_another, args=(identity,), daemon=True)
     watch.start()
-    commands = Commands(options.commands)
-    publisher = StatePublisher(
-        Publications(commands, options.has_link_frames), rate_hz=options.rate_hz, name=rospy.get_name()
-    )
+    commands = Commands(options.commands, options.group)
+    publications = Publications(commands, options.has_link_frames)
+    publisher: StatePublisher | GroupStates
+    if options.group:
+        publisher = GroupStates(publications, rospy.get_name(), options.rate_hz, publications.describe)
+    else:
+        publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=rospy.get_name())
     # Another master is not followed in the middle of a motion, which the end of its connection would stop.
     while not ends.is_set() and (watch.is_alive() or commands.commander.is_moving):
         publisher.step(_TURN_S)
@@ -151,9 +156,14 @@ class Publications:
         """Set robot_description, where the geometry is known and nobody has set it."""
         rospy.loginfo("connected to %s", config.name)
         self._arm = config.arm
+        if config.arm is not None:
+            self.describe(to_urdf(config.arm, [joint.torque for joint in config.joints]))
+
+    def describe(self, urdf: str) -> None:
+        """Set robot_description, where nobody has set it."""
         try:
-            if config.arm is not None and not rospy.has_param("robot_description"):
-                rospy.set_param("robot_description", to_urdf(config.arm, [joint.torque for joint in config.joints]))
+            if not rospy.has_param("robot_description"):
+                rospy.set_param("robot_description", urdf)
         except (OSError, rospy.ROSException) as error:  # the master is gone; another one starts the process anew
             rospy.logwarn("robot_description was not set: %s", error)
 
@@ -208,10 +218,10 @@ class Publications:
 class Commands:
     """Takes topics, services and the action; the core carries them out on an event loop in a thread of its own."""
 
-    def __init__(self, options: CommandOptions) -> None:
+    def __init__(self, options: CommandOptions, group: bool = False) -> None:
         self._loop = asyncio.new_event_loop()
         threading.Thread(target=self._loop.run_forever, daemon=True).start()
-        self.commander = self._wait(self._make(options))
+        self.commander = self._wait(self._make(options, group))
         self._goals: dict[str, tuple[Any, asyncio.Task[None]]] = {}
         """Of the action: handle and what carries it out, by its id."""
         for topic, kind, carry_out in (
@@ -245,8 +255,8 @@ class Commands:
             handle.publish_feedback(feedback)
 
     @staticmethod
-    async def _make(options: CommandOptions) -> Commander:
-        return Commander(lambda: connect_async(rospy.get_name(), disable_when_lost=True), options, rospy.logerr)
+    async def _make(options: CommandOptions, group: bool) -> Commander:
+        return Commander(connects(rospy.get_name(), group), options, rospy.logerr)
 
     def _wait(self, coroutine: Coroutine[Any, Any, T]) -> T:
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop).result()

@@ -90,7 +90,7 @@ class DdsWire:
     topics = tuple(OUT)
 
     def __init__(self, options: Ros2Options, commands: Commands) -> None:
-        self._commands = commands
+        self._options, self._commands = options, commands
         self._participant = DomainParticipant(options.domain, Qos(Policy.Userdata(b"enclave=/;")))
         self._writers: dict[str, Any] = {
             topic: DataWriter(self._participant, self._topic(topic, kind), qos_of(topic, kind))
@@ -113,7 +113,7 @@ class DdsWire:
         self._reading.join()
 
     def _topic(self, topic: str, kind: str) -> Any:
-        return Topic(self._participant, f"rt/{topic}", struct_of(kind))
+        return Topic(self._participant, f"rt/{self._options.resolved(topic)}", struct_of(kind))
 
     def _read(self) -> None:
         """Hand over what comes, until `close`."""

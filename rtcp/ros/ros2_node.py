@@ -21,8 +21,8 @@ from kinematics.model import ArmModel
 from kinematics.pose import IDENTITY
 from kinematics.urdf import to_urdf
 from rtcp.api import RtcpError
-from rtcp.api.async_robot import connect_async
 from rtcp.config.model import ArmConfig
+from rtcp.fieldbus.simple_message.messages import TriState
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.ros.commands import (
     Commander,
@@ -34,8 +34,8 @@ from rtcp.ros.commands import (
     Trajectory,
     TrajectoryPoint,
 )
+from rtcp.ros.group import GroupStates, connects
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, PATH_COMMAND, STOP_MOTION, TRIGGER
-from rtcp.ros.simple_message.messages import TriState
 from rtcp.ros.state import Diagnostics, JointSample, RobotStatus, StatePublisher
 
 Make = Callable[..., Any]
@@ -98,6 +98,14 @@ class Ros2Options:
     commands: CommandOptions = field(default_factory=CommandOptions)
     remappings: Sequence[str] = ()
     """`joint_states:=/left/joint_states`; with rclpy."""
+    group: bool = False
+    """Whether all arms of the cell are one group of joints."""
+    namespace: str = ""
+    """Of topics, services and the action, but `diagnostics`: `left`; empty: none."""
+
+    def resolved(self, name: str) -> str:
+        """Return the name of a topic or service with its namespace, without the slash before it."""
+        return f"{self.namespace}/{name}" if self.namespace and name != "diagnostics" else name
 
 
 class Wire(Protocol):
@@ -133,7 +141,7 @@ class Commands:
         threading.Thread(target=self.loop.run_forever, daemon=True).start()
 
         async def commander() -> Commander:
-            to_platform = connect or (lambda: connect_async(options.name, disable_when_lost=True))
+            to_platform = connect or connects(options.name, options.group)
             return Commander(to_platform, options.commands, _LOG.error)
 
         self.commander = self.submit(commander()).result()
@@ -229,8 +237,11 @@ class Publications:
         _LOG.info("connected to %s", config.name)
         self._arm = config.arm
         if config.arm is not None:
-            urdf = to_urdf(config.arm, [joint.torque for joint in config.joints])
-            self._publish("robot_description", data=urdf)
+            self.describe(to_urdf(config.arm, [joint.torque for joint in config.joints]))
+
+    def describe(self, urdf: str) -> None:
+        """Publish robot_description."""
+        self._publish("robot_description", data=urdf)
 
     def joints(self, names: tuple[str, ...], sample: JointSample) -> None:
         """Publish joint_states, tf, feedback_states, and the feedback of goals."""
@@ -329,7 +340,11 @@ def run(options: Ros2Options, open_wire: OpenWire) -> None:
         signal.signal(number, lambda *_: ends.set())
     with Commands(options) as commands, open_wire(options, commands, ends) as wire:
         publications = Publications(wire, options.name, commands.note_stop)
-        publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=options.name)
+        publisher: StatePublisher | GroupStates
+        if options.group:
+            publisher = GroupStates(publications, options.name, options.rate_hz, publications.describe)
+        else:
+            publisher = StatePublisher(publications, rate_hz=options.rate_hz, name=options.name)
         while not ends.is_set():
             publisher.step(_STEP_S)
         publisher.close()

@@ -62,7 +62,7 @@ def open_wire(options: Ros2Options, commands: Commands, ends: threading.Event) -
         domain_id=options.domain,
         signal_handler_options=SignalHandlerOptions.NO,
     )
-    node = rclpy.create_node(options.name)
+    node = rclpy.create_node(options.name, namespace=options.namespace or None)
     executor = MultiThreadedExecutor(_THREADS)
     try:
         wire = RclpyWire(node, commands)

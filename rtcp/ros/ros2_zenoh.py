@@ -103,10 +103,13 @@ class ZenohWire:
         self._session, self._options, self._commands = session, options, commands
         self._entities = itertools.count(1)
         self._numbers = itertools.count(1)
+        self._space = f"/{options.namespace}".replace("/", "%")
         self._prefix = f"@ros2_lv/{options.domain}/{session.info.zid()}/0"
         self._action = ActionServer(commands, make, self.publish)
         # What is declared ends with the last reference to it.
-        self._declared: list[Any] = [session.liveliness().declare_token(f"{self._prefix}/0/{_NODE}/%/%/{options.name}")]
+        self._declared: list[Any] = [
+            session.liveliness().declare_token(f"{self._prefix}/0/{_NODE}/%/{self._space}/{options.name}")
+        ]
         self._publishers = {topic: self._publisher(topic, kind) for topic, kind in {**OUT, **ACTION_TOPICS}.items()}
         for topic, kind in IN.items():
             self._subscribe(topic, kind)
@@ -127,7 +130,7 @@ class ZenohWire:
         self._action.publish_feedback(feedback)
 
     def _publisher(self, topic: str, kind: str) -> tuple[Any, str, bytes]:
-        key = key_of(self._options.domain, topic, kind)
+        key = key_of(self._options.domain, self._options.resolved(topic), kind)
         publisher: Any
         if topic in LATCHED:
             cache = zenoh.ext.CacheConfig(max_samples=1)
@@ -145,11 +148,13 @@ class ZenohWire:
                 return
             self._commands.receive(topic, message)
 
-        self._declared.append(self._session.declare_subscriber(key_of(self._options.domain, topic, kind), receive))
+        self._declared.append(
+            self._session.declare_subscriber(key_of(self._options.domain, self._options.resolved(topic), kind), receive)
+        )
         self._announce(_SUBSCRIBER, topic, kind)
 
     def _serve(self, service: str, kind: str, respond: Callable[[Any], Awaitable[Any]]) -> None:
-        key = key_of(self._options.domain, service, kind)
+        key = key_of(self._options.domain, self._options.resolved(service), kind)
 
         async def answer(query: zenoh.Query) -> None:
             with query:
@@ -177,9 +182,9 @@ class ZenohWire:
     def _announce(self, entity: str, topic: str, kind: str) -> bytes:
         """Make a topic or service appear in lists; return the id of the endpoint."""
         qos = _LATCHED_QOS if topic in LATCHED else _QOS
-        name = f"/{topic}".replace("/", "%")
+        name = f"/{self._options.resolved(topic)}".replace("/", "%")
         key = (
-            f"{self._prefix}/{next(self._entities)}/{entity}/%/%/{self._options.name}/{name}"
+            f"{self._prefix}/{next(self._entities)}/{entity}/%/{self._space}/{self._options.name}/{name}"
             f"/{dds_type(kind)}/{type_hash(kind)}/{qos}"
         )
         self._declared.append(self._session.liveliness().declare_token(key))

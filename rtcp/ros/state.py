@@ -19,8 +19,8 @@ from kinematics.pose import Vector
 from rtcp import api
 from rtcp.api import ControlMode, NotRunning, State
 from rtcp.api.feed import Feed, Records
+from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.motion.planning.interpolation import Quaternion, quaternion
-from rtcp.ros.simple_message.messages import RobotMode, TriState
 
 TOOL_FRAME = "tool0_controller"
 """As other drivers name it: `tool0` itself hangs at the last link of the URDF."""
@@ -252,7 +252,7 @@ class StatePublisher:
                 why = self._why if feed is None else "the loop publishes no cycles"
                 self._sink.diagnostics(Diagnostics(now_ns + ahead_ns, 3, why, (("connected", "false"),)))
             else:
-                self._sink.diagnostics(_diagnostics(record, feed.holder, ahead_ns))
+                self._sink.diagnostics(_diagnostics(feed, record, ahead_ns))
 
     def _publish_status(self, feed: Feed, record: Any, instant: int, ahead_ns: int) -> None:
         self._status_ns = instant + _STATUS_NS
@@ -281,7 +281,7 @@ def _sample(record: Any, stamp_ns: int) -> JointSample:
     )
 
 
-def _diagnostics(record: Any, holder: str, ahead_ns: int) -> Diagnostics:
+def _diagnostics(feed: Feed, record: Any, ahead_ns: int) -> Diagnostics:
     state = State(record["state"])
     level = 2 if state in _IN_ERROR else 0
     if not level and record["wkc"] != record["wkc_expected"]:
@@ -289,10 +289,14 @@ def _diagnostics(record: Any, holder: str, ahead_ns: int) -> Diagnostics:
     values = {
         "connected": "true",
         "state": state.words,
-        "commander": holder,
+        "commander": feed.holder,
         "working counter": f"{record['wkc']} of {record['wkc_expected']}",
         "cycles without an answer": str(record["lost"]),
         "ticks skipped": str(record["missed"]),
         "error code": str(record["fault"] or record["limit"]),
     }
+    processes = {one.name for one in feed.config.processes}
+    for field in feed.schema.fields:
+        if field.part in processes:
+            values[f"{field.part} {field.local_name}"] = str(record[field.name])
     return Diagnostics(int(record["time_ns"]) + ahead_ns, level, state.words, tuple(values.items()))

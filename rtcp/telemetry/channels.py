@@ -27,7 +27,6 @@ from kinematics.model import ArmModel
 from kinematics.urdf import to_urdf
 from rtcp.api.feed import Records
 from rtcp.config.model import ArmConfig
-from rtcp.devices.cia402 import STATE_BITS, state_of
 from rtcp.ipc import schema as record
 from rtcp.ipc.recording import (
     INFORMATION,
@@ -37,7 +36,7 @@ from rtcp.ipc.recording import (
     log_entry,
 )
 from rtcp.ipc.schema import RecordSchema
-from rtcp.ipc.states import ControlMode, DriveMode, State
+from rtcp.ipc.states import ControlMode, DriveMode, DriveState, State
 from rtcp.motion.planning.interpolation import quaternion
 from rtcp.telemetry.cdr import CdrTemplate, stamps
 
@@ -209,11 +208,10 @@ class Channels:
                   self._frames.messages(records["actual_position"][chosen], time_ns[chosen]))  # fmt: skip
 
     def _publish_changes(self, records: Records, instants: Sequence[int]) -> None:
-        # Bits of a statusword that tell no state may change in every cycle.
         columns = [
             *(records[name] for name in _WATCHED),
             *(records[name] & mask for name, mask in self._boxes.items()),
-            *(records["statusword"] & STATE_BITS).T,
+            *records["drive_state"].T,
         ]
         rows = np.column_stack([column.astype(np.int64) for column in columns])
         before = np.vstack([rows[:1] - 1 if self._last is None else self._last, rows[:-1]])
@@ -226,7 +224,7 @@ class Channels:
         (state, drive_mode, control_mode, flags), words = row[: len(_WATCHED)], row[len(_WATCHED) + len(self._boxes) :]
         boxes = dict(zip(self._boxes, row[len(_WATCHED) :], strict=False))
         config = self._config
-        drives = {joint.name: state_of(word).value for joint, word in zip(config.joints, words, strict=True)}
+        drives = {joint.name: DriveState(word).words for joint, word in zip(config.joints, words, strict=True)}
         return {
             "state": State(state).words,
             "drive_mode": _name(DriveMode, drive_mode),

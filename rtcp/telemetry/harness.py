@@ -56,7 +56,6 @@ class Harness:
         # The session knows the socket: another segment may have the usual one.
         self.segment = SegmentClient(read_session(directory).segment_control or segment_control(directory))
         self.observer = Observer(blackboard_file(directory))
-        self.segment.clear_peaks()  # from the first request on the segment observes its joints
         self._names = Names(config)
         self._speeds = np.array([joint.velocity for joint in config.joints])
         self._seen = self.observer.head
@@ -73,6 +72,7 @@ class Harness:
         """Largest step of a target between cycles with enabled drives, as a fraction of what its speed limit allows."""
 
     def __enter__(self) -> Harness:
+        self.segment.clear_peaks()  # from the first request on the segment observes its joints
         return self
 
     def __exit__(
@@ -166,7 +166,7 @@ class Harness:
     # -- commands ---------------------------------------------------------------------------------------------------
 
     def inject(self, fault: Mapping[str, Any]) -> None:
-        """Inject a fault; raises SegmentRefused, SegmentAway."""
+        """Inject a fault; raises RequestRefused, ServerAway."""
         self.segment.fault(fault)
         self.injected += 1
 

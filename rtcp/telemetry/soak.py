@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from random import Random
 from typing import Any
 
@@ -14,10 +15,14 @@ import psutil
 from rtcp.api import RtcpError
 from rtcp.telemetry.harness import Harness, TrialFailed
 from rtcp.telemetry.trial import WORKLOADS, named, run_trial
-from rtcp.virtual.faults.control import SegmentAway, SegmentRefused
+from rtcp.virtual.request_socket import RequestRefused, ServerAway
 
 SETTLE_S = 60.0
-"""After this time a process has allocated all that it keeps: its memory must not grow."""
+RECORDINGS = 8
+"""After this time and so many stops, each of which the black box records, a process has allocated all that it keeps:
+its memory must not grow."""
+READINGS = 5
+"""Trials whose least memory counts: a recording that is being written takes some 30 MiB until it is."""
 GROWTH = 2 << 20
 """Growth of a process after that, bytes, that is the allocator's noise and not a leak."""
 _WATCH_S = 1.0
@@ -54,7 +59,7 @@ def grown(first: Mapping[str, Resources], last: Mapping[str, Resources], *, sett
     Args:
         first: resources at first, by name of the process.
         last: present resources; a process that is missing has ended.
-        settled: `first` was taken after `SETTLE_S`: memory is compared too.
+        settled: `first` was taken when memory had settled: it is compared too.
     """
     found = []
     for name, before in first.items():
@@ -67,8 +72,17 @@ def grown(first: Mapping[str, Resources], last: Mapping[str, Resources], *, sett
                 if getattr(now, count) > getattr(before, count):
                     found.append(f"the {name} has {getattr(now, count)} {unit}, {getattr(before, count)} before")
         if settled and now.rss - before.rss > GROWTH:
-            found.append(f"the {name} uses {now.rss / 2**20:.1f} MiB, {before.rss / 2**20:.1f} after the first minute")
+            found.append(f"the {name} uses {now.rss / 2**20:.1f} MiB, {before.rss / 2**20:.1f} at first")
     return found
+
+
+def least(readings: Iterable[Mapping[str, Resources]]) -> dict[str, Resources]:
+    """Return the last reading, each process with the least memory of all readings."""
+    readings = list(readings)
+    return {
+        name: replace(last, rss=min(reading[name].rss for reading in readings if name in reading))
+        for name, last in readings[-1].items()
+    }
 
 
 def random_fault(random: Random, slaves: int, drives: tuple[int, ...]) -> dict[str, Any]:
@@ -139,7 +153,7 @@ class Summary:
     torn: int = 0
     largest_step: float = 0.0
     first: dict[str, Resources] = field(default_factory=dict)
-    """Resources of each process after the first minute, or at the beginning of a shorter soak."""
+    """Resources of each process when its memory had settled, or at the beginning of a shorter soak."""
     last: dict[str, Resources] = field(default_factory=dict)
     failures: list[str] = field(default_factory=list)
     """A message for each violation."""
@@ -171,19 +185,25 @@ class Soak:
         begun = time.monotonic()
         summary = self.summary
         summary.first = self._resources()
-        settled, number = False, 0
+        readings = deque([summary.first], READINGS)
+        settled, number, settles_at = False, 0, 0
         try:
             while (passed := time.monotonic() - begun) <= minutes * 60.0:
-                if not settled and passed > SETTLE_S:
-                    settled, summary.first = True, self._resources()
+                stops = sum(counts.stopped for counts in summary.counts.values())
+                if not settles_at and passed > SETTLE_S and stops >= RECORDINGS:
+                    settles_at = number + READINGS
+                if not settled and number == settles_at != 0:
+                    settled, summary.first = True, least(readings)
                 number += 1
                 fault = random_fault(self._random, self._slaves, self._drives)
                 self._trial(number, fault, self._random.choice(tuple(WORKLOADS)))
-                if len(self._resources()) < len(self._pids):
+                readings.append(self._resources())
+                if len(readings[-1]) < len(self._pids):
                     break
         finally:  # also after an interruption
             summary.minutes = (time.monotonic() - begun) / 60.0
-            summary.last = self._resources()
+            readings.append(self._resources())
+            summary.last = least(readings)
             summary.records, summary.torn = self._harness.records, self._harness.torn
             if summary.torn:
                 summary.failures.append(f"{summary.torn} cycle records were torn or lost")
@@ -198,10 +218,10 @@ class Soak:
         try:
             result = run_trial(harness, [fault], workload, _WATCH_S)
             harness.read_cycles()
-        except (TrialFailed, RtcpError, SegmentRefused, SegmentAway, OSError) as error:
+        except (TrialFailed, RtcpError, RequestRefused, ServerAway, OSError) as error:
             summary.failures.append(f"{trial}: {error}")
             self._log(f"{trial}: {error}")
-            with contextlib.suppress(SegmentRefused, SegmentAway, OSError):
+            with contextlib.suppress(RequestRefused, ServerAway, OSError):
                 harness.segment.clear()
             return
         finally:

@@ -66,10 +66,10 @@ def place(config: ArmConfig, plane: str) -> Square:
     if model is None:
         raise NoSquare("the arm's geometry is not known (key kinematics): no square can be driven")
     limits = Limits(config)
-    zones = Zones(model, limits)
+    zones = Zones(model, limits, config.cartesian.clearance)
 
     def zone_at(q: Sequence[float]) -> str | None:
-        return "a box" if zones.distance(frames(model, q))[0] < _ROOM_M else None
+        return "a box or itself" if zones.distance(frames(model, q))[0] < _ROOM_M else None
 
     for elbow, wrist, shoulder in product(_ELBOWS, _WRISTS, _SHOULDERS):
         square = _around(model, (0.0, shoulder, elbow, 0.0, wrist, 0.0), plane)

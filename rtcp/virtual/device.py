@@ -7,12 +7,12 @@ It is found by name among the entry points `rtcp.virtual_models`, or as `module:
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from math import isfinite
 from types import MappingProxyType
-from typing import ClassVar, Protocol, cast
+from typing import Any, ClassVar, Protocol, cast
 
 from rtcp.config.document import Finding, shown
 from rtcp.config.find import load_class, registered
@@ -111,6 +111,13 @@ def number(objects: ObjectDictionary, index: int, subindex: int = 0) -> Number:
     return cast(Number, objects[index, subindex])
 
 
+class FreezableInputs:
+    """Mixed into a model whose inputs can be frozen."""
+
+    freezes = 0
+    """Above 0: the inputs keep their values."""
+
+
 class DeviceModel:
     """Base of all device models. It knows objects by index and subindex and nothing of frames.
 
@@ -153,6 +160,9 @@ class DeviceModel:
         self.define(self.objects)
         self._defaults = [(entry, entry.value) for found in self.objects for entry in found.entries.values()]
 
+    def join(self, devices: Sequence[DeviceModel]) -> None:
+        """Get to know all devices of the segment, in the order of the cable; called once, before time passes."""
+
     def option(self, name: str, otherwise: float = 0.0) -> float:
         """Return the value of an option, `otherwise` where it follows from the model."""
         value = self.chosen[name]
@@ -180,6 +190,10 @@ class DeviceModel:
     def step(self, dt: float) -> None:
         """Let `dt` seconds pass: read the RxPDO objects, move, write the TxPDO objects."""
         raise NotImplementedError
+
+    def truth(self) -> dict[str, Any]:
+        """Return what tests ask for past the bus, by name, as JSON has it."""
+        return {}
 
     def power_off(self) -> None:
         """The supply goes: no torque, outputs off; `step` advances only the mechanics."""

@@ -1,6 +1,6 @@
-"""The cable: a veth pair in a network namespace that holds nothing else, made with or without root.
+"""The cable: a veth pair, or the loopback, in a network namespace that holds nothing else, with or without root.
 
-The kernel removes the pair when the last process in the segment's namespace is gone, also after SIGKILL.
+The kernel removes both when the last process in the namespace is gone, also after SIGKILL.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 MASTER_END = "ecat0"
 SEGMENT_END = "ecat0-seg"
 """Names of the two ends inside the segment's own namespace."""
+LOOPBACK = "lo"
 LONGEST_NAME = 15
 CLONE_NEWUSER = 0x10000000
 CLONE_NEWNET = 0x40000000
@@ -43,7 +44,7 @@ def _unshare(flags: int) -> None:
 
 def _forbidden(error: OSError) -> NetworkError:
     return NetworkError(
-        f"the system refuses a network namespace of the segment's own ({error.strerror}): {WHAT_TO_ALLOW}"
+        f"the system refuses a network namespace of this process's own ({error.strerror}): {WHAT_TO_ALLOW}"
     )
 
 
@@ -117,6 +118,25 @@ def private_pair() -> Iterator[Pair]:
         except NetlinkError as error:
             raise _refused(error) from error
         yield MASTER_END, SEGMENT_END, partial(_bring_up, links, MASTER_END)
+
+
+def private_loopback() -> str:
+    """Move this process into a namespace of its own and bring the loopback up there; return the loopback's name.
+
+    Another process reaches it as it reaches a private pair. Must be called while the process has one thread.
+
+    Raises:
+        NetworkError: the system forbids it.
+    """
+    _own_namespace()
+    from pyroute2 import IPRoute, NetlinkError  # slow to load
+
+    with IPRoute() as links:
+        try:
+            links.link("set", index=links.link_lookup(ifname=LOOPBACK)[0], state="up")
+        except NetlinkError as error:
+            raise _refused(error) from error
+    return LOOPBACK
 
 
 @contextmanager

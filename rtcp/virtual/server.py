@@ -17,11 +17,12 @@ from pathlib import Path
 from types import FrameType
 
 from rtcp.config.segment import load_segment
-from rtcp.virtual.faults.control import Control, GroundTruth, control_socket
+from rtcp.virtual.faults.control import Control, GroundTruth
 from rtcp.virtual.faults.fault import FOR_EVER
 from rtcp.virtual.faults.registry import FaultRegistry, Planned, load_script
 from rtcp.virtual.network import NetworkError, private_pair, public_pair
 from rtcp.virtual.protocol import ETHERTYPE
+from rtcp.virtual.request_socket import control_socket
 from rtcp.virtual.segment import Segment, make_segment
 
 PRIORITY = 70
@@ -230,8 +231,8 @@ def _run_on(cpu: int) -> None:
         raise ValueError(f"--cpu {cpu} cannot be used, there are CPUs 0 to {(os.cpu_count() or 1) - 1}") from error
 
 
-def _prefer() -> None:
-    """Ask for prompt scheduling; without the right to it the segment runs on as it is."""
+def request_prompt_scheduling() -> None:
+    """Ask for SCHED_FIFO and locked memory; without the right to them the process runs on as it is."""
     libc = ctypes.CDLL(None)
     libc.prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     with suppress(PermissionError):
@@ -273,7 +274,7 @@ def run(config_path: Path, interface: str | None, poll: bool, cpu: int | None, r
         control = None if listener is None else Control(listener, server.registry, truth)
         if control is not None:
             kept.callback(control.close)
-        _prefer()
+        request_prompt_scheduling()
         # A master that finds its interface up finds the slaves answering.
         bring_up()
         ready({

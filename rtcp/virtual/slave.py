@@ -303,6 +303,8 @@ def make_slaves(devices: Sequence[DeviceModel], drifts_ppm: Sequence[float], del
                 aliases: Sequence[int], t: int) -> list[Slave]:  # fmt: skip
     """Make a slave of every device, in the order of the wire; `delays` are ns from the master and must not fall."""
     slaves = []
+    for device in devices:
+        device.join(devices)
     for position, (device, drift, delay, alias) in enumerate(zip(devices, drifts_ppm, delays, aliases, strict=True)):
         last = position + 1 == len(devices)
         # A frame comes back to a slave after the way to the end of the chain and back.

@@ -38,6 +38,13 @@ def test_a_drive_whose_torque_is_not_looked_at_is_named_when_the_others_are_disa
     assert rtcp("disable").out == words
 
 
+def test_who_disables_an_arm_behind_its_controller_is_told_who_holds_it(
+    platform: Any, rtcp: Callable[..., Any]
+) -> None:
+    platform.status["lacks"] = {"power": "only people at the robot controller switch its motors on"}
+    assert rtcp("disable").out == "disabled: the arm stands, held by its robot controller with the motors on\n"
+
+
 @pytest.mark.parametrize(
     ("state", "words"),
     [

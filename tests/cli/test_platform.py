@@ -17,7 +17,7 @@ SLOW = ("--cycle-us", "2000")
 
 FIELDS = {
     "state": str, "drive_mode": str, "bus": str, "cycle_ns": int, "cycles": int, "missed": int, "wkc": dict,
-    "slaves": list, "joints": dict, "devices": dict, "wakeup_us": dict, "exchange_us": dict,
+    "slaves": list, "joints": dict, "devices": dict, "processes": dict, "wakeup_us": dict, "exchange_us": dict,
     "compute_us": dict, "dc": dict, "realtime": dict, "pids": dict,
 }  # fmt: skip
 

@@ -15,8 +15,13 @@ SHIPPED = Path(__file__).resolve().parents[2] / "config"
 
 @pytest.fixture
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The shipped configuration in the working directory, so that sentences show short paths."""
+    """The shipped configuration in the working directory, so that sentences show short paths.
+
+    `geometry.yaml` is the IRB 120 with the keys `name` and `kinematics` alone.
+    """
     shutil.copytree(SHIPPED, tmp_path, dirs_exist_ok=True)
+    text = (tmp_path / "abb_irb120.yaml").read_text()
+    (tmp_path / "geometry.yaml").write_text("name: abb-irb120\n\n" + text[text.index("kinematics:") :])
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

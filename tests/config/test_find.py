@@ -95,5 +95,5 @@ def test_a_path_that_leads_nowhere_is_named(directory: Path, given: str) -> None
 def test_an_unknown_name_is_answered_with_the_known_ones(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         find_arm("abb_irb140")
-    wanted = "there is no such file, and no arm of this name; known are abb_irb120, assistive_arm"
+    wanted = "there is no such file, and no arm of this name; known are abb_irb120, abb_irb120_rapid, assistive_arm"
     assert caught.value.problems == [f"--arm abb_irb140: {wanted}"]

@@ -12,13 +12,14 @@ import pytest
 import yaml
 
 from kinematics.forward import forward, frames
-from kinematics.model import DhRow, JointLimit
+from kinematics.model import Capsule, DhRow, JointLimit
 from kinematics.pose import IDENTITY, Pose
 from rtcp.config import ConfigError, default_config, load, load_kinematics
+from rtcp.config.loader import load_mechanics
 from rtcp.config.model import CartesianConfig
 from rtcp.config.numbers import angle
 
-ARM, IRB = Path("assistive_arm.yaml"), Path("abb_irb120.yaml")
+ARM, IRB = Path("assistive_arm.yaml"), Path("geometry.yaml")
 ROW1 = "{alpha: 0, a: 0, d: 0.290}"
 LIMIT1 = "{min: -11*pi/12, max: 11*pi/12, velocity: 25*pi/18}"
 LINK1 = "{mass: 3.067, centre: [0.0000977, -0.00012, -0.05159]}"
@@ -107,11 +108,18 @@ def test_a_quarter_turn_of_a_joint_of_the_irb_120_moves(
 
 
 def test_the_irb_120_has_the_ranges_and_speeds_of_its_data_sheet() -> None:
-    limits = load_kinematics(default_config().parent / "abb_irb120.yaml").limits
+    limits = load_mechanics(default_config().parent / "abb_irb120.yaml").limits
     degrees = [tuple(round(math.degrees(v), 9) for v in (one.lower, one.upper, one.velocity)) for one in limits]
     assert degrees == [
         (-165, 165, 250), (-110, 110, 250), (-110, 70, 250), (-160, 160, 320), (-120, 120, 320), (-400, 400, 420),
     ]  # fmt: skip
+
+
+def test_the_bodies_of_a_file_are_those_of_its_model(directory: Path) -> None:
+    body = {"link": 2, "start": [0, 0, 0], "end": [0.27, 0, 0.01], "radius": 0.05}
+    model = load_kinematics(rewritten(IRB, lambda data: data["kinematics"].update(bodies=[body])))  # type: ignore[attr-defined]
+    assert model.bodies == (Capsule(2, (0.0, 0.0, 0.0), (0.27, 0.0, 0.01), 0.05),)
+    assert load_kinematics(ARM).bodies == ()
 
 
 def test_a_file_of_kinematics_alone_is_no_arm_to_start(directory: Path) -> None:
@@ -183,7 +191,7 @@ def test_limits_are_needed_where_no_joints_have_them(directory: Path) -> None:
 def test_an_arm_without_kinematics_says_so_when_it_is_asked_for_them(directory: Path) -> None:
     with pytest.raises(ConfigError) as caught:
         load_kinematics(rewritten(ARM, without_kinematics))
-    wanted = "it must be a mapping with the keys dh, limits, links, tool"
+    wanted = "it must be a mapping with the keys dh, limits, links, tool, bodies"
     assert caught.value.problems == [f"{ARM}:1: the key kinematics is missing; {wanted}"]
 
 

@@ -8,7 +8,7 @@ from rtcp.config import find
 from rtcp.config.find import load_class, registered
 from rtcp.config.model import PluginError
 from rtcp.devices.driver import Driver
-from rtcp.virtual.faults import frames, slaves
+from rtcp.virtual.faults import frames, shape_setter, slaves
 from rtcp.virtual.faults.fault import Fault
 from rtcp.virtual.faults.registry import installed
 
@@ -45,6 +45,7 @@ def test_a_package_that_is_found_twice_counts_once(monkeypatch):
 
 
 def test_every_fault_of_this_package_is_registered():
-    kinds = [kind for module in (slaves, frames) for kind in vars(module).values() if isinstance(kind, type)]
+    modules = (slaves, frames, shape_setter)
+    kinds = [kind for module in modules for kind in vars(module).values() if isinstance(kind, type)]
     named = {kind for kind in kinds if issubclass(kind, Fault) and "name" in vars(kind)}
     assert named == set(installed().values())

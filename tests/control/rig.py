@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from time import monotonic_ns
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 from rtcp.config import default_config, load
 from rtcp.config.model import ArmConfig, InputConfig, InputsConfig, OutputsConfig
@@ -60,6 +61,13 @@ def small_arm() -> ArmConfig:
 
 
 CONFIG = small_arm()
+
+
+def master(bus: object) -> Any:
+    """A master with a bus that a test made."""
+    return SimpleNamespace(supervised=bus, config=CONFIG)
+
+
 SWITCH_INPUT = 10
 """Channel of the enabling switch, from 0."""
 
@@ -208,7 +216,7 @@ class LoopRig:
         self.board, self.observer = board, observer
         self.discipline = Followed(period_ns, 0)
         self.discipline.locked = True
-        self.service = BusService(None, board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
+        self.service = BusService(master(None), board, [2, 3], [joint.name for joint in CONFIG.joints], 5.0, 0, 80)
         self.slaves_come_back = True
         for position in range(1, 1 + len(config.slaves)):
             board.slave(position, AlState.OP, 0)

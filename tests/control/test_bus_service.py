@@ -23,6 +23,7 @@ from rtcp.fieldbus.recovery import MonitoredSlave
 from rtcp.fieldbus.registers import Steps
 from rtcp.ipc.blackboard import Blackboard
 from rtcp.ipc.observer import Health, Observer
+from tests.control import rig
 
 GONE = "the interface does not take frames any more"
 
@@ -106,7 +107,7 @@ def test_a_cycle_that_does_not_lock_under_fifo_names_the_cpu_that_it_keeps(
 ) -> None:
     monkeypatch.setattr(bus_service, "_LOCK_S", 0.0)
     monkeypatch.setattr(os, "sched_getscheduler", lambda pid: policy)
-    waiting = BusService(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)  # type: ignore[arg-type]
+    waiting = BusService(rig.master(bus), board, [2, 3], ["joint1", "joint2"], 5.0, 1, 80, watch_s=0.001)
     refused = threading.Event()
     waiting.on_refused = refused.set
     waiting.start()
@@ -124,7 +125,7 @@ def bus() -> Bus:
 
 @pytest.fixture
 def service(bus: Bus, board: Blackboard) -> Iterator[BusService]:
-    made = BusService(bus, board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)  # type: ignore[arg-type]
+    made = BusService(rig.master(bus), board, [2, 3], ["joint1", "joint2"], 5.0, 0, 1, watch_s=0.001)
     made.want_op()
     made.start()
     until(lambda: made.all_op)

@@ -22,6 +22,7 @@ from rtcp.ipc.commands import (
     MoveJoints,
     OpenStream,
     Reset,
+    RunInStep,
     RunLines,
     RunTrajectory,
     SetControlMode,
@@ -61,6 +62,7 @@ READY = [SetOutput(5, True), SetZero(0, 0.0), Enable(), SetDriveMode(DriveMode.C
          MoveGripper(False), SetLimits(0, 1)]  # fmt: skip
 HOLDING = [
     move_to(0.1, 0.1), RunTrajectory(0, 1), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
+    RunInStep(0, 1, 1, 0, 0, 1, 0.1),
     Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2),
     Home(0), *READY[3:],
 ]  # fmt: skip

@@ -34,8 +34,10 @@ from rtcp.ipc.events import (
     PermissionWithdrawn,
     PositionJumped,
     ProcessDataLost,
+    ProcessFailed,
     ResetTimeout,
     ResetWhileMoving,
+    ResetWithoutController,
     ResetWithoutFrames,
     ResetWithoutSlaves,
     SlaveLost,
@@ -248,8 +250,9 @@ CASES = (*FAULTS, *(stop_case(key, reaction) for key, reactions in REACTIONS.ite
 def test_every_fault_and_every_key_has_a_case() -> None:
     own = {kind for kind in Event.kinds if kind.__module__ == "rtcp.ipc.events"}
     faults = {kind for kind in own if kind.is_fault and not kind.is_emergency}
-    # A reset without frames: test_clock_lost.py.
-    assert faults <= {case.kind for case in CASES} | {ResetWithoutFrames}
+    # A reset without frames: test_clock_lost.py; without a robot controller: tests/faults/egm.py; a process:
+    # test_processes.py.
+    assert faults <= {case.kind for case in CASES} | {ResetWithoutFrames, ResetWithoutController, ProcessFailed}
     assert {entry.name for entry in fields(StopsConfig)} == {kind.stop_key for kind in own} - {""} == set(STOPS)
 
 

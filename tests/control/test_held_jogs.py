@@ -65,7 +65,7 @@ def test_the_virtual_arm_starts_bent_away_from_all_singularities_and_within_its_
     assert all((angle or 0.0) > 0.5 for angle in angles)
     for position, joint in zip(shipped.q, CONFIG.joints, strict=True):
         assert joint.position.min + 0.3 < position < joint.position.max - 0.3
-    assert shipped.loop.arm.trajectory_guard.nearest_box(shipped.q)[0] > 0.3
+    assert shipped.loop.arm.trajectory_guard.nearest_box(shipped.q)[0] > 0.1  # the shoulder beside the chair
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

@@ -23,6 +23,7 @@ from rtcp.ipc.commands import (
     MoveGripper,
     OpenStream,
     Reset,
+    RunInStep,
     RunLines,
     RunTrajectory,
     SetControlMode,
@@ -51,6 +52,7 @@ from rtcp.ipc.refusals import (
     NotOpen,
     PlanStartsElsewhere,
     Refusal,
+    StartOutOfReach,
     WrongControlMode,
     WrongRowCount,
     WrongState,
@@ -78,6 +80,7 @@ set_drive_mode   .     =     .     =     .     .     .     .     .     .     .  
 set_control_mode .     =     .     =     .     .     .     .     .     .     .     .     .
 move_joints      .     .     .     move  =     .     .     .     .     .     .     .     .
 run_trajectory   .     .     .     =     =     .     .     .     .     .     .     .     .
+run_in_step      .     .     .     =     =     .     .     .     .     .     .     .     .
 extend_trajectory . .   .     .     =     .     .     .     .     .     .     .     .
 run_lines        .     .     .     =     =     .     .     .     .     .     .     .     .
 stream_position  .     .     .     move  =     .     .     .     .     .     .     .     .
@@ -85,7 +88,7 @@ open_stream      .     .     .     move  .     .     .     .     .     .     .  
 jog              .     .     .     move  =     .     .     .     .     .     .     .     .
 move_at_velocity .     .     .     =     =     .     .     .     .     .     .     .     .
 apply_torque     .     .     .     =     =     .     .     .     .     .     .     .     .
-halt             .     .     .     =     stop  =     =     =     .     .     .     .     .
+halt             .     =     .     =     stop  =     =     =     .     .     .     .     .
 set_output       .     =     =     =     =     =     =     =     .     =     .     .     .
 move_gripper     .     =     .     =     =     =     =     .     .     .     .     .     .
 set_limits       .     =     .     =     =     .     =     .     .     =     =     .     .
@@ -113,7 +116,7 @@ COMMANDS: dict[str, Command] = {
     for command in (
         Enable(), Disable(), Reset(), SetDriveMode(DriveMode.CSP), SetControlMode(ControlMode.JOINT), move_to(0.1, 0.1),
         RunTrajectory(0, 1), ExtendTrajectory(1, False), RunLines(0, 1), StreamPosition((0.0, 0.0), 0.0), OpenStream(1),
-        Jog((0.0, 0.0), JogFrame.JOINTS, 0.2),
+        Jog((0.0, 0.0), JogFrame.JOINTS, 0.2), RunInStep(0, 1, 1, 0, 0, 1, 0.1),
         MoveAtVelocity((0.0, 0.0), 0.2), ApplyTorque((0.0, 0.0), 0.0, 0.0, 0.2), Halt(), SetOutput(5, True),
         MoveGripper(False), SetLimits(0, 1), SetZero(0, 0.0), Home(0), Shutdown(),
     )
@@ -121,6 +124,7 @@ COMMANDS: dict[str, Command] = {
 """One of each kind, with fields that nobody could refuse."""
 FOR_OTHER_REASONS: dict[type[Command], tuple[type[Refusal], ...]] = {
     RunTrajectory: (DamagedRow, PlanStartsElsewhere),
+    RunInStep: (StartOutOfReach, WrongState),
     ExtendTrajectory: (NotOpen,),
     RunLines: (NoGeometry,),
     MoveAtVelocity: (WrongControlMode,),

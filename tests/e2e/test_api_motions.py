@@ -15,7 +15,7 @@ import pytest
 import rtcp
 from rtcp.api import Arrival, AsyncRobot, Robot, State
 from rtcp.ipc.runtime_directory import control_socket
-from tests.e2e.conftest import Platform
+from tests.e2e.conftest import Platform, kill
 
 pytestmark = pytest.mark.alone
 
@@ -128,8 +128,23 @@ def test_a_setpoint_that_cannot_be_followed_ends_the_stream_and_the_next_send_sa
             time.sleep(0.002)
         with pytest.raises(rtcp.Faulted, match="joint1: a number of the stream's setpoint is not finite"):
             stream.send(HOME)
-    with robot.open_stream() as stream, pytest.raises(rtcp.Invalid, match="q: found 2 numbers"):
-        stream.send([0.0, 0.0])
+    wrong: list[tuple[Any, str]] = [
+        ([0.0, 0.0], "q: found 2 numbers, allowed are 6: one a joint"),
+        (None, "q: found None, allowed are 6 numbers: one a joint"),
+        (5, "q: found 5, allowed are 6 numbers: one a joint"),
+        ("x", "q: found 1 numbers"),
+        ("123456", "a setpoint cannot be sent"),
+        (np.array(0.5), "q: found array"),
+        ([HOME] * 6, "a setpoint cannot be sent"),
+        ([10**400] * 6, "a setpoint cannot be sent"),
+    ]
+    with robot.open_stream() as stream:
+        for q, sentence in wrong:
+            with pytest.raises(rtcp.Invalid, match=sentence):
+                stream.send(q)
+        with pytest.raises(rtcp.Invalid, match="velocity: found 5, allowed are 6 numbers"):
+            stream.send(HOME, 5)  # type: ignore[arg-type]
+        assert (stream.sent, stream.taken, stream.is_open) == (0, 0, True)
     with pytest.raises(rtcp.Invalid, match="the stream is closed"):
         stream.send(HOME)
     assert (stream.is_open, stream.taken) == (False, 0)
@@ -155,6 +170,42 @@ def test_a_stream_ends_with_a_halt_of_anyone_and_moves_nothing_after_it(shared: 
             stream.send(at(0.5))
     assert robot.status().commanded_positions[0] == pytest.approx(0.0, abs=1e-6)
     robot.close()
+
+
+@pytest.mark.parametrize("how", ["stop", "kill"])
+def test_a_stream_of_a_loop_that_has_ended_says_so_and_moves_nothing_of_the_next_platform(
+    platform: Platform, how: str
+) -> None:
+    def begin() -> Robot:
+        platform.rtcp("start", "--detach")
+        platform.call("enable")
+        return rtcp.connect("a program", control_socket(platform.directory))
+
+    def refuses(stream: rtcp.Stream) -> None:
+        with pytest.raises(rtcp.Faulted) as ended:
+            stream.send([0.5] * 6)
+        assert str(ended.value) == f"the loop (process {loop}) has ended: start the platform, then open another stream"
+
+    platform.be_patient(2000)
+    with begin() as robot:
+        loop = platform.pids()["loop"]
+        stream = robot.open_stream()
+        stream.send([0.0] * 6)
+    if how == "kill":
+        kill(loop)
+        refuses(stream)
+    platform.rtcp("stop", check=None)
+    refuses(stream)
+    assert not stream.is_open
+    with begin() as robot, robot.open_stream() as other:
+        for _ in range(20):
+            refuses(stream)
+            other.send([0.0] * 6)
+            time.sleep(0.02)
+        stream.close()
+        other.send([0.0] * 6)
+        assert (stream.sent, other.sent) == (1, 21)
+        assert robot.status().commanded_positions == pytest.approx([0.0] * 6, abs=1e-6)
 
 
 def test_an_open_trajectory_whose_first_point_is_where_the_arm_is_goes_to_its_second(robot: Robot) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from rtcp.cli.platform import running_platform
+from rtcp.config.find import default_config
 from rtcp.telemetry.experiments import (
     CycleExperiment,
     Experiment,
@@ -103,6 +104,17 @@ def test_a_streamed_sine_is_followed_with_a_latency_far_below_the_sources(setup:
         assert rows[f"{way}, 30 Hz: amplitude, actual / command"].here == pytest.approx(1.0, abs=0.05)
     assert rows["ring: p50"].here < 2 * 2000.0
     assert any("other limits" in note for note in read_result(setup.folder).notes)
+
+
+@pytest.mark.slow
+def test_by_rapid_the_sine_is_nearly_half_a_second_behind_and_reported_some_ms_late(setup: Setup) -> None:
+    pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+    by_rapid = replace(setup, config=default_config().with_name("abb_irb120_rapid.yaml"))
+    rows = carried_out(LatencyExperiment((30.0, 250.0), 3), by_rapid)
+    assert not any("250 Hz" in figure for figure in rows)
+    assert 300.0 < rows["Python API, 30 Hz: latency to the motion"].here < 700.0
+    assert rows["Python API, 30 Hz: amplitude, actual / command"].here == pytest.approx(1.0, abs=0.1)
+    assert abs(rows["Python API, 30 Hz: reported behind the accelerometer"].here) < 30.0
 
 
 @pytest.mark.slow

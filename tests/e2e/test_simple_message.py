@@ -16,8 +16,8 @@ from typing import Any
 
 import pytest
 
+from rtcp.fieldbus.simple_message.messages import JointPosition, JointTrajPt, Ping, ReplyCode
 from rtcp.ros.simple_message.client import MotionClient
-from rtcp.ros.simple_message.messages import JointPosition, JointTrajPt, Ping, ReplyCode
 from tests.e2e.conftest import Platform, gone, kill
 
 pytestmark = pytest.mark.alone
@@ -115,8 +115,8 @@ def test_a_lost_client_leaves_an_arm_at_rest_and_disabled(enabled: Platform, por
 
 CLIENT = """
 import socket, sys, time
-from rtcp.ros.simple_message.framing import Frame
-from rtcp.ros.simple_message.messages import ByteOrder, JointTrajPt
+from rtcp.fieldbus.simple_message.framing import Frame
+from rtcp.fieldbus.simple_message.messages import ByteOrder, JointTrajPt
 connection = socket.create_connection(("10.0.0.1", 11000))
 first, *rest = map(float, sys.argv[1:])
 while True:

@@ -61,6 +61,28 @@ def sway(path: Path) -> Any:
         }
 
 
+def fan(path: Path) -> Any:
+    """What the process publishes: before its command, after it, and after a halt."""
+    from rtcp_example.fan import RunFan
+
+    own = path.with_name("fan.yaml")
+    own.write_text(path.read_text() + "\nprocesses: [{kind: fan, name: fan}]\n")
+    with started(own) as simulation:
+
+        def published() -> list[float]:
+            simulation.run(0.01)
+            record = simulation.observer.latest()
+            assert record is not None
+            return [float(record["fan_kelvin"][0]), int(record["fan_on"][0])]
+
+        before = published()
+        assert simulation.send(RunFan(before[0] - 1.0)).refusal is None
+        after = published()
+        simulation.send(Halt())
+        kelvin = next(one for one in simulation.loop.devices if one.name == "thermometer").driver.values["second"]
+        return {"before": before, "after": after, "halted": published(), "kelvin": kelvin}
+
+
 def thermometer(path: Path) -> Any:
     """What the driver decodes and the record shows, beside the bytes on the bus and the model's own temperatures."""
     with started(path) as simulation:
@@ -165,5 +187,6 @@ def methods(path: Path) -> Any:
 if __name__ == "__main__":
     _, scene, config = sys.argv
     json.dump(
-        {one.__name__: one for one in (sway, thermometer, alarm, wire_break, methods)}[scene](Path(config)), sys.stdout
+        {one.__name__: one for one in (sway, thermometer, alarm, wire_break, methods, fan)}[scene](Path(config)),
+        sys.stdout,
     )

@@ -107,3 +107,25 @@ def test_its_values_are_in_the_black_box_around_its_fault(seen: SimpleNamespace)
     assert found.about.what.endswith("more than 10 K above the alarm")
     assert found.records["thermometer_second"][found.about.at] > seen.alarm + 9.9
     assert found.schema["thermometer_second"].unit == "K"
+
+
+def test_an_arm_on_a_bus_of_another_package_is_moved_and_what_the_bus_lacks_is_said(installed: Path) -> None:
+    platform = Platform()
+    try:
+        file = platform.directory / "bench.yaml"
+        limits = "position: {min: -1, max: 1}, velocity: 1, acceleration: 5, jerk: 50"
+        joints = "".join(f"  - {{name: {name}, {limits}}}\n" for name in ("lift", "tilt"))
+        file.write_text(
+            f"name: bench\nbus: {{kind: bench, start: 0.25}}\ncycle: {{period_us: 4000}}\njoints:\n{joints}"
+        )
+        platform.environment |= {"PYTHONPATH": str(installed), "RTCP_CONFIG": str(file)}
+        assert "a bench of 2 joints" in platform.rtcp("start", "--detach").stdout
+        platform.call("enable")
+        assert "arrived" in platform.rtcp("move", "0.5", "-0.5").stdout
+        status = platform.status()
+        assert status["joints"]["actual_position"] == pytest.approx([0.5, -0.5], abs=1e-6)
+        assert (status["bus_kind"], status["drive_states"][0]) == ("bench", "operation enabled")
+        refused = platform.rtcp("sdo", "read", "1", "0x6041", check=None)
+        assert "a bench has no objects" in refused.stderr
+    finally:
+        platform.end()

@@ -126,8 +126,25 @@ def test_no_other_test_sees_what_the_package_registers(installed: Path) -> None:
 
 def test_the_page_shows_every_file_of_the_example_whole() -> None:
     page = (REPOSITORY / "docs" / "extending.md").read_text()
-    assert len(page) <= 10_000
+    assert len(page) <= 10_200
     for name in ("pyproject.toml", "thermometer.yaml", "sway.py", "thermometer.py", "virtual.py"):
         path = next(EXAMPLE.rglob(name))
         text = re.sub(r'\A""".*?"""\n\n', "", path.read_text(), flags=re.DOTALL)
         assert f"\n{text}```" in page, path
+
+
+def test_the_page_of_processes_shows_the_process_of_the_example_whole() -> None:
+    text = re.sub(r'\A""".*?"""\n\n', "", (EXAMPLE / "rtcp_example" / "fan.py").read_text(), flags=re.DOTALL)
+    assert f"\n{text}```" in (REPOSITORY / "docs" / "processes.md").read_text()
+
+
+def test_a_process_of_another_package_reads_its_channel_and_takes_its_command(play: Any) -> None:
+    found = play("fan")
+    assert found["before"] == [pytest.approx(found["kelvin"], abs=5.0), 0]
+    assert found["after"][1] == 1
+    assert found["halted"][1] == 0
+
+
+def test_the_page_of_buses_shows_the_bus_of_the_example_whole() -> None:
+    text = re.sub(r'\A""".*?"""\n\n', "", (EXAMPLE / "rtcp_example" / "bench.py").read_text(), flags=re.DOTALL)
+    assert f"\n{text}```" in (REPOSITORY / "docs" / "buses.md").read_text()

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
+from dataclasses import replace
 from random import Random
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from rtcp.telemetry.soak import GROWTH, Resources, grown, random_fault, resources
+from rtcp.config import default_config, load
+from rtcp.telemetry.soak import GROWTH, Counts, Resources, Soak, grown, random_fault, resources
 from rtcp.virtual.faults.registry import installed, parse
 from tests.e2e.conftest import Platform
 from tests.faults.run import HOLD_MS
@@ -29,7 +34,7 @@ def test_every_random_fault_is_one_that_the_segment_accepts() -> None:
         assert 0 <= fault.get("after", 0) <= 6
         chosen.add(fault["fault"])
     # Left out: undetected bit errors, which may report any state or limit; frozen inputs, which nothing detects.
-    assert chosen == set(installed()) - {"garble", "input_frozen"}
+    assert chosen == set(installed()) - {"garble", "input_frozen", "circuit", "contacts"}
 
 
 def test_the_same_seed_gives_the_same_faults() -> None:
@@ -56,6 +61,36 @@ def test_equal_resources_unsettled_memory_and_the_gateways_threads_are_no_failur
     assert grown({"loop": HELD}, {"loop": HELD}, settled=True) == []
     assert grown({"loop": HELD}, {"loop": Resources(HELD.rss * 2, 2, 10)}, settled=False) == []
     assert grown({"gateway": HELD}, {"gateway": Resources(HELD.rss, 4, 12)}, settled=True) == []
+
+
+@pytest.mark.parametrize(
+    ("rss_mib", "failures"),
+    [
+        # Trials of 10 s: the first recordings enlarge the heap, and the last reading is amid another one.
+        (lambda trial: 70.0 if trial < 8 else 125.0 if trial == 40 else 92.0, 0),
+        (lambda trial: 70.0 + trial, 1),
+    ],
+)
+def test_memory_is_compared_after_the_first_recordings_and_between_them(
+    rss_mib: Callable[[int], float], failures: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Scripted(Soak):
+        trial = 0
+
+        def _trial(self, number: int, fault: dict[str, Any], workload: str) -> None:
+            self.trial = number
+            self.summary.counts.setdefault("cable", Counts()).stopped += 1
+
+        def _resources(self) -> dict[str, Resources]:
+            return {"gateway": replace(HELD, rss=round(rss_mib(self.trial) * 2**20))}
+
+    config = load(default_config())
+    harness: Any = SimpleNamespace(config=config, records=0, torn=0)
+    soak = Scripted(harness, {"loop": 1, "gateway": 1, "segment": 1}, 1, print)
+    soak._pids = {"gateway": 1}
+    monkeypatch.setattr("rtcp.telemetry.soak.time", SimpleNamespace(monotonic=lambda: 10.0 * soak.trial))
+    assert len(soak.run(39 / 6).failures) == failures
+    assert soak.trial == 40
 
 
 def test_resources_are_those_of_the_process() -> None:

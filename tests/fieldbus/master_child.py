@@ -317,8 +317,8 @@ def emergency(bus: SoemBus, count: int) -> Any:
         drive.decode(data.input(1))
         drive.advance(TargetState.ENABLED)
         data.set_output(1, drive.encode())
-        if not steps or steps[-1] != drive.state.value:
-            steps.append(drive.state.value)
+        if not steps or steps[-1] != drive.state.words:
+            steps.append(drive.state.words)
 
     to_op(bus, cycle)
     cycle.before = control

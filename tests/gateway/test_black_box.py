@@ -36,14 +36,14 @@ from rtcp.ipc.recording import FaultRecording, listed, read
 from rtcp.ipc.runtime_directory import stop_marker
 from rtcp.ipc.schema import arm_schema
 from rtcp.ipc.session import Pid, Processes, Session, identify
-from rtcp.ipc.states import State
+from rtcp.ipc.states import DriveState, State
 from rtcp.launch import launcher
 from rtcp.launch.simulation import Simulation
 from tests.records import numbers
 
 JOINTS = 6
 BEGAN_NS = 77
-LOST, DRIVE = ProcessDataLost(5, 3), DriveFault(2, 0x21F)
+LOST, DRIVE = ProcessDataLost(5, 3), DriveFault(2, DriveState.FAULT_REACTION_ACTIVE, 0x21F)
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +184,8 @@ def test_a_fault_event_after_the_end_of_the_file_begins_a_new_one_at_most_every_
     clock = Clock(monkeypatch)
     box = written.watched()
     happens = {
-        0.0: LOST, 0.05: DRIVE, 3.0: DRIVE, 5.0: EmergencyStopActivated(), 130.0: ResetTimeout(0, 0),
+        0.0: LOST, 0.05: DRIVE, 3.0: DRIVE, 5.0: EmergencyStopActivated(),
+        130.0: ResetTimeout(0, DriveState.UNKNOWN, 0),
         131.5: ResetWhileMoving(0, 0.1), 131.6: ResetDone(), 131.7: EmergencyStopActivated(),
     }  # fmt: skip
     for at_s in sorted({*happens, 9.9, 10.0, 20.0, 140.0}):

@@ -15,6 +15,7 @@ from rtcp.config.zero import read_zeros, state_directory, zero_file
 from rtcp.ipc.commands import (
     Disable,
     Enable,
+    Halt,
     Home,
     MoveGripper,
     Reset,
@@ -134,6 +135,12 @@ def test_a_refusal_in_a_fault_ends_with_the_fault(arm: FakePlatform) -> None:
     error = arm.error("enable")
     assert error.reason == "wrong_state"
     assert "`rtcp reset` first; the fault: joint1: measured speed 1.7 rad/s" in str(error)
+
+
+def test_a_halt_in_state_ready_reaches_the_loop_and_is_no_failure(arm: FakePlatform) -> None:
+    arm.show(state=State.READY)
+    arm.ask("halt")
+    assert arm.loop.kinds == [Halt]
 
 
 def test_disabling_that_another_command_ends_is_no_success(arm: FakePlatform) -> None:

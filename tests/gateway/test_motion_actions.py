@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from kinematics.forward import forward
-from rtcp.config.model import Stop
+from rtcp.config.model import Point, Stop
 from rtcp.gateway.command_channel import Caller
 from rtcp.gateway.motion_actions import Planner
 from rtcp.ipc.commands import MoveJoints, RunLines, RunTrajectory
@@ -329,3 +331,18 @@ def test_a_preview_is_refused_with_what_would_refuse_the_move(arm: FakePlatform)
     assert (error.reason, error.fields["axis"]) == ("position_out_of_range", 0)
     assert arm.error("preview", q=THERE, speed=9.0).reason == "speed_out_of_range"
     assert "cannot be reached" in str(arm.error("preview", pose=[5.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+FOLDED = [1.0, -1.9, 2.3, -2.9, -1.1, -0.2]
+"""The forearm lies on the base."""
+ITSELF = "a collision with itself (the base and the link of joint3)"
+
+
+def test_a_way_that_leads_into_the_arm_itself_is_refused(arm: FakePlatform) -> None:
+    config = replace(arm.config, cartesian=replace(arm.config.cartesian, box=None, keep_out=()))
+    planner = Planner(config, Limits(config))
+    with pytest.raises(RtcpError, match=re.escape(f"the move leads through {ITSELF} (after ")):
+        planner.joint_move(FOLDED, [1.0, -1.6, 2.2, -2.9, -1.1, -0.2], None, True)
+    points = [Point(0.0, tuple(BENT)), Point(60.0, tuple(FOLDED))]
+    with pytest.raises(RtcpError, match=re.escape(ITSELF)):
+        planner.trajectory(points, BENT)

@@ -23,7 +23,7 @@ from rtcp.ipc.schema import (
     HELD_SHOULDER,
 )
 from rtcp.ipc.session import Processes, Session
-from rtcp.ipc.states import State
+from rtcp.ipc.states import DriveState, State
 from tests.records import numbers
 
 JOINTS = 6
@@ -61,7 +61,7 @@ def written(board: Blackboard, path: Path, monkeypatch: pytest.MonkeyPatch) -> I
 
 def test_an_emergency_stop_out_of_a_fault_replaces_the_message_of_the_fault(written: Written) -> None:
     written.publish(State.FAULT)
-    written.board.event(DriveFault(2, 0x0218))
+    written.board.event(DriveFault(2, DriveState.FAULT, 0x0218))
     assert "joint3" in written.headline
     written.publish(State.EMERGENCY_STOP)
     written.board.event(EmergencyStopActivated())

@@ -17,11 +17,13 @@ from rtcp.ipc.layout import COMMAND, COMMAND_SIZE, COMMANDS_AT, RECORDS, records
 from rtcp.ipc.observer import BlackboardError, LeaseRefused, Observer
 from rtcp.ipc.refusals import Malformed, PositionOutOfRange
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
-from rtcp.ipc.states import DriveMode
+from rtcp.ipc.states import DriveMode, DriveState
 from tests.records import numbers
 
 JOINTS = 6
 SCHEMA = arm_schema(JOINTS)
+MEASURED = tuple(name for name in PER_JOINT if name not in ("drive_state", "statusword"))
+"""Fields of a joint that are no words of its drive."""
 
 
 @pytest.fixture
@@ -32,13 +34,15 @@ def observer(board: Blackboard, path: Path) -> Iterator[Observer]:
 
 
 def record(cycle: int) -> list[float]:
-    return numbers(SCHEMA, cycle=cycle, **dict.fromkeys(PER_JOINT[:-1], cycle), statusword=cycle & 0xFFFF)
+    words = {"drive_state": cycle % len(DriveState), "statusword": cycle & 0xFFFF}
+    return numbers(SCHEMA, cycle=cycle, **dict.fromkeys(MEASURED, cycle), **words)
 
 
 def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observer) -> None:
     scalars = {"state": 4, "wkc": -1, "dc_filtered_ns": -77, "elapsed_s": 0.5}
-    vectors = {name: [0.1 * (i + JOINTS * at) for i in range(JOINTS)] for at, name in enumerate(PER_JOINT[:-1])}
-    board.publish(numbers(SCHEMA, **scalars, **vectors, statusword=range(100, 100 + JOINTS)))
+    vectors = {name: [0.1 * (i + JOINTS * at) for i in range(JOINTS)] for at, name in enumerate(MEASURED)}
+    words = {"drive_state": range(JOINTS), "statusword": range(100, 100 + JOINTS)}
+    board.publish(numbers(SCHEMA, **scalars, **vectors, **words))
     latest = observer.latest()
     assert latest is not None
     assert int(latest[0]["number"]) == 1
@@ -47,6 +51,7 @@ def test_a_record_is_read_as_it_was_written(board: Blackboard, observer: Observe
     assert int(latest[0]["dc_filtered_ns"]) == -77
     assert list(latest[0]["actual_position"]) == [0.1 * i for i in range(JOINTS)]
     assert list(latest[0]["sent_position"]) == [0.1 * i for i in range(4 * JOINTS, 5 * JOINTS)]
+    assert list(latest[0]["drive_state"]) == list(range(JOINTS))
     assert list(latest[0]["statusword"]) == list(range(100, 100 + JOINTS))
 
 

@@ -1,4 +1,4 @@
-"""Comparison with other libraries: Pinocchio, which reads the exported URDF, and EAIK, an analytic solver.
+"""Comparison with other libraries: Pinocchio, which reads the exported URDF, EAIK, an analytic solver, and coal.
 
 `make oracles` installs them; the tests skip what is missing.
 """
@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.capsules import compare
 from kinematics.forward import forward_batch, frames
 from kinematics.gravity import gravity_torques
 from kinematics.inverse import InverseKinematics
@@ -19,6 +20,7 @@ from kinematics.urdf import to_urdf
 from tests.kinematics.arms import (
     as_pose,
     chain,
+    count,
     matrix,
     random_configurations,
     with_general_rows,
@@ -117,3 +119,12 @@ def test_eaik_finds_the_same_solutions(change, either):
         assert max(distance.min(axis=0).max(), distance.min(axis=1).max()) < 1e-9
         compared += len(theirs)
     assert compared > 4 * COUNT
+
+
+def test_coal_finds_the_same_distances_of_two_arms_and_of_boxes():
+    pytest.importorskip("coal")
+    found = compare(count(2000, 100_000))
+    assert found.overlapping > 30
+    assert found.in_boxes > 30
+    assert found.arms < 1e-6
+    assert found.boxes < 1e-6

@@ -11,10 +11,10 @@ from rtcp.config.model import ArmConfig, Box, KeepOut
 from rtcp.motion.guards.trajectory_guard import GuardResult, TrajectoryGuard
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
-from tests.arm_geometry import depth, points
+from tests.arm_geometry import box_gaps, depth, own_gap, points
 
 ROUNDING_RAD = 1e-6
-ROUNDING_M = 1e-9
+ROUNDING_M = 1e-8
 
 
 class GuardChecker:
@@ -32,12 +32,12 @@ class GuardChecker:
         self._depths = self.depths()
 
     def depths(self) -> list[float]:
-        """How far beyond each box's bounds each point is, m; negative: on the right side."""
+        """How far the tool is beyond its box, and bodies too near to each other and to each box, m; else negative."""
         if self.config.arm is None:
             return []
-        tool, wrist, elbow = points(self.state.commanded)
-        found = [-1.0 if self.limits.box is None else -depth(tool, self.limits.box)]
-        return found + [depth(point, box) for box in self.limits.keep_out for point in (tool, wrist, elbow)]
+        q = self.state.commanded
+        found = [-1.0 if self.limits.box is None else -depth(points(q)[0], self.limits.box), -own_gap(q)]
+        return found + [-gap for box in self.limits.keep_out for gap in box_gaps(q, box)]
 
     def request(
         self, position: Iterable[float], tolerates_saturation: bool, velocity: Iterable[float] | None = None

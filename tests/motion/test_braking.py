@@ -12,7 +12,7 @@ from kinematics.forward import frames
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
 from rtcp.motion.guards.zones import Zones
 from rtcp.motion.limits import Limits
-from tests.arm_geometry import Point, depth, points
+from tests.arm_geometry import CLEARANCE, RADIUS, box_gaps, own_gap, points
 from tests.samples import examples
 
 from .guard_checker import ARM, with_boxes
@@ -35,11 +35,6 @@ def stopped(mean: Sequence[float], rates: Sequence[float], q: Sequence[float], d
     return way
 
 
-def apart(point: Point, box: Sequence[float]) -> float:
-    """Distance of a point from a box that it is outside of; not more than it."""
-    return max(max(a - x, x - b) for x, a, b in zip(point, box[:3], box[3:], strict=True))
-
-
 @given(room=st.floats(1e-9, 10.0), u=st.floats(1e-6, 0.1), dt=st.floats(1e-4, 0.1))
 def test_from_the_fastest_stoppable_speed_the_stop_ends_exactly_at_the_edge(room: float, u: float, dt: float) -> None:
     # So small a change of speed would take a million cycles.
@@ -58,7 +53,7 @@ def test_no_point_travels_further_than_is_reported(
     q: Sequence[float], parts: Sequence[float], rates: Sequence[float], dt: float
 ) -> None:
     speeds = [part * joint.velocity for part, joint in zip(parts, ARM.joints, strict=True)]
-    step, whole = travel(speeds, rates, Zones(MODEL, Limits(ARM)).reach, dt)
+    step, whole = travel(speeds, rates, Zones(MODEL, Limits(ARM), CLEARANCE).reach, dt)
     before = [angle - v * dt for angle, v in zip(q, speeds, strict=True)]
     for bound, there in ((step, q), (whole, stopped(speeds, rates, q, dt)[-1])):
         for one, other in zip(points(before), points(there), strict=True):
@@ -89,21 +84,20 @@ def test_a_stop_that_is_reported_to_be_free_is_free_in_every_cycle_and_one_with_
     speeds = [part * joint.velocity for part, joint in zip(parts, ARM.joints, strict=True)]
     before = [angle - v * dt for angle, v in zip(q, speeds, strict=True)]
     way = [before, *stopped(speeds, rates, q, dt)]
-    # A box of any shape beside, or across, the way of one of the points.
+    # A box of any shape beside, or across, the way of one of the bodies.
     at = points(way[round(when * (len(way) - 1))])[which]
-    middle = [x + part * size for x, part, size in zip(at, off, sizes, strict=True)]
+    middle = [x + part * (size + RADIUS + CLEARANCE) for x, part, size in zip(at, off, sizes, strict=True)]
     box = [x + sign * size for sign in (-1.0, 1.0) for x, size in zip(middle, sizes, strict=True)]
-    assume(max(depth(point, box) for point in points(before)) <= 0.0)
-    zones = Zones(MODEL, Limits(with_boxes(WIDE, box)))
+    assume(min(*box_gaps(before, box), own_gap(before)) >= 0.0)
+    zones = Zones(MODEL, Limits(with_boxes(WIDE, box)), CLEARANCE)
     found = touched(zones, frames(MODEL, before), frames(MODEL, q), q, speeds, rates, dt)
-    room = [min(apart(point, box) for point in points(angles)) for angles in way]
-    inside = [max(depth(point, box) for point in points(angles)) for angles in way]
+    room = min(min(*box_gaps(angles, box), own_gap(angles)) for angles in way)
     if found is None:
         event("free")
-        assert max(inside) <= 1e-9
-    elif max(inside) > 0.0:
+        assert room >= -1e-8
+    elif room < 0.0:
         event("touched")
     else:
         event("said to be touched with room")
         # No farther from the box than a cycle's way of the farthest point, or a few millimetres.
-        assert min(room) < 0.003 + travel(speeds, rates, zones.reach, dt)[0]
+        assert room < 0.003 + travel(speeds, rates, zones.reach, dt)[0]

@@ -79,11 +79,11 @@ def test_along_each_wall_the_tool_slides_with_what_is_left_of_two_directions(jog
 @pytest.mark.parametrize(
     ("q", "axis", "sign"),
     [
-        ([2.7, 0.3, 1.6, 0.1, 1.6, 0.0], 0, 1),
+        ([2.2, 0.3, 1.6, 0.1, 1.6, 0.0], 0, 1),
         ([2.0, 0.2, 1.9, 0.1, 1.0, 0.0], 0, 1),
-        ([1.9, -0.6, 1.6, 0.0, 1.2, 0.0], 0, 1),
-        ([-2.0, -0.6, 1.6, 0.0, 1.2, 0.0], 1, -1),
-        ([2.6, 0.1, 1.2, 0.1, 1.0, 0.0], 2, -1),
+        ([1.6, -0.6, 1.6, 0.0, 1.2, 0.0], 0, 1),
+        ([1.6, -0.6, 1.6, 0.0, 1.2, 0.0], 1, -1),
+        ([2.2, 0.1, 1.2, 0.1, 1.0, 0.0], 2, -1),
     ],
 )
 @pytest.mark.parametrize("speed", some([0.25, 0.1]))
@@ -151,7 +151,7 @@ def test_where_it_stands_for_long_nothing_winds_up(jogged):
 
 @pytest.mark.parametrize("sideways", [0.0, 0.03, -0.03])
 def test_straight_up_where_all_three_are_singular_the_tool_comes_down(jogged, sideways):
-    drive = jogged(ZERO).run([sideways, 0.0, -0.1, 0.0, 0.0, 0.0], 3.0)
+    drive = jogged(ZERO).run([sideways, 0.0, -0.1, 0.0, 0.0, 0.0], 2.5)  # then the upper arm comes near to the chair
     x, y, z = drive.tool
     assert z < 1.2
     assert abs(y) < 1e-9
@@ -199,7 +199,7 @@ def stick(chance: random.Random) -> list[float]:
 def test_a_random_joystick_never_needs_the_guards(jogged, seed):
     chance = random.Random(seed)
     drive = jogged(ZERO)
-    while seed % 5 and not drive.distance() > 0.2:
+    while seed % 5 and not drive.distance() > 0.08:
         drive = jogged([chance.uniform(0.9 * limit.lower, 0.9 * limit.upper) for limit in MODEL.limits])
     for _ in range(12):
         drive.run(stick(chance), chance.choice((0.05, 0.3, 1.0, 2.0)), chance.choice(("base", "tool")))

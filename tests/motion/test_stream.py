@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtcp.ipc.commands import StreamPosition
-from rtcp.ipc.events import StreamEnded
+from rtcp.config.model import MOST_AXES
+from rtcp.ipc.commands import OpenStream, StreamPosition
+from rtcp.ipc.events import SetpointOutOfOrder, StreamEnded
 from rtcp.ipc.refusals import NotFinite, PositionOutOfRange, Refusal, StampNotFinite, StreamPointDropped
 from rtcp.motion.controllers.stream import TIMEOUT_S, StreamController
 from rtcp.motion.state import Phase
@@ -120,6 +121,15 @@ def test_a_target_that_is_out_of_order_or_stamped_alike_is_dropped(drive: Any, m
     assert send(drive, mode, [0.1] * 6, 5.0) == StreamPointDropped(0.0)
     assert send(drive, mode, [0.1] * 6, 4.5) == StreamPointDropped(0.5)
     assert send(drive, mode, ZERO, 5.001) is None
+
+
+def test_how_late_a_setpoint_came_is_a_finite_number_whatever_the_stamps(drive: Any, mode: StreamController) -> None:
+    assert drive.command(mode, OpenStream(1)) is None
+    mode.put(drive.state, 0, 1.7e308, [0.0] * 3 * MOST_AXES)
+    mode.put(drive.state, 0, -1.7e308, [0.0] * 3 * MOST_AXES)
+    assert isinstance(mode.ended, SetpointOutOfOrder)
+    assert math.isfinite(mode.ended.late_s)
+    assert mode.ended.late_s >= 1e9
 
 
 def test_a_target_that_is_late_by_more_than_the_timeout_is_dropped(drive: Any, mode: StreamController) -> None:

@@ -1,4 +1,4 @@
-"""Tool, wrist and elbow never enter a keep-out box, the tool never leaves its own; who begins inside may come out."""
+"""No body enters a keep-out box or another body, the tool never leaves its box; who begins inside may come out."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from kinematics.capsules import outside
 from kinematics.forward import frames
 from kinematics.model import ArmModel
 from kinematics.pose import Pose
-from rtcp.ipc.events import BoxReached
+from rtcp.ipc.events import BoxReached, CollisionAhead, NotLeavingBox
 from rtcp.motion.guards.braking import touched
 from rtcp.motion.guards.trajectory_guard import GuardResult
-from rtcp.motion.guards.zones import ELBOW, TOOL, WRIST, Zones, inside, outside
+from rtcp.motion.guards.zones import ITSELF, TOOL, Zones, inside
 from rtcp.motion.limits import Limits
-from tests.arm_geometry import Point, depth, points
+from tests.arm_geometry import CLEARANCE, RADIUS, Point, box_gaps, depth, own_gap, points
 from tests.samples import SLOW, examples
 
 from .guard_checker import ARM, MODEL, GuardChecker, with_boxes
@@ -29,14 +30,15 @@ WIDE = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
 Q = (0.3, -0.5, 1.2, 0.2, 0.7, -0.4)
 CYCLES_S = st.sampled_from([0.002, 0.005, 0.02])
 SIGN = st.sampled_from([-1.0, 0.0, 1.0])
+BODY = RADIUS + CLEARANCE
 DIRECTION = st.lists(st.one_of(SIGN, st.floats(-1.0, 1.0)), min_size=6, max_size=6)
 JOINTS = st.tuples(*(st.floats(0.9 * joint.position.min, 0.9 * joint.position.max) for joint in ARM.joints))
 
 
 def box_before(point: Point, axis: int, side: float, gap: float, shift: Sequence[float], size: float) -> list[float]:
-    """A box one of whose faces is `gap` from the point; `shift` (-1 to 1) moves it along the face, corners included."""
+    """A box with a face `gap` before the bodies that end at a point; `shift` (-1 to 1) moves it along the face."""
     middle = [point[n] + shift[n % 2] * 1.1 * size for n in range(3)]
-    middle[axis] = point[axis] + side * (gap + size)
+    middle[axis] = point[axis] + side * (BODY + gap + size)
     return [m - size for m in middle] + [m + size for m in middle]
 
 
@@ -56,10 +58,15 @@ def driven(
 
 
 @given(q=JOINTS)
-def test_the_points_that_are_watched_are_where_the_table_of_the_facts_puts_them(q: Sequence[float]) -> None:
-    poses = frames(MODEL, q)
-    for found, expected in zip((TOOL, WRIST, ELBOW), points(q), strict=True):
-        assert poses[found].position == pytest.approx(expected, abs=1e-12)
+def test_distances_are_those_of_the_table_of_the_facts(q: Sequence[float]) -> None:
+    limits = Limits(ARM)
+    zones, poses = Zones(MODEL, limits, CLEARANCE), frames(MODEL, q)
+    assert zones.own_distance(poses)[0] == pytest.approx(own_gap(q), abs=1e-8)
+    assert poses[TOOL].position == pytest.approx(points(q)[0], abs=1e-12)
+    limits.box = None
+    assert zones.box_distance(poses)[0] == pytest.approx(
+        min(gap for box in limits.keep_out for gap in box_gaps(q, box)), abs=1e-8
+    )
 
 
 @given(
@@ -86,7 +93,7 @@ def test_who_began_free_never_enters_a_keep_out_box(
     legs: list[tuple[list[float], int, bool]],
 ) -> None:
     box = box_before(points(q)[which], axis, side, gap, shift, size)
-    assume(max(depth(point, box) for point in points(q)) <= 0.0)
+    assume(min(*box_gaps(q, box), own_gap(q)) >= -1e-12)
     checker = GuardChecker(with_boxes(WIDE, box), q, dt)
     for direction, cycles, tolerates_saturation in legs:
         driven(checker, direction, cycles, tolerates_saturation)
@@ -128,6 +135,70 @@ def test_who_began_inside_a_keep_out_box_only_moves_outward(
         driven(checker, direction, cycles)
 
 
+def towards_itself(q: Sequence[float]) -> list[float]:
+    """The direction in which the arm's bodies come nearer to each other fastest, as parts of each joint's speed."""
+    slopes = [
+        own_gap([*q[:i], q[i] + 1e-3, *q[i + 1 :]]) - own_gap([*q[:i], q[i] - 1e-3, *q[i + 1 :]]) for i in range(6)
+    ]
+    most = max(map(abs, slopes)) or 1.0
+    return [-slope / most for slope in slopes]
+
+
+@given(q=JOINTS, dt=st.sampled_from([0.005, 0.02]), tolerates=st.booleans(), noise=DIRECTION, share=st.floats(0.0, 0.5))
+@settings(max_examples=examples(30))
+def test_an_arm_that_is_driven_at_itself_stops_before_it(
+    q: Sequence[float], dt: float, tolerates: bool, noise: Sequence[float], share: float
+) -> None:
+    assume(own_gap(q) >= 0.0)
+    checker = GuardChecker(with_boxes(None), q, dt)  # it checks every cycle
+    for _ in range(round(3.0 / dt / 20)):
+        direction = [a + share * b for a, b in zip(towards_itself(checker.state.commanded), noise, strict=True)]
+        driven(checker, direction, 20, tolerates)
+        if isinstance(checker.guard.ended, CollisionAhead):
+            assert checker.guard.ended.distance >= 0.0
+            return
+
+
+def test_beside_a_wall_at_the_shoulder_the_arm_moves_and_stops_before_the_wall() -> None:
+    wall = (0.02, -2.0, -2.0, 1.0, 2.0, 2.0)  # m; the shoulder is at x = 0
+    checker = GuardChecker(with_boxes(None, wall), [0.0, -0.5, 0.0, 0.0, 0.0, 0.0], 0.005)
+    assert checker.guard.zone_at(checker.state.commanded) is None
+    assert checker.guard.zone_at([0.0] * 6) == 0
+    assert all(verdict <= GuardResult.CLAMPED for verdict in driven(checker, [0.0, -1.0, 0.0, 0.0, 0.0, 0.0], 100))
+    driven(checker, [0.0, 1.0, 0.0, 0.0, 0.0, 0.0], 400)
+    assert isinstance(checker.guard.ended, BoxReached)
+    nearest = max(x for x, _, _ in points(checker.state.commanded))
+    assert wall[0] - BODY - 0.01 < nearest < wall[0] - BODY + 1e-6
+
+
+def test_a_stop_before_itself_names_the_links() -> None:
+    q = [2.8, 1.6, -2.3, 0.4, -1.2, 0.1]
+    assert 0.01 < own_gap(q) < 0.02
+    checker = GuardChecker(with_boxes(None), q, 0.005)
+    for _ in range(40):
+        if not checker.guard.stopping:
+            driven(checker, towards_itself(checker.state.commanded), 5)
+    checker.stop()
+    assert isinstance(checker.guard.ended, CollisionAhead)
+    assert (checker.guard.ended.first, checker.guard.ended.second) in {(0, 3), (0, 5), (2, 5)}
+    assert 0.0 <= own_gap(checker.state.commanded) < 0.02
+
+
+def test_bodies_that_overlap_may_only_come_apart() -> None:
+    q = [1.0, -1.9, 2.3, -2.9, -1.1, -0.2]
+    assert -0.02 < own_gap(q) < -0.01
+    checker = GuardChecker(with_boxes(None), q, 0.005)
+    driven(checker, towards_itself(q), 40)
+    assert isinstance(checker.guard.ended, NotLeavingBox)
+    checker.stop()
+    apart = [-part for part in towards_itself(checker.state.commanded)]
+    for _ in range(400):
+        assert driven(checker, apart, 1)[0] <= GuardResult.CLAMPED
+        if own_gap(checker.state.commanded) > 0.005:
+            return
+    raise AssertionError("they do not come apart")
+
+
 @pytest.mark.parametrize("dt", [0.002, 0.01])
 @pytest.mark.parametrize("gap", [-0.03, -1e-3, 0.0, 1e-3])
 @pytest.mark.parametrize("part", [1.0, 0.1])
@@ -136,17 +207,17 @@ def test_the_way_out_of_a_keep_out_box_is_not_hindered(dt: float, gap: float, pa
     tool = points(q)[0]
     away = [part, 0.0, 0.0, 0.0, 0.0, 0.0] if tool[0] > 0 else [-part, 0.0, 0.0, 0.0, 0.0, 0.0]
     # Joint 1 moves the tool along y; the box begins beside it.
-    box = [tool[0] - 0.3, tool[1] - 0.2 - gap, tool[2] - 0.05, tool[0] + 0.3, tool[1] - gap, tool[2] + 0.05]
+    face = tool[1] - BODY - gap
+    box = [tool[0] - 0.3, face - 0.2, tool[2] - 0.05, tool[0] + 0.3, face, tool[2] + 0.05]
     checker = GuardChecker(with_boxes(WIDE, box), q, dt)
-    while points(checker.state.commanded)[0][1] < box[4] + 0.01:
+    while min(box_gaps(checker.state.commanded, box)) < 0.01:
         assert driven(checker, away, 1)[0] <= GuardResult.CLAMPED
     # And the way back in ends before the box.
     while driven(checker, [-part for part in away], 1)[0] is not GuardResult.STOPPED:
-        assert points(checker.state.commanded)[0][1] > box[4]
+        assert min(box_gaps(checker.state.commanded, box)) > 0.0
     assert isinstance(checker.guard.ended, BoxReached)
     assert checker.guard.ended.box == 0
-    here = -depth(points(checker.state.commanded)[0], box)
-    assert 0.0 <= here < 0.004
+    assert 0.0 <= min(box_gaps(checker.state.commanded, box)) < 0.004
 
 
 @pytest.mark.interpreted
@@ -163,14 +234,14 @@ def test_a_stop_is_looked_at_in_no_more_than_sixteen_places(monkeypatch: pytest.
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
-        high[axis] = tool[axis] - 10 ** chance.uniform(-4, -1)
+        high[axis] = tool[axis] - BODY - 10 ** chance.uniform(-4, -1)
         low[axis] = high[axis] - 0.3
         limits = Limits(with_boxes(WIDE, low + high))
         mean = [chance.choice((-1, 1)) * v for v in limits.velocity]
         after = [at + w * dt for at, w in zip(q, mean, strict=True)]
         looked.clear()
         touched(
-            Zones(MODEL, limits),
+            Zones(MODEL, limits, CLEARANCE),
             frames(MODEL, q),
             frames(MODEL, after),
             after, mean, limits.acceleration, dt,
@@ -186,7 +257,7 @@ def test_a_stop_outside_a_box_is_never_reported_with_a_distance_inside() -> None
         q = [chance.uniform(-1, 1), chance.uniform(0, 1), chance.uniform(0.8, 2), 0.3, 0.5, 0.1]
         tool, axis = points(q)[0], chance.randrange(3)
         low, high = [at - 0.5 for at in tool], [at + 0.5 for at in tool]
-        high[axis] = tool[axis] - chance.choice((0.01, 0.03, 0.06, 0.1))
+        high[axis] = tool[axis] - BODY - chance.choice((0.01, 0.03, 0.06, 0.1))
         low[axis] = high[axis] - 0.2
         checker = GuardChecker(with_boxes(WIDE, low + high), q, 0.002)
         if checker.guard.zone_at(q) is not None:
@@ -231,9 +302,9 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
     monkeypatch.setattr(
         "rtcp.motion.guards.trajectory_guard.frames", lambda *given: counted.append(1) or frames(*given)
     )
-    checker = GuardChecker(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), Q, 0.001)
+    checker = GuardChecker(with_boxes(WIDE, (5.0, 5.0, 5.0, 6.0, 6.0, 6.0)), [0.0] * 6, 0.001)
     driven(checker, [0.5] * 6, 200)
-    assert len(counted) <= 1
+    assert len(counted) <= 3
     assert checker.guard.poses == frames(MODEL, checker.state.commanded)
 
 
@@ -244,7 +315,8 @@ def test_far_from_every_box_no_frames_are_computed_in_a_cycle(monkeypatch: pytes
 @pytest.mark.parametrize("kept_in", [False, True])
 def test_with_a_point_exactly_on_a_face_any_single_joint_may_be_asked_for(axis: int, kept_in: bool) -> None:
     x, y, z = frames(MODEL, Q)[6].position
-    box = (*WIDE[:3], x, *WIDE[4:]) if kept_in else (x, y - 0.1, z - 0.1, x + 0.2, y + 0.1, z + 0.1)
+    face = x + BODY
+    box = (*WIDE[:3], x, *WIDE[4:]) if kept_in else (face, y - 0.1, z - 0.1, face + 0.2, y + 0.1, z + 0.1)
     checker = GuardChecker(with_boxes(box) if kept_in else with_boxes(WIDE, box), Q, 0.001)
     for sign in (1.0, -1.0):
         for _ in range(60):
@@ -266,12 +338,12 @@ def test_a_plate_that_the_first_cycle_would_cross_is_not_crossed(dt: float, gap:
     x, y, z = frames(MODEL, q)[6].position
     # Joint 1 moves the tool along y; so far it comes in a cycle from rest.
     way = abs(x) * ARM.joints[0].acceleration * dt * dt
-    low = y + gap
+    low = y + BODY + gap
     checker = GuardChecker(with_boxes(WIDE, (x - 0.3, low, z - 0.3, x + 0.3, low + part * way, z + 0.3)), q, dt)
     speed = ARM.joints[0].velocity if x > 0 else -ARM.joints[0].velocity
     for _ in range(50):
         checker.request([checker.state.commanded[0] + speed * dt, *q[1:]], tolerates_saturation=True)
-        assert frames(MODEL, checker.state.commanded)[6].position[1] <= low + 1e-9
+        assert frames(MODEL, checker.state.commanded)[6].position[1] <= low - BODY + 1e-9
 
 
 # -- distances ------------------------------------------------------------------------------------------------------
@@ -294,29 +366,30 @@ def test_outside_is_the_distance_to_the_nearest_point_of_the_box_and_inside_the_
 @settings(max_examples=examples(50))
 def test_clearances_are_sorted_and_lead_out(q: Sequence[float]) -> None:
     limits = Limits(ARM)
-    zones = Zones(MODEL, limits)
+    zones = Zones(MODEL, limits, CLEARANCE)
     poses = frames(MODEL, q)
     found = zones.clearances(poses, inf)
     assert [one.distance for one in found] == sorted(one.distance for one in found)
-    assert len(found) == 6 + 3 * len(limits.keep_out)
-    assert found[0].distance == zones.distance(poses)[0]
+    assert found[0].distance == pytest.approx(zones.distance(poses)[0], abs=1e-12)
     for one in found:
-        moved = tuple(p + 1e-6 * n for p, n in zip(poses[one.point].position, one.normal, strict=True))
-        if one.box >= 0:
-            further = outside(*moved, limits.keep_out[one.box]) - one.distance
+        moved = tuple(p + 1e-6 * n for p, n in zip(one.place, one.normal, strict=True))
+        if 0 <= one.zone < ITSELF:
+            further = outside(*moved, limits.keep_out[one.zone]) - BODY - one.distance
             assert further == pytest.approx(1e-6, rel=1e-3)
-    assert zones.clearances(poses, found[0].distance) == []
+    assert zones.clearances(poses, min(zones.room(poses), 0.0)) == []
 
 
 @given(q=JOINTS, direction=DIRECTION)
 @settings(max_examples=examples(60))
 def test_no_point_moves_further_than_the_reach_of_each_joint_says(q: Sequence[float], direction: list[float]) -> None:
-    zones = Zones(MODEL, Limits(ARM))
+    zones = Zones(MODEL, Limits(ARM), CLEARANCE)
     step = 1e-4
     moved = [angle + step * part for angle, part in zip(q, direction, strict=True)]
     bound = sum(step * abs(part) * reach for part, reach in zip(direction, zones.reach, strict=True))
     for before, after in zip(points(q), points(moved), strict=True):
         assert hypot(*(a - b for a, b in zip(after, before, strict=True))) <= bound * (1 + 1e-6) + 1e-12
+    bound = sum(step * abs(part) * reach for part, reach in zip(direction, zones.pair_reach, strict=True))
+    assert abs(own_gap(moved) - own_gap(q)) <= bound * (1 + 1e-6) + 1e-8
     assert list(zones.reach) == sorted(zones.reach, reverse=True)
 
 
@@ -325,7 +398,7 @@ def test_a_box_that_a_fast_stop_would_jump_over_is_seen() -> None:
     q = (0.0, 0.6, 1.2, 0.0, 0.0, 0.0)
     tool = points(q)[0]
     for gap, sign in product([0.004 * n for n in range(1, 20, 1 if SLOW else 3)], [1.0, -1.0]):
-        y = tool[1] + sign * (gap + 0.001)
+        y = tool[1] + sign * (BODY + gap + 0.001)
         box = [tool[0] - 0.3, y - 0.001, tool[2] - 0.3, tool[0] + 0.3, y + 0.001, tool[2] + 0.3]
         checker = GuardChecker(with_boxes(WIDE, box), q, 0.01)
         side = -sign if tool[0] > 0 else sign

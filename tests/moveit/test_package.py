@@ -110,8 +110,11 @@ def test_the_limits_are_those_of_the_joints(package: Path) -> None:
             assert limits[joint.name][f"max_{kind}"] == getattr(joint, kind)
 
 
-def test_what_an_arm_does_not_say_has_no_limit() -> None:
-    files = moveit_package(find_arm("abb_irb120")).files
+def test_what_an_arm_does_not_say_has_no_limit(tmp_path: Path) -> None:
+    geometry = tmp_path / "geometry.yaml"
+    text = find_arm("abb_irb120").read_text()
+    geometry.write_text("name: abb-irb120\n\n" + text[text.index("kinematics:") :])
+    files = moveit_package(geometry).files
     limits = yaml.safe_load(files["config/joint_limits.yaml"])["joint_limits"]["joint1"]
     assert [limits[f"has_{kind}_limits"] for kind in ("velocity", "acceleration", "jerk")] == [True, False, False]
 

@@ -81,6 +81,7 @@ def test_what_cannot_be_started_is_said(page: Page, platform: Platform) -> None:
 
 def test_the_arm_page_shows_what_the_platform_reports(page: Page, holding: Platform) -> None:
     show(page, "/arm")
+    expect(page.locator('#menu [data-path="/cell"]')).to_be_hidden()
     for at, value in enumerate(holding.status()["joints"]["actual_position"]):
         shown = float(page.locator(f"[data-live='actual_position.{at}']").inner_text())
         assert shown == pytest.approx(value, abs=1e-3)

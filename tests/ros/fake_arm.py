@@ -8,8 +8,8 @@ from dataclasses import replace
 from typing import Any
 
 from rtcp.api import RtcpError
+from rtcp.fieldbus.simple_message.messages import Joints, RobotMode, Status, TriState
 from rtcp.ros.simple_message.arm import ArmState, Point
-from rtcp.ros.simple_message.messages import Joints, RobotMode, Status, TriState
 
 HOME = (0.0, 0.25, 1.5, 0.0, 0.5, 0.0)
 READY = Status(TriState.TRUE, TriState.FALSE, 0, TriState.FALSE, TriState.FALSE, RobotMode.AUTO, TriState.TRUE)

@@ -8,10 +8,8 @@ from collections.abc import Awaitable
 
 import pytest
 
-from rtcp.ros.simple_message import client as client_module
-from rtcp.ros.simple_message.client import MotionClient, StateClient
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
+from rtcp.fieldbus.simple_message.messages import (
     ByteOrder,
     CommType,
     GetVersion,
@@ -22,6 +20,8 @@ from rtcp.ros.simple_message.messages import (
     ReplyCode,
     Status,
 )
+from rtcp.ros.simple_message import client as client_module
+from rtcp.ros.simple_message.client import MotionClient, StateClient
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
 from tests.ros.fake_arm import HOME, FakeArm
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from rtcp.cli.__main__ import main
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder
-from rtcp.ros.simple_message.messages import ByteOrder, JointPosition, ReplyCode
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
+from rtcp.fieldbus.simple_message.messages import ByteOrder, JointPosition, ReplyCode
 
 
 def test_it_serves_without_a_platform_refuses_motion_and_ends_with_a_signal(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.ros.simple_message.framing import (
+from rtcp.fieldbus.simple_message.framing import (
     LEAST_LENGTH,
     MOST_LENGTH,
     Frame,
@@ -20,7 +20,7 @@ from rtcp.ros.simple_message.framing import (
     LengthError,
     TruncatedFrameError,
 )
-from rtcp.ros.simple_message.messages import ByteOrder, CommType, MessageError, Ping, ReplyCode
+from rtcp.fieldbus.simple_message.messages import ByteOrder, CommType, MessageError, Ping, ReplyCode
 
 replies = st.sampled_from([ReplyCode.SUCCESS, ReplyCode.FAILURE])
 frames = st.one_of(

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
+from rtcp.fieldbus.simple_message.messages import (
     MOST_BODY_BYTES,
     ByteOrder,
     CommType,
@@ -144,13 +144,26 @@ def test_joints_that_the_message_has_not_are_read_as_zeros() -> None:
 
 
 @pytest.mark.parametrize("kind", [kind for kind in MessageType if kind is not MessageType.PING])
-@pytest.mark.parametrize("change", [-1, 1, 4])
+@pytest.mark.parametrize("change", [-1, 1, 2])
 def test_a_body_of_another_length_is_refused(kind: MessageType, change: int) -> None:
     bodies: dict[MessageType, Message] = {message.TYPE: message for message, *_ in EXAMPLES}
     body = bodies[kind].pack(ByteOrder.LITTLE)
     wrong = body[:change] if change < 0 and body else body + bytes(abs(change))
     with pytest.raises(MessageError, match=kind.name):
         unpack_message(kind, wrong, ByteOrder.LITTLE)
+
+
+@pytest.mark.parametrize(
+    ("message", "length"),
+    [(JointPosition(0, (0.1,) * 12), 64), (JointTrajPt(7, (0.5,) * 12, 1.0, 0.25), 72), (JointPosition(0, (0.5,)), 56)],
+)
+def test_twelve_joints_widen_the_message_and_its_type_tells_which_it_is(message: Message, length: int) -> None:
+    body = message.pack(ByteOrder.LITTLE)
+    assert len(body) == length - 12
+    read = unpack_message(message.TYPE, body, ByteOrder.LITTLE)
+    assert isinstance(read, (JointPosition, JointTrajPt))
+    assert isinstance(message, (JointPosition, JointTrajPt))
+    assert read.positions[: len(message.positions)] == pytest.approx(message.positions)
 
 
 @pytest.mark.parametrize("number", [0, 12, 20, 21, 2001, 65001])
@@ -162,7 +175,7 @@ def test_unknown_and_deprecated_numbers_are_refused(number: int) -> None:
 @pytest.mark.parametrize(
     "message",
     [
-        JointPosition(0, (0.0,) * 11),
+        JointPosition(0, (0.0,) * 25),
         JointPosition(0, (1e39,)),
         JointPosition(1 << 31, (0.0,)),
         JointPoint(0, 0.0, (0.0,) * 125),

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from rtcp.ros.simple_message.arm import ArmState, Point
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.messages import (
     JointPoint,
     JointPosition,
     JointTrajPt,
@@ -16,6 +15,7 @@ from rtcp.ros.simple_message.messages import (
     TriState,
     ValidFields,
 )
+from rtcp.ros.simple_message.arm import ArmState, Point
 from rtcp.ros.simple_message.sequence import (
     BUFFER_POINTS,
     REALTIME_PAUSE_S,

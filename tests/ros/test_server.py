@@ -14,10 +14,8 @@ from math import nan
 import pytest
 
 from rtcp.api import RtcpError
-from rtcp.ros import held_up
-from rtcp.ros.simple_message.arm import Point
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder
+from rtcp.fieldbus.simple_message.messages import (
     ByteOrder,
     CommType,
     GetVersion,
@@ -33,6 +31,8 @@ from rtcp.ros.simple_message.messages import (
     TriState,
     Version,
 )
+from rtcp.ros import held_up
+from rtcp.ros.simple_message.arm import Point
 from rtcp.ros.simple_message.sequence import BUFFER_POINTS
 from rtcp.ros.simple_message.server import ServerOptions, SimpleMessageServer
 from tests.ros.fake_arm import HOME, READY, FakeArm, FakeTrajectory
@@ -417,10 +417,10 @@ def test_bodies_of_another_length_are_refused_and_logged_once(caplog: pytest.Log
     async def client(rig: Rig) -> None:
         peer = await rig.motion()
         for _ in range(3):
-            peer.writer.write(Frame(11, CommType.SERVICE_REQUEST, ReplyCode.INVALID, bytes(60)).pack(LITTLE))
+            peer.writer.write(Frame(11, CommType.SERVICE_REQUEST, ReplyCode.INVALID, bytes(61)).pack(LITTLE))
             assert (await peer.frame()).reply_code is NO
         assert len(lines(caplog)) == 1
-        assert "60 bytes of body" in lines(caplog)[0]
+        assert "61 bytes of body" in lines(caplog)[0]
 
     assert "run_trajectory" not in run(client).names
 

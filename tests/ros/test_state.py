@@ -48,7 +48,7 @@ def record(time_ns: int = 0, **fields: Any) -> Any:
 class FakeFeed:
     """Records that a test adds."""
 
-    config, period_ns = CONFIG, 2 * MS
+    config, period_ns, schema = CONFIG, 2 * MS, SCHEMA
 
     def __init__(self) -> None:
         self.holder = ""

@@ -201,7 +201,7 @@ def modules() -> dict[str, ModuleType]:
     contents: dict[str, dict[str, Any]] = {
         "rclpy": {
             "init": lambda args, domain_id, signal_handler_options: None,
-            "create_node": lambda name: Node(),
+            "create_node": lambda name, namespace=None: Node(),
             "shutdown": lambda: None,
         },
         "rclpy.action": {"ActionServer": ActionServer, "ActionClient": ActionClient, "CancelResponse": CancelResponse},

@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("rosbags", reason="rosbags is not installed: pip install 'rtcp[zenoh]'")
 
 from kinematics.forward import forward
+from rtcp.fieldbus.simple_message.messages import RobotMode, TriState
 from rtcp.ros.ros2_action import ActionServer
 from rtcp.ros.ros2_node import ACTION_TOPICS, OUT, Commands, Publications
 from rtcp.ros.ros2_types import CANCEL, FOLLOW, encode, make
-from rtcp.ros.simple_message.messages import RobotMode, TriState
 from rtcp.ros.state import Diagnostics, RobotStatus
 from tests.ros.test_commands import FakeArm
 

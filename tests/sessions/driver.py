@@ -18,7 +18,7 @@ from rtcp.ipc.message import PAYLOAD_SIZE, Joints, MalformedMessage
 from rtcp.ipc.states import State
 from rtcp.launch.simulation import Frame, Simulation
 from rtcp.motion.limits import Values, rows
-from tests.arm_geometry import depth, points
+from tests.arm_geometry import box_gaps, depth, own_gap, points
 from tests.sessions.actions import NONSENSE
 from tests.sessions.frame_checker import COUNTS, Bounds, FrameChecker
 
@@ -54,11 +54,10 @@ def bounds_of(config: ArmConfig) -> Bounds:
 
 
 def is_free(bounds: Bounds, q: Sequence[float], clearance: float = 0.0) -> bool:
-    """Whether elbow, wrist and tool are outside every keep-out box, and the tool inside the box, by `clearance` m."""
-    seen = points(q)
-    if bounds.box is not None and depth(seen[0], bounds.box) < clearance:
+    """Whether all bodies are off each keep-out box and each other, and the tool inside the box, by `clearance` m."""
+    if bounds.box is not None and depth(points(q)[0], bounds.box) < clearance:
         return False
-    return all(depth(point, box) < -clearance for box in bounds.keep_out for point in seen)
+    return all(gap > clearance for gap in (own_gap(q), *(gap for box in bounds.keep_out for gap in box_gaps(q, box))))
 
 
 class Raw:

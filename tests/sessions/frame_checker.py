@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rtcp.launch.simulation import Frame
 from rtcp.motion.limits import Corners, Values
-from tests.arm_geometry import L2, L3, L4, L5, depth, points
+from tests.arm_geometry import L2, L3, L4, L5, box_gaps, depth, own_gap, points
 
 WIRE = struct.Struct("<Hiiib")
 """Controlword or statusword, position, velocity, torque, mode: the same both ways."""
@@ -142,7 +142,7 @@ class FrameChecker:
             joint.last = position
         if obeying:
             self.obeyed += 1
-        if obeying == len(REACH) and (self.bounds.box or self.bounds.keep_out):
+        if obeying == len(REACH):
             if all(joint.positions for joint in self._joints):
                 self._check_zones(frame.now_ns)
         else:
@@ -243,10 +243,11 @@ class FrameChecker:
         if self._look_again > 0:
             return
         bounds = self.bounds
-        tool, wrist, elbow = points([joint.positions[-1] / COUNTS for joint in self._joints])
-        inner = [depth(point, box) for box in bounds.keep_out for point in (elbow, wrist, tool)]
+        q = [joint.positions[-1] / COUNTS for joint in self._joints]
+        inner = [max(-gap for gap in box_gaps(q, box)) for box in bounds.keep_out]
+        inner.append(-own_gap(q))
         if bounds.box is not None:
-            inner.append(-depth(tool, bounds.box))
+            inner.append(-depth(points(q)[0], bounds.box))
         deepest = max(inner)
         if deepest > ZONE_TOLERANCE_M and self._excused:
             # The arm was enabled in there: it is not to be checked until it is out.
@@ -255,10 +256,14 @@ class FrameChecker:
         self._excused = False
         if deepest > ZONE_TOLERANCE_M:
             which = inner.index(deepest)
-            name = "outside the box" if which == 3 * len(bounds.keep_out) else f"in keep-out box {which // 3}"
-            self._violation(now, -1, f"a point is {deepest * 1e3:.1f} mm {name}")
+            names = [
+                *(f"in keep-out box {n}" for n in range(len(bounds.keep_out))),
+                "in another body",
+                "outside the box",
+            ]
+            self._violation(now, -1, f"a body is {deepest * 1e3:.1f} mm {names[which]}")
             self._look_again = 50
             return
-        # No point is nearer than -deepest: until it can have moved so far nothing is to be looked at.
+        # Nothing is nearer than -deepest: until it can have moved so far nothing is to be looked at.
         fastest = sum(v * reach for v, reach in zip(bounds.velocity, REACH, strict=True)) * self._dt
         self._look_again = int(-deepest / fastest)

@@ -15,6 +15,7 @@ from rtcp.api.feed import Records
 from rtcp.config import default_config, load
 from rtcp.ipc.recording import WARNING, About, FaultRecording, RecordingError, cycle_messages, cycle_type, write
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
+from rtcp.ipc.states import DriveState
 from rtcp.telemetry.channels import Channels, fields_of
 from rtcp.telemetry.reading import Reader, read
 from rtcp.telemetry.recorder import CsvWriter, McapWriter
@@ -32,7 +33,8 @@ def cycles(count: int = 4000, first: int = 1000) -> Records:
     made["time_ns"] = 7_000_000_000 + numbers * PERIOD_NS
     made["wakeup_ns"] = numbers % 50_000
     for field, name in enumerate(PER_JOINT):
-        made[name] = 0x1237 if name == "statusword" else (1e-4 * numbers[:, None] + field + 0.1 * np.arange(6))
+        made[name] = 1e-4 * numbers[:, None] + field + 0.1 * np.arange(6)
+    made["drive_state"], made["statusword"] = DriveState.OPERATION_ENABLED, 0x1237
     return made
 
 

@@ -36,6 +36,7 @@ from rtcp.ipc.layout import EVENTS, TEXTS
 from rtcp.ipc.runtime_directory import blackboard_file
 from rtcp.ipc.schema import PER_JOINT, Field, RecordSchema, arm_schema
 from rtcp.ipc.session import Session
+from rtcp.ipc.states import DriveState
 from tests.records import numbers
 
 CONFIG = load(default_config())
@@ -66,7 +67,7 @@ class Loop:
                 name: [1e-4 * self.cycles + field + 0.1 * axis for axis in range(6)]
                 for field, name in enumerate(PER_JOINT)
             }
-            joints["statusword"] = 0x1237
+            joints |= {"drive_state": DriveState.OPERATION_ENABLED, "statusword": 0x1237}
             scalars = {"cycle": self.cycles, "time_ns": time.monotonic_ns(), "io_inputs": inputs}
             self.board.publish(numbers(SCHEMA, **scalars, **joints))
 

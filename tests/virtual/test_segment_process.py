@@ -232,7 +232,7 @@ def test_where_namespaces_are_forbidden_one_sentence_says_what_to_allow(config: 
         user=user, group=user, extra_groups=None if user is None else [], timeout=20, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
-    assert "the system refuses a network namespace of the segment's own" in done.stderr
+    assert "the system refuses a network namespace of this process's own" in done.stderr
     assert "user.max_user_namespaces" in done.stderr
     assert done.stderr.count("\n") == 1
 

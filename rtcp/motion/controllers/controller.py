@@ -7,7 +7,7 @@ A controller turns commands into setpoints, one `update` a cycle while it moves 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from math import isfinite
 from typing import ClassVar, Final
@@ -25,6 +25,7 @@ from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
 from rtcp.motion.joint_motion import JointMotion
 from rtcp.motion.limits import Limits
 from rtcp.motion.state import ArmState, Phase, Setpoint
+from rtcp.motion.step_group import StepGroup
 
 ENTRY_POINTS = "rtcp.controllers"
 LONGEST_HOLD_S: Final = 1.0
@@ -44,6 +45,8 @@ class ControllerSetup:
     """The cycle, s."""
     plan: Callable[[int], memoryview[float]]
     """Returns the rows of a slot of the plan area (`rtcp.motion.planning.plan`)."""
+    group: StepGroup = field(default_factory=StepGroup)
+    """Partners in a cell, and the motion in step."""
 
 
 @mypyc_attr(allow_interpreted_subclasses=True)

@@ -11,14 +11,14 @@ from math import sqrt
 from typing import Final
 
 from kinematics.pose import Pose
-from rtcp.ipc.schema import HELD_BOX_AT, HELD_RANGE_AT, HELD_SHOULDER
+from rtcp.ipc.schema import HELD_BOX_AT, HELD_ITSELF, HELD_RANGE_AT, HELD_SHOULDER
 from rtcp.motion.controllers.jog_inverse import JogInverse, Row
 from rtcp.motion.guards.trajectory_guard import TrajectoryGuard
-from rtcp.motion.guards.zones import ELBOW, INNER_BOX, TOOL, Clearance
+from rtcp.motion.guards.zones import INNER_BOX, Clearance
 from rtcp.motion.limits import Limits
 
 STANDOFF_M: Final = 0.008
-"""The points of the arm come so near to a box; what the guard's own stop needs beside it is less."""
+"""The arm comes so near to a boundary; what the guard's own stop needs beside it is less."""
 _GUARD_M: Final = 0.003
 JOINT_MARGIN_RAD: Final = 2e-4
 _BRAKES: Final = 0.5
@@ -59,7 +59,7 @@ class JogBounds:
         self._boxes: object = None
         self._turn2 = 1.0 / inverse.length**2
         self.axis = self.box = -2
-        """What held the motion back in this cycle: joint, box (-1: the inner one); -2: none."""
+        """What held the motion back in this cycle: joint, number of the box or pair (`zones`); -2: none."""
         self._singular = 0
 
     def look(self, poses: Sequence[Pose], position: Sequence[float], jumped: bool) -> None:
@@ -80,7 +80,7 @@ class JogBounds:
         self.near = zones.clearances(poses, _WITHIN_M)
         self._idle = 0
         if not self.near:
-            self._idle = int((zones.distance(poses)[0] - _WITHIN_M) / (_FASTEST_POINT_M_S * self._dt))
+            self._idle = int((zones.room(poses) - _WITHIN_M) / (_FASTEST_POINT_M_S * self._dt))
 
     @property
     def held(self) -> int:
@@ -89,7 +89,7 @@ class JogBounds:
         if self.axis >= 0:
             held |= (self.axis + 1) << HELD_RANGE_AT
         if self.box >= INNER_BOX:
-            held |= min(self.box + 2, 31) << HELD_BOX_AT
+            held |= (min(self.box, HELD_ITSELF) + 2) << HELD_BOX_AT
         return held
 
     def passed(self, poses: Sequence[Pose], twist: Sequence[float], speeds: Sequence[float]) -> bool:
@@ -162,21 +162,18 @@ class JogBounds:
             row = self._approach(poses, clearance)
             excess = _along(row, twist) - stopping(clearance.distance - STANDOFF_M, self._braking, dt)
             if excess > most:
-                worst, most, self.box = row, excess, clearance.box
+                worst, most, self.box = row, excess, clearance.zone
         return worst, most
 
     def _approach(self, poses: Sequence[Pose], clearance: Clearance) -> Row:
         """Return the row of the speed with which a point comes nearer to a boundary."""
         x, y, z = clearance.normal
         x, y, z = -x, -y, -z
-        if clearance.point == TOOL:
+        if clearance.zone == INNER_BOX:
             return x, y, z, 0.0, 0.0, 0.0
-        if clearance.point != ELBOW:
-            ox, oy, oz = self._inverse.to_centre
-            return x, y, z, oy * z - oz * y, oz * x - ox * z, ox * y - oy * x
-        px, py, pz = poses[ELBOW][0]
+        px, py, pz = clearance.place
         total = [0.0] * 6
-        for i in (0, 1):
+        for i in range(clearance.other, clearance.link):
             k = _lever(poses[i], px, py, pz, x, y, z)
             row = self._inverse.rows[i]
             for j in range(6):
@@ -217,11 +214,10 @@ class JogBounds:
         share = 1.0
         acceleration = self._limits.acceleration
         for clearance in self.near:
-            point = clearance.point
             x, y, z = clearance.normal
-            px, py, pz = poses[point][0]
+            px, py, pz = clearance.place
             travel = 0.0
-            for i in range(2 if point == ELBOW else 4 if point != TOOL else 6):
+            for i in range(clearance.other, clearance.link):
                 v = speeds[i]
                 towards = -_lever(poses[i], px, py, pz, x, y, z) * v
                 if towards > 0.0:
@@ -231,7 +227,7 @@ class JogBounds:
             stopping_distance = max(distance - _GUARD_M, 0.4 * distance)
             if stopping_distance > 0.0 and travel * share * share > stopping_distance:
                 share = sqrt(stopping_distance / travel)
-                self.box = clearance.box
+                self.box = clearance.zone
         return share
 
 

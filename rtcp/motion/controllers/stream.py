@@ -23,6 +23,7 @@ from rtcp.ipc.refusals import Malformed, Refusal, StampNotFinite, StreamPointDro
 from rtcp.motion.controllers.controller import Controller, ControllerSetup
 from rtcp.motion.joint_motion import allowed_accelerations, find_way, leaves_range, stoppable_speed
 from rtcp.motion.state import ArmState, Phase, Setpoint
+from rtcp.motion.step_group import StepPhase
 
 TIMEOUT_S: Final = 0.2
 """A stream that is silent for this long has ended."""
@@ -37,6 +38,8 @@ _OVER_S: Final = 0.01
 """Shortest time over which a target's speed is estimated, s: an encoder's steps and noise average out."""
 _AT_LEAST_S: Final = 0.01
 """Shortest time to meet a target, s: in less, a rounding error could only be corrected by a detour."""
+_MOST_LATE_S: Final = 1e9
+"""Most that is reported of how late a target came, s: the difference of two stamps may be infinite."""
 _LONGER: Final = 1.05
 """Factor on the shortest time: with no time to spare, rounding can leave no solution."""
 _DRIFT: Final = 1e-4
@@ -82,14 +85,21 @@ class StreamController(Controller):
         """What the sender says of the target's acceleration, rad/s^2."""
         self.stream = 0
         """Number of the open stream; 0: there is none, or it has ended."""
+        self._group = setup.group
+        self._in_step = False
 
     def accept(self, command: Command, state: ArmState, continues: bool) -> Refusal | None:
         """Follow the target from the next cycle on."""
         if isinstance(command, OpenStream):
             if command.stream <= 0:
                 return Malformed(command.number)
+            if command.motion and (refusal := self._group.refusal(command.motion, command.partners, state.now_ns)):
+                return refusal
             self._start(state)
             self.stream = command.stream
+            self._in_step = command.motion > 0
+            if self._in_step:
+                self._group.join(command.motion, command.partners, 0)
             return None
         assert isinstance(command, StreamPosition)
         if (refusal := self.not_in_range(command.q)) is not None:
@@ -111,6 +121,8 @@ class StreamController(Controller):
             numbers: 3 x `MOST_AXES`: positions, rad, velocities, rad/s, accelerations, rad/s^2.
         """
         if bits & SETPOINT_ENDS:
+            if self._in_step:
+                self._group.phase, self._in_step = StepPhase.DONE, False
             self.stop(state)
             return
         low, high = self.limits.low, self.limits.high
@@ -141,16 +153,22 @@ class StreamController(Controller):
     def hold(self) -> None:
         """End the motion where the setpoints are."""
         super().hold()
-        self.stream = 0
+        self._leave()
 
     def brake(self, state: ArmState) -> None:
         """Bring each joint to rest; an open stream has ended."""
         super().brake(state)
+        self._leave()
+
+    def _leave(self) -> None:
         self.stream = 0
+        if self._in_step:
+            self._group.leave()
+            self._in_step = False
 
     def _start(self, state: ArmState) -> None:
         self.begin()
-        self.stream = 0
+        self._leave()
         self._rate[:] = self._zero
         self._first, self._interval_s = True, 0.0
         self._came_ns = state.now_ns
@@ -164,7 +182,7 @@ class StreamController(Controller):
         step = stamp_s - self._stamp_s
         if not self._first:
             if step <= 0.0:
-                return -step
+                return min(-step, _MOST_LATE_S)
             # The least lag is the difference of the clocks: what exceeds it is how late a target came.
             self._lag_s = min(lag, self._lag_s + _DRIFT * step)
             if lag - self._lag_s > TIMEOUT_S:
@@ -202,8 +220,19 @@ class StreamController(Controller):
     def advance(self, state: ArmState) -> Setpoint:
         """Return the setpoints of the next cycle."""
         target = self.setpoint
+        if self._in_step:
+            if self._group.is_finished():
+                # Its commander has closed the stream of one arm: that ends all.
+                self._group.phase, self._in_step = StepPhase.DONE, False
+                self.stop(state)
+                return self.update(state)
+            ended = self._group.lost(state.now_ns, not self._first)
+            if ended is not None:
+                return self.give_up(state, ended)
         if state.now_ns - self._came_ns > _TIMEOUT_NS and not self._first:
             return self.give_up(state, StreamEnded())
+        if self._in_step and (self._group.phase is StepPhase.ARMED or self._group.waiting() >= 0):
+            return self.rest(state)
         if self._fresh:
             self._fresh = False
             self._aim(state)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import sqrt
-from typing import Final, NamedTuple
+from typing import ClassVar, Final, NamedTuple
 
 from ruckig import InputParameter, Ruckig, Trajectory
 
@@ -182,7 +182,7 @@ class TrajectoryController(Controller):
     """Accepts `RunTrajectory`, and `ExtendTrajectory` while an open one is under way."""
 
     name = "trajectory"
-    commands = (RunTrajectory, ExtendTrajectory)
+    commands: ClassVar[tuple[type[Command], ...]] = (RunTrajectory, ExtendTrajectory)
 
     def __init__(self, setup: ControllerSetup) -> None:
         super().__init__(setup)
@@ -213,7 +213,11 @@ class TrajectoryController(Controller):
         if isinstance(command, ExtendTrajectory):
             return self._extend(command, continues)
         assert isinstance(command, RunTrajectory)
-        rows, count = self.rows_of(command.slot, command.rows, PLAN_ROWS), command.rows
+        return self.take(command.slot, command.rows, command.open, state)
+
+    def take(self, slot: int, count: int, is_open: bool, state: ArmState) -> Refusal | None:
+        """Begin with the rows in a slot of the plan area, or return why not and change nothing."""
+        rows = self.rows_of(slot, count, PLAN_ROWS)
         if isinstance(rows, Refusal):
             return rows
         first, last = read_row(rows, 0), read_row(rows, count - 1)
@@ -229,7 +233,7 @@ class TrajectoryController(Controller):
             self._fade_out(state, first, last[0])
         else:
             self._approach_s = self._approach.duration_s
-        self._rows, self._row, self._count, self._open = rows, 0, count, command.open
+        self._rows, self._row, self._count, self._open = rows, 0, count, is_open
         self._waypoint = first
         self._delay_s = max(self._approach_s - first[0], 0.0)
         self._from_s = self._to_s = first[0] + self._delay_s

@@ -2,9 +2,9 @@
 
 For each joint the mean speed of the next cycle is within its limit, differs from the last by no more than
 acceleration x cycle, and leaves room to stop inside the range (`braking.fastest_stoppable`). Whoever keeps to this
-once can keep to it for ever: what a stop leaves of the speed in the next cycle fulfils it there. The boxes are kept
-in the same way: a setpoint is passed on only if the stop from it touches none, so that the stop from the last one,
-which was examined a cycle ago, is always at hand.
+once can keep to it for ever: what a stop leaves of the speed in the next cycle fulfils it there. Boxes and the arm's
+own bodies are kept clear in the same way: a setpoint is passed on only if the stop from it touches none, so that the
+stop from the last one, which was examined a cycle ago, is always at hand.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from typing import Final
 from kinematics.forward import frames
 from kinematics.pose import Pose
 from rtcp.config.model import ArmConfig
-from rtcp.ipc.events import BoxReached, JointLimitReached, MotionEnded, NotLeavingBox
+from rtcp.ipc.events import BoxReached, CollisionAhead, JointLimitReached, MotionEnded, NotLeavingBox
 from rtcp.ipc.refusals import LimitsExcludeArm, Refusal
 from rtcp.motion.guards.braking import fastest_stoppable, touched, travel
-from rtcp.motion.guards.zones import Zones
+from rtcp.motion.guards.neighbours import Neighbours
+from rtcp.motion.guards.zones import ITSELF, Zones
 from rtcp.motion.limits import Limits, Values
 from rtcp.motion.state import ArmState, Setpoint
 
@@ -49,7 +50,7 @@ class TrajectoryGuard:
     After a cut, `held` is the bit mask of the joints that were clamped.
 
     Args:
-        config: the arm; without its geometry no box is looked at.
+        config: the arm; without its geometry neither boxes nor the arm itself are looked at.
         limits: read every cycle.
         dt: the cycle, s.
     """
@@ -59,7 +60,8 @@ class TrajectoryGuard:
         self._limits = limits
         self._dt = dt
         self._model = config.arm
-        self.zones = None if config.arm is None else Zones(config.arm, limits)
+        self._clearance = config.cartesian.clearance
+        self.zones = None if config.arm is None else Zones(config.arm, limits, self._clearance)
         self._joints = range(n)
         self._mean = [0.0] * n
         """Mean speed of each joint in the last cycle: what its acceleration is counted from."""
@@ -68,11 +70,13 @@ class TrajectoryGuard:
         self._state = ArmState(n)
         self._poses: Sequence[Pose] | None = None
         self._room = self._room_then = 0.0
-        """No watched point is nearer to a boundary, m; 0: not known."""
+        """`Zones.room` of what is commanded, m, or less; 0: not known."""
         self._poses_then: Sequence[Pose] | None = None
         self._box, self._keep_out = limits.box, limits.keep_out
         self._rests = False
         """Whether the last setpoint was at rest where the arm is commanded, and no guard held it."""
+        self.neighbours: Neighbours | None = None
+        """Guards the distance to the partners in a cell; None: there are none."""
         self.stopping = False
         self.held = 0
         self.ended: MotionEnded | None = None
@@ -95,20 +99,27 @@ class TrajectoryGuard:
         self._poses, self._room = None, 0.0
 
     def zone_at(self, q: Sequence[float]) -> int | None:
-        """Return the number of the box (`zones`) whose bounds the arm would pass at `q` (rad), or None."""
+        """Return the number of the box or pair (`zones`) whose bounds the arm would pass at `q` (rad), or None."""
         distance, which = self.nearest_box(q)
         return which if distance < 0.0 else None
 
     def nearest_box(self, q: Sequence[float]) -> tuple[float, int]:
-        """Return how far the arm at `q` (rad) is from the bounds of the nearest box, m, below 0: beyond; and which."""
+        """Return how far the arm at `q` (rad) is from the nearest box or itself, m, below 0: beyond; and which."""
         if self.zones is None or self._model is None:
             return inf, 0
         return self.zones.distance(frames(self._model, q))
 
-    def _box_reached(self, box: int, ahead: float) -> MotionEnded:
-        """Return what ends the motion: its stop would come as near as `ahead`, m, or the arm is in the box already."""
-        here, nearest = (0.0, box) if self.zones is None else self.zones.distance(self.poses)
-        return NotLeavingBox(box, -here) if here < 0.0 and nearest == box else BoxReached(box, max(ahead, 0.0))
+    def _reached(self, zone: int, ahead: float) -> MotionEnded:
+        """Return what ends the motion: its stop would come as near as `ahead`, m, or the arm is there already."""
+        assert self.zones is not None
+        here, nearest = self.zones.distance(self.poses)
+        if here < 0.0 and nearest == zone:
+            return NotLeavingBox(zone, -here)
+        return (
+            BoxReached(zone, max(ahead, 0.0))
+            if zone < ITSELF
+            else CollisionAhead(*self.zones.links(zone), max(ahead, 0.0))
+        )
 
     def refusal_of(self, state: ArmState, new: Values) -> Refusal | None:
         """Return why `new` limits cannot come into force now: the arm is, or would come to rest, outside; or None."""
@@ -121,8 +132,8 @@ class TrajectoryGuard:
         # Also where the arm is on the wrong side of a box already: nothing becomes worse.
         if same and not (slower and any(mean)):
             return None
-        zones, poses = Zones(self._model, new), frames(self._model, state.commanded)
-        distance, which = zones.distance(poses)
+        zones, poses = Zones(self._model, new, self._clearance), frames(self._model, state.commanded)
+        distance, which = zones.box_distance(poses)
         if distance >= 0.0:
             stop = touched(zones, poses, poses, state.commanded, mean, new.acceleration, self._dt)
             if stop is None:
@@ -159,7 +170,9 @@ class TrajectoryGuard:
             wanted = position
         found = self._touches(state, wanted)
         if found is not None:
-            return self._stop(state, self._box_reached(*found))
+            return self._stop(state, self._reached(*found))
+        if self.neighbours is not None and (near := self.neighbours.ahead(wanted, mean)) is not None:
+            return self._stop(state, near)
         self._poses, self._room = self._poses_then, self._room_then
         here, speeds, rates, most = state.commanded, target.velocity, self._limits.acceleration, self._limits.velocity
         velocity, acceleration = state.commanded_velocity, state.commanded_acceleration
@@ -215,7 +228,7 @@ class TrajectoryGuard:
         return min(max(w if isfinite(w) else 0.0, low), high)
 
     def _touches(self, state: ArmState, position: Sequence[float]) -> tuple[int, float] | None:
-        """Return the box that `position` with the speeds `_next`, or the stop from there, would touch, or None."""
+        """Return the box or pair that `position` with the speeds `_next`, or the stop from there, would touch."""
         zones, model, mean, limits = self.zones, self._model, self._next, self._limits
         self._poses_then, self._room_then = None, self._room
         if zones is None or model is None:
@@ -227,11 +240,10 @@ class TrajectoryGuard:
             self._box, self._keep_out, self._room = limits.box, limits.keep_out, 0.0
         step, whole = travel(mean, limits.acceleration, zones.reach, self._dt)
         if self._room <= whole:
-            self._room = zones.distance(self.poses)[0]
+            self._room = zones.room(self.poses)
         self._room_then = self._room - step
         if self._room > whole:
             return None
-        self._room_then = 0.0
         self._poses_then = frames(model, position)
         return touched(zones, self.poses, self._poses_then, position, mean, limits.acceleration, self._dt)
 

@@ -1,23 +1,36 @@
-"""Boxes in space: the tool stays inside one, and tool, wrist and elbow outside the others.
+"""Where the arm may be: the tool inside one box, the arm's bodies clear of the keep-out boxes and of each other.
 
-Distances are signed, m: positive where it is allowed to be, negative where it is not.
+Distances are signed, m: positive where it is allowed to be, negative where it is not. Bodies are capsules
+(`kinematics.capsules`); they keep `cartesian.clearance` from keep-out boxes and from each other, and a distance is what
+is left beyond it. A body that no joint moves, the base, is not compared with boxes. Where an end of one stays in its
+place, as the upper arm's in the shoulder, and is nearer to a box than the clearance, the rest may come as near.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import hypot, sqrt
+from functools import lru_cache
+from math import dist, hypot, sqrt
 from typing import Final, NamedTuple, Protocol
 
-from kinematics.model import ArmModel
-from kinematics.pose import Pose
+from kinematics.capsules import Placed, between_axes, capsules, distance, from_box, outside, point_at, self_pairs
+from kinematics.forward import frames
+from kinematics.model import JOINTS, ArmModel, Capsule
+from kinematics.pose import Pose, Vector
 from rtcp.motion.limits import Corners
 
-ELBOW, WRIST, TOOL = 2, 4, 6
-"""Places in `frames` of the points that are watched: the origins of frames 3 and 5, and the tool."""
-POINTS = (TOOL, WRIST, ELBOW)
+TOOL: Final = 6
+"""Place of the tool in `frames`."""
 INNER_BOX: Final = -1
 """Number of the box that the tool stays inside; the keep-out boxes are numbered from 0."""
+ITSELF: Final = 1000
+"""Number of the first pair of the arm's own bodies."""
+_FAR: Final = 1e9
+"""m, where there is nothing."""
+_FIXED_M: Final = 0.005
+"""So much nearer to a box than its end that stays in its place a body may come: that end leaves it no room."""
+_NO_SHARE: Final = 1e-6
+_SAME_M: Final = 1e-9
 
 
 class Boxes(Protocol):
@@ -30,38 +43,37 @@ class Boxes(Protocol):
 
     @property
     def keep_out(self) -> tuple[Corners, ...]:
-        """Tool, wrist and elbow stay outside them."""
+        """The arm's bodies stay outside them."""
         ...
 
 
 class Clearance(NamedTuple):
-    """The nearest boundary: how far (m, signed), of which box, from which point; the way out of it, a unit vector."""
+    """How far a point of the arm is from something, m, signed.
+
+    `zone`: number of the box or pair. The point is at `place`, m, and moves with `link`; `normal` is its way out, a
+    unit vector. What it comes near to moves with the link `other`; 0: it does not move.
+    """
 
     distance: float
-    box: int
-    point: int
-    normal: tuple[float, float, float]
+    zone: int
+    link: int
+    other: int
+    place: Vector
+    normal: Vector
 
 
 class Gap(NamedTuple):
-    """One of the points that are watched beside one of the boxes: signed distance (m), which, and the point's place."""
+    """A pair of bodies, a body and a keep-out box, or the tool and its box: signed distance (m), number, first body.
+
+    Where the farthest point of the arm may move by some way, the distance changes by `share` of it at most; where that
+    point bends from its chord by something, what the gap is of bends by `bend` of it.
+    """
 
     distance: float
-    box: int
-    point: int
-    corners: Corners
-    place: tuple[float, float, float]
-
-
-def outside(x: float, y: float, z: float, box: Corners) -> float:
-    """Return how far a point is outside a box; negative: how deep inside."""
-    a, b, c, d, e, f = box
-    dx = a - x if a - x > x - d else x - d
-    dy = b - y if b - y > y - e else y - e
-    dz = c - z if c - z > z - f else z - f
-    if dx <= 0.0 and dy <= 0.0 and dz <= 0.0:
-        return max(dx, dy, dz)
-    return hypot(dx if dx > 0.0 else 0.0, dy if dy > 0.0 else 0.0, dz if dz > 0.0 else 0.0)
+    zone: int
+    body: int
+    share: float
+    bend: float
 
 
 def inside(x: float, y: float, z: float, box: Corners) -> float:
@@ -71,95 +83,303 @@ def inside(x: float, y: float, z: float, box: Corners) -> float:
 
 
 class Zones:
-    """The boxes of an arm.
+    """The boxes of an arm, and the arm itself.
 
     Args:
         model: the geometry.
         boxes: read every time.
+        clearance: what bodies keep from boxes and from each other, m.
     """
 
-    def __init__(self, model: ArmModel, boxes: Boxes) -> None:
+    def __init__(self, model: ArmModel, boxes: Boxes, clearance: float) -> None:
         self.model = model
         self._boxes = boxes
-        self.reach = _reaches(model)
-        """For each joint how far from its axis the farthest watched point can be, m."""
+        self._clearance = clearance
+        geometry = _geometry(model)
+        self._pairs, self._shares, self._fixed = geometry.pairs, geometry.shares, geometry.fixed
+        self._pair_shares, self._all_shares = geometry.pair_shares, geometry.all_shares
+        self.reach, self.pair_reach = geometry.reach, geometry.pair_reach
+        self.before, self.after = Placed(geometry.bodies), Placed(geometry.bodies)
+        """The bodies at the two ends of a piece of the way."""
+        self._moving = [which for which, body in enumerate(geometry.bodies) if body.link]
+        self._whole = [1.0] * (len(geometry.bodies) + len(self._pairs))
 
     @property
     def any(self) -> bool:
-        """Whether there is a box at all."""
-        return self._boxes.box is not None or bool(self._boxes.keep_out)
+        """Whether there is anything to come near to."""
+        return self._boxes.box is not None or bool(self._boxes.keep_out) or bool(self._pairs)
+
+    def links(self, zone: int) -> tuple[int, int]:
+        """Return the links of a pair of the arm's own bodies, the inner one first."""
+        i, j = self._pairs[zone - ITSELF]
+        one, other = self.before.bodies[i].link, self.before.bodies[j].link
+        return (one, other) if one < other else (other, one)
 
     def distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
-        """Return the least signed distance for the frames of a configuration, and the number of its box."""
-        least, which = 1e9, INNER_BOX
-        boxes = self._boxes
-        (tx, ty, tz), (wx, wy, wz), (ex, ey, ez) = poses[TOOL][0], poses[WRIST][0], poses[ELBOW][0]
+        """Return the least signed distance for the frames of a configuration, and the number of its box or pair."""
+        least, which = self.box_distance(poses)
+        own, pair = self.own_distance(poses)
+        return (own, pair) if own < least else (least, which)
+
+    def box_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
+        """Return the least signed distance from the boxes, and the number of the box."""
+        return self._from_boxes(poses, self._whole)
+
+    def own_distance(self, poses: Sequence[Pose]) -> tuple[float, int]:
+        """Return the least signed distance of the arm's bodies from each other, and the number of the pair."""
+        return self._from_itself(poses, self._whole)
+
+    def room(self, poses: Sequence[Pose]) -> float:
+        """Return how far the farthest point of the arm may move before anything can touch, m."""
+        return min(self._from_boxes(poses, self._shares)[0], self._from_itself(poses, self._all_shares)[0])
+
+    def _kept(self, body: int, box: Corners) -> float:
+        """Return the distance that a body keeps from a box, m."""
+        least = self._clearance
+        for place in self._fixed[body]:
+            least = min(least, outside(*place, box) - self.before.radii[body] - _FIXED_M)
+        return least
+
+    def _from_boxes(self, poses: Sequence[Pose], shares: Sequence[float]) -> tuple[float, int]:
+        least, which = _FAR, INNER_BOX
+        boxes, placed = self._boxes, self.before
         if boxes.box is not None:
-            least = inside(tx, ty, tz, boxes.box)
-        for number, box in enumerate(boxes.keep_out):
-            found = min(outside(tx, ty, tz, box), outside(wx, wy, wz, box), outside(ex, ey, ez, box))
-            if found < least:
-                least, which = found, number
+            x, y, z = poses[TOOL][0]
+            least = inside(x, y, z, boxes.box)
+        if boxes.keep_out:
+            placed.place(poses)
+            for number, box in enumerate(boxes.keep_out):
+                for body in self._moving:
+                    share, kept = shares[body], self._kept(body, box)
+                    found = (from_box(placed, body, box, least * share + kept)[0] - kept) / share
+                    if found < least:
+                        least, which = found, number
         return least, which
 
-    def clearances(self, poses: Sequence[Pose], within: float) -> list[Clearance]:
-        """Return every boundary nearer than `within` (m), the nearest first: for who slows down and slides."""
-        found: list[Clearance] = []
-        boxes = self._boxes
-        if boxes.box is not None:
-            position = poses[TOOL][0]
-            for axis in range(3):
-                for distance, sign in (
-                    (position[axis] - boxes.box[axis], 1.0),
-                    (boxes.box[axis + 3] - position[axis], -1.0),
-                ):
-                    if distance < within:
-                        found.append(Clearance(distance, INNER_BOX, TOOL, _unit(axis, sign)))
-        for number, box in enumerate(boxes.keep_out):
-            for point in POINTS:
-                x, y, z = poses[point][0]
-                distance = outside(x, y, z, box)
-                if distance < within:
-                    found.append(Clearance(distance, number, point, _way_out(x, y, z, box)))
-        found.sort(key=lambda clearance: clearance.distance)
-        return found
+    def _from_itself(self, poses: Sequence[Pose], shares: Sequence[float]) -> tuple[float, int]:
+        least, which = _FAR, ITSELF
+        placed = self.before
+        if self._pairs:
+            placed.place(poses)
+            for number, pair in enumerate(self._pairs):
+                found = (distance(placed, placed, (pair,))[0] - self._clearance) / shares[number]
+                if found < least:
+                    least, which = found, ITSELF + number
+        return least, which
 
-    def gaps(self, poses: Sequence[Pose], within: float) -> list[Gap]:
-        """Return every pair of a point and a box that are nearer than `within`, m."""
-        boxes = self._boxes
+    def gaps(self, poses: Sequence[Pose], within: float, pairs_within: float) -> list[Gap]:
+        """Return what could touch where the arm moves by `within`, and pairs by `pairs_within`, m; places `before`."""
+        boxes, placed, clearance, shares = self._boxes, self.before, self._clearance, self._shares
+        placed.place(poses)
         found = []
         if boxes.box is not None:
             x, y, z = poses[TOOL][0]
-            distance = inside(x, y, z, boxes.box)
-            if distance <= within:
-                found.append(Gap(distance, INNER_BOX, TOOL, boxes.box, (x, y, z)))
+            apart = inside(x, y, z, boxes.box)
+            if apart <= within:
+                found.append(Gap(apart, INNER_BOX, TOOL, 1.0, 1.0))
         for number, box in enumerate(boxes.keep_out):
-            for point in POINTS:
-                x, y, z = poses[point][0]
-                distance = outside(x, y, z, box)
-                if distance <= within:
-                    found.append(Gap(distance, number, point, box, (x, y, z)))
+            for body in self._moving:
+                share, kept = shares[body], self._kept(body, box)
+                apart = from_box(placed, body, box, share * within + kept)[0] - kept
+                if apart <= share * within:
+                    found.append(Gap(apart, number, body, share, share))
+        for number, (i, j) in enumerate(self._pairs):
+            share = self._pair_shares[number]
+            apart = distance(placed, placed, ((i, j),))[0] - clearance
+            if apart <= share * pairs_within:
+                found.append(Gap(apart, ITSELF + number, i, share, shares[i] + shares[j]))
+        return found
+
+    def remeasure(self, gap: Gap, poses: Sequence[Pose]) -> float:
+        """Return the distance (m) of a gap at `poses`, where the bodies `after` are."""
+        boxes, placed = self._boxes, self.after
+        if gap.zone == INNER_BOX:
+            assert boxes.box is not None
+            return inside(*poses[TOOL][0], boxes.box)
+        if gap.zone < ITSELF:
+            box = boxes.keep_out[gap.zone]
+            return from_box(placed, gap.body, box)[0] - self._kept(gap.body, box)
+        return distance(placed, placed, (self._pairs[gap.zone - ITSELF],))[0] - self._clearance
+
+    def parted(self, gap: Gap, margin: float) -> bool:
+        """Return whether a plane lies between what a gap is of, on both ends of a piece: `before` and `after`.
+
+        What goes straight from one end to the other stays on its side.
+
+        Args:
+            gap: of a body and a box, or of two bodies.
+            margin: what is to be left, beyond radius and clearance, m.
+        """
+        one, before, after = 6 * gap.body, self.before.axes, self.after.axes
+        margin += self.thickness(gap)
+        other = -1
+        if gap.zone >= ITSELF:
+            j = self._pairs[gap.zone - ITSELF][1]
+            other = 6 * j
+        for placed in (self.before, self.after):
+            if other < 0:
+                box = self._boxes.keep_out[gap.zone]
+                x, y, z = _way_out(point_at(placed.axes, one, from_box(placed, gap.body, box)[1]), box)
+                far = max(x * box[0], x * box[3]) + max(y * box[1], y * box[4]) + max(z * box[2], z * box[5])
+            else:
+                x, y, z = _apart(placed.axes, one, other)[2]
+                far = max(_greatest(before, other, x, y, z), _greatest(after, other, x, y, z))
+            near = -max(_greatest(before, one, -x, -y, -z), _greatest(after, one, -x, -y, -z))
+            if near - far >= margin:
+                return True
+        return False
+
+    def thickness(self, gap: Gap) -> float:
+        """Return how far from each other the axes of two bodies, or an axis and a box, are where the gap is 0, m."""
+        radius = self.before.radii[gap.body]
+        if gap.zone < ITSELF:
+            return radius + self._kept(gap.body, self._boxes.keep_out[gap.zone])
+        return radius + self.before.radii[self._pairs[gap.zone - ITSELF][1]] + self._clearance
+
+    def swap(self) -> None:
+        """Let what is `after` be `before`."""
+        self.before, self.after = self.after, self.before
+
+    def clearances(self, poses: Sequence[Pose], within: float) -> list[Clearance]:
+        """Return every boundary nearer than `within` (m), the nearest first: for who slows down and slides.
+
+        Of what moves less than the farthest point of the arm, the nearer ones: as `room` counts.
+        A body beside a box has one at its nearest point and one at each end: a turn brings these nearer.
+        """
+        found: list[Clearance] = []
+        boxes, placed, clearance = self._boxes, self.before, self._clearance
+        placed.place(poses)
+        if boxes.box is not None:
+            position = poses[TOOL][0]
+            for axis in range(3):
+                for apart, sign in (
+                    (position[axis] - boxes.box[axis], 1.0),
+                    (boxes.box[axis + 3] - position[axis], -1.0),
+                ):
+                    if apart < within:
+                        found.append(Clearance(apart, INNER_BOX, TOOL, 0, position, _unit(axis, sign)))
+        for number, box in enumerate(boxes.keep_out):
+            for body in self._moving:
+                near, kept = self._shares[body] * within, self._kept(body, box)
+                apart, part = from_box(placed, body, box, near + kept)
+                if apart - kept < near:
+                    beyond = placed.radii[body] + kept
+                    for at in sorted({part, 0.0, 1.0}):
+                        place = point_at(placed.axes, 6 * body, at)
+                        apart = outside(*place, box) - beyond
+                        if apart < near:
+                            link = placed.bodies[body].link
+                            found.append(Clearance(apart, number, link, 0, place, _way_out(place, box)))
+        for number, (i, j) in enumerate(self._pairs):
+            if distance(placed, placed, ((i, j),))[0] - clearance < self._all_shares[number] * within:
+                beyond = placed.radii[i] + placed.radii[j] + clearance
+                # Of the outer body, which moves against the inner one.
+                apart, place, normal = _apart(placed.axes, 6 * j, 6 * i)
+                links = placed.bodies[j].link, placed.bodies[i].link
+                found.append(Clearance(apart - beyond, ITSELF + number, *links, place, normal))
+        found.sort(key=lambda clearance: clearance.distance)
         return found
 
 
-def _reaches(model: ArmModel) -> list[float]:
-    """Lengths along a joint's own axis do not count; the reach of an outer joint is never the longer one."""
-    reach = sqrt(sum(component * component for component in model.tool.position))
-    reaches = []
-    for row in reversed(model.rows):
-        reaches.append(reach)
-        reach += abs(row.d) + abs(row.a)
-    reaches.reverse()
-    return reaches
+class _Geometry(NamedTuple):
+    """What a model says of its bodies, once for all.
+
+    `pairs` may collide, the inner body first. `reach`: how far from each joint's axis the farthest point of a body's
+    axis, or the tool, can be, m. `pair_reach`: by how much a joint changes the distance of a pair at most, m/rad.
+    `shares`: what part of `reach` the points of each body have at most; `pair_shares`: of `pair_reach`, each pair;
+    `all_shares`: of `reach`, each pair. `fixed`: the ends of each body that no joint moves, where they are, m.
+    """
+
+    bodies: tuple[Capsule, ...]
+    pairs: tuple[tuple[int, int], ...]
+    reach: list[float]
+    pair_reach: list[float]
+    shares: list[float]
+    pair_shares: list[float]
+    all_shares: list[float]
+    fixed: list[list[Vector]]
 
 
-def _unit(axis: int, sign: float) -> tuple[float, float, float]:
+@lru_cache(maxsize=8)
+def _geometry(model: ArmModel) -> _Geometry:
+    bodies = capsules(model)
+    pairs = tuple((i, j) if bodies[i].link < bodies[j].link else (j, i) for i, j in self_pairs(model))
+    lengths = [hypot(row.a, row.d) for row in model.rows]
+    reaches = [_reach(lengths, body.link, max(hypot(*body.start), hypot(*body.end))) for body in bodies]
+    tool = _reach(lengths, JOINTS, hypot(*model.tool.position))
+    reach = [max(of_joint) for of_joint in zip(tool, *reaches, strict=True)]
+    swept = [_swept(model, lengths, bodies[i], bodies[j].link, reaches[j]) for i, j in pairs]
+    pair_reach = [max(of_joint) for of_joint in zip([0.0] * JOINTS, *swept, strict=True)]
+    shares = [_share(one, reach) for one in reaches]
+    pair_shares, all_shares = ([_share(one, whole) for one in swept] for whole in (pair_reach, reach))
+    return _Geometry(bodies, pairs, reach, pair_reach, shares, pair_shares, all_shares, _fixed(model, bodies))
+
+
+def _fixed(model: ArmModel, bodies: Sequence[Capsule]) -> list[list[Vector]]:
+    """Return the ends of each body that are in one place in configurations without any symmetry."""
+    placed, places = Placed(bodies), []
+    for q in ((0.3, -0.7, 1.1, 0.5, -0.9, 0.2), (-1.2, 0.4, -0.6, 1.7, 0.8, -2.1), (2.2, 1.3, 0.4, -0.8, 1.9, 0.7)):
+        placed.place(frames(model, q))
+        places.append([[point_at(placed.axes, 6 * which, end) for end in (0.0, 1.0)] for which in range(len(bodies))])
+    one, other, third = places
+    return [
+        [a for a, b, c in zip(*ends, strict=True) if max(dist(a, b), dist(a, c)) < _SAME_M]
+        for ends in zip(one, other, third, strict=True)
+    ]
+
+
+def _reach(lengths: Sequence[float], link: int, beyond: float) -> list[float]:
+    """Return how far from each joint's axis a point can be that is `beyond` (m) off the origin of a link's frame."""
+    return [sum(lengths[joint + 1 : link]) + beyond if joint < link else 0.0 for joint in range(JOINTS)]
+
+
+def _swept(model: ArmModel, lengths: Sequence[float], inner: Capsule, link: int, reach: Sequence[float]) -> list[float]:
+    """Return by how much each joint changes the distance of a body from an outer one, of a link and a reach, m/rad.
+
+    Turning the outer one about a joint's axis is turning the inner one back: the one that is nearer to the axis counts.
+    """
+    sine, cosine, a, d, _ = model.constants[inner.link]
+    ends = (inner.start, inner.end)
+    swept = [0.0] * JOINTS
+    for joint in range(inner.link, link):
+        if joint == inner.link:  # its axis is fixed in the inner link
+            near = max([hypot(x - a, cosine * y + sine * z) for x, y, z in ends])
+        else:
+            near = max([hypot(x - a, y + sine * d, z - cosine * d) for x, y, z in ends])
+            near += sum(lengths[inner.link + 1 : joint + 1])
+        swept[joint] = min(near, reach[joint])
+    return swept
+
+
+def _share(part: Sequence[float], whole: Sequence[float]) -> float:
+    """Return the greatest part of something that has it of each joint; a little where it has none: to divide by it."""
+    return max([_NO_SHARE, *[a / b for a, b in zip(part, whole, strict=True) if b > 0.0]])
+
+
+def _apart(axes: Sequence[float], one: int, other: int) -> tuple[float, Vector, Vector]:
+    """Return the distance of two axes, m, the nearest point of the one, and the unit vector to it from the other."""
+    square, s, t = between_axes(axes, one, axes, other)
+    place, (x, y, z) = point_at(axes, one, s), point_at(axes, other, t)
+    apart = sqrt(square)
+    if apart == 0.0:
+        return 0.0, place, (0.0, 0.0, 1.0)
+    return apart, place, ((place[0] - x) / apart, (place[1] - y) / apart, (place[2] - z) / apart)
+
+
+def _greatest(axes: Sequence[float], at: int, x: float, y: float, z: float) -> float:
+    """Return how far along (x, y, z) the farther end of an axis is, m."""
+    start = x * axes[at] + y * axes[at + 1] + z * axes[at + 2]
+    along = x * axes[at + 3] + y * axes[at + 4] + z * axes[at + 5]
+    return start + along if along > 0.0 else start
+
+
+def _unit(axis: int, sign: float) -> Vector:
     x, y, z = (sign if axis == at else 0.0 for at in range(3))
     return x, y, z
 
 
-def _way_out(x: float, y: float, z: float, box: Corners) -> tuple[float, float, float]:
-    a, b, c, d, e, f = box
+def _way_out(place: Vector, box: Corners) -> Vector:
+    (x, y, z), (a, b, c, d, e, f) = place, box
     gaps = [(a - x if x < a else d - x if x > d else 0.0) for x, a, d in ((x, a, d), (y, b, e), (z, c, f))]
     length = hypot(*gaps)
     if length > 0.0:

@@ -46,11 +46,14 @@ async def build(view: View) -> None:
                 row(body, *cells)
         if status is not None:
             dc, wkc = status.raw["dc"], status.raw["wkc"]
-            locked = "locked" if dc["locked"] else "not locked"
+            clocks = ""
+            if dc is not None:
+                clocks = (
+                    f"Distributed clocks {'locked' if dc['locked'] else 'not locked'}, offset "
+                    f"{dc['offset_ns'] / 1e3:.1f} us, filtered {dc['filtered_ns'] / 1e3:.1f} us. "
+                )
             clock.text = (
-                f"Working counter {wkc['actual']} of {wkc['expected']}. Distributed clocks {locked}, offset "
-                f"{dc['offset_ns'] / 1e3:.1f} us, filtered {dc['filtered_ns'] / 1e3:.1f} us. "
-                f"Cycles skipped: {status.raw['missed']}."
+                f"Working counter {wkc['actual']} of {wkc['expected']}. {clocks}Cycles skipped: {status.raw['missed']}."
             )
         else:
             clock.text = view.live.problem
@@ -68,8 +71,10 @@ async def build(view: View) -> None:
 
     read_messages()
     ui.timer(0.5, read_messages)
-    _objects(view)
-    await _faults(view)
+    status = view.live.status
+    if status is None or status.raw["bus_kind"] == "ethercat":
+        _objects(view)
+        await _faults(view)
 
 
 def _cells(slave: dict[str, Any]) -> list[str]:

@@ -26,6 +26,8 @@ def build(view: View) -> None:
         config = field("Configuration (file)", _default(), list="configurations")
         mode = choice("Mode", (_CONFIGURED, *MODES, *DRIVE_MODES), _CONFIGURED)
         cycle = number("Cycle, us (empty: as configured)", min="1")
+    if (cell := view.live.partners.cell) is not None:
+        text("p", f"Start begins with the file of the cell {cell.name}, {cell.source}, and not with the configuration.")
     with ui.element("datalist").props("id=configurations"):
         for path in sorted(default_config().parent.glob("*.yaml")):
             ui.element("option").props["value"] = str(path)
@@ -53,7 +55,8 @@ def build(view: View) -> None:
         if not view.claim():
             return
         said.text = ""
-        arguments = where()
+        cell = view.live.partners.cell
+        arguments = where() if cell is None else ["--bus", bus.value, "--cell", str(cell.source)]
         if mode.value != _CONFIGURED:
             arguments += ["--mode", mode.value]
         if cycle.value.strip():

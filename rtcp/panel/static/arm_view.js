@@ -3,6 +3,7 @@
 import { THREE, OrbitControls } from "nicegui-scene";
 
 const TRACE = 600, TRACE_S = 10, SEEN = "rtcp-camera";
+const GHOST = { color: "#2f9e44", opacity: 0.35 }, PARTNER = { color: "#adb5bd" };
 const NORMAL = new THREE.Color("#4a6da7"), NEAR = new THREE.Color("#e8590c");
 
 function place(object, { xyz, rpy }) {
@@ -11,7 +12,8 @@ function place(object, { xyz, rpy }) {
 }
 
 class Chain {
-  constructor(scene, links, ghost) {
+  constructor(scene, links, look = {}) { // look: a color and opacity of all links
+    const { color, opacity = 1 } = look;
     this.joints = [];
     this.links = new Map();
     this.materials = [];
@@ -23,8 +25,8 @@ class Chain {
       this.links.set(link.name, turning);
       if (link.joint >= 0) this.joints[link.joint] = [turning, new THREE.Vector3(...link.axis)];
       for (const visual of link.visuals) {
-        const material = new THREE.MeshPhongMaterial({ color: ghost ? "#2f9e44" : visual.drawn ? "#868e96" : "#4a6da7",
-          transparent: ghost, opacity: ghost ? 0.35 : 1, depthWrite: !ghost });
+        const material = new THREE.MeshPhongMaterial({ color: color ?? (visual.drawn ? "#868e96" : "#4a6da7"),
+          transparent: opacity < 1, opacity, depthWrite: look !== GHOST });
         const mesh = new THREE.Mesh(shape(visual), material);
         const holder = new THREE.Group();
         place(holder, visual);
@@ -43,6 +45,39 @@ class Chain {
     this.root.updateWorldMatrix(true, true);
     return this.tool.getWorldPosition(new THREE.Vector3());
   }
+}
+
+class Partner { // another arm of the cell, at its base, with its name over it
+  constructor(scene, { name, position, rpy, links }) {
+    this.name = name;
+    this.place = new THREE.Group();
+    this.place.position.set(...position);
+    this.place.rotation.set(...rpy, "XYZ"); // R = Rx Ry Rz
+    this.place.visible = false;
+    this.chain = new Chain(this.place, links, PARTNER);
+    this.place.add(sign(name));
+    scene.add(this.place);
+  }
+  show(q) {
+    this.place.visible = Boolean(q);
+    return q && [this.name, this.chain.toolAt(q).toArray().map((one) => +one.toFixed(4))];
+  }
+}
+
+function sign(text) {
+  const canvas = document.createElement("canvas"), brush = canvas.getContext("2d"), font = "bold 40px sans-serif";
+  brush.font = font;
+  canvas.width = brush.measureText(text).width + 24;
+  canvas.height = 56;
+  brush.fillStyle = "#343a40";
+  brush.fillRect(0, 0, canvas.width, canvas.height);
+  brush.font = font;
+  brush.fillStyle = "#fff";
+  brush.fillText(text, 12, 42);
+  const made = new THREE.Sprite(new THREE.SpriteMaterial({ map: new THREE.CanvasTexture(canvas) }));
+  made.scale.set(0.1 * canvas.width / canvas.height, 0.1, 1);
+  made.position.set(0, 0, -0.08);
+  return made;
 }
 
 function shape({ kind, size }) {
@@ -64,7 +99,7 @@ function line(color, count) {
 export default {
   template: `<div class="arm-view" role="group" aria-label="The arm in space"><canvas tabindex="0" aria-label="Arrows turn the view, + and - zoom" @keydown="keys"></canvas>
     <p v-if="problem" class="arm-problem">{{ problem }}</p></div>`,
-  props: { links: Array },
+  props: { links: Array, partners: Array },
   data() { return { problem: "" }; },
   mounted() {
     const scene = (this.scene = new THREE.Scene());
@@ -81,10 +116,11 @@ export default {
     const grid = new THREE.GridHelper(2, 20, "#868e96", "#adb5bd");
     grid.rotateX(Math.PI / 2);
     scene.add(grid, new THREE.AxesHelper(0.2));
-    this.arm = new Chain(scene, this.links, false);
-    this.ghost = new Chain(scene, this.links, true);
+    this.arm = new Chain(scene, this.links);
+    this.ghost = new Chain(scene, this.links, GHOST);
     this.ghost.root.visible = false;
-    scene.add((this.boxes = new THREE.Group()));
+    this.others = this.partners.map((partner) => new Partner(scene, partner));
+    scene.add((this.boxes = new THREE.Group()), (this.rods = new THREE.Group()));
     this.trace = line("#d6336c", TRACE);
     this.path = line("#2f9e44", 400);
     scene.add(this.trace, this.path);
@@ -115,6 +151,10 @@ export default {
         if (!state.mine) this.path.geometry.setDrawRange(0, 0);
       }
       if (!this.plan) this.aim(state.goal);
+      const places = this.others.map((one) => one.show(state.partners?.[one.name]?.q)).filter(Boolean);
+      const around = JSON.stringify(Object.fromEntries(places));
+      if (around !== this.$el.dataset.partners) { this.$el.dataset.partners = around; this.draw(); }
+      this.drawRod(state.rod ?? []);
       if (!state.joints && this.points?.length) { this.points = []; this.trace.geometry.setDrawRange(0, 0); this.drawBoxes({ box: null, keep_out: {} }); this.draw(); }
       if (!state.joints || !this.$el.clientWidth) return;
       this.arm.set(state.joints.actual_position);
@@ -131,6 +171,19 @@ export default {
       // Drawn only where something has changed: an arm at rest costs its viewers nothing.
       this.drawn = [this.points?.map(([at]) => at), this.$el.dataset.boxes, state.joints.actual_position.map((q) => q.toFixed(4)), state.goal].join();
       if (this.plan || this.drawn !== before) this.draw();
+    },
+    drawRod(curves) { // the rod along its bend, as it is planned: the last curve is the wanted one
+      const drawn = JSON.stringify(curves);
+      if (drawn === (this.$el.dataset.rod ?? "[]")) return;
+      this.$el.dataset.rod = drawn;
+      for (const one of this.rods.children) { one.geometry.dispose(); one.material.dispose(); }
+      this.rods.clear();
+      curves.forEach((points, at) => {
+        const geometry = new THREE.BufferGeometry().setFromPoints(points.map((one) => new THREE.Vector3(...one)));
+        const opacity = at + 1 === curves.length ? 1 : 0.35;
+        this.rods.add(new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: GHOST.color, transparent: true, opacity })));
+      });
+      this.draw();
     },
     trail(tool) {
       const now = performance.now() / 1000, points = this.trace.geometry.attributes.position;

@@ -64,16 +64,17 @@ window.rtcp = (() => {
     }
     const joints = state.joints;
     for (const element of document.querySelectorAll("[data-live]")) {
-      const [name, index] = element.dataset.live.split(".");
+      const [name, ...path] = element.dataset.live.split("."), index = path[0];
       let value = connected ? state[name] : undefined;
       if (joints && name in joints) value = joints[name][index];
       else if (name === "error" && joints) value = joints.commanded_position[index] - joints.actual_position[index];
       else if (name === "drive" && state.statuswords) value = drive(state.statuswords[index]);
-      else if (Array.isArray(value)) value = value[index];
-      if (!connected) value = name === "state" ? "no connection" : undefined;
+      else for (const key of path) value = value?.[key];
+      const isState = element.dataset.live.endsWith("state");
+      if (!connected) value = isState ? "no connection" : undefined;
       const digits = element.dataset.digits;
       put(element, value === undefined || value === null || value === "" ? "–" : digits ? value.toFixed(digits) : String(value));
-      if (name === "state") element.dataset.state = String(value);
+      if (isState) element.dataset.state = String(value);
     }
     for (const element of document.querySelectorAll("[data-bar]")) {
       const [name, index] = element.dataset.bar.split(".");
@@ -90,6 +91,10 @@ window.rtcp = (() => {
       const fits = connected && element.dataset.when.split(" ").includes(state.state);
       if (element.disabled === fits) { element.disabled = !fits; element.ariaDisabled = String(!fits); }
     }
+    const toCell = document.querySelector('#menu [data-path="/cell"]');
+    if (toCell) toCell.hidden = !state.partners;
+    const toProcesses = document.querySelector('#menu [data-path="/processes"]');
+    if (toProcesses) toProcesses.hidden = !state.processes;
     const note = document.getElementById("operator");
     if (note) put(note, state.mine ? "You operate the arm" : state.operator ? `${state.operator} operates the arm` : "Nobody operates the arm");
     const lost = document.getElementById("lost"), old = document.getElementById("old");

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from rtcp.ros.simple_message.messages import Joints, Status
+from rtcp.fieldbus.simple_message.messages import Joints, Status
 
 
 class Point(NamedTuple):

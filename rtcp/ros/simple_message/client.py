@@ -10,8 +10,8 @@ import logging
 from collections import deque
 from collections.abc import Callable
 
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder, FrameError
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
+from rtcp.fieldbus.simple_message.messages import (
     JOINTS,
     ByteOrder,
     CommType,
@@ -123,10 +123,14 @@ class MotionClient(_Connection):
         host: name or address.
         port: of the controller.
         order: its byte order, in which the client speaks first.
+        joints: of all its arms; 12 for two.
     """
 
-    def __init__(self, host: str, port: int = MOTION_PORT, order: ByteOrder = ByteOrder.LITTLE) -> None:
+    def __init__(
+        self, host: str, port: int = MOTION_PORT, order: ByteOrder = ByteOrder.LITTLE, joints: int = JOINTS
+    ) -> None:
         super().__init__(host, port, order)
+        self._joints = joints
         self._speaks = order
         self._pending: deque[asyncio.Future[Frame]] = deque()
         """Requests in the order in which their replies come."""
@@ -154,7 +158,7 @@ class MotionClient(_Connection):
 
     async def stop(self) -> bool:
         """Stop the robot; return whether the controller says that it does. Errors as of `request`."""
-        stop = JointTrajPt(SpecialSequence.STOP_TRAJECTORY, (0.0,) * JOINTS, 0.0, 0.0)
+        stop = JointTrajPt(SpecialSequence.STOP_TRAJECTORY, (0.0,) * self._joints, 0.0, 0.0)
         return (await self.request(stop)).reply_code is ReplyCode.SUCCESS
 
     def _write(self, frame: Frame) -> None:

@@ -7,8 +7,8 @@ import logging
 from collections.abc import Callable, Coroutine, Sequence
 
 from rtcp.api import RtcpError
+from rtcp.fieldbus.simple_message.messages import Joints
 from rtcp.ros.simple_message.arm import Arm, OpenTrajectory, Point
-from rtcp.ros.simple_message.messages import Joints
 from rtcp.ros.simple_message.sequence import (
     BUFFER_POINTS,
     Append,

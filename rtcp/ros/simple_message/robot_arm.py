@@ -7,8 +7,8 @@ from collections.abc import Awaitable, Mapping, Sequence
 from typing import Any
 
 import rtcp
+from rtcp.fieldbus.simple_message.messages import Joints, RobotMode, Status, TriState
 from rtcp.ros.simple_message.arm import ArmState, Point
-from rtcp.ros.simple_message.messages import Joints, RobotMode, Status, TriState
 
 _RECONNECT_S = 1.0
 _WATCH_S = 0.1

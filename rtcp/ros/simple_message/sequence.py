@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TypeAlias
 
-from rtcp.ros.simple_message.arm import ArmState, Point
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.messages import (
     JointPoint,
     JointPosition,
     Joints,
@@ -25,6 +24,7 @@ from rtcp.ros.simple_message.messages import (
     TriState,
     ValidFields,
 )
+from rtcp.ros.simple_message.arm import ArmState, Point
 
 BUFFER_POINTS = 4096
 """Points that wait to be executed."""

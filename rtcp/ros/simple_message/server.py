@@ -17,11 +17,8 @@ from dataclasses import dataclass
 from types import TracebackType
 
 from rtcp import __version__
-from rtcp.ros.held_up import HeldUp
-from rtcp.ros.simple_message.arm import Arm, ArmState
-from rtcp.ros.simple_message.execution import MotionExecutor
-from rtcp.ros.simple_message.framing import Frame, FrameDecoder, FrameError
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.framing import Frame, FrameDecoder, FrameError
+from rtcp.fieldbus.simple_message.messages import (
     JOINTS,
     ByteOrder,
     CommType,
@@ -40,6 +37,9 @@ from rtcp.ros.simple_message.messages import (
     ValidFields,
     Version,
 )
+from rtcp.ros.held_up import HeldUp
+from rtcp.ros.simple_message.arm import Arm, ArmState
+from rtcp.ros.simple_message.execution import MotionExecutor
 from rtcp.ros.simple_message.sequence import Halt, PointIgnored, PointRefused, PointSequence
 
 MOTION_PORT = 11000

@@ -33,7 +33,7 @@ from rtcp.ipc.observer import BlackboardError
 from rtcp.ipc.recording import RecordingError, versions
 from rtcp.ipc.session import SessionError
 from rtcp.launch.launcher import StartOptions
-from rtcp.virtual.faults.control import SegmentAway, SegmentRefused
+from rtcp.virtual.request_socket import RequestRefused, ServerAway
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +46,7 @@ Source = float | str | None
 
 
 _FAILURES = (
-    RecordingError, SegmentAway, SegmentRefused, SessionError, BlackboardError, psutil.Error, RuntimeError,
+    RecordingError, ServerAway, RequestRefused, SessionError, BlackboardError, psutil.Error, RuntimeError,
 )  # fmt: skip
 """What a platform that ends meanwhile, or a fit without a solution, may raise."""
 
@@ -194,7 +194,7 @@ class Setup:
         options = StartOptions(config=self.config, bus=self.bus, mode="csp", cycle_us=cycle_us)
         with self.start(options), Robot(f"rtcp experiment (pid {os.getpid()})") as robot:
             until = time.monotonic() + LOCK_TIMEOUT_S
-            while not robot.status().raw["dc"]["locked"]:
+            while (clocks := robot.status().raw["dc"]) is not None and not clocks["locked"]:
                 if time.monotonic() > until:
                     raise ExperimentFailed(f"the clocks have not locked within {LOCK_TIMEOUT_S:g} s")
                 time.sleep(0.05)

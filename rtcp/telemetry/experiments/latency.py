@@ -23,20 +23,28 @@ import numpy.typing as npt
 from scipy.optimize import curve_fit
 
 from rtcp.api import Robot, State
+from rtcp.config.buses import ControllerBus
 from rtcp.ipc import jsonrpc
 from rtcp.ipc.observer import Observer
-from rtcp.ipc.runtime_directory import blackboard_file, control_socket, runtime_directory
+from rtcp.ipc.runtime_directory import blackboard_file, control_socket, irc5_control, runtime_directory
 from rtcp.telemetry.experiments.experiment import SPEED_RAD_S, Experiment, ExperimentFailed, Row, Setup
 from rtcp.telemetry.reading import Recorded, read
+from rtcp.virtual.request_socket import RequestClient
 
 Array = npt.NDArray[np.float64]
 Send = Callable[[Sequence[float]], bool]
 """Sends joint positions, rad; returns whether it did."""
 
 AMPLITUDE_RAD, PERIOD_S = pi / 16, 2.0
-SOURCE_MS = 455.0
+_SOURCE_MS: Mapping[str, float | str] = {"ethercat": 455.0, "rapid": 455.0, "egm": "8 to 20"}
+"""Of each kind of bus. That of EGM the thesis quotes; it measured RAPID."""
+_REPORTED_MS = "-5, -1, 12"
+"""By how much reported positions were behind an accelerometer, in three runs by RAPID."""
+_FASTER = 1.05
+"""A stream may be this much faster than the cycle."""
 AIM_CYCLES = 3.0
 _JOINT = 0
+_POLL_S = 0.2
 _UNDER_WAY = 4
 """Commands that wait for their answers."""
 _REFUSED = 10
@@ -140,6 +148,34 @@ def _by_socket(robot: Robot) -> Iterator[Send]:
         answers.join()
 
 
+@contextmanager
+def _accelerometer(setup: Setup) -> Iterator[list[tuple[float, float]]]:
+    """Yield a list that has the acceleration of the flange along y over the time of CLOCK_MONOTONIC afterwards.
+
+    Joint 1 moves the flange along y, near its zero. Only the virtual robot controller has an accelerometer.
+    """
+    felt: list[tuple[float, float]] = []
+    if not (setup.is_virtual and isinstance(setup.arm.bus, ControllerBus)):
+        yield felt
+        return
+    ended = threading.Event()
+
+    def poll(client: RequestClient) -> None:
+        while not ended.wait(_POLL_S):
+            for samples in client.ask({"do": "accelerometer"}).values():
+                felt.extend((stamp, y) for stamp, _, y, _ in samples)
+
+    with RequestClient(irc5_control(runtime_directory()), server="virtual IRC5") as client:
+        client.ask({"do": "accelerometer"})  # what was before
+        polling = threading.Thread(target=poll, args=(client,), daemon=True)
+        polling.start()
+        try:
+            yield felt
+        finally:
+            ended.set()
+            polling.join()
+
+
 WAYS: Mapping[str, Callable[[Robot], contextlib.AbstractContextManager[Send]]] = {
     "Python API": _by_api,
     "socket": _by_socket,
@@ -173,12 +209,15 @@ class LatencyExperiment(Experiment):
         if share < 1.0:
             setup.note(f"the sine has {share:.2f} of its amplitude: the limits of {limits.name} allow no more")
         rows: list[Row] = []
+        fastest = _FASTER * 1e6 / setup.arm.cycle.period_us
         with setup.platform() as robot:
             for way in WAYS:
                 for rate in self._rates_hz:
-                    if way == "socket" and rate > _MOST_BY_SOCKET_HZ:
-                        continue  # each command is a line of JSON, and answered
+                    if rate > fastest or (way == "socket" and rate > _MOST_BY_SOCKET_HZ):
+                        continue  # by the socket each command is a line of JSON, and answered
                     rows += self._stream(setup, robot, way, rate, share * AMPLITUDE_RAD)
+            if isinstance(setup.arm.bus, ControllerBus):
+                return rows  # the rest is the platform's own, and the same on every bus
             rows += self._parts(setup, robot)
             rows += self._to_frame(robot)
             rows += self._by_ros(setup, robot)
@@ -192,7 +231,7 @@ class LatencyExperiment(Experiment):
         times: list[float] = []
         values: list[float] = []
         with setup.recording(robot, f"recording-{name}", ("*_position",)) as path:
-            with WAYS[way](robot) as send:
+            with WAYS[way](robot) as send, _accelerometer(setup) as felt:
                 begun, number = time.monotonic(), 0
                 while (now := time.monotonic() - begun) < self._periods * PERIOD_S:
                     q = base[_JOINT] + sign * amplitude * (1.0 - cos(tau * now / PERIOD_S))
@@ -217,15 +256,28 @@ class LatencyExperiment(Experiment):
         wire, _ = behind(sines["sent"], command)
         cycles = wire / recorded.period_s
         aim = (0.0, AIM_CYCLES) if rate >= 1000.0 else ()
+        source = _SOURCE_MS.get(setup.arm.bus.kind) if rate == 30.0 else None
         self._drive_us = 1e6 * _behind_each(*series["sent"], *series["actual"], first, last)
         self._draw(setup, name, label, {one: (t - begun, y) for one, (t, y) in series.items()})
+        of_robot = []
+        if felt:
+            t, y = np.array(felt).T
+            inside = (t >= first) & (t <= last)
+            flange = fit_sine(t[inside], -y[inside], PERIOD_S, 0.5 * (first + last))
+            lag, lag_error = behind(sines["actual"], flange)
+            reported = _REPORTED_MS if setup.arm.bus.kind == "rapid" else None
+            of_robot = [
+                Row(f"{label}: reported behind the accelerometer", "ms", 1e3 * lag, reported),
+                Row(f"{label}: at most its standard error", "ms", 1e3 * lag_error),
+            ]
         setup.report(
             f"{label}: {1e3 * latency:.2f} +- {1e3 * error:.2f} ms to the motion, {cycles:.1f} cycles to the wire"
         )
         return [
             Row(f"{label}: rate", "Hz", (len(times) - 1) / (times[-1] - times[0]), least=0.95 * rate),
-            Row(f"{label}: latency to the motion", "ms", 1e3 * latency, SOURCE_MS if rate == 30.0 else None),
+            Row(f"{label}: latency to the motion", "ms", 1e3 * latency, source),
             Row(f"{label}: its standard error", "ms", 1e3 * error),
+            *of_robot,
             Row(f"{label}: command to the wire", "cycles", cycles, None, *aim),
             Row(f"{label}: sent to actual", "ms", 1e3 * behind(sines["actual"], sines["sent"])[0]),
             Row(f"{label}: amplitude, actual / command", "", sines["actual"].amplitude / command.amplitude),

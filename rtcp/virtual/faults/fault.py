@@ -17,6 +17,7 @@ from typing import Annotated, Any, ClassVar, TypeVar
 from annotated_types import Ge, Gt, Le
 
 from rtcp.config.document import Finding
+from rtcp.virtual.request_socket import RequestRefused
 from rtcp.virtual.segment import Segment
 from rtcp.virtual.slave import Slave
 
@@ -41,7 +42,7 @@ Send = Callable[[bytes], object]
 _T = TypeVar("_T")
 
 
-class FaultRefused(Exception):
+class FaultRefused(RequestRefused):
     """This segment cannot have this fault: a sentence."""
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Gt, Le
 
-from rtcp.virtual.device import DeviceModel
+from rtcp.virtual.device import DeviceModel, FreezableInputs
 from rtcp.virtual.distributed_clock import Clock, SyncGenerator
 from rtcp.virtual.faults.fault import (
     Cable,
@@ -303,14 +303,16 @@ class DriveErrorFault(DeviceFault):
 
 @dataclass(frozen=True)
 class InputsFrozen(DeviceFault):
-    """Inputs and counter of an IO box keep their value, as if its processor hung; frames are answered as ever."""
+    """Inputs and counters of a box or meter keep their value, as if its processor hung; frames are answered as ever."""
 
     name = "input_frozen"
     slave: Position
 
     def begin(self, devices: Sequence[DeviceModel]) -> End:
         """Freeze the inputs."""
-        box = _device_at(devices, self.slave, DiewuIoBox, "IO box")
+        box = devices[place_of(devices, self.slave)]
+        if not isinstance(box, FreezableInputs):
+            raise FaultRefused(f"slave {self.slave} ({box.identity.name}) is no IO box")
 
         def thaw(_: int) -> None:
             box.freezes -= 1

@@ -14,6 +14,7 @@ from rtcp.config.numbers import Name, NotNegative, Positive
 from rtcp.config.validation import Checker, rule
 
 MOST_UNITS = 4
+PositionDelay = Annotated[float, Ge(-0.01), Le(1.0)]
 
 
 @dataclass(frozen=True)
@@ -85,6 +86,34 @@ class UnitConfig:
 
 
 @dataclass(frozen=True)
+class RapidConfig:
+    """RAPID streaming: what `abb/rapid` and the planner do. The defaults give the 455 ms of a sine at 30 Hz."""
+
+    bind: Name = "127.0.0.1"
+    """Address of the controller."""
+    motion_port: Annotated[int, Ge(0), Le(65535)] = 11000
+    """TCP port of the motion server; 0: a free one."""
+    state_port: Annotated[int, Ge(0), Le(65535)] = 11002
+    """TCP port of the state server; 0: a free one."""
+    queue_moves: Annotated[int, Ge(1), Le(100)] = 13
+    """Moves that RAPID is ahead of the motion; the next one waits for room, and its reply too."""
+    start_delay_s: NotNegative = 0.385
+    """Look-ahead of the first motion from rest, s; a full queue ends it earlier."""
+    zone_mm: Positive = 10.0
+    """Zone between points; half the distance of the points where that is less."""
+    ramp_s: Annotated[float, Ge(0.005), Le(10)] = 0.1
+    """Time from rest to the programmed speed, and of a stop, s (assumed); a shorter move has its own duration."""
+    accept_timeout_s: Positive = 0.5
+    """Time that a point waits for room before it is refused (WaitSyncTask's timeout), s."""
+    max_speed: Positive = 180.0
+    """A point that asks a joint for more is refused, degrees/s (MAX_SPEED of `abb/rapid`)."""
+    state_period_s: Positive = 0.01
+    """Period of the state messages, s."""
+    position_delay_s: tuple[PositionDelay, PositionDelay] = (-0.005, 0.012)
+    """Range of the delay of a reported position behind the arm, s: each has its own. The range was measured."""
+
+
+@dataclass(frozen=True)
 class Irc5Config:
     """A controller."""
 
@@ -95,6 +124,8 @@ class Irc5Config:
     emergency_stop_category: Literal[0, 1] = 0
     do_not_restart_after_motors_off: bool = False
     """ABB's default lets corrections go on after Motors On."""
+    rapid: RapidConfig | None = None
+    """RAPID streaming in the place of EGM; none: EGM."""
 
 
 @rule(UnitConfig)
@@ -117,6 +148,24 @@ def _unique(config: Irc5Config) -> Iterator[Finding]:
         for i, value in enumerate(values):
             if value in values[:i]:
                 yield ("units", i, key), f"found {value}, which units[{values.index(value)}] has; each needs its own"
+
+
+@rule(RapidConfig)
+def _delays(rapid: RapidConfig) -> Iterator[Finding]:
+    low, high = rapid.position_delay_s
+    if low > high:
+        yield ("position_delay_s",), f"found {low:g} before {high:g}, allowed is the lower one first"
+
+
+@rule(Irc5Config, "units", "rapid")
+def _alike(config: Irc5Config) -> Iterator[Finding]:
+    if config.rapid is None:
+        return
+    for i, unit in enumerate(config.units):
+        if unit.period_s != config.units[0].period_s:
+            yield ("units", i, "period_s"), "with rapid all units have the same"
+        if unit.external_joint is not None:
+            yield ("units", i, "external_joint"), "with rapid a unit has six joints"
 
 
 _IRC5 = Checker(Irc5Config)

@@ -9,8 +9,10 @@ from typing import Any
 from rtcp.config.document import shown
 from rtcp.virtual.irc5.config import Irc5Config, UnitConfig
 from rtcp.virtual.irc5.faults import SHARES, DatagramFaults
-from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit, RapidRefused
-from rtcp.virtual.irc5.panel import Enabling, Mode, Panel, PanelRefused, Stop
+from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit
+from rtcp.virtual.irc5.panel import Enabling, Mode, Panel, Stop
+from rtcp.virtual.irc5.streaming import STREAMING_FAULTS, RapidStreaming
+from rtcp.virtual.request_socket import RequestRefused, choose
 
 _LONGEST_DELAY = 250
 """Cycles that a datagram may be late: 1 s."""
@@ -25,28 +27,15 @@ _ONCE: dict[str, Callable[[MechanicalUnit], None]] = {
 }
 """Faults that happen and are over."""
 _FAULTS = (*_ONCE, "utilization", "silent", "late", *SHARES)
-_BUTTONS: dict[str, Callable[[Panel], None]] = {
-    "motors_on": Panel.press_motors_on,
-    "motors_off": Panel.switch_motors_off,
-}
-_SWITCHES: dict[str, tuple[str, type[Enum], Callable[[Panel, Any], None]]] = {
-    "mode": ("mode", Mode, Panel.select_mode),
-    "enabling": ("position", Enabling, Panel.hold_enabling),
-    "stop": ("circuit", Stop, Panel.open_circuit),
-    "release": ("circuit", Stop, Panel.close_circuit),
-}
-"""Request -> its key, the values that the key may have, and what does it."""
-
-
-class RequestRefused(Exception):
-    """What an operator asks for is not possible: a sentence."""
+_UNIT_FAULTS_OF_STREAMING = ("arm_lost", "rapid_stop", "mci_error", "collision")
+"""Those of a unit that exist without EGM too, and the loss of an arm."""
 
 
 class Unit:
     """A mechanical unit and its UDP connection."""
 
-    def __init__(self, config: UnitConfig, panel: Panel, resume_after_motors_off: bool) -> None:
-        self.mechanical = MechanicalUnit(config, panel, resume_after_motors_off)
+    def __init__(self, config: UnitConfig, panel: Panel, resume_after_motors_off: bool, uses_egm: bool) -> None:
+        self.mechanical = MechanicalUnit(config, panel, resume_after_motors_off, uses_egm)
         self.to_pc, self.from_pc = DatagramFaults(config.port), DatagramFaults(config.port + 1)
 
     def step(self, received: Iterable[bytes], clock_s: float) -> list[bytes]:
@@ -56,15 +45,7 @@ class Unit:
         sent = self.mechanical.step(clock_s)
         return self.to_pc.cycle(() if sent is None else (sent,))
 
-    def start_rapid(self, request: dict[str, Any]) -> None:
-        """Press Start."""
-        self.mechanical.start_rapid()
-
-    def stop_rapid(self, request: dict[str, Any]) -> None:
-        """Press Stop."""
-        self.mechanical.stop_rapid()
-
-    def clear(self, request: dict[str, Any]) -> None:
+    def clear(self) -> None:
         """End the faults that last."""
         self.to_pc.clear()
         self.from_pc.clear()
@@ -74,7 +55,7 @@ class Unit:
         """Let a fault happen or begin.
 
         Raises:
-            RequestRefused, RapidRefused: with a sentence.
+            RequestRefused: with a sentence.
         """
         kind, direction = request.get("fault"), request.get("direction", "to_pc")
         if not isinstance(kind, str) or kind not in _FAULTS:
@@ -97,6 +78,7 @@ class Unit:
         """Return what the unit does, as plain values."""
         unit = self.mechanical
         return {
+            "remote": f"{unit.config.remote}:{unit.config.port}",
             "mci": unit.mci.name.lower(),
             "rapid_running": unit.rapid_running,
             "position_deg": list(unit.actual),
@@ -105,21 +87,6 @@ class Unit:
             "counts": dict(unit.counts),
             "events": list(unit.events),
         }
-
-
-_OF_UNITS: dict[str, tuple[tuple[str, ...], Callable[[Unit, dict[str, Any]], None]]] = {
-    "start_rapid": (("unit",), Unit.start_rapid),
-    "stop_rapid": (("unit",), Unit.stop_rapid),
-    "clear": (("unit",), Unit.clear),
-    "fault": (("unit", "fault", "value", "direction"), Unit.fault),
-}
-"""Request -> its keys, and what does it; without `unit` it concerns all units."""
-_KEYS: dict[str, tuple[str, ...]] = (
-    {"status": ()}
-    | dict.fromkeys(_BUTTONS, ())
-    | {verb: (switch[0],) for verb, switch in _SWITCHES.items()}
-    | {verb: keys for verb, (keys, _) in _OF_UNITS.items()}
-)
 
 
 class Controller:
@@ -133,7 +100,11 @@ class Controller:
         """
         self.panel = Panel(Mode(config.mode), config.emergency_stop_category)
         resume = not config.do_not_restart_after_motors_off
-        self.units = {unit.name: Unit(unit, self.panel, resume) for unit in config.units}
+        self.units = {unit.name: Unit(unit, self.panel, resume, config.rapid is None) for unit in config.units}
+        self.streaming: RapidStreaming | None = None
+        if config.rapid is not None:
+            units = {name: unit.mechanical for name, unit in self.units.items()}
+            self.streaming = RapidStreaming(units, self.panel, config.rapid)
         if config.autostart and self.panel.mode is Mode.AUTO:
             self.panel.press_motors_on()
             for unit in self.units.values():
@@ -145,35 +116,52 @@ class Controller:
         Raises:
             RequestRefused: with a sentence.
         """
-        verb = request.get("do")
-        if not isinstance(verb, str) or verb not in _KEYS:
-            raise RequestRefused(f"do: found {shown(verb)}, allowed is one of {', '.join(_KEYS)}")
-        for key in request:
-            if key != "do" and key not in _KEYS[verb]:
-                raise RequestRefused(f"{key}: {verb} has no such key; allowed are {', '.join(('do', *_KEYS[verb]))}")
-        try:
-            if verb in _BUTTONS:
-                _BUTTONS[verb](self.panel)
-            elif verb in _SWITCHES:
-                key, kind, switch = _SWITCHES[verb]
-                switch(self.panel, _choice(kind, request, key))
-            elif verb in _OF_UNITS:
-                for unit in self._named(request.get("unit")):
-                    _OF_UNITS[verb][1](unit, request)
-            else:
-                return self._status()
-        except (PanelRefused, RapidRefused) as error:
-            raise RequestRefused(str(error)) from error
-        return None
+        return choose(_VERBS, dict(request))(self, request)
 
-    def _named(self, name: object) -> list[Unit]:
+    def named(self, name: object) -> list[Unit]:
+        """Return the unit of this name, None: all.
+
+        Raises:
+            RequestRefused: there is none.
+        """
         if name is None:
             return list(self.units.values())
         if not isinstance(name, str) or name not in self.units:
             raise RequestRefused(f"unit: found {shown(name)}, allowed is one of {', '.join(self.units)}")
         return [self.units[name]]
 
-    def _status(self) -> dict[str, Any]:
+    def clear(self, request: dict[str, Any]) -> None:
+        """End the faults that last.
+
+        Raises:
+            RequestRefused: there is no such unit.
+        """
+        if self.streaming is not None:
+            self.streaming.clear()
+        for unit in self.named(request.get("unit")):
+            unit.clear()
+
+    def fault(self, request: dict[str, Any]) -> None:
+        """Let a fault happen or begin.
+
+        Raises:
+            RequestRefused: with a sentence.
+        """
+        kind, streaming = request.get("fault"), self.streaming
+        if streaming is not None and kind in STREAMING_FAULTS:
+            streaming.faults.add(str(kind))
+            return
+        if streaming is not None and kind not in _UNIT_FAULTS_OF_STREAMING:
+            allowed = ", ".join((*STREAMING_FAULTS, *_UNIT_FAULTS_OF_STREAMING))
+            raise RequestRefused(f"fault: found {shown(kind)}, allowed with rapid is one of {allowed}")
+        for unit in self.named(request.get("unit")):
+            if streaming is not None and kind == "arm_lost":
+                streaming.lose(unit.mechanical.config.name)
+            else:
+                unit.fault(request)
+
+    def status(self) -> dict[str, Any]:
+        """Return what the controller and its units do, as plain values."""
         panel = self.panel
         return {
             "mode": panel.mode.value,
@@ -182,7 +170,7 @@ class Controller:
             "open": sorted(stop.value for stop in panel.open),
             "latched": panel.latched,
             "units": {name: unit.status() for name, unit in self.units.items()},
-        }
+        } | ({} if self.streaming is None else {"streaming": self.streaming.status()})
 
 
 def _number(request: dict[str, Any], most: float) -> float:
@@ -198,3 +186,45 @@ def _choice(kind: type[Enum], request: dict[str, Any], key: str) -> Enum:
         if choice.value == found:
             return choice
     raise RequestRefused(f"{key}: found {shown(found)}, allowed is one of {', '.join(c.value for c in kind)}")
+
+
+_Do = Callable[[Controller, dict[str, Any]], Any]
+
+
+def _press(button: Callable[[Panel], None]) -> _Do:
+    return lambda controller, _: button(controller.panel)
+
+
+def _turn(switch: Callable[[Panel, Any], None], key: str, kind: type[Enum]) -> _Do:
+    return lambda controller, request: switch(controller.panel, _choice(kind, request, key))
+
+
+def _each(do: Callable[[MechanicalUnit], None]) -> _Do:
+    def of_units(controller: Controller, request: dict[str, Any]) -> None:
+        for unit in controller.named(request.get("unit")):
+            do(unit.mechanical)
+
+    return of_units
+
+
+_VERBS: dict[str, tuple[tuple[str, ...], _Do]] = {
+    "status": ((), lambda controller, _: controller.status()),
+    "motors_on": ((), _press(Panel.press_motors_on)),
+    "motors_off": ((), _press(Panel.switch_motors_off)),
+    "mode": (("mode",), _turn(Panel.select_mode, "mode", Mode)),
+    "enabling": (("position",), _turn(Panel.hold_enabling, "position", Enabling)),
+    "stop": (("circuit",), _turn(Panel.open_circuit, "circuit", Stop)),
+    "release": (("circuit",), _turn(Panel.close_circuit, "circuit", Stop)),
+    "start_rapid": (("unit",), _each(MechanicalUnit.start_rapid)),
+    "stop_rapid": (("unit",), _each(MechanicalUnit.stop_rapid)),
+    "clear": (("unit",), Controller.clear),
+    "accelerometer": (
+        ("unit",),
+        lambda controller, request: {
+            unit.mechanical.config.name: unit.mechanical.accelerometer.take()
+            for unit in controller.named(request.get("unit"))
+        },
+    ),
+    "fault": (("unit", "fault", "value", "direction"), Controller.fault),
+}
+"""Request -> its keys, and what does it."""

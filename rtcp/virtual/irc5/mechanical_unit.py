@@ -10,8 +10,9 @@ from collections import Counter, deque
 from collections.abc import Sequence
 
 from rtcp.config.find import find_arm
-from rtcp.config.loader import load_kinematics
+from rtcp.config.loader import load_mechanics
 from rtcp.config.model import ConfigError
+from rtcp.virtual.irc5.accelerometer import Accelerometer
 from rtcp.virtual.irc5.config import UnitConfig
 from rtcp.virtual.irc5.control_law import ControlLaw
 from rtcp.virtual.irc5.geometry import Geometry
@@ -25,6 +26,7 @@ from rtcp.virtual.irc5.messages import (
     UnitState,
 )
 from rtcp.virtual.irc5.panel import STOPPING_TIME_S, Mode, Motors, Panel
+from rtcp.virtual.request_socket import RequestRefused
 
 HAND_SPEED = 250.0
 """Largest speed of the flange in Hand, mm/s (ISO 10218-1)."""
@@ -35,20 +37,22 @@ QUEUE = 64
 MOST_EVENTS = 50
 
 
-class RapidRefused(Exception):
+class RapidRefused(RequestRefused):
     """RAPID cannot be started now: a sentence."""
 
 
 class MechanicalUnit:
     """One arm of the controller. `receive` takes datagrams, `step` lets one period pass and returns what is sent."""
 
-    def __init__(self, config: UnitConfig, panel: Panel, resume_after_motors_off: bool = True) -> None:
-        """Build the unit at rest with RAPID stopped.
+    def __init__(
+        self, config: UnitConfig, panel: Panel, resume_after_motors_off: bool = True, uses_egm: bool = True
+    ) -> None:
+        """Build the unit at rest with RAPID stopped; without EGM it is moved by `follow`.
 
         Raises:
             ConfigError: the arm's file does not exist or is wrong, or the initial position is outside its ranges.
         """
-        arm = load_kinematics(find_arm(config.arm))
+        arm = load_mechanics(find_arm(config.arm))
         self.config = config
         self.ranges = [(math.degrees(limit.lower), math.degrees(limit.upper)) for limit in arm.limits]
         self.speed_limits = [math.degrees(limit.velocity) for limit in arm.limits]
@@ -73,7 +77,9 @@ class MechanicalUnit:
         """%, a fault; None: as computed."""
         self._panel = panel
         self._resumes = resume_after_motors_off
-        self._geometry = Geometry([(row.alpha, row.a, row.d, row.offset) for row in arm.rows])
+        self._uses_egm = uses_egm
+        self.geometry = Geometry([(row.alpha, row.a, row.d, row.offset) for row in arm.rows])
+        self.accelerometer = Accelerometer(self.geometry, config.period_s)
         self._codec = EgmCodec(config.robotware)
         self._law = ControlLaw(config.egm, self.speed_limits)
         self._queue: deque[bytes] = deque()
@@ -117,7 +123,9 @@ class MechanicalUnit:
             return
         self.rapid_running = True
         self._suspended = False
-        if self._in_instruction:
+        if not self._uses_egm:
+            self.mci, self.collision = MciState.STOPPED, False
+        elif self._in_instruction:
             self._run()
         else:
             self._begin_session()
@@ -188,12 +196,19 @@ class MechanicalUnit:
             return None
         return self._codec.encode(self._state(clock_s))
 
+    def follow(self, position: Sequence[float], dt: float) -> None:
+        """Let one period pass in which RAPID's move instructions plan this position, degrees."""
+        self._follow_motors()
+        self.speeds = [(now - then) / dt for now, then in zip(position, self.planned, strict=True)]
+        self.planned = list(position)
+        self._servo.append(tuple(self.planned))
+
     def _state(self, clock_s: float) -> UnitState:
         seqno = self._seqno
         self._seqno = (seqno + 1) & 0xFFFFFFFF
         planned = tuple(self.planned)
         return UnitState(
-            seqno, clock_s, self.actual, planned, self._geometry.flange(self.actual), self._geometry.flange(planned),
+            seqno, clock_s, self.actual, planned, self.geometry.flange(self.actual), self.geometry.flange(planned),
             self._panel.motors is not Motors.OFF, self.rapid_running, self.mci, self._converged_s > 0.0,
             self._law.utilization if self.utilization_override is None else self.utilization_override,
             self._move_index, self.collision,
@@ -254,8 +269,10 @@ class MechanicalUnit:
 
     def _leave(self, state: MciState, time_s: float) -> None:
         """Leave MCI_RUNNING and come to rest within `time_s`."""
-        if self.mci is MciState.RUNNING:
+        if self.mci is MciState.RUNNING and self._reference is not None:
             self._stop_from, self._stop_left, self._stop_rate = self.speeds, 1.0, 1.0 / time_s
+        else:  # a stop under way goes on
+            self._stop_rate = max(self._stop_rate, self._stop_left / time_s)
         self.mci = state
         self._pause_s = 0.0
         self._law.utilization = 0.0
@@ -299,7 +316,7 @@ class MechanicalUnit:
 
     def _slowed_in_hand(self, speeds: list[float], dt: float) -> list[float]:
         after = [position + speed * dt for position, speed in zip(self.planned, speeds, strict=True)]
-        here, there = self._geometry.flange(self.planned).position, self._geometry.flange(after).position
+        here, there = self.geometry.flange(self.planned).position, self.geometry.flange(after).position
         size = math.dist(here, there) / dt
         scale = 1.0 if size <= HAND_SPEED else HAND_SPEED / size
         for speed in speeds[ROBOT_AXES:]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from rtcp.virtual.request_socket import RequestRefused
+
 
 class Mode(Enum):
     """Operating mode."""
@@ -59,7 +61,7 @@ STOPPING_TIME_S = {0: 0.15, 1: 0.4}
 """Time from full speed to rest by category, s (assumed; of an IRB 120 with its load some tenths of a second)."""
 
 
-class PanelRefused(Exception):
+class PanelRefused(RequestRefused):
     """The panel does not do this now: a sentence."""
 
 

@@ -1,26 +1,22 @@
-"""The controller's process: a UDP socket for each unit, each with its own period, and the operator's socket.
-
-The operator's socket is a Unix socket of packets as the virtual segment's: one JSON object each, answered by
-`{"ok": true, "result": ...}` or by `{"ok": false, "error": "a sentence"}`.
-"""
+"""The controller's process: sockets for each unit or for RAPID streaming, and the operator's socket."""
 
 from __future__ import annotations
 
-import json
-import os
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from rtcp.config.model import ConfigError
-from rtcp.virtual.faults.control import control_socket
 from rtcp.virtual.irc5.config import UnitConfig, load_irc5
-from rtcp.virtual.irc5.controller import Controller, RequestRefused, Unit
-from rtcp.virtual.server import StopRequest
+from rtcp.virtual.irc5.controller import Controller, Unit
+from rtcp.virtual.irc5.streaming_server import StreamingServer
+from rtcp.virtual.network import private_loopback
+from rtcp.virtual.request_socket import RequestSocket, control_socket
+from rtcp.virtual.server import StopRequest, request_prompt_scheduling
 
 DATAGRAM = 2048
 """Longest datagram that is read, bytes; EgmSensor has about 130."""
@@ -30,10 +26,20 @@ PHASE_S = 0.0011
 """From the first message of a unit to that of the next: units are not in step."""
 STALL_S = 0.1
 """A unit that is further behind, because the process was stopped, goes on from now without catching up."""
-LONGEST_REQUEST = 1024
-MOST_OPERATORS = 8
 
-Ready = Callable[[dict[str, Any]], None]
+Ready = Callable[[Controller, "str | None"], None]
+
+
+class Cyclic(Protocol):
+    """Sockets with a period of their own."""
+
+    period_s: float
+
+    def cycle(self, clock_s: float) -> None:
+        """Read, let time pass, send."""
+
+    def close(self) -> None:
+        """Close the sockets."""
 
 
 class UnitSocket:
@@ -57,9 +63,16 @@ class UnitSocket:
         # The kernel takes the sender's address from the route; a datagram before the first message has nowhere to go.
         self.socket.bind(("", 0))
 
+    def close(self) -> None:
+        """Close the socket."""
+        self.socket.close()
+
     def cycle(self, clock_s: float) -> None:
         """Read, let the unit step, send."""
-        for datagram in self._unit.step(self._received(), clock_s):
+        datagrams = self._unit.step(self._received(), clock_s)
+        unit = self._unit.mechanical
+        unit.accelerometer.sample(unit.actual, time.monotonic())
+        for datagram in datagrams:
             try:
                 self.socket.sendto(datagram, self._remote)
             except OSError:
@@ -79,61 +92,12 @@ class UnitSocket:
         return received
 
 
-class OperatorSocket:
-    """Answers at most one request of each operator in a look; nothing here waits."""
-
-    def __init__(self, listener: socket.socket, controller: Controller) -> None:
-        self._listener = listener
-        self._controller = controller
-        self._operators: list[socket.socket] = []
-
-    def close(self) -> None:
-        """Let all operators go."""
-        for operator in self._operators:
-            operator.close()
-
-    def look(self) -> None:
-        """Take a new operator, and answer requests."""
-        try:
-            operator, _ = self._listener.accept()
-        except OSError:
-            pass
-        else:
-            operator.setblocking(False)
-            self._operators.append(operator)
-            if len(self._operators) > MOST_OPERATORS:
-                self._operators.pop(0).close()
-        for operator in tuple(self._operators):
-            try:
-                packet = operator.recv(LONGEST_REQUEST)
-                if packet:
-                    operator.send(json.dumps(self._answer(packet)).encode(), socket.MSG_NOSIGNAL)
-            except BlockingIOError:
-                continue
-            except OSError:
-                packet = b""
-            if not packet:
-                self._operators.remove(operator)
-                operator.close()
-
-    def _answer(self, packet: bytes) -> dict[str, Any]:
-        try:
-            request = json.loads(packet)
-        except (ValueError, RecursionError):
-            request = None
-        if not isinstance(request, dict):
-            return {"ok": False, "error": "a request is one JSON object in UTF-8, and this is none"}
-        try:
-            return {"ok": True, "result": self._controller.request(request)}
-        except RequestRefused as refusal:
-            return {"ok": False, "error": str(refusal)}
-
-
 def serve(
-    controller: Controller, sockets: list[UnitSocket], operators: OperatorSocket | None, stop: StopRequest
+    controller: Controller, sockets: Sequence[Cyclic], operators: RequestSocket | None, stop: StopRequest
 ) -> None:
     """Run in real time until `stop` came."""
     last = time.monotonic()
+    since_1970 = time.time() - last
     due = [last + PHASE_S * i for i in range(len(sockets))]
     while not stop.came:
         i = min(range(len(due)), key=due.__getitem__)
@@ -142,7 +106,8 @@ def serve(
         now = time.monotonic()
         controller.panel.advance(now - last)
         last = now
-        sockets[i].cycle(time.time())
+        # The controller's own clock: exact periods, however late this process is.
+        sockets[i].cycle(due[i] + since_1970)
         due[i] += sockets[i].period_s
         if now - due[i] > STALL_S:
             due[i] = now
@@ -150,14 +115,15 @@ def serve(
             operators.look()
 
 
-def run(config_path: Path, ready: Ready, control_path: Path | None = None) -> None:
+def run(config_path: Path, ready: Ready, control_path: Path | None = None, private: bool = False) -> None:
     """Run a virtual IRC5 until SIGTERM or SIGINT.
 
-    `ready` is called once with "pid" and "units", the names. At `control_path` an operator works and faults can be
-    asked for.
+    `ready` is called once, with the network interface of the units or None for those of the caller. At `control_path`
+    an operator works and faults can be asked for. With `private` a PC reaches the units by joining this process's
+    namespaces (/proc/PID/ns/user and /proc/PID/ns/net).
 
     Raises:
-        ConfigError, ValueError: with sentences for the user.
+        ConfigError, ValueError, NetworkError: with sentences for the user.
     """
     config = load_irc5(config_path)
     controller = Controller(config)
@@ -167,10 +133,16 @@ def run(config_path: Path, ready: Ready, control_path: Path | None = None) -> No
     with ExitStack() as kept:
         operators = None
         if control_path is not None:
-            operators = OperatorSocket(kept.enter_context(control_socket(control_path)), controller)
+            operators = RequestSocket(kept.enter_context(control_socket(control_path)), controller.request)
             kept.callback(operators.close)
-        sockets = [UnitSocket(controller.units[unit.name], unit) for unit in config.units]
+        interface = private_loopback() if private else None
+        sockets: Sequence[Cyclic]
+        if controller.streaming is None:
+            sockets = [UnitSocket(controller.units[unit.name], unit) for unit in config.units]
+        else:
+            sockets = [StreamingServer(controller.streaming, config.units[0].period_s)]
         for each in sockets:
-            kept.enter_context(each.socket)
-        ready({"pid": os.getpid(), "units": list(controller.units)})
+            kept.callback(each.close)
+        request_prompt_scheduling()
+        ready(controller, interface)
         serve(controller, sockets, operators, stop)

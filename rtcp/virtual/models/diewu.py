@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import MappingProxyType
 
-from rtcp.virtual.device import DeviceModel, Option, number
+from rtcp.virtual.device import DeviceModel, FreezableInputs, Option, number
 from rtcp.virtual.objects import Access, DataType, Entry, ObjectDictionary, Value
 from rtcp.virtual.pdo import define_pdo_objects
 
@@ -14,7 +14,7 @@ RELEASED = 0x033F
 _U16, _I32 = DataType.UNSIGNED16, DataType.INTEGER32
 
 
-class DiewuIoBox(DeviceModel):
+class DiewuIoBox(DeviceModel, FreezableInputs):
     """The IO box.
 
     The outside world sets `inputs` (or one of them with `set_input`) and turns the encoder. The master may force inputs
@@ -43,8 +43,6 @@ class DiewuIoBox(DeviceModel):
         self._turned = 0.0
         self.broken: list[BrokenTerminals] = []
         """Input terminals that do not show their level, also where it is forced."""
-        self.freezes = 0
-        """Above 0: inputs and counter keep their values."""
         self._held_s = 0.0
         self._input_entry = number(objects, 0x6000, 1)
         self._counter_entry = number(objects, 0x6010, 1)

@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
-from rtcp.virtual.faults.control import LONGEST_REQUEST, MOST_CLIENTS, SegmentAway, SegmentRefused
 from rtcp.virtual.protocol import DatagramCommand
+from rtcp.virtual.request_socket import LONGEST_REQUEST, MOST_CLIENTS, RequestRefused, ServerAway
 from tests.virtual.faults.conftest import BeginSegment, Exchange, Running
 from tests.virtual.frames import Datagram, build, parse
 
@@ -192,7 +192,7 @@ def test_a_malformed_request_is_answered_with_a_sentence(
 
 
 def test_a_refusal_reaches_the_caller_as_its_sentence(segment: Running) -> None:
-    with segment.client() as client, pytest.raises(SegmentRefused, match="there is no cable behind slave 3"):
+    with segment.client() as client, pytest.raises(RequestRefused, match="there is no cable behind slave 3"):
         client.fault({"fault": "cable", "after": 3})
 
 
@@ -272,7 +272,7 @@ def test_a_socket_in_use_is_refused_in_a_sentence_and_left_alone(begin_segment: 
     _, said = second.communicate(timeout=20)
     assert second.returncode == 2
     assert said == (
-        f"the control socket {segment.control} is in use by a segment that runs: choose another path\n"
+        f"the control socket {segment.control} is in use by a process that runs: choose another path\n"
     )  # fmt: skip
     with segment.client() as client:
         assert client.faults() == []
@@ -300,14 +300,14 @@ def test_a_killed_segments_socket_is_replaced_and_a_stopped_ones_removed(
             assert client.faults() == []
             running.send_signal(end)
             running.wait(10)
-            with pytest.raises(SegmentAway, match="has gone"):
+            with pytest.raises(ServerAway, match="has gone"):
                 client.faults()
         assert path.exists() == (end == signal.SIGKILL)
 
 
 def test_where_there_is_no_segment_the_client_says_where_it_looked(tmp_path: Path) -> None:
     path = tmp_path / "segment.sock"
-    with pytest.raises(SegmentAway, match=f"no segment answers at {path}"):
+    with pytest.raises(ServerAway, match=f"no segment answers at {path}"):
         Running(None, path).client()  # type: ignore[arg-type]
 
 

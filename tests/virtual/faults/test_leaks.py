@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 
-from rtcp.virtual.faults.control import Control, GroundTruth, control_socket
+from rtcp.virtual.faults.control import Control, GroundTruth
 from rtcp.virtual.faults.fault import FaultRefused
 from rtcp.virtual.faults.registry import FaultRegistry, installed, load_script, parse
 from rtcp.virtual.protocol import DatagramCommand
+from rtcp.virtual.request_socket import control_socket
 from tests.malformed.line import ACK, OP, SAFE_OP, STATION, Line
 from tests.virtual.frames import Datagram, build
 
@@ -124,7 +125,8 @@ def left_by(play: Callable[[], object]) -> int:
 
 
 def test_every_kind_of_fault_is_tried_here() -> None:
-    assert set(KINDS) == set(installed())
+    # Those of the shape setter need its box: test_shape_setter.py.
+    assert set(KINDS) == set(installed()) - {"circuit", "contacts"}
 
 
 @pytest.mark.parametrize("name", KINDS)

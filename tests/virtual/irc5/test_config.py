@@ -56,3 +56,24 @@ def test_an_initial_position_outside_the_range_is_named(tmp_path: Path) -> None:
 
 def test_an_arm_that_is_not_there_is_named(tmp_path: Path) -> None:
     assert "irb_9000" in problems(tmp_path, "units:\n  - {name: A, port: 1, arm: irb_9000}\n")[0]
+
+
+@pytest.mark.parametrize(
+    ("unit", "rapid", "sentence"),
+    [
+        ("period_s: 0.008", "{}", "4: units[1].period_s: with rapid all units have the same"),
+        (
+            "external_joint: {min: 0, max: 1, velocity: 1}, initial_position: [0, 0, 0, 0, 0, 0, 0]",
+            "{}",
+            "4: units[1].external_joint: with rapid a unit has six joints",
+        ),
+        (
+            "robotware: 6",
+            "{position_delay_s: [0.02, 0.01]}",
+            "1: rapid.position_delay_s: found 0.02 before 0.01, allowed is the lower one first",
+        ),
+    ],
+)
+def test_what_rapid_streaming_cannot_do_is_named(tmp_path: Path, unit: str, rapid: str, sentence: str) -> None:
+    text = f"rapid: {rapid}\nunits:\n  - {{name: A, port: 1}}\n  - {{name: B, port: 2, {unit}}}\n"
+    assert problems(tmp_path, text) == [sentence]

@@ -8,8 +8,8 @@ import pytest
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
-from rtcp.virtual.irc5.controller import RequestRefused
 from rtcp.virtual.irc5.faults import DatagramFaults
+from rtcp.virtual.request_socket import RequestRefused
 from tests.virtual.irc5.wire import Pc, pc
 
 STILL = (0.0,) * 6
@@ -139,7 +139,7 @@ def test_a_collision_is_an_error_which_robotware_7_also_names(robotware: int, re
         ({"do": "stop"}, "circuit: found nothing, allowed is one of emergency, automatic, general, superior"),
         ({"do": "stop", "circuit": ["emergency"]}, "circuit: found a list"),
         ({"do": "mode", "mode": "manual"}, 'mode: found the text "manual", allowed is one of hand, auto'),
-        ({"do": "status", "unit": "ROB_1"}, "unit: status has no such key; allowed are do"),
+        ({"do": "status", "unit": "ROB_1"}, "unit: this key does not exist; allowed are do"),
         ({"do": "clear", "unit": "ROB_2"}, 'unit: found the text "ROB_2", allowed is one of ROB_1'),
         ({"do": "fault", "unit": "ROB_1"}, "fault: found nothing, allowed is one of seqno_restart, rapid_stop,"),
         ({"do": "fault", "fault": "lost", "value": 1.5}, "value: found 1.5, allowed is a number from 0 to 1"),

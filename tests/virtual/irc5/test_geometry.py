@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from kinematics.forward import forward
 from rtcp.config.find import find_arm
-from rtcp.config.loader import load_kinematics
+from rtcp.config.loader import load_mechanics
 from rtcp.virtual.irc5.geometry import Geometry
 
-ARM = load_kinematics(find_arm("abb_irb120"))
+ARM = load_mechanics(find_arm("abb_irb120"))
 GEOMETRY = Geometry([(row.alpha, row.a, row.d, row.offset) for row in ARM.rows])
 
 

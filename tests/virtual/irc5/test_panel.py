@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
-from rtcp.virtual.irc5.controller import RequestRefused
 from rtcp.virtual.irc5.mechanical_unit import HAND_SPEED
 from rtcp.virtual.irc5.panel import STOPPING_TIME_S
+from rtcp.virtual.request_socket import RequestRefused
 from tests.virtual.irc5.wire import PERIOD, Pc, pc
 
 SPEED = (20.0, 0, 0, 0, 0, 0)

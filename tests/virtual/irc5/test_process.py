@@ -19,11 +19,12 @@ import pytest
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
 from tests.virtual.irc5.wire import Robot, sensor
+from tests.virtual.test_segment_process import NOBODY, needs_nobody
 
 pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).parents[3]
-PEERS = Path(os.environ.get("RTCP_EGM_PEERS", "/tmp/egm-peers")) / "bin" / "python"
+PEERS = Path(os.environ.get("RTCP_EGM_PEERS", ROOT / ".venv-egm-peers")) / "bin" / "python"
 """Of an environment with abb-robot-client 0.4.0 and ABBRobotEGM 1.0.7: their packages cannot be in one process."""
 
 
@@ -46,19 +47,32 @@ def unit(name: str, port: int, *more: str) -> str:
 @contextmanager
 def irc5(folder: Path, *units: str) -> Iterator[socket.socket]:
     """A running controller; its operator's socket."""
+    with started(folder, *units) as (operator, _):
+        yield operator
+
+
+@contextmanager
+def started(
+    folder: Path, *units: str, options: tuple[str, ...] = (), user: int | None = None
+) -> Iterator[tuple[socket.socket, dict[str, Any]]]:
+    """A running controller: its operator's socket and its line when ready."""
     config, control = folder / "irc5.yaml", folder / "irc5.sock"
     config.write_text("units:\n" + "".join(units), encoding="utf-8")
     command = [sys.executable, "-m", "rtcp.virtual.irc5", "--config", str(config), "--control", str(control)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    process = subprocess.Popen(
+        [*command, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, user=user,
+        group=user, extra_groups=None if user is None else [],
+    )  # fmt: skip
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line, process.communicate()[1]
-        assert json.loads(line)["pid"] == process.pid
+        ready = json.loads(line)
+        assert ready["pid"] == process.pid
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as operator:
             operator.settimeout(10.0)
             operator.connect(str(control))
-            yield operator
+            yield operator, ready
         process.send_signal(signal.SIGTERM)
         assert process.communicate(timeout=20.0)[1] == ""
         assert process.returncode == 0
@@ -132,9 +146,8 @@ def test_the_operator_stops_and_an_unknown_request_is_answered_with_a_sentence(t
     with listening() as pc, irc5(tmp_path, unit("ROB_1", pc.getsockname()[1])) as operator:
         ask(operator, do="stop", circuit="emergency")
         assert ask(operator, do="status")["motors"] == "off"
-        for packet in (b"[]", b"\xff\xff", b"[" * 1000):
-            operator.send(packet)
-            assert json.loads(operator.recv(4096))["error"] == "a request is one JSON object in UTF-8, and this is none"
+        operator.send(b"[]")
+        assert json.loads(operator.recv(4096))["error"] == "found an empty list, allowed is an object with the key do"
 
 
 def test_datagrams_from_elsewhere_are_counted_and_dropped(tmp_path: Path) -> None:
@@ -157,6 +170,32 @@ def test_a_mistake_in_the_file_is_a_sentence_without_a_traceback(tmp_path: Path)
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 2
     assert done.stderr == f"{config}:2: units[0].dead_time_s: found 0.5, allowed is a number from 0.01 to 0.02\n"
+
+
+@pytest.mark.parametrize("user", [None, pytest.param(NOBODY, marks=needs_nobody)], ids=["caller", "nobody"])
+def test_a_private_controller_is_reached_by_joining_its_namespaces_and_not_from_the_host(
+    user: int | None, tmp_path: Path
+) -> None:
+    if user is not None:
+        if os.getuid() != 0:
+            pytest.skip("only root may start a process as another user")
+        for folder in (tmp_path, *tmp_path.parents[:2]):
+            folder.chmod(folder.stat().st_mode | 0o055)
+        os.chown(tmp_path, user, user)
+    with listening() as host:
+        port = host.getsockname()[1]
+        with started(tmp_path, unit("ROB_1", port), options=("--private",), user=user) as (_, ready):
+            assert (ready["interface"], ready["units"]) == ("lo", ["ROB_1"])
+            child = [sys.executable, str(Path(__file__).with_name("pc_child.py")), str(ready["pid"]), str(port), "5"]
+            done = subprocess.run(
+                child, capture_output=True, text=True, cwd=ROOT, check=False, user=user, group=user,
+                extra_groups=None if user is None else [],
+            )  # fmt: skip
+            assert done.stderr == ""
+            assert float(done.stdout) == pytest.approx(5.0, abs=0.1)
+        host.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            host.recv(1)
 
 
 @pytest.mark.skipif(not PEERS.exists(), reason="no environment with abb-robot-client and ABBRobotEGM (RTCP_EGM_PEERS)")

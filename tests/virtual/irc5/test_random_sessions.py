@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
 
-from rtcp.virtual.irc5.controller import RequestRefused
 from rtcp.virtual.irc5.panel import STOPPING_TIME_S, Motors
+from rtcp.virtual.request_socket import RequestRefused
 from tests.virtual.irc5.wire import PERIOD, pc
 
 CIRCUITS = ("emergency", "automatic", "general", "superior")

@@ -216,3 +216,10 @@ def test_datagrams_for_the_last_session_are_not_used_in_the_next() -> None:
     used = robot.unit.counts["used"]
     robot.wait(0.05)
     assert robot.unit.counts["used"] == used
+
+
+def test_a_stop_under_way_goes_on_when_no_data_come_in_the_next_session_either() -> None:
+    robot = pc()
+    robot.wait(0.5, [0.0] * 6, [20.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    robot.wait(0.2 + 0.5 + 5 * PERIOD)  # CommTimeout, then the default ramp time
+    assert robot.unit.speeds == [0.0] * 6

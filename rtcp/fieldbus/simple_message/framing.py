@@ -10,7 +10,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rtcp.ros.simple_message.messages import (
+from rtcp.fieldbus.simple_message.messages import (
     ByteOrder,
     CommType,
     Message,

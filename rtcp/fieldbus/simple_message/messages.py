@@ -12,6 +12,8 @@ from dataclasses import astuple, dataclass
 from enum import Enum, IntEnum, IntFlag
 from typing import ClassVar, TypeAlias
 
+MOST_JOINTS = 24
+"""Of JOINT_POSITION and JOINT_TRAJ_PT between two programs that agree on more: four arms of six."""
 JOINTS = 10
 """Joints of every message but `JointPoint`; those that an arm does not have are 0."""
 Joints: TypeAlias = tuple[float, ...]
@@ -157,12 +159,13 @@ class JointPosition:
 
     def pack(self, order: ByteOrder) -> bytes:
         """Return the body."""
-        return _pack(self.TYPE, order, "i10f", self.sequence, *_ten(self.TYPE, self.positions))
+        positions = _ten(self.TYPE, self.positions, MOST_JOINTS)
+        return _pack(self.TYPE, order, f"i{len(positions)}f", self.sequence, *positions)
 
     @classmethod
     def unpack(cls, body: bytes, order: ByteOrder) -> JointPosition:
-        """Read a body, with ten positions; raises MessageError."""
-        sequence, *positions = _unpack(cls.TYPE, order, "i10f", body)
+        """Read a body, with ten positions or more; raises MessageError."""
+        sequence, *positions = _unpack(cls.TYPE, order, f"i{_joints_in(len(body) - 4)}f", body)
         return cls(int(sequence), tuple(positions))
 
 
@@ -179,13 +182,15 @@ class JointTrajPt:
 
     def pack(self, order: ByteOrder) -> bytes:
         """Return the body."""
-        positions = _ten(self.TYPE, self.positions)
-        return _pack(self.TYPE, order, "i10fff", self.sequence, *positions, self.velocity, self.duration)
+        positions = _ten(self.TYPE, self.positions, MOST_JOINTS)
+        layout = f"i{len(positions)}fff"
+        return _pack(self.TYPE, order, layout, self.sequence, *positions, self.velocity, self.duration)
 
     @classmethod
     def unpack(cls, body: bytes, order: ByteOrder) -> JointTrajPt:
-        """Read a body, with ten positions; raises MessageError."""
-        sequence, *positions, velocity, duration = _unpack(cls.TYPE, order, "i10fff", body)
+        """Read a body, with ten positions or more; raises MessageError."""
+        layout = f"i{_joints_in(len(body) - 12)}fff"
+        sequence, *positions, velocity, duration = _unpack(cls.TYPE, order, layout, body)
         return cls(int(sequence), tuple(positions), velocity, duration)
 
 
@@ -349,9 +354,16 @@ def _unpack(kind: MessageType, order: ByteOrder, layout: str, body: bytes) -> tu
     return struct.unpack(order.value + layout, body)
 
 
-def _ten(kind: MessageType, values: Sequence[float]) -> Joints:
-    if len(values) > JOINTS:
-        raise MessageError(f"{kind.name}: {len(values)} joints; {JOINTS} fit, JOINT_POINT has room for more")
+def _joints_in(size: int) -> int:
+    """Return how many joints a body has whose positions take `size` bytes; ten where that cannot be."""
+    joints = size // 4
+    return joints if size % 4 == 0 and JOINTS <= joints <= MOST_JOINTS else JOINTS
+
+
+def _ten(kind: MessageType, values: Sequence[float], most: int = JOINTS) -> Joints:
+    """Return values filled up to ten."""
+    if len(values) > most:
+        raise MessageError(f"{kind.name}: {len(values)} joints; {most} fit, JOINT_POINT has room for more")
     return (*values, *[0.0] * (JOINTS - len(values)))
 
 

@@ -1,0 +1,96 @@
+MODULE stream_motion
+  ! The motion task of every arm (T_ROB1, T_ROB2...): the same source, the unit's index is found at run time.
+
+  ! A first point of a download within this distance is where the arm stands, degrees.
+  CONST num AT_START := 0.1;
+  ! MoveAbsJ takes the time of \T instead.
+  CONST speeddata MOVE_SPEED := v1000;
+
+  VAR num unit := 0;
+  VAR intnum stop_interrupt;
+  VAR bool stopped := FALSE;
+  VAR bool offered;
+  VAR num points;
+  VAR num duration;
+  VAR jointtarget target := [[0, 0, 0, 0, 0, 0], [9E+09, 9E+09, 9E+09, 9E+09, 9E+09, 9E+09]];
+
+  PROC main()
+    find_unit;
+    IDelete stop_interrupt;
+    CONNECT stop_interrupt WITH stop_requested;
+    IPers stop_number, stop_interrupt;
+    ! Here by ExitCycle after a stop. Started otherwise, the arm is not where the server counts from: it has to stop first.
+    IF stopped THEN
+      stop_done{unit} := stop_number;
+    ELSE
+      stop_done{unit} := -1;
+    ENDIF
+    stopped := FALSE;
+    WHILE TRUE DO
+      wait_for_offer;
+      IF offered THEN
+        IF points = 0 THEN
+          ! Returns when the queue has room, long before the arm is there.
+          MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, POINT_ZONE, tool0;
+        ELSE
+          move_path;
+        ENDIF
+      ENDIF
+    ENDWHILE
+  ERROR
+    TPWrite "Streaming of " + RobName() + " stopped, ERRNO " \Num:=ERRNO;
+    Stop;
+  ENDPROC
+
+  PROC find_unit()
+    unit := 0;
+    FOR u FROM 1 TO UNITS DO
+      IF UNIT_NAMES{u} = RobName() unit := u;
+    ENDFOR
+    IF unit = 0 THEN
+      TPWrite RobName() + " is not among the first UNITS of UNIT_NAMES in stream_shared.sys";
+      Stop;
+    ENDIF
+  ENDPROC
+
+  ! Between the two rendezvous the shared data is this task's to read. A timeout lets traps in, and is no error.
+  PROC wait_for_offer()
+    offered := FALSE;
+    WaitSyncTask point_offered, sync_tasks \TimeOut:=ACCEPT_TIMEOUT;
+    points := path_points;
+    duration := target_duration;
+    target.robax := targets{unit};
+    WaitSyncTask point_copied, sync_tasks \TimeOut:=COPY_TIMEOUT;
+    offered := TRUE;
+  ERROR
+    ! After COPY_TIMEOUT another task has not copied: no arm moves by this point.
+    IF ERRNO = ERR_WAITSYNCTASK RETURN;
+    RAISE;
+  ENDPROC
+
+  ! The path stays as it is until all arms were stopped: the server stops them before it collects the next.
+  PROC move_path()
+    VAR num at;
+    VAR jointtarget here;
+    here := CJointT();
+    FOR p FROM 1 TO points DO
+      at := (p - 1) * UNITS + unit;
+      target.robax := path{at};
+      duration := path_durations{p};
+      IF p = points THEN
+        MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, fine, tool0;
+      ELSEIF p > 1 OR NOT is_near(target.robax, here.robax, AT_START) THEN
+        MoveAbsJ target \NoEOffs, MOVE_SPEED \T:=duration, POINT_ZONE, tool0;
+      ENDIF
+    ENDFOR
+  ENDPROC
+
+  TRAP stop_requested
+    StopMove;
+    ClearPath;
+    StartMove;
+    stopped := TRUE;
+    ExitCycle;
+  ENDTRAP
+
+ENDMODULE

@@ -1,0 +1,384 @@
+"""A cell: several arms, commanded together (`docs/cell.md`). Each is a `Robot`; motions in step are the cell's."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from rtcp.api.results import Arrival, Status, result
+from rtcp.api.robot import Robot
+from rtcp.config.cell import CellConfig, Member
+from rtcp.ipc.errors import NotRunning, RtcpError
+from rtcp.ipc.runtime_directory import control_socket, runtime_directory
+from rtcp.ipc.session import SessionError, read_session
+
+if TYPE_CHECKING:
+    from rtcp.api.stream import Stream
+
+T = TypeVar("T")
+_LEAD_S, _LONGEST_LEAD_S = 0.25, 9.0
+"""From the commands of a motion in step to its beginning: every arm has checked it by then, and allows 10 s."""
+_LEAD_SHARE: Final = 3.0
+"""Of the time that planning took: checking takes about as long."""
+_SAYS_LESS = {"partner_stopped": 2, "partner_not_ready": 2, "partner_left": 1, "partner_silent": 1}
+"""Why an arm ends a motion in step on account of another, whose own reason says more: the greater, the less."""
+
+
+@dataclass(frozen=True)
+class StepPlan:
+    """A planned motion in step.
+
+    arms: points of each. duration_s: of all. brakes: times of the group's brakes, s, every `brake_step_s` of the path.
+    lead_s: how long after it was commanded it begins.
+    """
+
+    arms: Mapping[str, Sequence[Mapping[str, Any]]]
+    duration_s: float
+    brakes: Sequence[float]
+    brake_step_s: float
+    lead_s: float
+
+    @classmethod
+    def from_json(cls, found: Mapping[str, Any], asked_ns: int) -> StepPlan:
+        """Read the answer of the method `plan_in_step`, asked for at `asked_ns`, CLOCK_MONOTONIC."""
+        arms = {one["arm"]: one["points"] for one in found["arms"]}
+        took_s = 1e-9 * (time.monotonic_ns() - asked_ns)
+        lead_s = min(max(_LEAD_S, _LEAD_SHARE * took_s), _LONGEST_LEAD_S)
+        return cls(arms, found["duration_s"], found["brakes"], found["brake_step_s"], lead_s)
+
+    def fields_of(self, arm: str, motion: int) -> dict[str, Any]:
+        """Return the parameters of `run_in_step` for an arm; `motion`: when it was commanded, CLOCK_MONOTONIC, ns."""
+        return {
+            "points": [{key: value for key, value in one.items() if value is not None} for one in self.arms[arm]],
+            "partners": [other for other in self.arms if other != arm],
+            "motion": motion,
+            "start_ns": motion + round(self.lead_s * 1e9),
+            "brakes": list(self.brakes),
+            "brake_step_s": self.brake_step_s,
+        }
+
+
+def rod_file(cell: Path) -> Path:
+    """Return the file in the runtime directory of a cell with the curves of the rod that its arms are to bend."""
+    return cell / "rod.json"
+
+
+def find_cell(name: str = "", directory: Path | None = None) -> CellConfig:
+    """Return the cell whose arms run under a runtime directory, else that of the environment.
+
+    `name`: where there is more than one.
+
+    Raises:
+        NotRunning: there is none.
+        Refused: there are several, and none is named.
+    """
+    found = find_cells(name, directory)
+    if len(found) > 1:
+        listed = ", ".join(f"{cell.name} of {cell.source}" for cell in found)
+        raise RtcpError("refused", f"several cells run, {listed}: name one (`rtcp cell --cell NAME`), or stop one")
+    return found[0]
+
+
+def find_cells(name: str = "", directory: Path | None = None) -> list[CellConfig]:
+    """Return all cells, of a `name` where one is given, whose arms run under a runtime directory or the environment's.
+
+    Raises:
+        NotRunning: there is none.
+    """
+    root = runtime_directory("") if directory is None else directory
+    found: dict[int, CellConfig] = {}
+    for path in sorted(root.glob("*/session.json")):
+        with contextlib.suppress(SessionError):
+            cell = read_session(path.parent).cell
+            if cell is not None and name in ("", cell.name) and control_socket(path.parent).exists():
+                found[cell.digest] = cell
+    if found:
+        return list(found.values())
+    what = f"the cell {name}" if name else "a cell"
+    raise NotRunning("not running", f"no arm of {what} is running (runtime directory {root}): `rtcp cell start`")
+
+
+def cell_of_this_arm() -> tuple[CellConfig, Member] | None:
+    """Return the cell of the platform that this environment names, and its arm; None: it is in none.
+
+    While the platform itself does not run, its partners that do are asked.
+    """
+    own, root = runtime_directory().absolute(), runtime_directory("").absolute()
+    if own == root:
+        return None
+    others = (path.parent for path in sorted(root.glob("*/session.json")) if path.parent != own)
+    for directory in (own, *others):
+        if not control_socket(directory).exists():
+            continue
+        with contextlib.suppress(SessionError):
+            cell = read_session(directory).cell
+            member = None if cell is None else next((one for one in cell.members if one.directory == own), None)
+            if cell is not None and member is not None:
+                return cell, member
+            if directory == own:
+                return None
+    return None
+
+
+class CellStream:
+    """Setpoints of several arms in step: what ends the stream of one ends that of all.
+
+    Args:
+        streams: of the arms, by their names.
+    """
+
+    def __init__(self, streams: Mapping[str, Stream]) -> None:
+        self.streams = dict(streams)
+
+    def __enter__(self) -> CellStream:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def is_open(self) -> bool:
+        """Whether all arms follow it."""
+        return all(stream.is_open for stream in self.streams.values())
+
+    def send(
+        self,
+        q: Mapping[str, Sequence[float]],
+        velocity: Mapping[str, Sequence[float]] | None = None,
+        t: float | None = None,
+    ) -> None:
+        """Send a setpoint to every arm, with one time stamp.
+
+        Args:
+            q: rad, one a joint, by the names of all arms of the stream.
+            velocity: of the targets, rad/s; None: it is estimated.
+            t: time stamp, s, rising; None: now.
+
+        Raises:
+            as `Stream.send`; and Invalid where an arm is missing.
+        """
+        if q.keys() != self.streams.keys():
+            found, allowed = ", ".join(q), ", ".join(self.streams)
+            raise RtcpError("invalid", f"q: found the arms {found or 'none'}, allowed are all of {allowed}")
+        if velocity is not None and velocity.keys() != self.streams.keys():
+            found, allowed = ", ".join(velocity), ", ".join(self.streams)
+            raise RtcpError("invalid", f"velocity: found the arms {found or 'none'}, allowed are all of {allowed}")
+        stamp = time.monotonic_ns() * 1e-9 if t is None else t
+        for name, stream in self.streams.items():
+            stream.send(q[name], None if velocity is None else velocity[name], t=stamp)
+
+    def close(self) -> None:
+        """Bring all arms to rest and end the stream; a second time is harmless."""
+        for stream in self.streams.values():
+            stream.close()
+
+
+class Cell:
+    """The arms of a running cell. Closing it stops what it moves.
+
+    Args:
+        name: who commands, as others are told when they are refused; empty: this process.
+        cell: name of the cell; empty: the one that runs.
+        directory: the runtime directory that holds those of the arms; None: that of the environment.
+
+    Attributes:
+        arms: a `Robot` for each arm, by its name, in the order of the cell's file.
+        processes: a `Robot` for each platform of processes, by its name.
+
+    Raises:
+        NotRunning: an arm does not run.
+    """
+
+    def __init__(self, name: str = "", cell: str = "", directory: Path | None = None) -> None:
+        self.config = find_cell(cell, directory)
+        self._name = name
+        self.arms: dict[str, Robot] = {}
+        self.processes: dict[str, Robot] = {}
+        try:
+            for members, robots in ((self.config.arms, self.arms), (self.config.processes, self.processes)):
+                for one in members:
+                    robots[one.name] = Robot(name, control_socket(one.directory))
+        except RtcpError:
+            self.close()
+            raise
+
+    def __enter__(self) -> Cell:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all connections; a second time is harmless."""
+        for robot in self._members.values():
+            robot.close()
+
+    @property
+    def _members(self) -> dict[str, Robot]:
+        return self.arms | self.processes
+
+    # -- all arms -----------------------------------------------------------------------------------------------------
+
+    def status(self) -> dict[str, Status]:
+        """Return the status of each arm."""
+        return self._each(Robot.status)
+
+    def enable(self) -> None:
+        """Enable all arms; where one cannot be enabled, those that this call has enabled are disabled again."""
+        enabled: list[str] = []
+
+        def enable(name: str, robot: Robot) -> None:
+            robot.enable()
+            enabled.append(name)
+
+        try:
+            self._all(enable)
+        except RtcpError:
+            for name in enabled:
+                with contextlib.suppress(RtcpError):
+                    self._members[name].disable()
+            raise
+
+    def disable(self) -> None:
+        """Stop all arms and remove their torque. Needs no lease."""
+        self._apart(Robot.disable)
+
+    def halt(self) -> None:
+        """Stop every motion of every arm, whoever began it. Needs no lease; may be called from any thread."""
+        self._apart(Robot.halt)
+
+    def reset(self) -> None:
+        """Leave the faults of all arms."""
+        self._each(Robot.reset)
+
+    def stop(self) -> dict[str, tuple[str, ...]]:
+        """End the platforms of all arms; return what could not be left in order."""
+        return self._apart(Robot.stop)
+
+    # -- motions in step ----------------------------------------------------------------------------------------------
+
+    def move_joints(self, q: Mapping[str, Sequence[float]], speed: float | None = None) -> dict[str, Arrival]:
+        """Move joints of several arms in step: all begin and end together; return when all are there.
+
+        Args:
+            q: rad, base to tool, by the names of the arms.
+            speed: of the fastest joint of all, rad/s; None: the limits.
+
+        Raises:
+            Refused: a target outside the limits, the wrong state, an arm that does not run: then no arm moves.
+            Faulted: it ended before all arrived; all have stopped.
+        """
+        return self.run(self.plan([{"arm": name, "q": list(one)} for name, one in q.items()], speed))
+
+    def run_trajectory(self, points: Mapping[str, Sequence[Mapping[str, Any]]]) -> dict[str, Arrival]:
+        """Run trajectories of several arms in step: points as of `Robot.run_trajectory`, the first at time 0.
+
+        Raises:
+            as `move_joints`.
+        """
+        targets = [{"arm": name, "points": [dict(point) for point in some]} for name, some in points.items()]
+        return self.run(self.plan(targets))
+
+    def plan(self, targets: Sequence[Mapping[str, Any]], speed: float | None = None) -> StepPlan:
+        """Plan a motion in step and move nothing; targets with `arm` and `q` or `points`."""
+        robot, asked_ns = next(iter(self.arms.values())), time.monotonic_ns()
+        found = robot.command("plan_in_step", targets=[dict(one) for one in targets], speed=speed)
+        return StepPlan.from_json(found, asked_ns)
+
+    def run(self, plan: StepPlan) -> dict[str, Arrival]:
+        """Run a planned motion; return when all arms are there."""
+        motion = time.monotonic_ns()
+
+        def run(name: str, robot: Robot) -> Arrival:
+            return result(Arrival, robot.command("run_in_step", **plan.fields_of(name, motion)))
+
+        return self._all(run, plan.arms)
+
+    def open_stream(self, arms: Sequence[str] = ()) -> CellStream:
+        """Begin a stream of setpoints for several arms in step, all of them where none is named; leave it to end it.
+
+        Raises:
+            Refused: what would refuse any motion, or an arm that does not run.
+        """
+        from rtcp.api.stream import Stream  # here: numpy loads slowly, and a command has no use for it
+
+        names = list(arms) or list(self.arms)
+        if unknown := [name for name in names if name not in self.arms]:
+            allowed = ", ".join(self.arms)
+            raise RtcpError("invalid", f"arms: found {unknown[0]!r:.40}, allowed is a list of some of {allowed}")
+        motion = time.monotonic_ns()
+
+        def open_one(name: str, robot: Robot) -> Stream:
+            partners = [other for other in names if other != name]
+            return Stream.from_json(robot.command("open_stream", motion=motion, partners=partners))
+
+        opened: dict[str, Stream] = {}
+
+        def keep(name: str, robot: Robot) -> None:
+            opened[name] = open_one(name, robot)
+
+        try:
+            self._all(keep, dict.fromkeys(names))
+        except RtcpError:
+            for stream in opened.values():
+                stream.close()
+            raise
+        return CellStream({name: opened[name] for name in names})
+
+    # -- in parallel --------------------------------------------------------------------------------------------------
+
+    def _each(self, call: Callable[[Robot], T]) -> dict[str, T]:
+        return self._all(lambda name, robot: call(robot))
+
+    def _apart(self, call: Callable[[Robot], T]) -> dict[str, T]:
+        """Call a method of every arm over connections of their own: those of this cell may be waiting."""
+
+        def on_its_own(name: str, robot: Robot) -> T:
+            path = control_socket(self.config.member(name).directory)
+            with Robot(self._name, path) as another:
+                return call(another)
+
+        return self._all(on_its_own)
+
+    def _all(self, call: Callable[[str, Robot], T], names: Mapping[str, object] | None = None) -> dict[str, T]:
+        """Call a function for several members at once; raise the error that says most, when all have returned."""
+        members = self._members
+        chosen = [name for name in members if names is None or name in names]
+        if not chosen:
+            return {}
+        with ThreadPoolExecutor(len(chosen)) as pool:
+            futures: dict[str, Future[T]] = {name: pool.submit(call, name, members[name]) for name in chosen}
+            try:
+                errors = {name: future.exception() for name, future in futures.items()}
+            except BaseException:
+                with contextlib.suppress(RtcpError):
+                    self.halt()
+                raise
+        failed = {name: error for name, error in errors.items() if error is not None}
+        if not failed:
+            return {name: future.result() for name, future in futures.items()}
+        raise most_telling(failed)
+
+
+def most_telling(failed: Mapping[str, BaseException]) -> BaseException:
+    """Return of the errors of several arms, at least one, that which says why; with its arm's name."""
+    first = min(failed, key=lambda name: _SAYS_LESS.get(getattr(failed[name], "reason", ""), 0))
+    error = failed[first]
+    if isinstance(error, RtcpError):
+        return RtcpError(error.kind, f"{first}: {error.message}", error.reason, error.fields)
+    return error
+
+
+def connect_cell(name: str = "", cell: str = "", directory: Path | None = None) -> Cell:
+    """Connect to the running cell; arguments and errors as of `Cell`."""
+    return Cell(name, cell, directory)

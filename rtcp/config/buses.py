@@ -1,0 +1,216 @@
+"""The kinds of bus beside EtherCAT: their keys under `bus`, and what the platform finds on them.
+
+A robot controller has no slaves. Its joints, and the mechanical unit as a whole, are nodes with process images of their
+own, laid out as the PDOs of a slave: the loop needs no second way for them. Packages add kinds by the entry point
+`rtcp.buses` (docs/extending.md).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, ClassVar
+
+from annotated_types import Ge, Gt, Le
+
+from rtcp.config.find import class_of_kind
+from rtcp.config.model import (
+    VIRTUAL,
+    ArmFile,
+    BusConfig,
+    Capability,
+    DataTypeName,
+    DeviceDescription,
+    Pdo,
+    PdoEntry,
+    SlaveConfig,
+)
+from rtcp.config.numbers import Name, Positive
+
+ENTRY_POINTS = "rtcp.buses"
+_ADDRESS = re.compile(r"(?:\d{1,3}\.){3}\d{1,3}", re.ASCII)
+Rows = tuple[tuple[str, DataTypeName, str], ...]
+"""Channels: name, type, unit."""
+
+JOINT_OUTPUTS: Rows = (
+    ("target_position", "float64", "rad"),
+    ("target_velocity", "float64", "rad/s"),
+    ("command", "uint8", ""),
+)
+"""`command`: 0 stand still, 1 follow the targets, 2 stop and forget what was accepted."""
+JOINT_INPUTS: Rows = (
+    ("position", "float64", "rad"),
+    ("state", "uint8", ""),
+    ("missing", "uint8", ""),
+)
+"""`state` is a `rtcp.ipc.states.DriveState`, `missing` a `Missing`."""
+
+_CONTROLLERS_OWN: Mapping[Capability, str] = {
+    "sdo": "a robot controller has no SDO: its parameters are set at its display",
+    "states": "a robot controller has no AL states: `rtcp status` shows its motors and its program",
+    "clocks": "a robot controller has no distributed clocks: its messages set the pace",
+    "torque": "the robot controller takes no torque and measures none for others",
+    "homing": "the robot controller knows where its joints are: calibrate them there",
+    "power": "only people at the robot controller switch its motors on and start its program",
+}
+
+
+def bus_class(kind: str) -> type[BusConfig]:
+    """Return the configuration class of a kind of bus; raises as `class_of_kind`."""
+    return class_of_kind(BusConfig, ENTRY_POINTS, kind)
+
+
+def node(name: str, kind: str, outputs: Rows, inputs: Rows, watchdog_s: float) -> SlaveConfig:
+    """Return a node with these channels, which stops by itself after `watchdog_s` without a message."""
+
+    def pdos(index: int, rows: Rows) -> tuple[Pdo, ...]:
+        entries = tuple(PdoEntry(0x2000, i, kind, name, unit=unit) for i, (name, kind, unit) in enumerate(rows, 1))
+        return (Pdo(index, entries),) if entries else ()
+
+    device = DeviceDescription(
+        name, kind, 0, 0, pdos(0x1600, outputs), pdos(0x1A00, inputs), watchdog_ms=1000.0 * watchdog_s
+    )
+    return SlaveConfig(name, device)
+
+
+@dataclass(frozen=True)
+class ControllerBus(BusConfig):
+    """What all buses to a robot controller have in common."""
+
+    LACKS: ClassVar[Mapping[Capability, str]] = _CONTROLLERS_OWN
+    VIRTUAL_PROCESS: ClassVar[tuple[str, ...]] = ("rtcp.virtual.irc5", "--private")
+    VIRTUAL_CONTROL: ClassVar[str] = "irc5"
+
+    @staticmethod
+    def joints_and_unit(joints: Sequence[str], inputs: Rows, unit: SlaveConfig) -> tuple[SlaveConfig, ...]:
+        """Return a node a joint with these inputs, then the mechanical unit, which has their watchdog."""
+        watchdog_s = 1e-3 * unit.device.watchdog_ms
+        return (*(node(name, "joint", JOINT_OUTPUTS, inputs, watchdog_s) for name in joints), unit)
+
+    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        """Yield what needs a capability that the bus lacks, and an invalid address."""
+        name = self.interface
+        if name != VIRTUAL and not _ADDRESS.fullmatch(name):
+            yield ("bus", "interface"), f'found the text "{name}", allowed is {VIRTUAL}, or an IPv4 address'
+        if arm.drive_mode == "cst" or arm.control_mode == "torque":
+            key, found = ("drive_mode", arm.drive_mode) if arm.drive_mode == "cst" else ("control_mode", "torque")
+            yield (key,), f'found the text "{found}" on a bus of kind {self.kind}: {self.LACKS["torque"]}'
+        for key, reaction in vars(arm.stops).items():
+            if reaction == "torque_off":
+                text = f'found the text "torque_off" on a bus of kind {self.kind}, which cannot switch motors off'
+                yield ("stops", key), f"{text}; allowed are the others"
+        if arm.gripper is not None and arm.gripper.joint is not None:
+            yield ("gripper", "joint"), f"found a drive on a bus of kind {self.kind}: it has those of the arm alone"
+
+
+@dataclass(frozen=True)
+class EgmBus(ControllerBus):
+    """ABB's Externally Guided Motion: the controller sends a message every few ms and gets an answer to each."""
+
+    kind: Name = "egm"
+    interface: Name = VIRTUAL
+    """`virtual`, or the own IPv4 address to which the controller sends; `0.0.0.0`: any."""
+    segment: str = "irc5.yaml"
+    """File of the virtual controller, relative to the arm's file."""
+    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
+    """Messages that did not come, which are a fault: in a row, or more than those that did."""
+    timeout_scale: Annotated[float, Ge(1), Le(100)] = 4.5
+    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    port: Annotated[int, Ge(1), Le(65535)] = 6511
+    """UDP port: that of the unit's UdpUc device, one for each mechanical unit."""
+    controller: str = ""
+    """IPv4 address of the controller; none: whoever speaks first is it until it falls silent."""
+    unit: Name = "robot"
+    """Name of the mechanical unit in records and status."""
+    comm_timeout_s: Annotated[float, Gt(0), Le(1)] = 0.2
+    """CommTimeout of EGMSetupUC, s: time after the last answer at which the controller stops."""
+
+    MASTER: ClassVar[str] = "rtcp.fieldbus.egm:EgmMaster"
+
+    UNIT_INPUTS: ClassVar[Rows] = (
+        ("motors", "uint8", ""),
+        ("rapid", "uint8", ""),
+        ("mci", "uint8", ""),
+        ("converged", "uint8", ""),
+        ("collision", "uint8", ""),
+        ("utilization", "float64", "%"),
+        ("move_index", "uint32", ""),
+        ("session", "uint32", ""),
+        ("lost", "uint32", ""),
+        ("doubled", "uint32", ""),
+        ("disordered", "uint32", ""),
+        ("superseded", "uint32", ""),
+        ("foreign", "uint32", ""),
+        *((f"measured_force_{axis}", "float64", "N") for axis in "xyz"),
+        *((f"measured_torque_{axis}", "float64", "Nm") for axis in "xyz"),
+        *((f"path_deviation_{axis}", "float64", "m") for axis in "xyz"),
+    )
+    """Numbers of `motors`, `rapid` and `mci` are EGM's (docs/abb.md). `path_deviation`: the flange as measured minus as
+    planned by the controller. Counted are messages, since the start."""
+
+    def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
+        """Return the joints and the mechanical unit."""
+        inputs = (*JOINT_INPUTS, ("velocity", "float64", "rad/s"))
+        unit = node(self.unit, "generic", (), self.UNIT_INPUTS, self.comm_timeout_s)
+        return self.joints_and_unit(joints, inputs, unit)
+
+    def findings(self, arm: ArmFile) -> Iterator[tuple[tuple[str | int, ...], str]]:
+        """Yield what does not suit EGM."""
+        yield from super().findings(arm)
+        if len(arm.joints) not in (6, 7):
+            yield ("joints",), f"found {len(arm.joints)} joints, allowed by EGM are 6, or 7 with the external one third"
+        if (lost_s := self.lost_cycles * arm.cycle.period_us * 1e-6) > self.comm_timeout_s:
+            text = f"found {self.lost_cycles} cycles, {lost_s:g} s, allowed is at most bus.comm_timeout_s"
+            yield ("bus", "lost_cycles"), f"{text}, {self.comm_timeout_s:g} s: the controller stops by itself then"
+        period, rest = arm.cycle.period_us, arm.cycle.period_us % EGM_PERIOD_US
+        if min(rest, EGM_PERIOD_US - rest) > 0.02 * EGM_PERIOD_US or period < 0.9 * EGM_PERIOD_US:
+            text = f"found {period:g} us, allowed by EGM is {EGM_PERIOD_US:g} or a multiple: what \\SampleRate sets"
+            yield ("cycle", "period_us"), text
+
+
+EGM_PERIOD_US = 4032.0
+"""The controller's own period: \\SampleRate 4 is 4.032 ms (3HAC073318-001)."""
+
+
+@dataclass(frozen=True)
+class RapidBus(ControllerBus):
+    """RAPID streaming: joint targets by Simple Message to a program on the controller, which queues them."""
+
+    kind: Name = "rapid"
+    interface: Name = VIRTUAL
+    """`virtual`, or the controller's IPv4 address."""
+    segment: str = "irc5_rapid.yaml"
+    """File of the virtual controller, relative to the arm's file."""
+    lost_cycles: Annotated[int, Ge(1), Le(1000)] = 10
+    """Cycles without a state message, which are a fault: in a row, or more than those with one."""
+    timeout_scale: Annotated[float, Ge(1), Le(100)] = 3.0
+    """Factor on limits that a slow host exceeds, on the virtual bus alone: [real time](realtime.md)."""
+    motion_port: Annotated[int, Ge(1), Le(65535)] = 11000
+    """TCP port of the motion server."""
+    state_port: Annotated[int, Ge(1), Le(65535)] = 11002
+    """TCP port of the state server."""
+    unit: Name = "robot"
+    """Name of the mechanical unit in records and status."""
+    state_period_s: Positive = 0.05
+    """Longest interval between two state messages, s: a cycle after a longer one is lost."""
+    answer_timeout_s: Positive = 1.0
+    """Time without acceptance of a point after which the connection counts as lost, s."""
+
+    MASTER: ClassVar[str] = "rtcp.fieldbus.rapid:RapidMaster"
+
+    UNIT_INPUTS: ClassVar[Rows] = (
+        ("accepted", "uint32", ""),
+        ("refused", "uint32", ""),
+        ("waiting", "uint8", ""),
+        ("acceptance_s", "float64", "s"),
+        ("e_stopped", "uint8", ""),
+        ("mode", "uint8", ""),
+    )
+    """Points accepted and refused since the start; whether one waits, and how long the last acceptance took; the
+    controller's emergency stop, and its mode: 1 Hand, 2 Auto, 0 unknown."""
+
+    def nodes(self, joints: Sequence[str], period_us: float) -> tuple[SlaveConfig, ...]:
+        """Return the joints and the mechanical unit."""
+        unit = node(self.unit, "generic", (), self.UNIT_INPUTS, self.answer_timeout_s)
+        return self.joints_and_unit(joints, JOINT_INPUTS, unit)

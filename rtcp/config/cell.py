@@ -1,0 +1,133 @@
+"""A cell: several arms on one host, where they stand, and what they share. Its file is read by `cell_file`."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from annotated_types import Ge, Gt, Le, MaxLen, MinLen
+
+from rtcp.config.model import ArmConfig, ConfigError
+from rtcp.config.numbers import Name, Turn, Vector
+from rtcp.config.serialization import to_json
+
+_PATHS = ("source", "directory", "file", "warnings")
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,31}", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Base:
+    """Where the base of an arm stands in the world."""
+
+    position: Vector = (0.0, 0.0, 0.0)
+    """x, y, z, m."""
+    rpy: Annotated[tuple[Turn, ...], MinLen(3), MaxLen(3)] = (0.0, 0.0, 0.0)
+    """rx, ry, rz, rad: R = Rx(rx) Ry(ry) Rz(rz)."""
+
+
+@dataclass(frozen=True)
+class CellArm:
+    """An arm of the cell: a platform of its own."""
+
+    name: Name
+    """Name of the platform: `rtcp --name NAME status`."""
+    config: Name
+    """File of the arm, from this file's directory on."""
+    base: Base = field(default_factory=Base)
+
+
+@dataclass(frozen=True)
+class CellProcess:
+    """A platform of processes beside motion, without an arm."""
+
+    name: Name
+    """Name of the platform."""
+    config: Name
+    """Its file, from this file's directory on."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """What the arms have in common."""
+
+    emergency_stop: bool = True
+    """Whether the emergency stop of one arm is that of all."""
+
+
+@dataclass(frozen=True)
+class CellSettings:
+    """What the file of a cell and what a loop is given of it have in common."""
+
+    name: Name
+    """Name of the cell."""
+    share: Share = field(default_factory=Share)
+    silence_s: Annotated[float, Gt(0), Le(0.5)] | None = None
+    """How old the newest record of a partner may be in a motion in step, s; left out: two cycles of the slowest arm."""
+    clearance: Annotated[float, Ge(0), Le(1)] = 0.02
+    """Distance that bodies of two arms keep, m."""
+
+
+@dataclass(frozen=True)
+class Member:
+    """An arm as its partners see it."""
+
+    name: str
+    config: ArmConfig
+    base: Base
+    directory: Path = Path()
+    """Runtime directory of its platform."""
+
+
+@dataclass(frozen=True)
+class CellConfig(CellSettings):
+    """A cell with the configurations of its arms, in the order of the file, and the file."""
+
+    arms: tuple[Member, ...] = ()
+    source: Path = Path()
+    processes: tuple[Member, ...] = ()
+    """Platforms of processes beside motion."""
+
+    @property
+    def members(self) -> tuple[Member, ...]:
+        """All platforms: the arms, then the others."""
+        return self.arms + self.processes
+
+    def member(self, name: str) -> Member:
+        """Return the platform with this name; raises ConfigError."""
+        for one in self.members:
+            if one.name == name:
+                return one
+        names = ", ".join(one.name for one in self.members)
+        raise ConfigError([f'{self.source}: found no arm with the name "{name}", allowed is one of {names}'])
+
+    @property
+    def slowest_s(self) -> float:
+        """Longest cycle among the arms, s."""
+        return 1e-6 * max(one.config.cycle.period_us for one in self.arms)
+
+    @property
+    def digest(self) -> int:
+        """64 bits that differ for another cell, or another state of its files; not of where they stand."""
+        text = json.dumps(_without_paths(to_json(self)), sort_keys=True)
+        return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "little")
+
+    @property
+    def longest_silence_s(self) -> float:
+        """How old the newest record of a partner may be, s."""
+        return 2.0 * self.slowest_s if self.silence_s is None else self.silence_s
+
+
+def _without_paths(value: Any) -> Any:
+    """Return a JSON value without what says where files were found, and what was noticed in them."""
+    if isinstance(value, dict):
+        return {key: _without_paths(one) for key, one in value.items() if key not in _PATHS}
+    return [_without_paths(one) for one in value] if isinstance(value, list) else value
+
+
+def is_platform_name(name: str) -> bool:
+    """Return whether a platform may have this name: it becomes a directory, beside `lock`, and a namespace of ROS."""
+    return _NAME.fullmatch(name) is not None and name != "lock"

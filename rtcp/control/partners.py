@@ -1,0 +1,169 @@
+"""The partners of an arm in a cell: their newest records, read once a cycle, and what this arm tells them in its own.
+
+Shared memory and nothing else passes between the loops of a cell. Files are opened by the thread beside the cycle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from rtcp.config.cell import CellConfig, Member
+from rtcp.control.part import Part
+from rtcp.ipc.record_view import RecordView, RecordViewError
+from rtcp.ipc.runtime_directory import blackboard_file
+from rtcp.ipc.schema import FLAG_EMERGENCY_STOP, FLAG_MOTION_ALLOWED, Field
+from rtcp.ipc.states import State
+from rtcp.motion.guards.neighbours import Neighbours, body_of
+from rtcp.motion.limits import Limits
+from rtcp.motion.state import ArmState
+from rtcp.motion.step_group import Partner, StepGroup, StepPhase
+
+_NOTICE_CYCLES: Final = 1.5
+"""Of the slowest arm: an arm announces its brake this long ahead."""
+_AHEAD_NS: Final = 1_000_000_000
+"""A record from further in the future is none."""
+_FORGOTTEN_NS: Final = 1_000_000_000
+"""Age of a partner's newest record from which on its emergency stop counts as unknown."""
+_SCALARS = ("time_ns", "state", "flags", "step_motion", "step_phase", "step_brake_ns", "step_path_s", "step_cell")
+_VECTORS = ("commanded_position", "commanded_velocity", "acceleration_limit")
+_STATES = tuple(State)
+_STOPPED = (State.EMERGENCY_STOP, State.RESETTING)
+_PHASES = tuple(StepPhase)
+
+
+def step_fields(joints: int) -> tuple[Field, ...]:
+    """Return the fields of the record that partners read."""
+    return (
+        Field("step_motion", "uint64", "", "Number of the motion in step; 0: none yet.", part="cell"),
+        Field("step_phase", "uint8", "", "Where the arm is in it (rtcp.motion.step_group.StepPhase).", part="cell"),
+        Field("step_brake_ns", "int64", "ns", "When the group begins to brake; 0: it does not.", part="cell"),
+        Field("step_path_s", "float64", "s", "How far the arm has got, by the path's own time.", part="cell"),
+        Field("step_cell", "uint64", "", "Digest of the cell's files, as this arm was started with them.", part="cell"),
+        Field("commanded_velocity", "float64", "rad/s", "Speed of the setpoint.", (joints,), part="cell"),
+        Field("acceleration_limit", "float64", "rad/s^2", "Acceleration limit in force.", (joints,), part="cell"),
+    )
+
+
+class Partners(Part):
+    """Reads what the partners publish, and publishes what they need to know of this arm.
+
+    Args:
+        cell: the cell.
+        name: of this arm in it.
+    """
+
+    def __init__(self, cell: CellConfig, name: str) -> None:
+        super().__init__("cell", step_fields(len(cell.member(name).config.joints)))
+        self._own = cell.member(name)
+        self._clearance, self._delay_s = cell.clearance, cell.longest_silence_s + cell.slowest_s
+        self.members: list[Member] = [one for one in cell.members if one.name != name]
+        self.group = StepGroup(cell.longest_silence_s, _NOTICE_CYCLES * cell.slowest_s, cell.digest)
+        self.group.members = [Partner(len(one.config.joints)) for one in self.members]
+        for partner, one in zip(self.group.members, self.members, strict=True):
+            partner.acceleration[:] = (joint.acceleration for joint in one.config.joints)
+        self._shares_stop = cell.share.emergency_stop
+        self.pressed = self.stopped = -1
+        """The first partner whose emergency stop is pressed, where it is shared, or -1; and the first one that has not
+        been reset since."""
+        self.files = [blackboard_file(one.directory) for one in self.members]
+        """Their blackboards."""
+        self._inodes = [0] * len(self.members)
+        self._views: list[RecordView | None] = [None] * len(self.members)
+        self._values: list[list[Any]] = [
+            [0] * (len(_SCALARS) + len(_VECTORS) * len(one.config.joints)) for one in self.members
+        ]  # fmt: skip
+        self._arm: ArmState | None = None
+        self._acceleration: Sequence[float] = ()
+
+    def watch(self, arm: ArmState, limits: Limits, period_s: float) -> Neighbours | None:
+        """Publish the setpoints of this arm from now on; return what keeps it away from its partners."""
+        self._arm, self._acceleration = arm, limits.acceleration
+        own = body_of(self._own, limits.acceleration)
+        if own is None:
+            return None
+        partners = zip(self.members, self.group.members, strict=True)
+        bodies = [body_of(one, partner.acceleration) for one, partner in partners]
+        return Neighbours(own, bodies, self.group, self._clearance, period_s, self._delay_s)
+
+    def open(self) -> None:
+        """Open the blackboards of partners that have started since; not for the cycle."""
+        for index, path in enumerate(self.files):
+            with contextlib.suppress(OSError):
+                inode = path.stat().st_ino
+                if inode != self._inodes[index]:
+                    self._views[index] = _view(path, len(self.group.members[index].position))
+                    self._inodes[index] = inode
+
+    def read(self, now_ns: int) -> None:
+        """Read the newest record of each partner; of one that is just being written the one before counts."""
+        self.pressed = self.stopped = self.group.foreign = -1
+        for index, partner in enumerate(self.group.members):
+            view, values = self._views[index], self._values[index]
+            if view is not None and view.read(values):
+                _take(partner, values, now_ns)
+            known = now_ns - partner.time_ns < _FORGOTTEN_NS
+            if known and partner.cell != self.group.cell and self.group.foreign < 0:
+                self.group.foreign = index
+            if partner.cell != self.group.cell:
+                partner.motion_allowed = False
+            if not (known and self._shares_stop):
+                continue
+            if partner.emergency_stop and self.pressed < 0:
+                self.pressed = index
+            # While it is reset its button is not read.
+            if (partner.emergency_stop or partner.state in _STOPPED) and self.stopped < 0:
+                self.stopped = index
+
+    def publish(self, values: list[Any]) -> None:
+        """Write where this arm is in the motion in step."""
+        group, arm, at = self.group, self._arm, self.at
+        values[at : at + 5] = group.motion, group.phase, group.brake_ns, group.path_s, group.cell
+        if arm is not None:
+            n = len(arm.commanded_velocity)
+            values[at + 5 : at + 5 + n] = arm.commanded_velocity
+            values[at + 5 + n : at + 5 + 2 * n] = self._acceleration
+
+
+def _view(path: Path, joints: int) -> RecordView | None:
+    """Return a view of a partner's records: whole, or of a platform outside any cell its instants alone."""
+    for names in ((*_SCALARS, *_VECTORS), ("time_ns",)):
+        with contextlib.suppress(RecordViewError):
+            view = RecordView(path, names)
+            if view.count in (len(_SCALARS) + len(_VECTORS) * joints, 1):
+                return view
+    return None
+
+
+def _take(partner: Partner, values: Sequence[Any], now_ns: int) -> None:
+    """Take over a record; one that no loop writes counts as none: its sender becomes silent."""
+    time_ns = values[0]
+    if time_ns > now_ns + _AHEAD_NS:
+        return
+    if len(values) == 1:
+        # It runs, and as part of no cell.
+        partner.time_ns, partner.cell = time_ns, 0
+        partner.state, partner.motion_allowed = State.OFF, False
+        return
+    _, state, flags, motion, phase, brake_ns, path_s, cell = values[: len(_SCALARS)]
+    n, at = len(partner.position), len(_SCALARS)
+    speeds = at + n
+    accelerations = speeds + n
+    whole = sum(values[at:], path_s)
+    # NaN and infinity are no numbers of a joint; an acceleration of 0 is no limit.
+    if (
+        state >= len(_STATES)
+        or phase >= len(_PHASES)
+        or whole - whole != 0.0
+        or (n and min(values[accelerations:]) <= 0.0)
+    ):
+        return
+    partner.time_ns, partner.motion, partner.brake_ns, partner.path_s = time_ns, motion, brake_ns, path_s
+    partner.state, partner.phase, partner.cell = _STATES[state], _PHASES[phase], cell
+    partner.emergency_stop = flags & FLAG_EMERGENCY_STOP != 0
+    partner.motion_allowed = flags & FLAG_MOTION_ALLOWED != 0
+    partner.position[:] = values[at:speeds]
+    partner.velocity[:] = values[speeds:accelerations]
+    partner.acceleration[:] = values[accelerations:]

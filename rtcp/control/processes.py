@@ -1,0 +1,191 @@
+"""Processes beside motion as parts of the cycle: a heater, a pump, a camera's light.
+
+A process reads channels of the slaves, and partners in the cell, and writes channels. It runs after the machine and
+before the slaves' outputs are encoded, so that what it decides leaves with the frame of the same cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint
+from typing import Any
+
+from mypy_extensions import mypyc_attr
+
+from rtcp.config.find import load_class
+from rtcp.config.model import ArmConfig, ProcessConfig
+from rtcp.control.part import Device, Part, PartContext
+from rtcp.control.partners import Partners
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import MotionEnded, ProcessFailed
+from rtcp.ipc.refusals import ProcessRaised, Refusal
+from rtcp.ipc.schema import Field, device_field
+from rtcp.ipc.states import State
+from rtcp.motion.step_group import Partner
+
+
+class Signal:
+    """A channel of a slave, in SI units."""
+
+    def __init__(self, values: dict[str, float], name: str) -> None:
+        self._values = values
+        self._name = name
+
+    @property
+    def value(self) -> float:
+        """What the slave has sent last, or what it is sent in this cycle."""
+        return self._values[self._name]
+
+    @value.setter
+    def value(self, number: float) -> None:
+        self._values[self._name] = number
+
+
+class ProcessSetup:
+    """What a process is made of.
+
+    Args:
+        period_s: the cycle, s.
+        signals: of the slaves, by SLAVE.CHANNEL.
+        partners: the newest records of the partners in the cell, by name; read anew in every cycle.
+    """
+
+    def __init__(self, period_s: float, signals: Mapping[str, Signal], partners: Mapping[str, Partner]) -> None:
+        self.period_s = period_s
+        self.signals = signals
+        self.partners = partners
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Process:
+    """Base of all processes: a subclass writes its outputs in every `update`.
+
+    Args:
+        config: its keys.
+        setup: the cycle, the channels and the partners.
+    """
+
+    def __init__(self, config: ProcessConfig, setup: ProcessSetup) -> None:
+        self.name = config.name
+        self.commands = config.COMMANDS
+
+    def fields(self) -> Sequence[Field]:
+        """Return what it publishes in the cycle record, without its own name."""
+        return ()
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        """Carry out one of the configuration's `COMMANDS`, or return why not and change nothing."""
+        raise NotImplementedError
+
+    def update(self, context: PartContext) -> None:
+        """Do a cycle: read the inputs, write the outputs, report events by `context.report`."""
+        raise NotImplementedError
+
+    def publish(self, values: list[Any], at: int) -> None:
+        """Write the values of `fields` into the record, from index `at` on."""
+
+    def safe(self) -> None:
+        """Set the outputs to their safe state: called on a fault, on stale inputs and at the end.
+
+        It lasts until the process is commanded again: nothing starts by itself.
+        """
+        raise NotImplementedError
+
+
+class ProcessPart(Part):
+    """A process in the cycle.
+
+    One that raises is a fault: it is asked no more, and its outputs are 0 until the machine is ready again.
+
+    Args:
+        number: of the process in the configuration, from 0.
+        process: it.
+        outputs: all that it may write.
+    """
+
+    def __init__(self, number: int, process: Process, outputs: Sequence[Signal]) -> None:
+        super().__init__(process.name, [device_field(process.name, f) for f in process.fields()], process.commands)
+        self.process = process
+        self._number = number
+        self._outputs = tuple(outputs)
+        self._failed = self._reported = False
+        self._error: Exception | None = None
+
+    def _fail(self, error: Exception) -> None:
+        self._failed, self._error = True, error
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        """Let the process carry out the command."""
+        try:
+            return ProcessRaised(self._number) if self._failed else self.process.accept(command, lease)
+        except Exception as error:
+            self._fail(error)
+            return ProcessRaised(self._number)
+
+    def update(self, context: PartContext) -> None:
+        """Let the process do its cycle."""
+        if self._failed and self._reported and context.state is State.READY:
+            self._failed = self._reported = False
+            self.safe()
+        try:
+            if not self._failed:
+                self.process.update(context)
+                if isinstance(context.reported, MotionEnded):
+                    raise TypeError(f"a process ends no motion: {context.reported.name}")
+        except Exception as error:
+            self._fail(error)
+        if self._error is not None:
+            context.explain(f"process {self.name}", self._error)
+            self._error = None
+        if self._failed:
+            for output in self._outputs:
+                output.value = 0.0
+            if not self._reported:
+                self._reported = True
+                context.report(ProcessFailed(self._number))
+
+    def publish(self, values: list[Any]) -> None:
+        """Write what the process shows."""
+        try:
+            if not self._failed:
+                self.process.publish(values, self.at)
+        except Exception as error:
+            self._fail(error)
+        if self._failed:
+            # Nothing is busy, and nothing on.
+            at = self.at
+            for field in self.fields:
+                values[at : at + field.count] = [0] * field.count
+                at += field.count
+
+    def safe(self) -> None:
+        """Let the process set its outputs to their safe state."""
+        try:
+            self.process.safe()
+        except Exception as error:
+            self._fail(error)
+
+
+def make_processes(config: ArmConfig, devices: Sequence[Device], partners: Partners | None) -> list[ProcessPart]:
+    """Return a part for each process of the configuration; raises PluginError."""
+    inputs = {
+        f"{device.name}.{name}": Signal(device.driver.values, name)
+        for device in devices
+        for name in device.driver.values
+    }
+    outputs = {
+        f"{device.name}.{name}": Signal(device.driver.targets, name)
+        for device in devices
+        for name in device.driver.targets
+    }
+    records: dict[str, Partner] = {}
+    if partners is not None:
+        records = {one.name: record for one, record in zip(partners.members, partners.group.members, strict=True)}
+    setup = ProcessSetup(config.cycle.period_us * 1e-6, {**inputs, **outputs}, records)
+    made = []
+    for number, keys in enumerate(config.processes):
+        entry = EntryPoint(keys.kind, keys.PROCESS, keys.ENTRY_POINTS)
+        process = load_class(entry, Process)(keys, setup)
+        written = [outputs[text] for _, image, text in keys.channels() if image == "rpdo"]
+        made.append(ProcessPart(number, process, written))
+    return made

@@ -1,0 +1,128 @@
+"""What moves a joint, in SI units: the base class of every drive, and how the driver of a joint is made."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import ClassVar, Final
+
+from mypy_extensions import mypyc_attr
+
+from rtcp.config.model import ArmConfig, Joint, SlaveConfig
+from rtcp.devices.driver import DeviceError, Driver, make_driver
+from rtcp.ipc.states import DriveState, Missing
+
+CSP, CSV, CST = 8, 9, 10
+"""Modes of operation, object 0x6060 (CiA 402-2, clause 10.1)."""
+_WINDOW_S: Final = 0.02
+"""Time over which the velocity is measured where the drive does not report it: 1 count of 1e-4 rad is 0.005 rad/s."""
+
+
+class TargetState(Enum):
+    """State to which a drive is brought."""
+
+    DISABLED = "disabled"
+    QUICK_STOPPED = "stopped by quick stop"
+    """Ramps down by itself and holds (0x605A = 6) until DISABLED is requested; a drive without torque stays without."""
+    ENABLED = "enabled"
+    TORQUE_OFF = "without torque at once"
+    """Disable voltage from every state: no ramp, the brake closes on whatever moves."""
+    RESET = "free of faults"
+    """Resets a fault and takes the drive no further than `switch on disabled`."""
+
+
+@mypyc_attr(allow_interpreted_subclasses=True)
+class Drive(Driver):
+    """A drive in SI units: `decode`, `advance`, set targets, `encode`.
+
+    Attributes that `decode` sets: `position` (rad), `velocity` (rad/s), `torque` (Nm; 0 where it is not measured),
+    `state`, `missing`, `mode_display`, `temperature` (C; not a number where it is not measured), and `statusword`,
+    0 for a drive without one.
+    Attributes that `encode` takes: `mode`, `target_position` (rad), `target_velocity` (rad/s, CSV), `target_torque`
+    (Nm, CST), `speed_limit` (rad/s). `zero` (rad) is what the drive itself shows where the joint is at 0; `position`
+    and `target_position` count from it.
+
+    Args:
+        slave: the name and description of what is on the bus.
+        period_s: the cycle, s.
+        speed_limit: rad/s; fixed once it is enabled.
+        zero: what the drive shows where the joint is at 0, rad.
+
+    Raises:
+        DeviceError: the description lacks a channel, or one has a type or a factor that cannot serve.
+    """
+
+    HAS_STATUSWORD: ClassVar[bool] = False
+
+    def __init__(self, slave: SlaveConfig, period_s: float, *, speed_limit: float = 0.0, zero: float = 0.0) -> None:
+        super().__init__(slave, period_s)
+        self.position = self.velocity = self.torque = 0.0
+        self.temperature = math.nan
+        self.statusword = self.mode_display = 0
+        self.state = DriveState.NOT_READY_TO_SWITCH_ON
+        self.missing = Missing.NOTHING
+        """What people have to do at a robot controller before it follows targets."""
+        self.mode = CSP
+        self.speed_limit = speed_limit
+        self.deceleration = math.inf
+        """Of a quick stop that this driver ramps itself, rad/s^2."""
+        self.low, self.high = -math.inf, math.inf
+        """Ends of that ramp, rad."""
+        self._zero = zero
+        self.target_position = self.target_velocity = self.target_torque = 0.0
+        self._past: list[float] = []
+        self._past_at = 0
+
+    @property
+    def zero(self) -> float:
+        """What the drive shows where the joint is at 0, rad. Set anew, what is shown moves, what is sent does not."""
+        return self._zero
+
+    @zero.setter
+    def zero(self, zero: float) -> None:
+        moved = self._zero - zero
+        self._zero = zero
+        self.position += moved
+        self.target_position += moved
+
+    def supports(self, mode: int) -> bool:
+        """Whether targets of a mode (CSP, CSV, CST) reach the joint."""
+        raise NotImplementedError
+
+    def advance(self, target: TargetState) -> bool:
+        """Take the next step towards `target` by the state found; return whether it is reached."""
+        raise NotImplementedError
+
+    def latch(self) -> None:
+        """Set the target position to the actual one, the other targets to zero: on enabling, on entering CSP."""
+        self.target_position = self.position
+        self.target_velocity = self.target_torque = 0.0
+
+    def _measured_velocity(self, shown: float) -> float:
+        """Return the mean velocity over 20 ms, rad/s; `shown`: the position of this cycle, rad."""
+        past = self._past
+        if not past:
+            past += [shown] * max(round(_WINDOW_S / self.period_s), 1)
+        at = self._past_at
+        moved = shown - past[at]
+        past[at] = shown
+        self._past_at = at + 1 if at + 1 < len(past) else 0
+        return moved / (len(past) * self.period_s)
+
+
+def drive_of(config: ArmConfig, joint: Joint, zero: float) -> tuple[int, Drive]:
+    """Return the driver of the drive that moves `joint`, with the index of its slave; `zero` as in `Drive`.
+
+    Raises:
+        DeviceError: its device's description cannot serve, or it is no drive.
+    """
+    slot = next(slot for slot, slave in enumerate(config.slaves) if slave.name == joint.slave)
+    slave = config.slaves[slot]
+    drive = make_driver(slave, config.cycle.period_us * 1e-6)
+    if not isinstance(drive, Drive):
+        raise DeviceError(f"slave {slave.name} (kind {slave.device.kind}) is no drive: it cannot move {joint.name}")
+    drive.speed_limit = joint.velocity
+    drive.deceleration = joint.acceleration
+    drive.low, drive.high = joint.position.min, joint.position.max
+    drive.zero = zero
+    return slot, drive

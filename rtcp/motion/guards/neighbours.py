@@ -1,0 +1,170 @@
+"""The guard between two arms of a cell: their bodies keep apart, also while both come to rest.
+
+A distance that is certain is found in two ways, and the greater one counts: what both are apart now, less all that any
+point of them can travel until both stand; or the lesser of what they are apart now and at the ends of both stops, less
+half of that. The distance is worked out anew only when what was travelled since may have used it up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import hypot
+from typing import Final
+
+from kinematics.capsules import Placed, capsules, distance
+from kinematics.forward import frames
+from kinematics.model import JOINTS, ArmModel
+from kinematics.pose import Pose
+from rtcp.config.cell import Member
+from rtcp.ipc.events import MotionEnded, PartnerForeign, PartnerNear
+from rtcp.motion.step_group import StepGroup
+
+_SLOW_M: Final = 0.02
+"""Who is too near already may move away: with stops that are shorter than this, m."""
+
+
+def reach_of(model: ArmModel) -> list[float]:
+    """Return for each joint how far from its axis a body's axis can be at most, m."""
+    lengths = [hypot(row.a, row.d) for row in model.rows]
+    tool = hypot(*model.tool.position)
+    beyond = max((hypot(*end) for body in capsules(model) for end in (body.start, body.end)), default=0.0)
+    return [sum(lengths[i + 1 :]) + max(tool, beyond) for i in range(JOINTS)]
+
+
+class Body:
+    """An arm in the world, as the guard needs it.
+
+    Args:
+        model: its geometry.
+        base: where its base stands.
+        acceleration: with which its joints stop at least, rad/s^2; may change in place.
+    """
+
+    def __init__(self, model: ArmModel, base: Pose, acceleration: Sequence[float]) -> None:
+        self.model = model
+        self.base = base
+        self.placed = Placed(capsules(model))
+        self.reach = reach_of(model)
+        self.acceleration = acceleration
+        self.end = [0.0] * JOINTS
+
+    def place(self, q: Sequence[float]) -> None:
+        """Put the bodies where the joints are at `q`, rad."""
+        self.placed.place(frames(self.model, q), self.base)
+
+    def travel(self, velocity: Sequence[float], delay_s: float) -> float:
+        """Return how far a point moves at most until the arm stands, m: it goes on for `delay_s` and stops then."""
+        way = 0.0
+        for i, reach in enumerate(self.reach):
+            speed = velocity[i] if velocity[i] >= 0.0 else -velocity[i]
+            way += reach * speed * (delay_s + 0.5 * speed / self.acceleration[i])
+        return way
+
+    def stop(self, q: Sequence[float], velocity: Sequence[float], delay_s: float) -> None:
+        """Put the bodies where the arm comes to rest."""
+        for i in range(JOINTS):
+            speed = velocity[i] if velocity[i] >= 0.0 else -velocity[i]
+            self.end[i] = q[i] + velocity[i] * (delay_s + 0.5 * speed / self.acceleration[i])
+        self.place(self.end)
+
+    def moved(self, before: Sequence[float], q: Sequence[float]) -> float:
+        """Return how far a point has moved at most between two configurations, m."""
+        way = 0.0
+        for i, reach in enumerate(self.reach):
+            turned = q[i] - before[i]
+            way += reach * (turned if turned >= 0.0 else -turned)
+        return way
+
+
+def body_of(member: Member, acceleration: Sequence[float] | None = None) -> Body | None:
+    """Return an arm of a cell, with its configured accelerations or others; None: its geometry is not known."""
+    model, base = member.config.arm, member.base
+    if model is None:
+        return None
+    bounds = [joint.acceleration for joint in member.config.joints] if acceleration is None else acceleration
+    return Body(model, Pose.from_xyzrpy(*base.position, *base.rpy), bounds)
+
+
+def certain(
+    a: Body,
+    q: Sequence[float],
+    v: Sequence[float],
+    b: Body,
+    p: Sequence[float],
+    w: Sequence[float],
+    delays_s: tuple[float, float],
+) -> tuple[float, float, float]:
+    """Return the distance that two arms keep for certain while both come to rest, m; now; and where both stand.
+
+    Args:
+        a: one arm, at `q`, rad, with the speeds `v`, rad/s.
+        b: the other one, at `p` with `w`.
+        delays_s: how long each goes on before it stops.
+    """
+    a.place(q)
+    b.place(p)
+    here = distance(a.placed, b.placed)[0]
+    whole = a.travel(v, delays_s[0]) + b.travel(w, delays_s[1])
+    if whole == 0.0:
+        return here, here, here
+    a.stop(q, v, delays_s[0])
+    b.stop(p, w, delays_s[1])
+    then = distance(a.placed, b.placed)[0]
+    return max(here - whole, min(here, then) - 0.5 * whole), here, then
+
+
+class Neighbours:
+    """Watches the distance of an arm to its partners.
+
+    Args:
+        own: this arm.
+        partners: in the order of the cell; None: of one without geometry.
+        group: what they publish.
+        clearance: m.
+        period_s: the cycle.
+        delay_s: how long a partner may go on before it stops, beyond the age of its record.
+    """
+
+    def __init__(
+        self,
+        own: Body,
+        partners: Sequence[Body | None],
+        group: StepGroup,
+        clearance: float,
+        period_s: float,
+        delay_s: float,
+    ) -> None:
+        self._own = own
+        self._partners = list(partners)
+        self._group = group
+        self._clearance = clearance
+        self._period_s, self._delay_s = period_s, delay_s
+        self._room = [0.0] * len(self._partners)
+        """No two bodies were nearer when this arm was at `_here` and the partner at `_there`, m."""
+        self._here = [[0.0] * JOINTS for _ in self._partners]
+        self._there = [[0.0] * JOINTS for _ in self._partners]
+
+    def ahead(self, q: Sequence[float], velocity: Sequence[float]) -> MotionEnded | None:
+        """Return why this arm may not go on to `q`, rad, with these speeds, rad/s, or None."""
+        if not any(velocity):
+            return None
+        if self._group.foreign >= 0:
+            return PartnerForeign(self._group.foreign)
+        own, dt = self._own, self._period_s
+        way = own.travel(velocity, dt)
+        for index, body in enumerate(self._partners):
+            partner = self._group.members[index]
+            if body is None or not partner.time_ns:
+                continue
+            there, theirs = partner.position, partner.velocity
+            whole = way + body.travel(theirs, self._delay_s)
+            used = own.moved(self._here[index], q) + body.moved(self._there[index], there)
+            if self._room[index] - used - whole > self._clearance:
+                continue
+            kept, here, then = certain(own, q, velocity, body, there, theirs, (dt, self._delay_s))
+            self._room[index] = here
+            self._here[index][:], self._there[index][:] = q, there
+            if kept > self._clearance or (then > here and whole < _SLOW_M):
+                continue
+            return PartnerNear(index, max(min(here, then), 0.0))
+        return None

@@ -1,0 +1,356 @@
+"""Plan of a bend: two arms of a cell hold a straight rod and bring it to a wanted shape, as one motion in step.
+
+The middle of the rod stays where it is held, both arms move about it. The plan is checked whole: joints, stability and
+strain, the bodies of rod, chucks and arms. Weight is left out: it bends a rod of 1 mm by 0.3 m by 0.4 mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import pairwise, product
+from math import ceil
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+from scipy.interpolate import CubicSpline
+
+from kinematics import IDENTITY, Capsule, InverseKinematics, JointLimit, Placed, Pose, capsules, distance, forward
+from rtcp.config.cell import CellConfig, Member
+from rtcp.config.model import Point
+from rtcp.ipc.errors import Refused, RtcpError
+from rtcp.motion.guards.neighbours import Body
+from rtcp.motion.limits import Limits
+from rtcp.motion.planning.in_step import ACCELERATION_SHARE, SPEED_SHARE, Curve, check_apart, plan_brakes
+from rtcp.motion.planning.plan import PlanRefused, PlanTooFast
+from rtcp.motion.planning.trajectories import plan_trajectory
+from rtcp.processes.rod.continuation import bend, check
+from rtcp.processes.rod.statics import Equilibrium, Rod, shoot
+
+Array = npt.NDArray[np.float64]
+HALF_TURN: Final = Pose((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0))
+"""From the end of the rod, whose e1 points into the second chuck, to the mouth of that chuck."""
+_LARGEST_JOINT_STEP: Final = 0.3
+"""Of a joint between two steps of the rod, rad; more is another branch."""
+_POINT_S: Final = 0.1
+_SMALLEST_PART: Final = 1e-4
+_STRETCH: Final = 1.25
+_ATTEMPTS: Final = 8
+_NEAR_STRAIGHT_RAD: Final = 0.1
+"""Between the ends. Below it the rod is too near to the singular straight one to be solved again by its end pose."""
+
+
+@dataclass(frozen=True)
+class Chuck:
+    """A chuck on a flange: a cylinder from the flange to its mouth."""
+
+    pose: Pose
+    """The mouth from the flange; its x axis points out of the chuck, along the rod."""
+    radius: float
+    """Radius, m."""
+
+
+@dataclass(frozen=True)
+class BendingPlan:
+    """A motion that bends a rod, and the rod along it.
+
+    arms: points of each arm; both begin at rest with the straight rod. steps: the rod, in the frame of its start.
+    times: of the steps, s. starts: poses of the rod's start in the world. curves: the rod in the world,
+    (steps, nodes, 3), m. clearance: least distance of the rod to what does not hold it, m.
+    """
+
+    arms: Mapping[str, tuple[Point, ...]]
+    steps: tuple[Equilibrium, ...]
+    times: tuple[float, ...]
+    starts: tuple[Pose, ...]
+    curves: Array
+    clearance: float
+
+    @property
+    def trajectory(self) -> dict[str, list[dict[str, Any]]]:
+        """The points as `Cell.run_trajectory` takes them."""
+        return {name: [asdict(point) for point in points] for name, points in self.arms.items()}
+
+    @property
+    def begin(self) -> dict[str, tuple[float, ...]]:
+        """Where the arms hold the straight rod, rad."""
+        return {name: points[0].q for name, points in self.arms.items()}
+
+    @property
+    def duration_s(self) -> float:
+        """How long it takes."""
+        return self.times[-1]
+
+
+def plan_bending(
+    cell: CellConfig,
+    chucks: Mapping[str, Chuck],
+    rod: Rod,
+    end: Pose,
+    held: Pose,
+    near: Mapping[str, Sequence[float]],
+) -> BendingPlan:
+    """Return the plan from the straight rod to an end pose (frame of the rod's start); arguments as `plan_motion`.
+
+    Raises:
+        Refused: as `bend` and `plan_motion`.
+    """
+    return plan_motion(cell, chucks, bend(rod, end), held, near)
+
+
+def plan_motion(
+    cell: CellConfig,
+    chucks: Mapping[str, Chuck],
+    steps: Sequence[Equilibrium],
+    held: Pose,
+    near: Mapping[str, Sequence[float]],
+) -> BendingPlan:
+    """Return the plan of a way of the rod, which is a continuous one (`rtcp.processes.rod.continuation`).
+
+    Args:
+        cell: with the two arms.
+        chucks: by the names of their arms; the first one holds the start of the rod.
+        steps: of the rod, from the straight one on.
+        held: pose of the rod's middle in the world, x along the straight rod.
+        near: joint positions, rad, that choose between the configurations of an arm.
+
+    Raises:
+        Invalid: not two arms of the cell.
+        Refused: `arm_out_of_reach`, `rod_collision`, `arms_too_near`, `rod_strain`, `rod_unstable`, with what, where,
+            the value and what is allowed; nothing is begun.
+    """
+    names = [one.name for one in cell.arms]
+    if len(chucks) != 2 or not set(chucks) <= set(names) or set(near) != set(chucks):
+        raise RtcpError(
+            "invalid",
+            f"chucks: found {', '.join(chucks) or 'none'}, near: found {', '.join(near) or 'none'}, allowed are two "
+            f"arms of {', '.join(names)}, the same in both",
+        )
+    for step in steps[1:]:
+        check(step)
+    holders = {name: _Holder(cell.member(name), chuck) for name, chuck in chucks.items()}
+    starts = tuple(held @ step.pose(len(step.s) // 2).inverse() for step in steps)
+    tools = (starts, [start @ step.end @ HALF_TURN for start, step in zip(starts, steps, strict=True)])
+    ways = [list(holder.ways(poses, near[name])) for (name, holder), poses in zip(holders.items(), tools, strict=True)]
+    curves = np.array(
+        [
+            step.p @ np.reshape(start.rotation, (3, 3)).T + np.array(start.position)
+            for start, step in zip(starts, steps, strict=True)
+        ]
+    )
+    refused: RtcpError | None = None
+    for pair in product(*ways):
+        paths = dict(zip(holders, pair, strict=True))
+        try:
+            clearance = _check_rod(holders, paths, curves, steps[0].rod.diameter, cell.clearance)
+            arms, times = _timed(cell, holders, paths)
+            _check_between(holders, arms, steps, times)
+        except Refused as error:
+            refused = refused or error
+            continue
+        return BendingPlan(arms, tuple(steps), times, starts, curves, clearance)
+    assert refused is not None
+    raise refused
+
+
+class _Holder:
+    """An arm with its chuck: the chuck's mouth is its tool, and the chuck the last of its bodies."""
+
+    def __init__(self, member: Member, chuck: Chuck) -> None:
+        model = member.config.arm
+        if model is None:
+            raise RtcpError("invalid", f"{member.name}: its geometry is not known: give its file `kinematics`")
+        self.name, self.chuck, self.limits = member.name, chuck, Limits(member.config)
+        x, y, z = chuck.pose.position
+        a, _, _, d, _, _, g, _, _ = chuck.pose.rotation
+        end = (x - chuck.radius * a, y - chuck.radius * d, z - chuck.radius * g)
+        model = replace(
+            model,
+            tool=chuck.pose,
+            limits=tuple(JointLimit(*both) for both in zip(self.limits.low, self.limits.high, strict=True)),
+            bodies=(*capsules(replace(model, tool=IDENTITY)), Capsule(6, (0.0, 0.0, 0.0), end, chuck.radius)),
+        )
+        base = Pose.from_xyzrpy(*member.base.position, *member.base.rpy)
+        self.body = Body(model, base, self.limits.acceleration)
+        self._solver = InverseKinematics(model)
+
+    def ways(self, poses: Sequence[Pose], near: Sequence[float]) -> Iterator[list[tuple[float, ...]]]:
+        """Yield the continuous joint paths that lead the chuck through poses in the world, the nearest first.
+
+        Raises:
+            Refused: there is none; with why the one that comes farthest ends.
+        """
+        back = self.body.base.inverse()
+        local = [back @ pose for pose in poses]
+        first = self._solver.solve(local[0], near)
+        starts = [one.q for one in first.solutions if one.within_limits]
+        starts.sort(key=lambda q: max(abs(one - other) for one, other in zip(q, near, strict=True)))
+        farthest, reason, count = 0, first.reason or "every configuration there is beyond a joint limit", 0
+        for start in starts:
+            way = [start]
+            for number, pose in enumerate(local[1:], 1):
+                following = self._solver.solve_near(pose, way[-1])
+                problem = following.reason
+                if following.q is not None:
+                    step = max(abs(one - other) for one, other in zip(following.q, way[-1], strict=True))
+                    if step <= _LARGEST_JOINT_STEP:
+                        way.append(following.q)
+                        continue
+                    problem = f"a joint would jump by {step:.3g} rad, {_LARGEST_JOINT_STEP:g} rad is allowed"
+                if number > farthest:
+                    farthest, reason = number, problem
+                break
+            else:
+                count += 1
+                yield [tuple(q) for q in way]
+        if not count:
+            raise RtcpError(
+                "refused",
+                f"{self.name}: at step {farthest} of {len(poses) - 1} of the bend: {reason}: hold the rod elsewhere",
+                "arm_out_of_reach",
+                {"arm": self.name, "step": farthest},
+            )
+
+
+def _check_rod(
+    holders: Mapping[str, _Holder],
+    paths: Mapping[str, Sequence[Sequence[float]]],
+    curves: Array,
+    diameter: float,
+    clearance: float,
+) -> float:
+    """Return the least distance of the rod to arms and chucks, half of what moves between two steps taken off.
+
+    To its own chuck the rod may be nearer than the clearance, and beside its mouth it is in it.
+    """
+    least, count = np.inf, curves.shape[1] - 1
+    segment = float(np.linalg.norm(np.diff(curves[0], axis=0), axis=1)[0])
+    radius = 0.5 * diameter
+    moved = np.abs(np.diff(curves, axis=0, prepend=curves[:1])).max(axis=(1, 2))
+    before = {name: np.zeros(0) for name in holders}
+    for number, curve in enumerate(curves):
+        rod = Placed([Capsule(0, a, b, radius) for a, b in pairwise(map(tuple, curve.tolist()))])
+        rod.place(())
+        for index, (name, holder) in enumerate(holders.items()):
+            holder.body.place(paths[name][number])
+            placed = holder.body.placed
+            axes = np.array(placed.axes)
+            ends = np.concatenate([axes.reshape(-1, 6)[:, :3], axes.reshape(-1, 6)[:, :3] + axes.reshape(-1, 6)[:, 3:]])
+            way = float(np.linalg.norm(ends - before[name], axis=1).max()) if number else 0.0
+            before[name] = ends
+            own = len(placed.radii) - 1
+            inside = min(ceil(2.0 * holder.chuck.radius / segment), count)
+            beyond = range(inside, count) if index == 0 else range(count - inside)
+            between = 0.5 * (float(moved[number]) + way)
+            for pairs, allowed in (
+                (product(range(count), range(own)), clearance),
+                (product(beyond, (own,)), 0.0),
+            ):
+                apart, place, body = distance(rod, placed, tuple(pairs))
+                if apart - between <= allowed:
+                    part = f"link {placed.bodies[body].link}" if body != own else "chuck"
+                    raise RtcpError(
+                        "refused",
+                        f"at step {number} of {len(curves) - 1} the rod, {place * segment:.3f} m from its start, would "
+                        f"be {apart:.3f} m from {name} ({part}), allowed is more than {allowed + between:.3f} m: hold "
+                        "the rod elsewhere",
+                        "rod_collision",
+                        {"arm": name, "step": number, "distance": apart, "s": place * segment},
+                    )
+                if body != own:
+                    least = min(least, apart - between)
+    return float(least)
+
+
+def _timed(
+    cell: CellConfig, holders: Mapping[str, _Holder], paths: Mapping[str, Sequence[Sequence[float]]]
+) -> tuple[dict[str, tuple[Point, ...]], tuple[float, ...]]:
+    """Return the points of both arms and the times of the steps: one spline through the steps, one time law for both.
+
+    The time law is 10 x^3 - 15 x^4 + 6 x^5; its duration is the least that keeps speeds, accelerations and jerks.
+    """
+    joints = np.hstack([np.asarray(path) for path in paths.values()])
+    along = np.append(0.0, np.cumsum(np.abs(np.diff(joints, axis=0)).max(axis=1) + _SMALLEST_PART))
+    along /= along[-1]
+    spline = CubicSpline(along, joints)
+    x = np.linspace(0.0, 1.0, 1001)
+    law = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    position, speed, acceleration = _by_time(spline, x)
+    jerk = np.gradient(acceleration, x, axis=0)
+    limits = [holder.limits for holder in holders.values()]
+    fastest = SPEED_SHARE * np.concatenate([one.velocity for one in limits])
+    strongest = ACCELERATION_SHARE * np.concatenate([one.acceleration for one in limits])
+    jerkiest = np.concatenate([one.jerk for one in limits])
+    duration = max(
+        float((np.abs(speed) / fastest).max()),
+        float((np.abs(acceleration) / strongest).max()) ** 0.5,
+        float((np.abs(jerk) / jerkiest).max()) ** (1.0 / 3.0),
+    )
+    for attempt in range(_ATTEMPTS):
+        count = max(ceil(duration / _POINT_S), 2)
+        parts = np.linspace(0.0, 1.0, count + 1)
+        position, speed, acceleration = _by_time(spline, parts)
+        arms, first = {}, 0
+        for name in holders:
+            columns = slice(first, first + 6)
+            arms[name] = tuple(
+                Point(float(t), tuple(q[columns]), tuple(v[columns]), tuple(a[columns]))
+                for t, q, v, a in zip(
+                    duration * parts,
+                    position.tolist(),
+                    (speed / duration).tolist(),
+                    (acceleration / duration**2).tolist(),
+                    strict=True,
+                )
+            )
+            first += 6
+        try:
+            _check_motion(cell, holders, arms)
+        except PlanTooFast as too_fast:
+            if attempt == _ATTEMPTS - 1:
+                raise RtcpError("refused", str(too_fast), type(too_fast).__name__) from None
+            duration *= _STRETCH
+            continue
+        except PlanRefused as refused:
+            raise RtcpError("refused", str(refused), "arms_too_near") from None
+        break
+    return arms, tuple(float(one) for one in duration * np.interp(along, law, x))
+
+
+def _by_time(spline: CubicSpline, x: Array) -> tuple[Array, Array, Array]:
+    """Position, first and second derivative of the motion by the part x of its duration."""
+    law = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    first, second = 30.0 * (x * (1.0 - x)) ** 2, 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)
+    slope, bow = spline(law, 1), spline(law, 2)
+    return spline(law), slope * first[:, None], bow * first[:, None] ** 2 + slope * second[:, None]
+
+
+def _check_motion(cell: CellConfig, holders: Mapping[str, _Holder], arms: Mapping[str, tuple[Point, ...]]) -> None:
+    """Check all that the gateway will check, with the chucks as bodies; raises PlanRefused."""
+    curves = {}
+    for name, points in arms.items():
+        names = [f"{name} {one.name}" for one in cell.member(name).config.joints]
+        plan = plan_trajectory(points, holders[name].limits, points[0].q, names=names)
+        curves[name] = Curve(plan.rows, len(points[0].q))
+    plan_brakes(curves, {name: holder.limits for name, holder in holders.items()})
+    bodies = {name: holder.body for name, holder in holders.items()}
+    check_apart(curves, bodies, {}, cell.clearance, cell.longest_silence_s + cell.slowest_s)
+
+
+def _check_between(
+    holders: Mapping[str, _Holder],
+    arms: Mapping[str, tuple[Point, ...]],
+    steps: Sequence[Equilibrium],
+    times: Sequence[float],
+) -> None:
+    """Check the rod at the points of the motion: the arms are there where no step is; raises Refused."""
+    first, second = holders
+    rod = steps[0].rod
+    for point, other in zip(arms[first], arms[second], strict=True):
+        nearest = steps[int(np.abs(np.array(times) - point.t).argmin())]
+        if float(nearest.rotations[-1][0, 0]) > np.cos(_NEAR_STRAIGHT_RAD):
+            continue
+        start = holders[first].body.base @ forward(holders[first].body.model, point.q)
+        end = holders[second].body.base @ forward(holders[second].body.model, other.q) @ HALF_TURN
+        check(shoot(rod, start.inverse() @ end, nearest))

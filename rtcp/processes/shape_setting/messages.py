@@ -1,0 +1,269 @@
+"""What the heater is commanded, why it refuses, and what it reports. Events have the numbers 127 to 149."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rtcp.ipc.commands import ANYWHERE, AT_REST, Command, ProcessCommand
+from rtcp.ipc.events import Event, ProcessEnded
+from rtcp.ipc.refusals import Refusal
+from rtcp.processes.shape_setting.interlocks import Mode, Row
+
+
+class HeaterState(IntEnum):
+    """What the heater is doing."""
+
+    OFF = 0
+    """The key is at Off."""
+    READY = 1
+    """The relay is open."""
+    ARMED = 2
+    """The relay is closed, the gate is off."""
+    MEASURING = 3
+    """Pulses for the initial resistance."""
+    HEATING = 4
+    """The setpoint rises."""
+    HOLDING = 5
+    COOLING = 6
+    """Only pulses that measure."""
+    DONE = 7
+    """The profile is complete, the relay is open."""
+    TRIPPED = 8
+    """A row of the interlocks has latched."""
+
+
+class RodPhase(IntEnum):
+    """Phase of the straight, unloaded rod, as the operator knows it from its Af."""
+
+    UNKNOWN = 0
+    AUSTENITE = 1
+    MARTENSITE = 2
+
+
+# -- commands ----------------------------------------------------------------------------------------------------------
+
+
+class ArmHeater(Command):
+    """Close the heater's relay; the gate stays off."""
+
+    states = AT_REST
+
+
+class MeasureResistance(ProcessCommand):
+    """Measure the initial resistance by a few pulses: of the straight, unloaded rod, all austenite."""
+
+    straight_and_unloaded: bool
+    """The operator confirms that nothing bends the rod: stress makes martensite, worth 7 to 20 % of resistance."""
+    phase: RodPhase
+    """The phase that the operator confirms; only austenite is measured, whose line the profile has."""
+
+
+class SetHeatProfile(Command):
+    """Set what is heated to next: a profile's numbers (`rtcp.processes.shape_setting.profile`)."""
+
+    states = AT_REST
+    initial_c: float
+    """Temperature of the rod at its initial resistance, C."""
+    chuck_c: float
+    """Temperature of the chucks, C."""
+    kelvin_per_ratio: float
+    """Resistivity at `initial_c` by its slope: rise of the mean temperature at twice the initial resistance, K."""
+    mean_by_middle: float
+    """Rise of the mean by that of the middle, over the temperature of the chucks."""
+    uncertainty_k: float
+    """Standard uncertainty of the target in the middle by alloy, room and cold ends, K."""
+    target_c: float
+    """Of the middle, C."""
+    ramp_k_s: float
+    """Of the middle, K/s."""
+    hold_s: float
+    cool_c: float
+    """Middle at which the relay opens, C."""
+    max_current: float
+    """Limit of the average current, A."""
+    max_power: float
+    """Limit of the average power, W."""
+
+
+class StartHeating(ProcessCommand):
+    """Heat by the profile: ramp, hold, cool down."""
+
+
+class StopHeating(Command):
+    """Turn gate and relay off."""
+
+    states = ANYWHERE
+    needs_lease = False
+
+
+class ResetTrips(Command):
+    """Forget the latched rows whose cause is gone; the heater starts nothing by that."""
+
+    states = AT_REST
+
+
+# -- refusals ----------------------------------------------------------------------------------------------------------
+
+
+class HeatForbidden(Refusal):
+    """the interlock {row} forbids heat in mode {mode}: see the table in docs/shape_setting.md, then arm the heater"""
+
+    row: Row
+    mode: Mode
+
+
+class TripLatched(Refusal):
+    """the interlock {row} has latched: remove its cause, then reset_trips, then arm the heater"""
+
+    row: Row
+
+
+class CauseRemains(Refusal):
+    """the cause of the latched interlock {row} is still there: remove it, then reset_trips again"""
+
+    row: Row
+
+
+class BatteryLow(Refusal):
+    """the battery has {voltage:.4g} V, at least {limit:.4g} V are needed (least_battery_voltage): charge it"""
+
+    voltage: float
+    limit: float
+
+
+class WrongHeaterState(Refusal):
+    """the heater is {state}, the command needs it {needed}"""
+
+    state: HeaterState
+    needed: HeaterState
+
+
+class RodNotConfirmed(Refusal):
+    """the initial resistance needs a straight, unloaded rod of austenite, {phase} was confirmed: unload it, or warm it
+    above its Af and state that temperature in the profile"""
+
+    phase: RodPhase
+
+
+class ResistanceNotMeasured(Refusal):
+    """there is no initial resistance: arm the heater, then measure_resistance"""
+
+
+class RodStillHot(Refusal):
+    """the rod was heated {elapsed_s:.0f} s ago and has not cooled down under the heater: an initial resistance is
+    measured {wait_s:.0f} s after it (rod_cooling_s)"""
+
+    elapsed_s: float
+    wait_s: float
+
+
+class NoHeatProfile(Refusal):
+    """there is no heat profile: set_heat_profile first"""
+
+
+class ProfileOutOfRange(Refusal):
+    """the profile cannot be heated to: {target_c:.6g} C in the middle is a ratio of {ratio:.4g}, the limit is
+    {limit:.4g} (greatest_ratio), and all numbers have to be finite and positive: correct the profile"""
+
+    target_c: float
+    ratio: float
+    limit: float
+
+
+# -- events ------------------------------------------------------------------------------------------------------------
+
+
+class HeaterArmed(Event, number=127):
+    """the heater is armed in mode {mode}: its relay is closed"""
+
+    mode: Mode
+
+
+class ResistanceMeasured(Event, number=128):
+    """initial resistance of the rod: {resistance:.6g} ohm, standard uncertainty {uncertainty:.2g} ohm, of {pulses}
+    pulses"""
+
+    resistance: float
+    uncertainty: float
+    pulses: int
+
+
+class HeatingStarted(Event, number=129):
+    """heating to {target_c:.6g} C in the middle of the rod, ratio of resistances {ratio:.5g}"""
+
+    target_c: float
+    ratio: float
+
+
+class HoldBegun(Event, number=130):
+    """the middle of the rod has {middle_c:.5g} C: holding for {hold_s:g} s"""
+
+    middle_c: float
+    hold_s: float
+
+
+class CoolingBegun(Event, number=131):
+    """the hold is complete after {energy:.5g} J: the rod cools"""
+
+    energy: float
+
+
+class ShapeSet(Event, number=132):
+    """the middle of the rod has cooled to {middle_c:.5g} C, the relay is open: the rod can be released"""
+
+    middle_c: float
+
+
+class HeatStopped(ProcessEnded, number=133):
+    """the heater was stopped from outside: gate and relay are off; arm it to heat again"""
+
+
+class HeatEnded(ProcessEnded, number=134):
+    """the interlock {row} ended the heat in mode {mode}: gate and relay are off; restore it, then arm the heater"""
+
+    row: Row
+    mode: Mode
+
+
+class ResistanceUncertain(ProcessEnded, number=139):
+    """the initial resistance is {resistance:.6g} ohm with {percent:.2g} % uncertainty, {limit:.2g} % are allowed
+    (greatest_initial_uncertainty): check the contacts, then measure again"""
+
+    resistance: float
+    percent: float
+    limit: float
+
+
+class CoolingTooLong(ProcessEnded, number=140):
+    """the middle of the rod has {middle_c:.5g} C after {limit_s:g} s of cooling (longest_cooling_s): the relay is open;
+    the profile's cool_c may be below what the rod's resistance returns to"""
+
+    middle_c: float
+    limit_s: float
+
+
+class HeaterTripped(ProcessEnded, number=135):
+    """the interlock {row} tripped at {value:.5g}, limit {limit:.5g}: gate and relay are off; remove the cause, then
+    reset_trips"""
+
+    row: Row
+    value: float
+    limit: float
+
+
+class TripsReset(Event, number=136):
+    """the latched interlocks are reset: arm the heater to heat again"""
+
+
+class TargetNotReached(ProcessEnded, number=137):
+    """the middle of the rod has {middle_c:.5g} C after {longest_s:g} s (longest_s): gate and relay are off; check the
+    battery and the profile's limits"""
+
+    middle_c: float
+    longest_s: float
+
+
+class ArmedTooLong(ProcessEnded, number=138):
+    """the heater was armed for {armed_s:g} s (armed_s) without pulses or heat: its relay is open; arm it again"""
+
+    armed_s: float

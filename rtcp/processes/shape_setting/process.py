@@ -1,0 +1,425 @@
+"""The heater as a part of the cycle: interlocks first, then measuring, heating, holding, cooling; outputs last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from math import hypot, inf, isfinite
+from typing import Any, Final
+
+from rtcp.control.part import PartContext
+from rtcp.control.processes import Process, ProcessSetup
+from rtcp.ipc.commands import Command
+from rtcp.ipc.events import Event
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.schema import Field
+from rtcp.ipc.states import State
+from rtcp.motion.step_group import Partner
+from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.control import CurrentControl, Ramp
+from rtcp.processes.shape_setting.interlocks import Interlocks, Mode, Row, first_row
+from rtcp.processes.shape_setting.messages import (
+    ArmedTooLong,
+    ArmHeater,
+    BatteryLow,
+    CauseRemains,
+    CoolingBegun,
+    CoolingTooLong,
+    HeatEnded,
+    HeaterArmed,
+    HeaterState,
+    HeaterTripped,
+    HeatForbidden,
+    HeatingStarted,
+    HeatStopped,
+    HoldBegun,
+    MeasureResistance,
+    NoHeatProfile,
+    ProfileOutOfRange,
+    ResetTrips,
+    ResistanceMeasured,
+    ResistanceNotMeasured,
+    ResistanceUncertain,
+    RodNotConfirmed,
+    RodPhase,
+    RodStillHot,
+    SetHeatProfile,
+    ShapeSet,
+    StopHeating,
+    TargetNotReached,
+    TripLatched,
+    TripsReset,
+    WrongHeaterState,
+)
+from rtcp.processes.shape_setting.resistance import InitialResistance, ResistanceMeter
+from rtcp.processes.shape_setting.supervision import Inputs, Supervision
+from rtcp.processes.shape_setting.temperature import RatioScale
+
+_AT_REST: Final = frozenset({HeaterState.OFF, HeaterState.READY, HeaterState.DONE, HeaterState.TRIPPED})
+_HEAT: Final = frozenset({HeaterState.HEATING, HeaterState.HOLDING})
+_BUSY: Final = _HEAT | {HeaterState.MEASURING, HeaterState.COOLING}
+_HOT: Final = _HEAT | {HeaterState.COOLING}
+_HALF: Final = 0.5
+"""Between the levels of a digital channel."""
+_NO_AGE: Final = 9999.0
+"""s; a record is also written as JSON, which has no infinity."""
+_FIELDS: Final = (
+    Field("state", "uint8", "", "What it is doing (HeaterState)."),
+    Field("busy", "uint8", "", "1: it measures, heats, holds or cools."),
+    Field("mode", "uint8", "", "Position of the key: 0 Off, 1 Manual, 2 Auto."),
+    Field("cause", "uint8", "", "Row of the interlocks that ended the last heating; 31: none."),
+    Field("forbids", "uint32", "", "Rows that keep the relay from closing now, a bit each."),
+    Field("latched", "uint32", "", "Rows that have latched, a bit each."),
+    Field("gate", "uint8", "", "What the gate is commanded; 1: on."),
+    Field("relay", "uint8", "", "What the relay is commanded; 1: closed."),
+    Field("resistance", "float64", "ohm", "Of the newest conversion with the gate on throughout."),
+    Field("resistance_age", "float64", "s", "Its age; 9999: there is none."),
+    Field("initial_resistance", "float64", "ohm", "Mean of the pulses; 0: not measured."),
+    Field("initial_uncertainty", "float64", "ohm", "Its standard uncertainty."),
+    Field("ratio", "float64", "", "Resistance by the initial one; 0: unknown."),
+    Field("target_ratio", "float64", "", "Setpoint of the ratio."),
+    Field("setpoint_middle", "float64", "C", "Setpoint of the temperature in the middle of the rod."),
+    Field("mean_temperature", "float64", "C", "Estimate of the mean temperature."),
+    Field("middle_temperature", "float64", "C", "Estimate of the temperature in the middle."),
+    Field("middle_uncertainty", "float64", "K", "Standard uncertainty of the middle at the target."),
+    Field("average_current", "float64", "A", "Exponential average."),
+    Field("target_current", "float64", "A", "What the average is held at."),
+    Field("energy", "float64", "J", "Into the rod since heating was started."),
+)
+
+
+class ShapeSetting(Process):
+    """See `ShapeSettingConfig`."""
+
+    def __init__(self, config: ShapeSettingConfig, setup: ProcessSetup) -> None:
+        super().__init__(config, setup)
+        self._config = config
+        self._period_s = period_s = setup.period_s
+        signals = setup.signals
+        self._digital = [
+            (name, signals[getattr(config, name)])
+            for name in ("key_auto", "key_manual", "button_a", "button_b", "circuit_a", "circuit_b", "relay_closed",
+                         "fuse_ok", "gate_sense")
+        ]  # fmt: skip
+        self._analog = [
+            (name, signals[getattr(config, name)])
+            for name in ("chassis_voltage", "battery_voltage", "voltage", "current", "sample", "alive")
+        ]
+        self._gate_output, self._relay_output = signals[config.gate], signals[config.relay]
+        self._green, self._yellow = signals[config.lamp_green], signals[config.lamp_yellow]
+        # An arm that the cell does not have is one that never was alive.
+        arms = [setup.partners.get(name) or Partner(0) for name in config.arms]
+        self.inputs = Inputs()
+        self.interlocks = Interlocks()
+        self.supervision = Supervision(config, period_s, arms)
+        self.meter = ResistanceMeter(period_s, config.short_resistance, config.open_resistance)
+        self.initial = InitialResistance()
+        self.control = CurrentControl(
+            period_s, config.average_s, config.proportional, config.integral, config.derivative
+        )  # fmt: skip
+        self.ramp = Ramp(period_s)
+        self.state = HeaterState.OFF
+        self._profile: SetHeatProfile | None = None
+        self._scale = RatioScale(0.0, 1.0, 0.0, 1.0)
+        self.gate = False
+        self.energy = self.uncertainty_k = 0.0
+        self._lease = 0
+        self._elapsed_s = self._pulse_s = self._hold_s = 0.0
+        self._since_heat_s = inf
+        """Since the rod was heated without a cool-down to its end, s."""
+        self._pending: list[Event] = []
+        """Events of commands and of `safe`; the next cycle reports them."""
+
+    def fields(self) -> Sequence[Field]:
+        """Return what it publishes."""
+        return _FIELDS
+
+    # -- commands -----------------------------------------------------------------------------------------------------
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        """Carry out a command, or return why not."""
+        if isinstance(command, StopHeating):
+            return self._stop()
+        if isinstance(command, ResetTrips):
+            return self._reset_trips()
+        if isinstance(command, SetHeatProfile):
+            return self._set_profile(command)
+        if isinstance(command, ArmHeater):
+            return self._arm()
+        if self.state is not HeaterState.ARMED:
+            return WrongHeaterState(self.state, HeaterState.ARMED)
+        if isinstance(command, MeasureResistance):
+            return self._measure(command, lease)
+        return self._start(lease)
+
+    def _stop(self) -> Refusal | None:
+        self.safe()
+        return None
+
+    def _reset_trips(self) -> Refusal | None:
+        was, remains = self.interlocks.latched, self.interlocks.reset(self.supervision.holds)
+        if remains:
+            return CauseRemains(first_row(remains))
+        if was:
+            self._pending.append(TripsReset())
+        return None
+
+    def _set_profile(self, command: SetHeatProfile) -> Refusal | None:
+        if self.state not in _AT_REST and self.state is not HeaterState.ARMED:
+            return WrongHeaterState(self.state, HeaterState.ARMED)
+        numbers = [float(getattr(command, entry.name)) for entry in fields(command)]
+        finite = all(map(isfinite, numbers))
+        positive = finite and all(
+            number > 0.0
+            for number in (
+                command.kelvin_per_ratio, command.mean_by_middle, command.ramp_k_s, command.max_current,
+                command.max_power,
+            )
+        )  # fmt: skip
+        limit = self._config.greatest_ratio
+        scale, ratio = self._scale, 0.0
+        if positive:
+            scale = RatioScale(
+                command.initial_c, command.kelvin_per_ratio, command.chuck_c, command.mean_by_middle
+            )  # fmt: skip
+            ratio = scale.ratio_for_middle(command.target_c)
+        sound = positive and command.hold_s >= 0.0 and command.uncertainty_k >= 0.0 and command.mean_by_middle <= 1.0
+        if not sound or not command.initial_c < command.target_c or not command.cool_c < command.target_c:
+            return ProfileOutOfRange(command.target_c, ratio, limit)
+        config = self._config
+        if not ratio < limit or command.target_c > config.greatest_target_c or command.hold_s >= config.longest_s:
+            return ProfileOutOfRange(command.target_c, ratio, limit)
+        self._profile, self._scale = command, scale
+        return None
+
+    def _arm(self) -> Refusal | None:
+        interlocks, config = self.interlocks, self._config
+        if interlocks.latched:
+            return TripLatched(first_row(interlocks.latched))
+        if self.state not in _AT_REST:
+            return WrongHeaterState(self.state, HeaterState.READY)
+        holds = self.supervision.holds
+        if self.inputs.relay_closed:
+            return HeatForbidden(Row.RELAY_FEEDBACK, interlocks.mode)
+        if not interlocks.close(holds):
+            return HeatForbidden(first_row(interlocks.forbids(holds)), interlocks.mode)
+        voltage = self.inputs.battery_voltage
+        if voltage < config.least_battery_voltage:
+            interlocks.open()
+            return BatteryLow(voltage, config.least_battery_voltage)
+        self.state, self._elapsed_s = HeaterState.ARMED, 0.0
+        self.control.reset()
+        self._pending.append(HeaterArmed(interlocks.mode))
+        return None
+
+    def _measure(self, command: MeasureResistance, lease: int) -> Refusal | None:
+        if not command.straight_and_unloaded or command.phase is not RodPhase.AUSTENITE:
+            return RodNotConfirmed(command.phase)
+        if not self.inputs.relay_closed:
+            return HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
+        if self._since_heat_s < self._config.rod_cooling_s:
+            return RodStillHot(self._since_heat_s, self._config.rod_cooling_s)
+        self.initial.begin()
+        self._pulse_s, self._lease = 0.0, lease
+        self.state = HeaterState.MEASURING
+        return None
+
+    def _start(self, lease: int) -> Refusal | None:
+        profile = self._profile
+        if profile is None:
+            return NoHeatProfile()
+        if not self.initial.value:
+            return ResistanceNotMeasured()
+        if not self.inputs.relay_closed:
+            return HeatForbidden(Row.RELAY_FEEDBACK, self.interlocks.mode)
+        measured = profile.kelvin_per_ratio / profile.mean_by_middle * self.initial.uncertainty / self.initial.value
+        self.uncertainty_k = hypot(profile.uncertainty_k, measured)
+        self.ramp.begin(self._scale.middle(1.0), profile.target_c, profile.ramp_k_s)
+        self.control.reset()
+        self.energy = self._elapsed_s = 0.0
+        self._lease = lease
+        self.state = HeaterState.HEATING
+        self._pending.append(HeatingStarted(profile.target_c, self._scale.ratio_for_middle(profile.target_c)))
+        return None
+
+    # -- the cycle ----------------------------------------------------------------------------------------------------
+
+    @property
+    def ratio(self) -> float:
+        """Resistance by the initial one; 0: unknown."""
+        return self.meter.resistance / self.initial.value if self.initial.value else 0.0
+
+    def update(self, context: PartContext) -> None:
+        """Do a cycle."""
+        if context.state is State.STARTING:
+            # The inputs are not valid yet.
+            self._open()
+            return
+        self._read()
+        self._since_heat_s = 0.0 if self.state in _HOT else self._since_heat_s + self._period_s
+        inputs, interlocks, meter = self.inputs, self.interlocks, self.meter
+        meter.update(inputs.voltage, inputs.current, inputs.sample, inputs.gate_sense)
+        holds = self.supervision.update(
+            inputs, meter, self.initial.value, context, self._lease, interlocks.closed, self.gate
+        )  # fmt: skip
+        latched = interlocks.latched
+        if interlocks.update(inputs.mode, holds):
+            self._report_cause(context, interlocks.latched & ~latched)
+            self._open()
+        for event in self._pending:
+            context.report(event)
+        self._pending.clear()
+        self.control.measure(inputs.current)
+        if context.good and self.state in _BUSY:
+            self.energy += inputs.voltage * inputs.current * self._period_s
+        if not interlocks.closed:
+            self._rest()
+        else:
+            self._work(context)
+        self._write(context)
+
+    def _read(self) -> None:
+        inputs = self.inputs
+        for name, signal in self._digital:
+            setattr(inputs, name, signal.value > _HALF)
+        for name, signal in self._analog:
+            setattr(inputs, name, signal.value)
+
+    def _report_cause(self, context: PartContext, latches: int) -> None:
+        row, supervision = self.interlocks.cause, self.supervision
+        if latches:
+            context.report(HeaterTripped(row, supervision.values[row], supervision.limits[row]))
+        else:
+            context.report(HeatEnded(row, self.interlocks.mode))
+
+    def _rest(self) -> None:
+        """Show why the relay is open."""
+        mode = self.interlocks.mode
+        if mode is Mode.OFF:
+            # With the key out the rod may be changed.
+            self.initial.forget()
+        if self.interlocks.latched:
+            # Contacts, wires or the rod itself may have changed.
+            self.initial.forget()
+            self.state = HeaterState.TRIPPED
+        elif mode is Mode.OFF:
+            self.state = HeaterState.OFF
+        elif self.state is not HeaterState.DONE:
+            self.state = HeaterState.READY
+
+    def _work(self, context: PartContext) -> None:
+        """Decide on the gate for this cycle."""
+        if self.state is HeaterState.ARMED:
+            self._wait(context)
+        elif self.state is HeaterState.MEASURING:
+            self._pulse(context)
+        elif self.state is HeaterState.COOLING:
+            self._cool(context)
+        else:
+            self._heat(context)
+
+    def _wait(self, context: PartContext) -> None:
+        """Open a relay that nobody uses: no commander watches over an armed heater."""
+        self._elapsed_s += self._period_s
+        if self._elapsed_s > self._config.armed_s:
+            context.report(ArmedTooLong(self._config.armed_s))
+            self._open()
+
+    def _pulse(self, context: PartContext) -> None:
+        """Do a cycle of the pulses: the gate is on until a conversion with the gate on throughout has come."""
+        initial, config = self.initial, self._config
+        self._pulse_s += self._period_s
+        if self.gate and self.meter.fresh:
+            initial.add(self.meter.resistance)
+            self.gate, self._pulse_s = False, 0.0
+            if initial.pulses == config.pulses:
+                initial.finish()
+                self.state, self._lease, self._elapsed_s = HeaterState.ARMED, 0, 0.0
+                if initial.uncertainty > config.greatest_initial_uncertainty * initial.value:
+                    percent, limit = initial.uncertainty / initial.value, config.greatest_initial_uncertainty
+                    context.report(ResistanceUncertain(initial.value, 100.0 * percent, 100.0 * limit))
+                    initial.forget()
+                else:
+                    context.report(ResistanceMeasured(initial.value, initial.uncertainty, initial.pulses))
+        elif self._pulse_s >= config.pulse_interval_s or not initial.pulses:
+            self.gate = True
+
+    def _heat(self, context: PartContext) -> None:
+        config, meter, control, profile, scale = self._config, self.meter, self.control, self._profile, self._scale
+        assert profile is not None
+        middle = scale.middle(self.ratio)
+        reached = self.ramp.update(middle)
+        self._elapsed_s += self._period_s
+        if meter.voltage:
+            limit = min(profile.max_current, profile.max_power / meter.voltage)
+            setpoint = scale.ratio_for_middle(self.ramp.setpoint_c)
+            control.update(setpoint, self.ratio, meter.current, limit)
+        self.gate = control.gate or meter.age_s >= config.sense_interval_s
+        if self.state is HeaterState.HEATING and reached:
+            self.state, self._hold_s = HeaterState.HOLDING, 0.0
+            context.report(HoldBegun(middle, profile.hold_s))
+        elif self.state is HeaterState.HOLDING:
+            self._hold_s += self._period_s
+            if self._hold_s >= profile.hold_s:
+                self.state, self.gate, self._hold_s = HeaterState.COOLING, False, 0.0
+                control.reset()
+                context.report(CoolingBegun(self.energy))
+                return
+        if self._elapsed_s > config.longest_s:
+            context.report(TargetNotReached(middle, config.longest_s))
+            self._open()
+
+    def _cool(self, context: PartContext) -> None:
+        assert self._profile is not None
+        self.gate = self.meter.age_s >= self._config.cooling_interval_s
+        middle = self._scale.middle(self.ratio)
+        self._hold_s += self._period_s
+        if self.meter.fresh and middle <= self._profile.cool_c:
+            context.report(ShapeSet(middle))
+            self._open()
+            # The rod is taken out now: the next one is measured anew.
+            self.initial.forget()
+            self.state, self._since_heat_s = HeaterState.DONE, inf
+        elif self._hold_s > self._config.longest_cooling_s:
+            context.report(CoolingTooLong(middle, self._config.longest_cooling_s))
+            self._open()
+
+    def _write(self, context: PartContext) -> None:
+        closed = self.interlocks.closed
+        # The one place where anything is turned on: the walk of the table in this cycle has permitted it.
+        self.gate = self.gate and closed and self.inputs.relay_closed and context.good
+        self._relay_output.value = float(closed)
+        self._gate_output.value = float(self.gate)
+        self._yellow.value = float(closed)
+        self._green.value = float(context.state in (State.READY, State.HOLDING))
+
+    def safe(self) -> None:
+        """Turn gate and relay off; they stay off until the heater is armed again."""
+        if self.interlocks.closed:
+            self._pending.append(HeatStopped())
+        self._open()
+
+    def _open(self) -> None:
+        self.interlocks.open()
+        self.gate = False
+        self._lease = 0
+        self._relay_output.value = self._gate_output.value = self._yellow.value = 0.0
+        self.control.reset()
+        self.meter.forget()
+        self.supervision.forget_gradient()
+        if self.state not in _AT_REST:
+            self.state = HeaterState.READY
+
+    def publish(self, values: list[Any], at: int) -> None:
+        """Write the values of `_FIELDS`."""
+        interlocks, meter, initial, control = self.interlocks, self.meter, self.initial, self.control
+        ratio, scale = self.ratio, self._scale
+        values[at : at + len(_FIELDS)] = (
+            self.state, self.state in _BUSY, interlocks.mode, interlocks.cause,
+            interlocks.forbids(self.supervision.holds), interlocks.latched,
+            self.gate, interlocks.closed,
+            meter.resistance, min(meter.age_s, _NO_AGE), initial.value, initial.uncertainty,
+            ratio, scale.ratio_for_middle(self.ramp.setpoint_c), self.ramp.setpoint_c,
+            scale.mean(ratio) if ratio else 0.0, scale.middle(ratio) if ratio else 0.0, self.uncertainty_k,
+            control.average, control.target, self.energy,
+        )  # fmt: skip

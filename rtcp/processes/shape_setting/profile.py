@@ -1,0 +1,117 @@
+"""Profiles of shape setting, in YAML: `read_profile(path)` checks them whole, `heat_command` makes the loop's numbers.
+
+config/shape_setting/nitinol.yaml is an example. Not for the loop: this module loads the validator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le
+
+from rtcp.config.document import Finding, read
+from rtcp.config.numbers import NotNegative
+from rtcp.config.validation import Checker, rule
+from rtcp.processes.shape_setting.messages import SetHeatProfile
+from rtcp.processes.shape_setting.temperature import (
+    Alloy,
+    ColdEnds,
+    Temperature,
+    mean_temperature,
+    middle_temperature,
+    ratio_scale,
+)
+
+_Room = Annotated[float, Ge(-20), Le(200)]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the heater does not exceed with this rod."""
+
+    current: Annotated[float, Gt(0), Le(300)] = 50.0
+    """Greatest average current, A."""
+    power: Annotated[float, Gt(0), Le(5000)] = 500.0
+    """Greatest average power, W."""
+
+
+@dataclass(frozen=True)
+class HeatProfile:
+    """A profile: what is heated to which temperature, for how long."""
+
+    alloy: Alloy
+    ends: ColdEnds
+    target_c: Annotated[float, Ge(50), Le(600)]
+    """Temperature in the middle of the rod, C; Nitinol loses its structure above 600 C."""
+    hold_s: NotNegative
+    """Time at the target, s."""
+    ramp_k_s: Annotated[float, Ge(0.1), Le(500)] = 50.0
+    """Rise of the setpoint in the middle, K/s."""
+    cool_c: Annotated[float, Ge(20), Le(400)] = 80.0
+    """Temperature in the middle at which the relay opens and the rod can be released, C."""
+    initial_c: _Room = 20.0
+    """Temperature of the rod when its initial resistance is measured, C: of the room, or of a preheat above Af."""
+    initial_uncertainty_k: NotNegative = 1.0
+    """Standard uncertainty of `initial_c`, K."""
+    chuck_c: _Room = 20.0
+    """Temperature of the chucks, C."""
+    ratio_uncertainty: Annotated[float, Ge(0), Le(0.1)] = 0.001
+    """Standard uncertainty of the ratio of resistances: contacts, noise, offsets; 0.002 is some 10 K."""
+    limits: Limits = field(default_factory=Limits)
+
+
+@rule(HeatProfile, "target_c", "cool_c", "initial_c")
+def _order(profile: HeatProfile) -> Iterator[Finding]:
+    for key in ("cool_c", "initial_c"):
+        if getattr(profile, key) >= profile.target_c:
+            yield (key,), f"found {getattr(profile, key):g}, allowed is less than target_c, {profile.target_c:g}"
+    if profile.cool_c <= profile.initial_c:
+        yield ("cool_c",), f"found {profile.cool_c:g}, allowed is more than initial_c, {profile.initial_c:g}"
+
+
+_FILE = Checker(HeatProfile)
+
+
+def read_profile(path: Path) -> HeatProfile:
+    """Return the profile in a YAML file.
+
+    Raises:
+        ConfigError: one sentence per mistake, with its line.
+    """
+    return _FILE.read(read(path))
+
+
+def target_ratio(profile: HeatProfile) -> float:
+    """Return the ratio of resistances at which the middle has its target temperature."""
+    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    return scale.ratio_for_middle(profile.target_c)
+
+
+def target_temperatures(profile: HeatProfile) -> tuple[Temperature, Temperature]:
+    """Return the temperatures of mean and middle at the target, with their uncertainties."""
+    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    mean = mean_temperature(
+        profile.alloy, scale, target_ratio(profile), profile.ratio_uncertainty, profile.initial_uncertainty_k
+    )
+    return mean, middle_temperature(profile.ends, scale, mean)
+
+
+def heat_command(profile: HeatProfile) -> SetHeatProfile:
+    """Return the command that brings a profile to the loop."""
+    scale = ratio_scale(profile.alloy, profile.ends, profile.initial_c, profile.chuck_c)
+    return SetHeatProfile(
+        initial_c=scale.initial_c,
+        chuck_c=scale.chuck_c,
+        kelvin_per_ratio=scale.kelvin_per_ratio,
+        mean_by_middle=scale.mean_by_middle,
+        uncertainty_k=target_temperatures(profile)[1].uncertainty_k,
+        target_c=profile.target_c,
+        ramp_k_s=profile.ramp_k_s,
+        hold_s=profile.hold_s,
+        cool_c=profile.cool_c,
+        max_current=profile.limits.current,
+        max_power=profile.limits.power,
+    )

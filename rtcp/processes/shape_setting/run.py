@@ -1,0 +1,373 @@
+"""Shape setting as one run: grip, measure, bend, heat, hold, cool, release. Heat is off before an arm moves, always."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from kinematics import Pose, forward
+from rtcp.api import Robot, RtcpError, State
+from rtcp.api.cell import Cell, rod_file
+from rtcp.api.robot import Process
+from rtcp.config.cell import Member
+from rtcp.config.model import VIRTUAL
+from rtcp.ipc.runtime_directory import control_socket
+from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
+from rtcp.processes.rod.bending import HALF_TURN
+from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from rtcp.processes.shape_setting.interlocks import TABLE
+from rtcp.processes.shape_setting.job import Job, pose_of
+from rtcp.processes.shape_setting.profile import HeatProfile, heat_command
+
+Array = npt.NDArray[np.float64]
+SAMPLE_S: Final = 0.2
+"""Interval at which the heater's fields are kept for the report, s."""
+_RELAY_S: Final = 2.0
+_RESISTANCE_SHARE: Final = 0.2
+"""Largest relative deviation of the initial resistance from that by alloy and dimensions; another phase: 7 to 20 %."""
+_GHOSTS, _GHOST_STRIDE = 4, 4
+"""Number of curves of the rod that panels draw, and the step between their nodes."""
+_FIELDS: Final = (
+    "ratio", "target_ratio", "setpoint_middle", "mean_temperature", "middle_temperature", "average_current",
+    "target_current", "energy",
+)  # fmt: skip
+_VIRTUAL_BOX: Final = (0x00000A55, 0x00000010)
+_BEND, _ACT, _FRACTION, _CELLS_AT, _HIGHEST = 0x2010, 0x2013, 0x2021, 0x2025, 0x2026
+_CELLS: Final = 48
+
+
+@dataclass
+class Outcome:
+    """What a run came to; the shapes are curves of points, (n, 3), m, in the frame of the rod's start.
+
+    times, samples: of the heater's fields by name. wanted, held, released: curves; released is an estimate from the
+    temperatures along the rod. straight: lengths at the two ends that are not set, m. error: of the released rod
+    against the wanted one, largest and root mean square, m.
+    """
+
+    times: list[float] = field(default_factory=list)
+    samples: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in _FIELDS})
+    wanted: Array | None = None
+    held: Array | None = None
+    released: Array | None = None
+    s: Array | None = None
+    fraction: Array | None = None
+    highest: Array | None = None
+    straight: tuple[float, float] = (0.0, 0.0)
+    error: tuple[float, float] = (0.0, 0.0)
+    strain: float = 0.0
+    initial_resistance: float = 0.0
+    energy: float = 0.0
+    interlocks: dict[str, str] = field(default_factory=dict)
+    steps: list[tuple[float, str]] = field(default_factory=list)
+    """Time since the beginning, s, and what began."""
+
+
+class ShapeSettingRun:
+    """One run on a cell that is running.
+
+    Args:
+        cell: two arms and the heater.
+        job: the shape.
+        profile: of the heat.
+        say: called with what begins.
+        confirm: called where people do something at the rod; returns when they have.
+
+    Raises:
+        Refused: the cell has no heater, or the bend cannot be planned; nothing has moved.
+    """
+
+    def __init__(
+        self, cell: Cell, job: Job, profile: HeatProfile, say: Callable[[str], None], confirm: Callable[[str], None]
+    ) -> None:
+        self._cell, self._job, self._profile = cell, job, profile
+        self._say, self._confirm = say, confirm
+        self._member, self._name = _heater_of(cell)
+        self._robot = cell.processes[self._member.name]
+        self._heater = self._robot.processes[self._name]
+        self.outcome = Outcome()
+        self.heat_is_off = False
+        """Whether a run that ended early has seen gate and relay off."""
+        self._began = time.monotonic()
+        self.plan: BendingPlan = plan_motion(cell.config, job.holders, job.steps(), pose_of(job.held), job.near)
+        """The motion that bends the rod."""
+
+    def run(self) -> Outcome:
+        """Do all of it; whatever ends it early turns the heat off first, then stops the arms.
+
+        Raises:
+            RtcpError: what ended it.
+        """
+        ghost = rod_file(self._member.directory.parent)
+        try:
+            self._draw(ghost)
+            self._steps()
+        except BaseException:
+            self._stop()
+            raise
+        finally:
+            with contextlib.suppress(OSError):
+                ghost.unlink(missing_ok=True)
+        return self.outcome
+
+    def _draw(self, path: Path) -> None:
+        """Let the panels of the arms draw the rod along its bend: some curves of points in the world, m."""
+        curves = self.plan.curves
+        chosen = np.linspace(0, len(curves) - 1, min(_GHOSTS, len(curves))).round().astype(int)
+        made = path.with_suffix(".new")
+        # What a panel does not draw is no reason not to begin.
+        with contextlib.suppress(OSError):
+            made.write_text(json.dumps(curves[chosen][:, ::_GHOST_STRIDE].round(4).tolist()))
+            made.replace(path)
+
+    def _begin(self, what: str) -> None:
+        self.outcome.steps.append((time.monotonic() - self._began, what))
+        self._say(what)
+
+    def _steps(self) -> None:
+        cell, heater = self._cell, self._heater
+        last = self.plan.steps[-1]
+        self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
+        heater.command("stop_heating")
+        self._confirm("the chucks are empty, nothing stands between the arms")
+        self._begin("arms are enabled and go to where the straight rod is gripped")
+        for robot in cell.arms.values():
+            if robot.state is State.READY:
+                robot.enable()
+        cell.move_joints(self.plan.begin, self._job.approach_speed)
+        room = f"{self._profile.initial_c:g} C"
+        self._confirm(f"grip the rod, straight and unloaded, at {room}, which is above its Af; the key is at Auto")
+        virtual = VirtualRod(self._robot) if _is_virtual(self._member) else None
+        if virtual is not None:
+            virtual.renew()
+        heater.command("set_heat_profile", **asdict(heat_command(self._profile)))
+        self._begin("the initial resistance is measured")
+        self._arm()
+        heater.command("measure_resistance", straight_and_unloaded=True, phase="austenite")
+        self.outcome.initial_resistance = float(heater.fields["initial_resistance"])
+        heater.command("stop_heating")
+        self._check_resistance()
+        self._await_relay(closed=False)
+        self._begin("the rod is bent")
+        cell.run_trajectory(self.plan.trajectory)
+        held = self._held()
+        self.outcome.held = held.p
+        if virtual is not None:
+            virtual.bend(held)
+        self._begin(f"heating to {self._profile.target_c:g} C in the middle, hold {self._profile.hold_s:g} s, cooling")
+        self._arm()
+        with self._sampling():
+            heater.command("start_heating")
+        self.outcome.energy = float(heater.fields["energy"])
+        self._note_interlocks(heater)
+        self._begin("the rod has cooled: release")
+        self._finish(held, virtual)
+        self._confirm("open the chucks and take the rod out; the arms stay where they are")
+
+    def _check_resistance(self) -> None:
+        """Compare the initial resistance with that of the rod by its alloy and dimensions."""
+        rod, found = self._job.rod, self.outcome.initial_resistance
+        area = 0.25 * np.pi * rod.diameter**2
+        expected = float(self._profile.alloy.resistivity(self._profile.initial_c) * rod.length / area)
+        if not abs(found / expected - 1.0) <= _RESISTANCE_SHARE:
+            raise RtcpError(
+                "refused",
+                f"the initial resistance is {found:.4g} ohm, by alloy and dimensions {expected:.4g} ohm are expected, "
+                f"{100 * _RESISTANCE_SHARE:g} % off at most: check rod, phase, contacts and the profile's alloy",
+                "implausible_resistance",
+                {"resistance": found, "expected": expected},
+            )
+
+    def _arm(self) -> None:
+        if self._robot.state is State.READY:
+            self._robot.enable()
+        self._heater.command("arm_heater")
+        self._await_relay(closed=True)
+
+    def _await_relay(self, closed: bool) -> None:
+        until = time.monotonic() + _RELAY_S
+        while self._relay_closed() is not closed:
+            if time.monotonic() > until:
+                what = "close" if closed else "open"
+                raise RtcpError("fault", f"the heater's relay did not {what} within {_RELAY_S:g} s: see its feedback")
+            time.sleep(0.02)
+
+    def _relay_closed(self) -> bool:
+        config = next(one for one in self._member.config.processes if one.name == self._name)
+        assert isinstance(config, ShapeSettingConfig)
+        slave, _, channel = config.relay_closed.partition(".")
+        return bool(self._robot.status().raw["devices"][slave][channel]["value"])
+
+    def _socket(self) -> Path:
+        return control_socket(self._member.directory)
+
+    @contextlib.contextmanager
+    def _sampling(self) -> Iterator[None]:
+        """Keep the heater's fields meanwhile, over a connection of their own."""
+        ended = threading.Event()
+        outcome, began = self.outcome, time.monotonic()
+
+        def sample() -> None:
+            with contextlib.suppress(RtcpError), Robot("shape-set: report", self._socket()) as robot:
+                process = robot.processes[self._name]
+                while not ended.wait(SAMPLE_S):
+                    fields = process.fields
+                    outcome.times.append(time.monotonic() - began)
+                    for name, values in outcome.samples.items():
+                        values.append(float(fields[name] or 0.0))
+
+        thread = threading.Thread(target=sample, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            # Not waited for: what ended the heat early has to turn it off first.
+            ended.set()
+
+    def _held(self) -> Equilibrium:
+        """Return the rod as the arms hold it by their measured positions."""
+        mouths = []
+        for name, chuck in self._job.holders.items():
+            member, status = self._cell.config.member(name), self._cell.arms[name].status()
+            assert member.config.arm is not None
+            base = Pose.from_xyzrpy(*member.base.position, *member.base.rpy)
+            bare = member.config.arm
+            flange = forward(bare, status.positions) @ bare.tool.inverse()
+            mouths.append(base @ flange @ chuck.pose)
+        end = mouths[0].inverse() @ mouths[1] @ HALF_TURN.inverse()
+        return shoot(self.plan.steps[-1].rod, end, self.plan.steps[-1])
+
+    def _finish(self, held: Equilibrium, virtual: VirtualRod | None) -> None:
+        """Estimate the released shape: of a virtual rod from its own temperatures, else from the fin's."""
+        outcome = self.outcome
+        if virtual is not None:
+            at, fraction, highest = virtual.read()
+            outcome.fraction, outcome.highest = np.interp(held.s, at, fraction), np.interp(held.s, at, highest)
+            virtual.release()
+        else:
+            grid = self._along(held.s)
+            outcome.fraction, outcome.highest = set_fraction(outcome.times, grid), grid.max(axis=1)
+        freed: Release = release(held, np.clip(outcome.fraction, 0.0, 1.0), outcome.wanted)
+        outcome.released = freed.shape.p
+        outcome.straight = freed.straight_start, freed.straight_end
+        outcome.error = float(freed.error.max()), float(np.sqrt(np.mean(freed.error**2)))
+
+    def _along(self, s: Array) -> Array:
+        """Return the temperatures along the rod, (n, k), C, from those of the middle, by the solution of a fin."""
+        ends, chuck = self._profile.ends, self._profile.chuck_c
+        half = 0.5 * ends.length
+        shape = 1.0 - np.cosh((s - half) / ends.end_length) / np.cosh(half / ends.end_length)
+        middle = np.array(self.outcome.samples["middle_temperature"])
+        return np.asarray(chuck + (shape / shape.max())[:, None] * (middle - chuck)[None, :])
+
+    def _note_interlocks(self, heater: Process) -> None:
+        fields = heater.fields
+        for rule in TABLE:
+            bit = 1 << rule.row
+            state = "latched" if int(fields["latched"]) & bit else "forbids" if int(fields["forbids"]) & bit else "good"
+            self.outcome.interlocks[rule.row.name.lower()] = state
+
+    def _stop(self) -> None:
+        """Heat first, then motion; what does not answer keeps nothing from stopping."""
+        with _undisturbed():
+            self._stop_all()
+
+    def _stop_all(self) -> None:
+        # Over connections of their own: an interrupt has left those of the cell in the middle of an answer.
+        with contextlib.suppress(Exception), Robot("shape-set: stop", self._socket()) as robot:
+            robot.command("stop_heating")
+        with contextlib.suppress(Exception):
+            self._cell.halt()
+        with contextlib.suppress(Exception), Robot("shape-set: report", self._socket()) as robot:
+            heater = robot.processes[self._name]
+            self._note_interlocks(heater)
+            fields = heater.fields
+            self.heat_is_off = not fields["gate"] and not fields["relay"]
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Ignore a second Ctrl-C meanwhile."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+class VirtualRod:
+    """The rod of the virtual control box, which cannot see what the virtual arms do: by SDO.
+
+    Args:
+        robot: the heater's platform; it is disabled for each change, since objects are written in state ready only.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
+        self._slave = next(
+            one["position"] for one in robot.scan() if (one["vendor_id"], one["product_code"]) == _VIRTUAL_BOX
+        )
+
+    def renew(self) -> None:
+        """Grip another rod, cold and straight."""
+        self._act(3)
+
+    def bend(self, held: Equilibrium) -> None:
+        """Impose the shape in which the arms hold it."""
+        at = self._column(_CELLS_AT)
+        self._disable()
+        for axis in range(3):
+            for number, value in enumerate(np.interp(at, held.s, held.u[:, axis]).tolist(), 1):
+                self._robot.sdo_write(self._slave, _BEND + axis, number, struct.pack("<f", value))
+        self._act(1)
+
+    def release(self) -> None:
+        """Let it spring back."""
+        self._act(2)
+
+    def read(self) -> tuple[Array, Array, Array]:
+        """Return where its cells are, m, which part of the bend is set there, and how hot each was at most, C."""
+        return self._column(_CELLS_AT), self._column(_FRACTION), self._column(_HIGHEST)
+
+    def _column(self, index: int) -> Array:
+        cells = (self._robot.sdo_read(self._slave, index, number) for number in range(1, _CELLS + 1))
+        return np.array([struct.unpack("<f", one)[0] for one in cells], dtype=np.float64)
+
+    def _disable(self) -> None:
+        if self._robot.state is State.HOLDING:
+            self._robot.disable()
+
+    def _act(self, what: int) -> None:
+        self._disable()
+        self._robot.sdo_write(self._slave, _ACT, 1, bytes((what,)))
+
+
+def _heater_of(cell: Cell) -> tuple[Member, str]:
+    for member in cell.config.processes:
+        for process in member.config.processes:
+            if isinstance(process, ShapeSettingConfig):
+                return member, process.name
+    raise RtcpError(
+        "refused",
+        f"the cell {cell.config.name} has no process of kind shape_setting: `rtcp cell start --config "
+        "config/cell_shape_setting.yaml` has one",
+        "no_heater",
+    )
+
+
+def _is_virtual(member: Member) -> bool:
+    return member.config.bus.interface == VIRTUAL

@@ -1,0 +1,124 @@
+"""Simple Message as RAPID reads and writes it (ROS-Industrial REP-I0004: numbers, REP-I0006: layouts).
+
+A message is its length, msg_type, comm_type, reply_code (int32 each) and a body, little endian and packed; the length
+counts all but itself. A joint message has as many joints as its length says. Units: rad, s.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from math import isfinite
+from typing import NamedTuple
+
+LEAST_LENGTH, MOST_LENGTH = 12, 1023
+LEAST_JOINTS = 10
+"""Joints that REP-I0006 has room for; longer messages have more."""
+_HEADER = struct.Struct("<4i")
+
+
+class MessageType(IntEnum):
+    """Messages of the RAPID tasks."""
+
+    JOINT_POSITION = 10
+    JOINT_TRAJ_PT = 11
+    STATUS = 13
+
+
+class CommType(IntEnum):
+    """Whether a reply follows."""
+
+    TOPIC = 1
+    REQUEST = 2
+    REPLY = 3
+
+
+class ReplyCode(IntEnum):
+    """0 in all but replies."""
+
+    INVALID = 0
+    SUCCESS = 1
+    FAILURE = 2
+
+
+class SpecialSequence(IntEnum):
+    """Sequence numbers that are no count."""
+
+    START_DOWNLOAD = -1
+    END_TRAJECTORY = -3
+    STOP_TRAJECTORY = -4
+
+
+class NotAMessage(Exception):
+    """A length outside 12..1023: nothing after it can be read."""
+
+
+class Frame(NamedTuple):
+    """One message; its numbers may be unknown ones."""
+
+    msg_type: int
+    comm_type: int
+    reply_code: int
+    body: bytes
+
+
+class JointPoint(NamedTuple):
+    """A JOINT_TRAJ_PT."""
+
+    sequence: int
+    joints: tuple[float, ...]
+    """rad."""
+    duration: float
+    """Time from the point before, s."""
+
+
+def pack(msg_type: int, comm_type: int, reply_code: int = 0, body: bytes = b"") -> bytes:
+    """Return a message."""
+    return _HEADER.pack(LEAST_LENGTH + len(body), msg_type, comm_type, reply_code) + body
+
+
+def take_frame(data: bytearray) -> Frame | None:
+    """Remove the first message from `data` and return it; None while it is not complete.
+
+    Raises:
+        NotAMessage: what is there begins with no length.
+    """
+    if len(data) < 4:
+        return None
+    length = int.from_bytes(data[:4], "little", signed=True)
+    if not LEAST_LENGTH <= length <= MOST_LENGTH:
+        raise NotAMessage(f"length {length} is outside {LEAST_LENGTH}..{MOST_LENGTH}")
+    if len(data) < 4 + length:
+        return None
+    _, msg_type, comm_type, reply_code = _HEADER.unpack_from(data)
+    frame = Frame(msg_type, comm_type, reply_code, bytes(data[_HEADER.size : 4 + length]))
+    del data[: 4 + length]
+    return frame
+
+
+def read_joint_point(frame: Frame, joints: int) -> JointPoint | None:
+    """Return the point of a JOINT_TRAJ_PT with its first `joints` joints.
+
+    None: another message (only the type tells a JOINT_POSITION of 12 joints from a point of 10), fewer joints, or
+    numbers that are not finite.
+    """
+    sent, rest = divmod(len(frame.body) - 12, 4)
+    if frame.msg_type != MessageType.JOINT_TRAJ_PT or rest or sent < joints:
+        return None
+    sequence, *values = struct.unpack(f"<i{sent + 2}f", frame.body)
+    if not all(map(isfinite, values)):
+        return None
+    return JointPoint(sequence, tuple(values[:joints]), values[-1])
+
+
+def joint_position(sequence: int, joints: Sequence[float]) -> bytes:
+    """Return a JOINT_POSITION as a topic; joints in rad, at least ten on the wire."""
+    padded = (*joints, *[0.0] * (LEAST_JOINTS - len(joints)))
+    return pack(MessageType.JOINT_POSITION, CommType.TOPIC, body=struct.pack(f"<i{len(padded)}f", sequence, *padded))
+
+
+def status(powered: bool, e_stopped: bool, failed: bool, in_motion: bool, automatic: bool, possible: bool) -> bytes:
+    """Return a STATUS as a topic; its error_code is 0 always, as in `abb/rapid`."""
+    fields = (powered, e_stopped, 0, failed, in_motion, 2 if automatic else 1, possible)
+    return pack(MessageType.STATUS, CommType.TOPIC, body=struct.pack("<7i", *fields))

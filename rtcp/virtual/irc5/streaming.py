@@ -1,0 +1,188 @@
+"""RAPID streaming in simulated time: the motion server's task, the state server's task, and a motion task a unit.
+
+As `abb/rapid`: one message at a time; a point is offered to all motion tasks at once, and the reply follows its
+acceptance. Without acceptance within WaitSyncTask's timeout the reply is FAILURE.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from math import degrees, radians
+from random import Random
+from typing import Any
+
+from rtcp.virtual.irc5.config import RapidConfig
+from rtcp.virtual.irc5.mechanical_unit import MechanicalUnit
+from rtcp.virtual.irc5.messages import ROBOT_AXES, MciState
+from rtcp.virtual.irc5.motion_task import SHORTEST_MOVE_S, MotionTask, Move
+from rtcp.virtual.irc5.panel import Mode, Motors, Panel, Stop
+from rtcp.virtual.irc5.simple_message import (
+    CommType,
+    Frame,
+    JointPoint,
+    ReplyCode,
+    SpecialSequence,
+    joint_position,
+    pack,
+    read_joint_point,
+    status,
+)
+
+MOST_POINTS = 200
+"""Of a downloaded path."""
+STOPPING_SEQUENCES = (SpecialSequence.STOP_TRAJECTORY, SpecialSequence.START_DOWNLOAD)
+STREAMING_FAULTS = ("socket_cut", "half_message", "silent_state", "silent_motion")
+"""Faults of the connections; socket_cut is over when it has happened, the others last until they are cleared."""
+
+
+class RapidStreaming:
+    """`receive` takes a message of the motion client, `step` lets a period pass and returns the reply that is due."""
+
+    def __init__(self, units: Mapping[str, MechanicalUnit], panel: Panel, config: RapidConfig) -> None:
+        self.config = config
+        self.tasks = {name: MotionTask(unit, panel, config) for name, unit in units.items()}
+        self.counts: Counter[str] = Counter()
+        """Messages by what became of them."""
+        self.faults: set[str] = set()
+        """Those of `STREAMING_FAULTS` that last, and a socket_cut that has not happened yet."""
+        self.ports = {"motion_port": config.motion_port, "state_port": config.state_port}
+        """TCP ports; the server replaces 0 by those that it got."""
+        self._panel = panel
+        self._frame: Frame | None = None
+        self._point: JointPoint | None = None
+        """The message's point until the arms stand that it stops."""
+        self._refused = False
+        self._last: tuple[float, ...] = ()
+        """Where the arms are commanded, rad; empty: where they are."""
+        self._offered: list[JointPoint] = []
+        """Points that wait for acceptance."""
+        self._download: list[JointPoint] | None = None
+        """Points of a path that is not complete; None: streaming."""
+        self._waited_s = 0.0
+        self._random = Random(0)
+        self._sequence = 0
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether a message is being served: RAPID reads no other one then."""
+        return self._frame is not None
+
+    def receive(self, frame: Frame) -> None:
+        """Begin to serve a message."""
+        self._frame, self._waited_s, self._offered = frame, 0.0, []
+        self._point = read_joint_point(frame, ROBOT_AXES * len(self.tasks))
+        self._refused = self._point is None
+        if self._point is not None and self._point.sequence in STOPPING_SEQUENCES:
+            self.stop()
+
+    def stop(self) -> None:
+        """Stop all arms and forget their queues: a stop message, or the client is gone."""
+        self._download = None
+        self._last = ()
+        for task in self.tasks.values():
+            task.stop()
+
+    def disconnect(self) -> None:
+        """The motion client is gone."""
+        self._frame = None
+        self.stop()
+
+    def step(self, dt: float) -> bytes | None:
+        """Let one period pass; return the reply that is due in it."""
+        for task in self.tasks.values():
+            task.step(dt)
+        frame, self._waited_s = self._frame, self._waited_s + dt
+        code = None if frame is None else self._reply_code()
+        if frame is None or code is None:
+            return None
+        self._frame = None
+        self.counts[code.name.lower()] += 1
+        return pack(frame.msg_type, CommType.REPLY, code) if frame.comm_type == CommType.REQUEST else None
+
+    def state(self) -> bytes:
+        """Return a JOINT_POSITION and a STATUS, as the state server sends them."""
+        tasks, panel = self.tasks.values(), self._panel
+        delay = self._random.uniform(*self.config.position_delay_s)
+        joints = [radians(joint) for task in tasks for joint in task.reported(delay)]
+        self._sequence += 1
+        return joint_position(self._sequence - 1, joints) + status(
+            powered=panel.motors is not Motors.OFF,
+            e_stopped=Stop.EMERGENCY in panel.open,
+            failed=any(task.lost or task.unit.mci is MciState.ERROR for task in tasks),
+            in_motion=any(any(task.unit.speeds) for task in tasks),
+            automatic=panel.mode is Mode.AUTO,
+            possible=all(task.runs for task in tasks),
+        )
+
+    def clear(self) -> None:
+        """End all faults."""
+        self.faults.clear()
+        for task in self.tasks.values():
+            task.lost = False
+
+    def lose(self, name: str) -> None:
+        """Let a unit fail: it stops on its brakes, the others go on with what they have."""
+        self.tasks[name].unit.fail("the arm is lost (a fault on command)")
+        self.tasks[name].lost = True
+
+    def status(self) -> dict[str, Any]:
+        """Return what the tasks do, as plain values."""
+        return {
+            **self.ports,
+            "moves_ahead": {name: task.moves_ahead for name, task in self.tasks.items()},
+            "downloaded": 0 if self._download is None else len(self._download),
+            "counts": dict(self.counts),
+            "faults": sorted(self.faults),
+        }
+
+    def _reply_code(self) -> ReplyCode | None:
+        """None while RAPID waits: for arms that slow down, or for room in the queues."""
+        tasks = self.tasks.values()
+        if any(task.stopping for task in tasks):
+            return None
+        if self._point is not None:
+            self._take(self._point)
+            self._point = None
+        if self._refused:
+            return ReplyCode.FAILURE
+        if self._offered:
+            path = self._offered[-1].sequence == SpecialSequence.END_TRAJECTORY
+            if not all(task.is_ready for task in tasks):
+                if self._waited_s < self.config.accept_timeout_s:
+                    return None
+                if path:
+                    self._last = ()
+                return ReplyCode.FAILURE
+            for i, task in enumerate(tasks):
+                moves = [Move(_of_unit(point, i), point.duration) for point in self._offered]
+                task.execute([*moves[:-1], moves[-1]._replace(fine=path)])
+            self._last = self._offered[-1].joints
+        return ReplyCode.SUCCESS
+
+    def _take(self, point: JointPoint) -> None:
+        """Decide what a point is for: it is offered, collected, or refused."""
+        if point.sequence == SpecialSequence.STOP_TRAJECTORY:
+            return
+        if point.sequence == SpecialSequence.START_DOWNLOAD:
+            self._download = []
+        elif point.sequence == 0 and self._download is not None:
+            self._download, self._last = None, ()
+        last = self._last or [radians(joint) for task in self.tasks.values() for joint in task.unit.actual]
+        step = degrees(max(abs(there - here) for there, here in zip(point.joints, last, strict=True)))
+        if step > self.config.max_speed * max(point.duration, SHORTEST_MOVE_S):
+            self._refused = True
+        elif self._download is None:
+            self._offered = [point]
+        elif len(self._download) == MOST_POINTS:
+            self._refused = True
+        else:
+            self._download.append(point)
+            self._last = point.joints
+            if point.sequence == SpecialSequence.END_TRAJECTORY:
+                self._offered, self._download = self._download, None
+
+
+def _of_unit(point: JointPoint, index: int) -> tuple[float, ...]:
+    """Return the joints of a unit, degrees."""
+    return tuple(degrees(joint) for joint in point.joints[ROBOT_AXES * index : ROBOT_AXES * (index + 1)])

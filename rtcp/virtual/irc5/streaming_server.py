@@ -1,0 +1,173 @@
+"""The TCP servers of RAPID streaming: one client each; another one waits until it is gone, as in RAPID."""
+
+from __future__ import annotations
+
+import socket
+import time
+
+from rtcp.config.model import ConfigError
+from rtcp.virtual.irc5.simple_message import NotAMessage, take_frame
+from rtcp.virtual.irc5.streaming import RapidStreaming
+
+_READ_BYTES = 4096
+
+
+class ClientSocket:
+    """A listening socket and its one client; nothing here waits."""
+
+    def __init__(self, host: str, port: int) -> None:
+        """Listen.
+
+        Raises:
+            ConfigError: the address cannot be used.
+        """
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            self._listener.bind((host, port))
+        except OSError as error:
+            self._listener.close()
+            raise ConfigError([f"rapid: cannot listen at {host}:{port} ({error.strerror})"]) from error
+        self._listener.listen(4)
+        self._listener.setblocking(False)
+        self.port: int = self._listener.getsockname()[1]
+        self._client: socket.socket | None = None
+        self._received = bytearray()
+        self._unsent: list[bytes] = []
+        """Parts that are not sent yet, one a cycle."""
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether there is a client."""
+        return self._client is not None
+
+    @property
+    def is_blocked(self) -> bool:
+        """Whether SocketSend waits for the client to read."""
+        return bool(self._unsent)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self.drop()
+        self._listener.close()
+
+    def drop(self) -> None:
+        """Close the client's connection."""
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+        self._received.clear()
+        self._unsent.clear()
+
+    def receive(self) -> bytearray:
+        """Take a client, read, and return what is there and not taken yet; the client may be gone afterwards."""
+        try:
+            if self._client is None:
+                self._client, _ = self._listener.accept()
+                self._client.setblocking(False)
+                self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if len(self._received) < _READ_BYTES:  # else the client is ahead of RAPID, and TCP holds it back
+                data = self._client.recv(_READ_BYTES)
+                self._received += data
+                if not data:
+                    self.drop()
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.drop()
+        return self._received
+
+    def send(self, message: bytes, in_halves: bool) -> None:
+        """Send a message, or half of it in this cycle and half in the next."""
+        half = len(message) // 2
+        self._unsent += [message[:half], message[half:]] if in_halves else [message]
+
+    def flush(self) -> None:
+        """Send the first part of what is not sent yet."""
+        if self._client is None or not self._unsent:
+            return
+        try:
+            sent = self._client.send(self._unsent[0], socket.MSG_NOSIGNAL)
+        except BlockingIOError:
+            return
+        except OSError:
+            self.drop()
+            return
+        if sent == len(self._unsent[0]):
+            self._unsent.pop(0)
+        else:
+            self._unsent[0] = self._unsent[0][sent:]
+
+
+class StreamingServer:
+    """Serves a controller's RAPID streaming; `cycle` lets a period pass."""
+
+    def __init__(self, streaming: RapidStreaming, period_s: float) -> None:
+        """Listen at both ports.
+
+        Raises:
+            ConfigError: a port cannot be used.
+        """
+        self.period_s = period_s
+        self._streaming = streaming
+        config = streaming.config
+        self._motion = ClientSocket(config.bind, config.motion_port)
+        try:
+            self._state = ClientSocket(config.bind, config.state_port)
+        except ConfigError:
+            self._motion.close()
+            raise
+        streaming.ports = {"motion_port": self._motion.port, "state_port": self._state.port}
+        self._state_due_s = 0.0
+
+    def close(self) -> None:
+        """Close all sockets."""
+        self._motion.close()
+        self._state.close()
+
+    def cycle(self, clock_s: float) -> None:
+        """Read, let all units step, send."""
+        streaming = self._streaming
+        if "socket_cut" in streaming.faults:
+            streaming.faults.discard("socket_cut")
+            self._cut()
+        self._serve_motion()
+        self._serve_state()
+        for task in streaming.tasks.values():
+            task.unit.accelerometer.sample(task.unit.actual, time.monotonic())
+
+    def _cut(self) -> None:
+        if self._motion.is_connected:
+            self._streaming.disconnect()
+        self._motion.drop()
+        self._state.drop()
+
+    def _serve_motion(self) -> None:
+        streaming, motion = self._streaming, self._motion
+        connected = motion.is_connected
+        data = motion.receive()
+        if not streaming.is_busy and motion.is_connected:
+            try:
+                frame = take_frame(data)
+            except NotAMessage:
+                streaming.counts["not_a_message"] += 1
+                motion.drop()
+            else:
+                if frame is not None:
+                    streaming.receive(frame)
+        if connected and not motion.is_connected:
+            streaming.disconnect()
+        reply = streaming.step(self.period_s)
+        if reply is not None and "silent_motion" not in streaming.faults:
+            motion.send(reply, "half_message" in streaming.faults)
+        motion.flush()
+
+    def _serve_state(self) -> None:
+        streaming, state = self._streaming, self._state
+        state.receive().clear()  # a state client sends nothing
+        self._state_due_s -= self.period_s
+        if self._state_due_s <= 0.0:
+            self._state_due_s = max(self._state_due_s + streaming.config.state_period_s, 0.0)
+            if state.is_connected and not state.is_blocked and "silent_state" not in streaming.faults:
+                state.send(streaming.state(), "half_message" in streaming.faults)
+        state.flush()

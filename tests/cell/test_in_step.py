@@ -1,0 +1,301 @@
+"""Two arms in step on in-process buses; `benchmarks/cell.py` runs thousands of the same."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from rtcp.config.model import MOST_AXES
+from rtcp.ipc.commands import Disable, Enable, MoveGripper, MoveJoints, OpenStream, Reset, RunInStep
+from rtcp.ipc.schema import RecordSchema
+from rtcp.ipc.states import State
+from rtcp.launch.simulation import Simulation
+from tests.cell.random_steps import Pair, run_mishaps, run_motions, run_near
+
+SLOWEST_NS = 2_000_000
+
+
+def test_random_motions_begin_and_end_together() -> None:
+    found = run_motions(seed=1, count=6)
+    assert found.problems == []
+    assert found.motions == 6
+    assert found.off_goal < 1e-9
+    # Each begins in its own first cycle after the instant, and ends in its own.
+    assert found.begin_apart_ns <= SLOWEST_NS
+    assert found.end_apart_ns <= 2 * SLOWEST_NS
+    assert found.apart_s <= SLOWEST_NS * 1e-9
+
+
+@pytest.mark.parametrize("kind", ["halt", "halt at both", "disable", "lease ends"])
+def test_both_brake_on_one_time_scale(kind: str) -> None:
+    found = run_mishaps(2, 3, [kind])
+    assert found.problems == []
+    assert found.off_path < 1e-7
+    assert found.rest_apart_s < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["drive fault", "emergency stop", "frames lost", "loop hangs"])
+def test_the_other_brakes_along_its_path(kind: str) -> None:
+    found = run_mishaps(3, 3, [kind])
+    assert found.problems == []
+    assert found.off_path < 1e-7
+    # What is found out at once is answered within two cycles of the slower arm; silence takes as long as it may last,
+    # an emergency stop is debounced.
+    most = {"drive fault": 2, "emergency stop": 6, "frames lost": 6, "loop hangs": 4}[kind]
+    assert found.reaction_ns[kind] <= most * SLOWEST_NS
+
+
+def test_arms_that_know_nothing_of_each_others_targets_keep_apart() -> None:
+    found = run_near(seed=3, count=12)
+    assert found.problems == []
+    assert found.stops > 0
+    assert found.arrivals > 0
+
+
+def test_no_arm_begins_alone() -> None:
+    pair = Pair(4)
+    motion = pair.begin(only=("left",))
+    pair.follow(motion, lambda: pair.arm("left").state is State.HOLDING, 1.0)
+    assert pair.last_end("left") == "PartnerNotReady"
+    assert motion.begun_ns == {}
+    pair.close()
+
+
+def test_an_arm_that_is_halted_before_the_instant_keeps_the_other_back() -> None:
+    pair = Pair(5)
+    motion = pair.begin()
+    pair.mishaps["halt"]("right")
+    pair.follow(motion, lambda: pair.simulation.now_ns > motion.start_ns + 10 * SLOWEST_NS, 1.0)
+    assert motion.begun_ns == {}
+    assert pair.last_end("left") == "PartnerNotReady"
+    pair.close()
+
+
+def test_a_partner_that_does_not_run_is_a_refusal() -> None:
+    pair = Pair(6)
+    pair.simulation.silent.add("right")
+    pair.simulation.run(0.02)
+    command = RunInStep(0, 1, 1, 1, pair.simulation.now_ns + 50_000_000, 1, 0.1)
+    refusal = pair.simulation.send("left", command).refusal
+    assert refusal is not None
+    assert refusal.name == "partner_missing"
+    assert pair.simulation.all_in(State.HOLDING)
+    pair.close()
+
+
+def test_a_partner_of_another_cell_is_a_refusal() -> None:
+    pair = Pair(6)
+    pair.simulation.partners["right"].group.cell += 1
+    pair.simulation.run(0.02)
+    refusal = pair.simulation.send("left", RunInStep(0, 1, 1, 1, pair.simulation.now_ns + 50_000_000, 1, 0.1)).refusal
+    assert refusal is not None
+    assert refusal.name == "partner_of_another_cell"
+    assert pair.simulation.all_in(State.HOLDING)
+    pair.close()
+
+
+def test_the_guard_knows_the_acceleration_limits_in_force_at_a_partner() -> None:
+    pair = Pair(6)
+    limits = pair.arm("right").loop.arm.limits
+    limits.acceleration[2] *= 0.5
+    pair.simulation.run(0.02)
+    assert pair.simulation.partners["left"].group.members[0].acceleration == limits.acceleration
+    pair.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"start_ns": 0}, "start_out_of_reach"),
+        ({"start_ns": 1 << 62}, "start_out_of_reach"),
+        ({"partners": 2}, "unknown_partner"),
+        ({"partners": -1}, "unknown_partner"),
+        ({"motion": 0}, "unknown_partner"),
+        ({"motion": (1 << 63) - 1}, "motion_number_ahead"),
+        ({"brakes": 0}, "wrong_row_count"),
+        ({"brakes": 1 << 60}, "wrong_row_count"),
+        ({"rows": 0}, "wrong_row_count"),
+        ({"rows": 1 << 60}, "wrong_row_count"),
+        ({"slot": 9}, "wrong_row_count"),
+        ({"brake_step_s": float("nan")}, "wrong_row_count"),
+        ({"brake_step_s": -1.0}, "wrong_row_count"),
+    ],
+)
+def test_a_command_that_cannot_be_is_refused(change: dict[str, float], reason: str) -> None:
+    pair = Pair(7)
+    at = pair.simulation.now_ns + 50_000_000
+    given = {"slot": 0, "rows": 2, "motion": 1, "partners": 1, "start_ns": at, "brakes": 1, "brake_step_s": 0.1}
+    refusal = pair.simulation.send("left", RunInStep(**{**given, **change})).refusal  # type: ignore[arg-type]
+    assert refusal is not None
+    assert refusal.name == reason
+    assert pair.simulation.all_in(State.HOLDING)
+    pair.close()
+
+
+def test_with_both_buttons_pressed_each_arm_can_be_reset() -> None:
+    pair = Pair(10)
+    for name in ("left", "right"):
+        pair.mishaps["emergency stop"](name)
+    assert pair.simulation.until(lambda: pair.simulation.all_in(State.EMERGENCY_STOP), 1.0)
+    pair.simulation.run(1.0)
+    assert pair.recover()
+    pair.close()
+
+
+def test_no_arm_is_enabled_while_its_partner_is_in_the_emergency_stop() -> None:
+    pair = Pair(11)
+    pair.mishaps["emergency stop"]("left")
+    assert pair.simulation.until(lambda: pair.simulation.all_in(State.EMERGENCY_STOP), 1.0)
+    pair.simulation.run(1.5)
+    assert pair.simulation.send("right", Reset()).refusal is None
+    assert pair.simulation.until(lambda: pair.arm("right").state is State.READY, 5.0)
+    for command in (Enable(), MoveGripper(open=True)):
+        refusal = pair.simulation.send("right", command).refusal
+        assert refusal is not None
+        assert refusal.name == "partner_stop_pressed"
+    pair.close()
+
+
+def test_a_partner_that_does_not_begin_in_time_stops_this_arm() -> None:
+    pair = Pair(12)
+    motion = pair.begin()
+    pair.follow(motion, lambda: pair.simulation.now_ns > motion.start_ns - 3_000_000)
+    pair.arm("right").data.lose(15)
+    assert pair.follow(motion, lambda: pair.arm("left").state is State.HOLDING, 5.0)
+    assert pair.path_s("left") < 0.1
+    assert pair.last_end("left") == "PartnerLeft"
+    pair.close()
+
+
+def test_no_other_motion_takes_the_place_of_one_in_step() -> None:
+    pair = Pair(13)
+    motion = pair.begin()
+    pair.follow(motion, lambda: pair.speed("left") > 0.01)
+    refusal = pair.simulation.send("left", MoveJoints(tuple(motion.goal["left"]), 0.5, True)).refusal
+    assert refusal is not None
+    assert refusal.name == "wrong_state"
+    assert pair.follow(motion, lambda: pair.rests_after(motion))
+    assert pair.last_end("left") == ""
+    pair.close()
+
+
+def test_the_emergency_stop_is_shared() -> None:
+    pair = Pair(8)
+    pair.mishaps["emergency stop"]("left")
+    assert pair.simulation.until(lambda: pair.simulation.all_in(State.EMERGENCY_STOP), 1.0)
+    assert pair.events("right")[-1] in ("PartnerEmergencyStop", "SlavesParked")
+    assert pair.recover()
+    pair.close()
+
+
+def test_with_a_partner_of_another_cell_no_arm_is_enabled_or_moved_and_one_that_moves_stops() -> None:
+    pair = Pair(6)
+    goal = [q + 0.3 for q in pair.commanded("left")]
+    assert pair.simulation.send("left", MoveJoints(tuple(goal), 0.3, True)).refusal is None
+    assert pair.simulation.until(lambda: pair.speed("left") > 0.1, 1.0)
+    pair.simulation.partners["right"].group.cell += 1
+    assert pair.simulation.until(lambda: pair.arm("left").state is State.HOLDING, 2.0)
+    assert pair.last_end("left") == "PartnerForeign"
+    refusal = pair.simulation.send("left", MoveJoints(tuple(goal), 0.3, True)).refusal
+    assert refusal is not None
+    assert refusal.name == "partner_of_another_cell"
+    assert pair.simulation.send("left", Disable()).refusal is None
+    assert pair.simulation.until(lambda: pair.arm("left").state is State.READY, 2.0)
+    refusal = pair.simulation.send("left", Enable()).refusal
+    assert refusal is not None
+    assert refusal.name == "partner_of_another_cell"
+    pair.close()
+
+
+def test_a_partner_that_runs_in_no_cell_is_seen() -> None:
+    pair = Pair(6)
+    with Simulation(pair.cell.arms[1].config) as alone:
+        left = pair.simulation.partners["left"]
+        alone.now_ns = pair.simulation.now_ns
+        left.files[0] = alone.path
+        left.open()
+        left.read(alone.now_ns)
+        assert left.group.foreign == -1  # it has published nothing yet
+        alone.cycle()
+        left.read(alone.now_ns)
+        assert left.group.foreign == 0
+    pair.close()
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("state", 200), ("step_phase", 99), ("commanded_velocity", math.nan), ("commanded_position", math.inf),
+        ("step_path_s", math.nan), ("acceleration_limit", 0.0), ("time_ns", 1 << 62),
+    ],
+)  # fmt: skip
+def test_a_record_that_no_loop_writes_makes_its_sender_silent_and_ends_no_other_loop(field: str, value: float) -> None:
+    pair = Pair(6)
+    board = pair.arm("right").board
+    publish = board.publish
+    at = _index_of(board.schema, field)
+
+    def spoiled(values: list[Any]) -> None:
+        publish([value if index == at else one for index, one in enumerate(values)])
+
+    board.publish = spoiled  # type: ignore[method-assign]
+    pair.simulation.run(0.02)
+    partner = pair.simulation.partners["left"].group.members[0]
+    assert pair.simulation.now_ns - partner.time_ns > 10_000_000
+    goal = [q + 0.05 for q in pair.commanded("left")]
+    assert pair.simulation.send("left", MoveJoints(tuple(goal), 0.3, True)).refusal is None
+    assert pair.simulation.until(lambda: pair.arm("left").state is State.HOLDING, 5.0)
+    pair.close()
+
+
+def _index_of(schema: RecordSchema, name: str) -> int:
+    """Return the index of a field's first number among the values that are published: all but the record's number."""
+    at = -1
+    for field in schema.fields:
+        if field.name == name:
+            return at
+        at += field.count
+    raise KeyError(name)
+
+
+def test_in_a_stream_no_arm_moves_before_each_has_its_first_setpoint() -> None:
+    pair = Pair(14)
+    motion = 7
+    for name, number in (("left", 1), ("right", 2)):
+        assert pair.simulation.send(name, OpenStream(number, motion, 1)).refusal is None
+    begin = {name: pair.commanded(name) for name in ("left", "right")}
+
+    def send(name: str, number: int) -> None:
+        q = [one + 0.01 for one in begin[name]]
+        numbers = (*q, *[0.0] * (3 * MOST_AXES - len(q)))
+        pair.arm(name).observer.setpoint(number, 0, pair.simulation.now_ns * 1e-9, numbers)
+
+    for _ in range(30):
+        send("left", 1)
+        pair.simulation.run(0.01)
+    assert pair.commanded("left") == begin["left"]
+    for _ in range(30):
+        send("left", 1)
+        send("right", 2)
+        pair.simulation.run(0.01)
+    assert pair.commanded("left")[0] == pytest.approx(begin["left"][0] + 0.01, abs=1e-3)
+    assert pair.commanded("right")[0] == pytest.approx(begin["right"][0] + 0.01, abs=1e-3)
+    pair.close()
+
+
+def test_a_stream_whose_partner_gets_no_setpoint_ends_where_it_began() -> None:
+    pair = Pair(15)
+    for name, number in (("left", 1), ("right", 2)):
+        pair.simulation.send(name, OpenStream(number, 7, 1))
+    begin = pair.commanded("left")
+    for _ in range(150):
+        numbers = (*[one + 0.01 for one in begin], *[0.0] * (3 * MOST_AXES - len(begin)))
+        pair.arm("left").observer.setpoint(1, 0, pair.simulation.now_ns * 1e-9, numbers)
+        pair.simulation.run(0.01)
+    assert pair.last_end("left") == "PartnerNotReady"
+    assert pair.commanded("left") == begin
+    assert pair.simulation.until(lambda: pair.simulation.all_in(State.HOLDING), 1.0)
+    pair.close()

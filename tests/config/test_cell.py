@@ -1,0 +1,77 @@
+"""The file of a cell: what it holds, and its mistakes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rtcp.config import ConfigError, default_config
+from rtcp.config.cell import CellConfig, is_platform_name
+from rtcp.config.cell_file import load_cell
+from rtcp.config.serialization import from_json, to_json
+
+CONFIG = default_config().parent
+ARM = str(CONFIG / "assistive_arm.yaml")
+
+
+def written(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "cell.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("file", ["cell.yaml", "cell_mixed.yaml"])
+def test_the_shipped_cells_are_read_and_handed_to_the_loops(file: str) -> None:
+    cell = load_cell(CONFIG / file)
+    assert len(cell.arms) == 2
+    assert from_json(CellConfig, to_json(cell)) == cell
+
+
+def test_a_partner_may_be_silent_for_two_cycles_of_the_slowest_arm(tmp_path: Path) -> None:
+    arms = f"arms: [{{name: a, config: {ARM}}}, {{name: b, config: {CONFIG / 'abb_irb120.yaml'}}}]\n"
+    cell = load_cell(written(tmp_path, f"name: c\n{arms}"))
+    assert cell.longest_silence_s == pytest.approx(2 * 4.032e-3)
+    assert load_cell(written(tmp_path, f"name: c\n{arms}silence_s: 0.1\n")).longest_silence_s == 0.1
+
+
+def test_a_cell_is_told_from_another_by_what_its_files_say_not_by_where_they_are(tmp_path: Path) -> None:
+    text = f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}, base: {{position: [0, 1, 0]}}}}]\n"
+    cell = load_cell(written(tmp_path, text))
+    (tmp_path / "elsewhere").mkdir()
+    assert load_cell(written(tmp_path / "elsewhere", text)).digest == cell.digest
+    assert load_cell(CONFIG / "../config/cell.yaml").digest == load_cell(CONFIG / "cell.yaml").digest
+    assert load_cell(written(tmp_path, text.replace("[0, 1, 0]", "[0, 1.1, 0]"))).digest != cell.digest
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (f"name: c\narms: [{{name: a, config: {ARM}}}]\n", "arms"),
+        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: a, config: {ARM}}}]\n", "the name of arms[0]"),
+        (f"name: c\narms: [{{name: ../a, config: {ARM}}}, {{name: b, config: {ARM}}}]\n", 'found the text "../a"'),
+        (f"name: c\narms: [{{name: a, config: none.yaml}}, {{name: b, config: {ARM}}}]\n", "arm a: "),
+        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}, at: 1}}]\n", "at"),
+        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}}}]\nsilence_s: 0\n", "silence_s"),
+        (f"name: c\narms: [{{name: a, config: {ARM}}}, {{name: b, config: {ARM}}}]\nclearance: .nan\n", "clearance"),
+        (
+            f"name: c\narms: [{{name: a, config: {ARM}, base: {{rpy: [0, 0, 90]}}}}, {{name: b, config: {ARM}}}]\n",
+            "arms[0].base.rpy[2]",
+        ),
+    ],
+)
+def test_every_mistake_is_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    with pytest.raises(ConfigError) as found:
+        load_cell(written(tmp_path, text))
+    assert sentence in str(found.value)
+
+
+def test_an_arm_that_is_not_in_the_cell_is_named() -> None:
+    with pytest.raises(ConfigError, match="allowed is one of left, right"):
+        load_cell(CONFIG / "cell.yaml").member("middle")
+
+
+@pytest.mark.parametrize("name", ["", "..", "a/b", "1st", "-a", "a" * 33, "a b", "ä"])
+def test_a_name_that_could_be_another_path_is_none(name: str) -> None:
+    assert not is_platform_name(name)
+    assert is_platform_name("left_arm-2")

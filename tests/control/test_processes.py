@@ -1,0 +1,161 @@
+"""Processes beside motion as parts of the cycle, on a platform without an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rtcp.config import default_config, load
+from rtcp.config.model import ArmConfig, InputsConfig, OutputsConfig
+from rtcp.control.part import PartContext
+from rtcp.ipc.commands import AT_REST, Command, Disable, Enable, MoveJoints, Reset
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.schema import Field
+from rtcp.ipc.states import State
+from rtcp.launch.simulation import Simulation
+from rtcp.processes import InputChannel, OutputChannel, Process, ProcessConfig, ProcessSetup
+from rtcp.virtual.models.diewu import RELEASED
+
+
+class Blink(Command):
+    """Show `pattern` at the outputs."""
+
+    states = AT_REST
+    pattern: int
+
+
+class Dark(Refusal):
+    """pattern 0 shows nothing: choose another one"""
+
+
+@dataclass(frozen=True)
+class LampConfig(ProcessConfig):
+    """Copies its pattern to the outputs of a box, while nobody presses anything there."""
+
+    PROCESS = "tests.control.test_processes:Lamp"
+    COMMANDS = (Blink,)
+    inputs: InputChannel = "io.inputs"
+    outputs: OutputChannel = "io.outputs"
+
+
+class Lamp(Process):
+    """See `LampConfig`."""
+
+    def __init__(self, config: LampConfig, setup: ProcessSetup) -> None:
+        super().__init__(config, setup)
+        self._inputs, self._outputs = setup.signals[config.inputs], setup.signals[config.outputs]
+        self.pattern = 0
+        self.raises = False
+
+    def fields(self) -> Sequence[Field]:
+        return (Field("pattern", "uint16", "", "What it shows."),)
+
+    def accept(self, command: Command, lease: int) -> Refusal | None:
+        assert isinstance(command, Blink)
+        if not command.pattern:
+            return Dark()
+        self.pattern = command.pattern
+        return None
+
+    def update(self, context: PartContext) -> None:
+        if self.raises:
+            raise RuntimeError("the lamp is gone")
+        self._outputs.value = self.pattern if self._inputs.value == RELEASED else 0
+
+    def publish(self, values: list[Any], at: int) -> None:
+        values[at] = self.pattern
+
+    def safe(self) -> None:
+        self.pattern = 0
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> ArmConfig:
+    (tmp_path / "segment.yaml").write_text("slaves: [{model: diewu-io}]\n")
+    box = load(default_config())
+    slave = replace(box.slaves[0], device=replace(box.slaves[0].device, kind="generic"))
+    found = replace(box, joints=(), slaves=(slave,), arm=None, source=tmp_path / "lamp.yaml", gripper=None)
+    return replace(found, inputs=InputsConfig(), outputs=OutputsConfig(), processes=(LampConfig("lamp", "lamp"),))
+
+
+@pytest.fixture
+def running(config: ArmConfig) -> Iterator[Simulation]:
+    with Simulation(config) as made:
+        assert made.until(lambda: made.state is State.READY, 5.0)
+        made.acquire()
+        yield made
+
+
+def lamp(running: Simulation) -> Lamp:
+    part = next(part for part in running.loop.parts if part.name == "lamp")
+    process = part.process  # type: ignore[attr-defined]
+    assert isinstance(process, Lamp)
+    return process
+
+
+def shown(running: Simulation) -> int:
+    """Return the levels at the box' outputs two cycles later."""
+    for _ in range(2):
+        running.cycle()
+    assert running.box is not None
+    return running.box.outputs
+
+
+def test_a_process_is_commanded_and_writes_its_channels_without_an_arm(running: Simulation) -> None:
+    assert running.send(Blink(5)).refusal is None
+    assert shown(running) == 5
+    record = running.observer.latest()
+    assert record is not None
+    assert int(record["lamp_pattern"][0]) == 5
+    assert running.send(Blink(0)).refusal == Dark()
+    assert running.send(Enable()).refusal is None
+    assert running.until(lambda: running.state is State.HOLDING, 1.0)
+    assert shown(running) == 5
+    assert running.send(Disable()).refusal is None
+    assert running.until(lambda: running.state is State.READY, 1.0)
+
+
+def test_what_it_reads_acts_within_two_cycles(running: Simulation) -> None:
+    running.send(Blink(5))
+    assert shown(running) == 5
+    assert running.box is not None
+    running.box.set_input(0, False)
+    assert shown(running) == 0
+
+
+def test_a_motion_command_of_a_platform_without_an_arm_is_refused(running: Simulation) -> None:
+    running.send(Enable())
+    assert running.until(lambda: running.state is State.HOLDING, 1.0)
+    assert running.send(MoveJoints((), 0.5, True)).refusal is not None
+    assert running.send(MoveJoints((0.1,), 0.5, True)).refusal is not None
+
+
+def test_a_fault_makes_it_safe_until_it_is_commanded_again(running: Simulation) -> None:
+    running.send(Blink(5))
+    running.data.lose(running.config.bus.lost_cycles + 5)
+    assert running.until(lambda: running.state is State.FAULT, 1.0)
+    assert shown(running) == 0
+    running.send(Reset())
+    assert running.until(lambda: running.state is State.READY, 5.0)
+    assert shown(running) == 0
+    running.send(Blink(6))
+    assert shown(running) == 6
+
+
+def test_one_that_raises_is_a_fault_with_outputs_of_zero(running: Simulation) -> None:
+    running.send(Blink(5))
+    lamp(running).raises = True
+    assert running.until(lambda: running.state is State.FAULT, 0.1)
+    assert shown(running) == 0
+    refusal = running.send(Blink(6)).refusal
+    assert refusal is not None
+    lamp(running).raises = False
+    running.send(Reset())
+    assert running.until(lambda: running.state is State.READY, 5.0)
+    assert shown(running) == 0
+    running.send(Blink(6))
+    assert shown(running) == 6

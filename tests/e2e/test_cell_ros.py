@@ -1,0 +1,106 @@
+"""All arms of a cell as one group of joints for ROS, over Zenoh, on a real cell; and an arm in its namespace."""
+
+from __future__ import annotations
+
+import signal
+import time
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from math import sin
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("zenoh", reason="eclipse-zenoh is not installed: pip install 'rtcp[zenoh]'")
+pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+
+from rtcp.ros.ros2_types import decode, encode, make
+from rtcp.ros.ros2_zenoh import key_of, open_session
+from tests.cell.running import ABB_HOME, CONFIG, Records, RunningCell, instants
+from tests.ros2.node import point, until
+from tests.ros2.zenoh_client import JOINT_STATES, Router, call
+
+pytestmark = pytest.mark.alone
+NAMES = [f"{arm}_joint_{number}" for arm in ("left", "right") for number in range(1, 7)]
+HOME = [*ABB_HOME, *ABB_HOME]
+THERE = [0.3, 0.1, 0.0, 0.1, 0.5, 0.1, -0.3, 0.1, 0.0, 0.0, 0.5, 0.2]
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+
+
+@pytest.fixture(scope="module")
+def irbs() -> Iterator[RunningCell]:
+    made = RunningCell(CONFIG / "cell.yaml")
+    yield made
+    made.end()
+
+
+def test_twelve_joints_are_one_group(irbs: RunningCell) -> None:
+    router = Router()
+    node = irbs.platform.background("ros", "--zenoh", "--router", router.address, "--cell", "--name", "arm")
+    received: list[Any] = []
+
+    def joints() -> dict[str, float]:
+        message = decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes())
+        return dict(zip(message.name, message.position.tolist(), strict=True))
+
+    with open_session(router.address) as session:
+        subscriber = session.declare_subscriber(JOINT_STATES, received.append)
+        assert call(session, "robot_enable", "std_srvs/srv/Trigger").success
+        until(lambda: received and sorted(joints()) == sorted(NAMES), "the joints of both arms")
+        begin = [joints()[name] for name in NAMES]
+        records = Records(irbs)
+        points = [point(0.0, begin), point(3.0, THERE)]
+        trajectory = make("trajectory_msgs/msg/JointTrajectory", joint_names=NAMES, points=points)
+        answer = call(session, "joint_path_command", "industrial_msgs/srv/CmdJointTrajectory", trajectory=trajectory)
+        assert answer.code.val == 1
+        until(lambda: [joints()[name] for name in NAMES] == pytest.approx(THERE, abs=2e-3), "the end of the trajectory")
+        (began, ended), (other_began, other_ended) = instants(records.read()).values()
+        assert abs(began - other_began) <= 4_200_000
+        assert abs(ended - other_ended) <= 8_400_000
+        # A sine of all joints, 30 points a second.
+        records = Records(irbs)
+        publisher = session.declare_publisher(key_of(0, "joint_command", POINT))
+        start = time.monotonic()
+        while (t := time.monotonic() - start) < 3.0:
+            moved = make(POINT, positions=[q + 0.08 * sin(3.0 * t) * min(t, 1.0) for q in THERE])
+            publisher.put(encode(POINT, moved))
+            time.sleep(1.0 / 30.0)
+        found = records.read()
+        ways = {name: rows["commanded_position"][:, 0] for name, rows in found.items()}
+        assert min(float(np.ptp(way)) for way in ways.values()) > 0.1
+        assert call(session, "stop_motion", "industrial_msgs/srv/StopMotion").code.val == 1
+        assert call(session, "robot_disable", "std_srvs/srv/Trigger").success
+        subscriber.undeclare()
+    node.send_signal(signal.SIGINT)
+    node.communicate()
+
+
+def test_an_arm_has_its_namespace(irbs: RunningCell) -> None:
+    router = Router()
+    node = irbs.platform.background("--name", "right", "ros", "--zenoh", "--router", router.address)
+    received: list[Any] = []
+    with open_session(router.address) as session:
+        subscriber = session.declare_subscriber(
+            JOINT_STATES.replace("joint_states", "right/joint_states"), received.append
+        )
+        until(lambda: bool(received), "joint states")
+        assert decode("sensor_msgs/msg/JointState", received[-1].payload.to_bytes()).name[0] == "joint_1"
+        subscriber.undeclare()
+    node.send_signal(signal.SIGINT)
+    node.communicate()
+
+
+def test_the_urdf_has_all_arms_on_one_world() -> None:
+    from rtcp.config.cell_file import load_cell
+    from rtcp.ros.group import group_urdf, joint_names
+
+    cell = load_cell(CONFIG / "cell.yaml")
+    assert list(joint_names(cell)) == NAMES
+    robot = ET.fromstring(group_urdf(cell))
+    moved = [joint.get("name") for joint in robot.iter("joint") if joint.get("type") == "revolute"]
+    assert moved == NAMES
+    parents = {joint.find("child").get("link"): joint.find("parent").get("link") for joint in robot.iter("joint")}  # type: ignore[union-attr]
+    links = {link.get("name") for link in robot.iter("link")}
+    assert set(parents) == links - {"world"}
+    assert parents["left_base_link"] == "world"

@@ -1,0 +1,366 @@
+"""`rtcp shape-set` on the virtual cell: a rod gets its shape; what ends it early ends the heat before the motion."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from rtcp.api import Robot, State
+from rtcp.api.cell import Cell
+from rtcp.cli.__main__ import main
+from rtcp.config.find import default_config
+from rtcp.ipc.runtime_directory import control_socket, irc5_control, segment_control
+from rtcp.ipc.session import read_processes
+from rtcp.virtual.faults.control import SegmentClient
+from rtcp.virtual.request_socket import RequestClient
+from tests.cell.running import put_in_order
+from tests.e2e.conftest import Platform, kill, lives
+
+pytestmark = pytest.mark.alone
+
+CONFIG = default_config().parent
+AWAY = (0.2, 0.0, 0.7, 0.0, -0.6, 0.0)
+BEGINS = {
+    "approaching": "arms are enabled",
+    "bending": "the rod is bent",
+    "heating": "heating to",
+    "holding": "heating to",
+}
+"""What the command says when a phase begins."""
+
+
+class HeaterCell:
+    """The virtual cell with a profile of seconds; its heater has a cycle that a shared host holds."""
+
+    def __init__(self) -> None:
+        self.platform = platform = Platform()
+        self.directory = platform.directory
+        self.config = config = platform.directory / "config"
+        shutil.copytree(CONFIG, config)
+        in_cycles = {"period_us": 2000, "lost_cycles": 100, "stale_cycles": 100, "gate_cycles": 200}
+        self._set(config / "heater.yaml", **in_cycles)
+        self._set(config / "shape_setting" / "nitinol.yaml", hold_s=1, ramp_k_s=200, cool_c=400)
+        self.job = config / "shape_setting" / "arc.yaml"
+        self._set(self.job, approach_speed=1.0)
+        self.run: Run | None = None
+        self._runs = 0
+        self.start()
+
+    @staticmethod
+    def _set(file: Path, **values: float) -> None:
+        text = file.read_text()
+        for key, value in values.items():
+            text, count = re.subn(rf"\b{key}: [0-9.]+", f"{key}: {value}", text)
+            assert count == 1, key
+        file.write_text(text)
+
+    def start(self) -> None:
+        """Start what does not run."""
+        self.platform.rtcp("cell", "start", "--detach", "--config", str(self.config / "cell_shape_setting.yaml"))
+
+    def connect(self) -> Cell:
+        return Cell("the tests", directory=self.directory)
+
+    def heater(self) -> Robot:
+        return Robot("the tests", control_socket(self.directory / "heater"))
+
+    def begin(self) -> Run:
+        """Begin `rtcp shape-set`."""
+        self._runs += 1
+        folder = self.directory / f"report{self._runs}"
+        arguments = ("shape-set", str(self.job), "--yes", "--out", str(folder))
+        self.run = Run(arguments, self.platform.environment, folder)
+        return self.run
+
+    def truth(self) -> dict[str, Any]:
+        """Return what the virtual control box does, past the bus."""
+        with SegmentClient(segment_control(self.directory / "heater")) as segment:
+            box: dict[str, Any] = segment.truth()["slaves"][0]
+        return box
+
+    def until(self, met: Callable[[dict[str, Any]], bool], what: str, patience_s: float = 30.0) -> dict[str, Any]:
+        end = time.monotonic() + patience_s
+        while not met(truth := self.truth()):
+            assert time.monotonic() < end, f"{what} did not come: {truth}\n{self.platform.logs()}"
+            time.sleep(0.01)
+        return truth
+
+    def assert_cold(self, within_s: float) -> None:
+        """Gate and relay go off within a time, and the rod only cools from then on."""
+        self.until(lambda truth: not (truth["gate"] or truth["relay"]), "heat off", within_s)
+        before = self.truth()["middle_temperature"]
+        end = time.monotonic() + 1.0
+        while time.monotonic() < end:
+            truth = self.truth()
+            assert not truth["gate"]
+            assert not truth["relay"]
+            assert truth["middle_temperature"] <= before + 0.1
+            time.sleep(0.02)
+
+    def restore(self) -> None:
+        """Bring back what a test has ended; reset and enable all."""
+        ended = False
+        for name in ("left", "right", "heater"):
+            processes = read_processes(self.directory / name)
+            if not lives(processes.loop):
+                self.platform.rtcp("--name", name, "stop", check=None)
+                ended = True
+            elif not lives(processes.gateway):
+                # Any command starts it again.
+                self.platform.rtcp("--name", name, "status")
+        if ended:
+            self.start()
+        for name in ("left", "right"):
+            with RequestClient(irc5_control(self.directory / name), server="virtual IRC5") as operator:
+                put_in_order(operator)
+        with self.connect() as cell:
+            end = time.monotonic() + 20.0
+            while any(status.state in (State.STOPPING, State.STARTING) for status in cell.status().values()):
+                assert time.monotonic() < end
+                time.sleep(0.05)
+            cell.reset()
+            cell.processes["heater"].command("reset_trips")
+            for name, status in cell.status().items():
+                if status.state is State.READY and name != "heater":
+                    cell.arms[name].enable()
+
+    def end(self) -> None:
+        self.platform.rtcp("cell", "stop", check=None)
+        self.platform.end()
+
+
+class Run:
+    """A command that runs, in a process that begins as a copy of this one: it need not load scipy and matplotlib."""
+
+    def __init__(self, arguments: Sequence[str], environment: Mapping[str, str], folder: Path) -> None:
+        self.folder = folder
+        self.code: int | None = None
+        reading, writing = os.pipe()
+        self._errors = folder.with_suffix(".errors")
+        self.pid = os.fork()
+        if not self.pid:
+            _become_command(arguments, environment, writing, self._errors)
+        os.close(writing)
+        self._lines = os.fdopen(reading)
+
+    def await_line(self, text: str) -> None:
+        """Read until it says so."""
+        said = []
+        for line in self._lines:
+            said.append(line)
+            if text in line:
+                return
+        raise AssertionError(f"{text!r} was not said: {''.join(said)}{self._errors.read_text()}")
+
+    def finish(self) -> str:
+        """Wait for its end; return what it said on standard error."""
+        self._lines.read()
+        self.end()
+        errors = self._errors.read_text()
+        assert "Traceback" not in errors, errors
+        return errors
+
+    def end(self, number: signal.Signals | None = None) -> None:
+        """Send it a signal, and wait for its end."""
+        if self.code is None:
+            if number is not None:
+                os.kill(self.pid, number)
+            self.code = os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1])
+            self._lines.close()
+
+    def facts(self) -> dict[str, str]:
+        """Return the table of its report."""
+        facts: dict[str, str] = json.loads((self.folder / "report.json").read_text())["facts"]
+        return facts
+
+
+def _become_command(arguments: Sequence[str], environment: Mapping[str, str], out: int, errors: Path) -> NoReturn:
+    code = 1
+    try:
+        os.environ.update(environment)
+        os.dup2(out, 1)
+        os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT), 2)
+        sys.stdout, sys.stderr = os.fdopen(1, "w", closefd=False), os.fdopen(2, "w", closefd=False)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        code = main(arguments)
+    finally:
+        os._exit(code)
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[HeaterCell]:
+    pytest.importorskip("google.protobuf", reason="protobuf is not installed: pip install 'rtcp[abb]'")
+    for name in ("matplotlib.pyplot", "rtcp.processes.shape_setting.report"):
+        importlib.import_module(name)
+    made = HeaterCell()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def cell(shared: HeaterCell) -> Iterator[HeaterCell]:
+    """All run, nothing has tripped, and the arms are enabled."""
+    shared.restore()
+    yield shared
+    if shared.run is not None:
+        shared.run.end(signal.SIGKILL)
+
+
+def begin(cell: HeaterCell, phase: str) -> Run:
+    """Begin a run; return when it is in a phase."""
+    if phase == "approaching":
+        with cell.connect() as arms:
+            arms.move_joints({name: list(AWAY) for name in arms.arms}, 1.0)
+    run = cell.begin()
+    run.await_line(BEGINS[phase])
+    if phase == "approaching":
+        with cell.connect() as arms:
+            end = time.monotonic() + 20.0
+            while not any(status.state is State.MOVING for name, status in arms.status().items() if name != "heater"):
+                assert time.monotonic() < end
+    elif phase == "heating":
+        cell.until(lambda truth: truth["middle_temperature"] > 100.0, "heat")
+    elif phase == "holding":
+        with cell.heater() as robot:
+            end = time.monotonic() + 30.0
+            while robot.processes["heater"].state != "holding":
+                assert time.monotonic() < end
+                time.sleep(0.01)
+    return run
+
+
+def assert_arms_rest(cell: HeaterCell) -> None:
+    with cell.connect() as arms:
+        end = time.monotonic() + 5.0
+        while any(status.state in (State.MOVING, State.STOPPING) for status in arms.status().values()):
+            assert time.monotonic() < end
+            time.sleep(0.02)
+
+
+def test_a_rod_gets_its_shape_and_the_report_says_what_was_measured(cell: HeaterCell) -> None:
+    cell.platform.rtcp("cell", "enable")
+    hottest, run = 0.0, cell.begin()
+    with ThreadPoolExecutor(1) as pool:
+        errors = pool.submit(run.finish)
+        while not errors.done():
+            hottest = max(hottest, cell.truth()["middle_temperature"])
+            time.sleep(0.05)
+    assert run.code == 0, errors.result()
+    assert {file.name for file in run.folder.iterdir()} == {
+        "report.html", "report.json", "shape.png", "heat.png", "along.png",
+    }  # fmt: skip
+    page = (run.folder / "report.html").read_text()
+    assert all(f'src="{name}.png"' in page for name in ("shape", "heat", "along"))
+    report, facts = json.loads((run.folder / "report.json").read_text()), run.facts()
+    assert facts["result"] == "the profile is complete"
+    assert report["initial_resistance"] == pytest.approx(0.34, rel=0.01)
+    assert max(report["samples"]["middle_temperature"]) == pytest.approx(510.0, abs=10.0)
+    # The fast ramp has not reached the steady state of the fin, which the estimate is by.
+    assert hottest == pytest.approx(510.0, abs=30.0)
+    assert float(facts["hottest place of the rod"].split()[0]) == pytest.approx(hottest, abs=10.0)
+    assert set(report["interlocks"].values()) == {"good"}
+    truth = cell.truth()
+    assert (truth["gate"], truth["relay"], truth["relay_closed"]) == (False, False, False)
+
+
+@pytest.mark.parametrize(
+    ("number", "phase"),
+    [
+        pytest.param(number, phase, id=f"{number.name}-{phase}", marks=[] if phase == "heating" else [pytest.mark.slow])
+        for number in (signal.SIGINT, signal.SIGKILL)
+        for phase in BEGINS
+    ],
+)
+def test_a_command_that_is_ended_anywhere_leaves_no_heat_and_arms_at_rest(
+    cell: HeaterCell, number: signal.Signals, phase: str
+) -> None:
+    run = begin(cell, phase)
+    os.kill(run.pid, number)
+    cell.assert_cold(3.0)
+    errors = run.finish()
+    assert_arms_rest(cell)
+    if number is signal.SIGINT:
+        assert run.code == 130
+        assert "interrupted: all arms come to a controlled stop" in errors
+        assert run.facts()["result"] == "interrupted"
+    else:
+        assert run.code == -signal.SIGKILL
+
+
+def halt_left(cell: HeaterCell) -> None:
+    with Robot("the tests", control_socket(cell.directory / "left")) as left:
+        left.halt()
+
+
+def halt_all(cell: HeaterCell) -> None:
+    cell.platform.rtcp("cell", "halt")
+
+
+def press_emergency_stop(cell: HeaterCell) -> None:
+    with RequestClient(irc5_control(cell.directory / "left"), server="virtual IRC5") as operator:
+        operator.ask({"do": "stop", "circuit": "emergency"})
+
+
+def kill_loop(name: str) -> Callable[[HeaterCell], None]:
+    return lambda cell: kill(read_processes(cell.directory / name).loop)
+
+
+def kill_gateway(cell: HeaterCell) -> None:
+    kill(read_processes(cell.directory / "heater").gateway)
+
+
+CAUSES: dict[str, tuple[Callable[[HeaterCell], None], str]] = {
+    "cell halt": (halt_all, "stop"),
+    "emergency stop of an arm": (press_emergency_stop, "arms engaged"),
+    "an arm's loop is killed": (kill_loop("right"), "arm lost"),
+    "the heater's gateway is killed": (kill_gateway, "closed the connection"),
+    "the heater's loop is killed": (kill_loop("heater"), "loop"),
+}
+
+
+@pytest.mark.parametrize(
+    "cause", [pytest.param(one, marks=[] if one == "cell halt" else [pytest.mark.slow]) for one in CAUSES]
+)
+def test_heat_ends_by_itself_and_the_message_says_why(cell: HeaterCell, cause: str) -> None:
+    act, words = CAUSES[cause]
+    run = begin(cell, "heating")
+    act(cell)
+    # The lease of a gateway that has died, and the watchdog of the virtual box, are longer than on hardware.
+    cell.assert_cold(4.0)
+    errors = run.finish()
+    assert run.code == 5, errors
+    assert words in errors.lower().replace("_", " ")
+    assert run.facts()["result"] in errors
+
+
+def test_a_halt_of_one_arm_that_bends_the_rod_ends_all(cell: HeaterCell) -> None:
+    run = begin(cell, "bending")
+    with cell.connect() as arms:
+        end = time.monotonic() + 20.0
+        while arms.arms["left"].state is not State.MOVING:
+            assert time.monotonic() < end
+    halt_left(cell)
+    errors = run.finish()
+    cell.assert_cold(1.0)
+    assert_arms_rest(cell)
+    assert run.code == 5, errors
+    assert "stop" in errors
+
+
+@pytest.mark.slow
+def test_a_run_after_all_that_is_complete(cell: HeaterCell) -> None:
+    folder = cell.directory / "last"
+    cell.platform.rtcp("shape-set", str(cell.job), "--yes", "--out", str(folder))
+    assert json.loads((folder / "report.json").read_text())["facts"]["result"] == "the profile is complete"

@@ -1,0 +1,68 @@
+"""The page Processes, made from the heater's description, and used as a person would."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from rtcp.processes.shape_setting.config import ShapeSettingConfig
+from tests.e2e.conftest import Platform
+from tests.panel.conftest import barriers, begun, show
+
+pytestmark = [pytest.mark.alone, pytest.mark.browser]
+HEATER = Path(__file__).parents[2] / "config/heater.yaml"
+
+
+@pytest.fixture(scope="module")
+def panel(platform: Platform) -> Iterator[str]:
+    platform.rtcp("start", "--detach", "--config", str(HEATER))
+    platform.rtcp("enable")
+    with begun(platform) as (_, url):
+        yield url
+
+
+def test_what_the_heater_publishes_its_lamps_and_its_commands_are_there(page: Page) -> None:
+    show(page, "/processes")
+    expect(page.locator("[data-live='processes.heater.state']")).to_have_text("ready")
+    for kind in ShapeSettingConfig.COMMANDS:
+        name = kind.name.replace("_", " ").capitalize()
+        expect(page.get_by_role("button", name=name, exact=True)).to_be_visible()
+    expect(page.locator(".lamps")).to_contain_text("red: off")
+    expect(page.get_by_role("row", name="average current")).to_be_visible()
+    expect(page.get_by_role("row", name="over_current 280")).to_be_visible()
+    expect(page.locator("canvas")).not_to_have_count(0)
+    assert barriers(page) == {}
+
+
+def test_the_heater_is_armed_and_measures_by_hand_in_manual(page: Page, platform: Platform) -> None:
+    platform.rtcp("segment", "fault", "contacts", "slave=1", "closed=14")
+    show(page, "/processes")
+    page.get_by_role("button", name="Arm heater", exact=True).click()
+    expect(page.locator("[data-live='processes.heater.state']")).to_have_text("armed")
+    expect(page.locator(".lamps")).to_contain_text("red: on")
+    page.get_by_label("Straight and unloaded").select_option("yes")
+    page.get_by_label("Phase").select_option("austenite")
+    page.get_by_role("button", name="Measure resistance", exact=True).click()
+    expect(page.locator("[data-live='processes.heater.fields.initial_resistance']")).to_contain_text("0.34")
+    page.get_by_role("button", name="Stop heating", exact=True).click()
+    expect(page.locator(".lamps")).to_contain_text("red: off")
+    expect(page.locator("[data-live='processes.heater.state']")).to_have_text("ready")
+
+
+def test_stop_opens_the_relay(page: Page) -> None:
+    show(page, "/processes")
+    page.get_by_role("button", name="Arm heater", exact=True).click()
+    expect(page.locator(".lamps")).to_contain_text("red: on")
+    page.locator("[data-stop]").click()
+    expect(page.locator(".lamps")).to_contain_text("red: off")
+
+
+def test_a_refusal_is_shown(page: Page) -> None:
+    show(page, "/processes")
+    page.get_by_role("button", name="Start heating", exact=True).click()
+    expect(page.get_by_text("the command needs it armed")).to_be_visible()
+    page.get_by_role("button", name="Set heat profile", exact=True).click()
+    expect(page.get_by_text("allowed is a number")).to_be_visible()

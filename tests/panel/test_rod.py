@@ -1,0 +1,30 @@
+"""The rod that two arms are to bend, as a panel of one of them sees it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from rtcp.api.cell import rod_file
+from rtcp.config.cell_file import load_cell
+from rtcp.config.find import default_config
+from rtcp.panel.partners import Partners
+
+
+def test_a_panel_sees_the_curves_of_the_rod_from_its_own_base(tmp_path: Path) -> None:
+    cell = load_cell(default_config().with_name("cell.yaml"))
+    partners = Partners()
+    partners.own = replace(cell.arms[0], directory=tmp_path / "left")
+    partners.find()
+    assert partners.rod == []
+    # The left arm stands at y = 0.6 and looks along -y: what is at the world's origin is 0.6 m before it.
+    rod_file(tmp_path).write_text(json.dumps([[[0.0, 0.0, 0.4], [0.0, 0.1, 0.4]]]))
+    partners.find()
+    assert partners.rod == [[pytest.approx([0.6, 0.0, 0.4]), pytest.approx([0.5, 0.0, 0.4])]]
+    for damaged in ("{", "3", '[["x"]]', "[[[1, 2]]]"):
+        rod_file(tmp_path).write_text(damaged)
+        partners.find()
+        assert partners.rod == []

@@ -1,0 +1,159 @@
+"""A bend as one motion in step of the shipped cell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+import pytest
+
+from kinematics import Pose, forward
+from kinematics.pose import rotation_from_rpy
+from rtcp.config.cell import CellConfig
+from rtcp.config.cell_file import load_cell
+from rtcp.config.find import default_config
+from rtcp.ipc.errors import Invalid, Refused
+from rtcp.processes.rod import (
+    BendingPlan,
+    Chuck,
+    Form,
+    Rod,
+    bend,
+    follow_parameters,
+    plan_bending,
+    plan_motion,
+    pre_bend,
+    sample_equilibrium,
+)
+from rtcp.processes.rod.bending import _check_between, _Holder
+
+CELL = load_cell(default_config().parent / "cell.yaml")
+ROD = Rod(0.3, 1e-3)
+CHUCK = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.12, 0.0, -pi / 2, 0.0), 0.02)
+CHUCKS = {"left": CHUCK, "right": CHUCK}
+HELD = Pose.from_xyzrpy(0.0, 0.0, 0.4, 0.0, 0.0, -pi / 2)
+NEAR = {"left": (0.0, 0.0, 0.8, 0.0, -0.77, 0.0), "right": (0.0, 0.0, 0.8, 0.0, -0.77, 0.0)}
+END = Pose((0.25, 0.05, 0.06), rotation_from_rpy(0.3, -0.3, 0.4))
+LONG = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.25, 0.0, -pi / 2, 0.0), 0.02)
+SHORT_END = Pose((0.25 / 3.0, 0.05 / 3.0, 0.02), END.rotation)
+
+
+def planned(end: Pose = END, cell: CellConfig = CELL, held: Pose = HELD, chuck: Chuck = CHUCK) -> BendingPlan:
+    return plan_bending(cell, {"left": chuck, "right": chuck}, ROD, end, held, NEAR)
+
+
+@pytest.fixture(scope="module")
+def plan() -> BendingPlan:
+    return planned()
+
+
+def mouth(name: str, q: tuple[float, ...]) -> Pose:
+    member = CELL.member(name)
+    assert member.config.arm is not None
+    return Pose.from_xyzrpy(*member.base.position, *member.base.rpy) @ forward(member.config.arm, q) @ CHUCK.pose
+
+
+def test_it_begins_with_the_straight_rod_at_rest_and_ends_with_the_wanted_end_pose_at_rest(plan: BendingPlan) -> None:
+    for number, wanted in ((0, Pose((0.3, 0.0, 0.0), rotation_from_rpy(0.0, 0.0, 0.0))), (-1, END)):
+        ends = {name: mouth(name, points[number].q) for name, points in plan.arms.items()}
+        relative = ends["left"].inverse() @ ends["right"] @ Pose((0, 0, 0), rotation_from_rpy(0.0, 0.0, pi))
+        assert relative.position == pytest.approx(wanted.position, abs=1e-8)
+        assert relative.rotation == pytest.approx(wanted.rotation, abs=1e-8)
+        assert not any(one for points in plan.arms.values() for one in (*points[number].v, *points[number].a))  # type: ignore[misc]
+
+
+def test_the_chucks_hold_the_ends_of_the_curve_at_each_step(plan: BendingPlan) -> None:
+    times = {name: [point.t for point in points] for name, points in plan.arms.items()}
+    for name, node in (("left", 0), ("right", -1)):
+        joints = np.array([point.q for point in plan.arms[name]])
+        for t, curve in zip(plan.times, plan.curves, strict=True):
+            q = tuple(float(np.interp(t, times[name], column)) for column in joints.T)
+            assert np.linalg.norm(np.array(mouth(name, q).position) - curve[node]) < 1e-3
+
+
+def test_the_middle_of_the_rod_stays_where_it_is_held(plan: BendingPlan) -> None:
+    assert np.abs(plan.curves[:, 30] - HELD.position).max() < 1e-12
+
+
+def test_every_step_is_stable_and_the_rod_keeps_clear(plan: BendingPlan) -> None:
+    assert all(step.is_stable for step in plan.steps[1:])
+    assert plan.clearance > CELL.clearance
+
+
+def test_both_arms_have_the_same_times(plan: BendingPlan) -> None:
+    left, right = ([point.t for point in plan.arms[name]] for name in ("left", "right"))
+    assert left == right
+    assert left[0] == 0.0
+    assert plan.duration_s == pytest.approx(left[-1])
+    assert plan.begin == {name: points[0].q for name, points in plan.arms.items()}
+    assert plan.trajectory["left"][1]["q"] == plan.arms["left"][1].q
+
+
+def test_a_drawn_shape_is_planned_by_its_parameters() -> None:
+    arcs = pre_bend(ROD, (1.0, 0.0))
+    wanted = sample_equilibrium(ROD, Form.ARC, np.random.default_rng(1))
+    steps = (*arcs, *follow_parameters(arcs[-1], wanted.a)[1:])
+    found = plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
+    assert found.steps[-1].a == pytest.approx(wanted.a)
+
+
+def test_an_end_pose_at_which_the_rod_snaps_is_refused() -> None:
+    with pytest.raises(Refused) as refused:
+        planned(Pose((0.25, 0.08, 0.0), rotation_from_rpy(0.0, 0.0, 0.0)))
+    assert refused.value.reason == "rod_unstable"
+
+
+def test_a_rod_held_out_of_reach_is_refused_by_the_name_of_the_arm() -> None:
+    with pytest.raises(Refused, match="left") as refused:
+        planned(held=Pose.from_xyzrpy(0.0, -0.5, 0.4, 0.0, 0.0, -pi / 2))
+    assert refused.value.reason == "arm_out_of_reach"
+    assert refused.value.fields["arm"] == "left"
+
+
+def test_a_rod_too_near_to_a_hand_is_refused() -> None:
+    short = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.06, 0.0, -pi / 2, 0.0), 0.02)
+    with pytest.raises(Refused) as refused:
+        planned(chuck=short)
+    assert refused.value.reason == "rod_collision"
+    assert refused.value.fields["s"] < 0.03
+
+
+def test_chucks_that_would_come_nearer_than_the_clearance_are_refused() -> None:
+    with pytest.raises(Refused, match="left and right") as refused:
+        plan_bending(replace(CELL, clearance=0.09), dict.fromkeys(NEAR, LONG), Rod(0.1, 0.5e-3), SHORT_END, HELD, NEAR)
+    assert refused.value.reason == "arms_too_near"
+
+
+def test_a_step_at_which_an_arm_would_jump_is_refused() -> None:
+    steps = bend(ROD, END)
+    with pytest.raises(Refused, match="jump") as refused:
+        plan_motion(CELL, CHUCKS, (steps[0], steps[-1]), HELD, NEAR)
+    assert refused.value.reason == "arm_out_of_reach"
+
+
+@pytest.mark.parametrize("number", [3, -1])
+def test_an_unstable_step_is_refused(number: int) -> None:
+    steps = list(bend(ROD, END))
+    jacobian = steps[number].jacobian.copy()
+    jacobian[40:, 0] *= -1.0
+    steps[number] = replace(steps[number], jacobian=jacobian)
+    with pytest.raises(Refused) as refused:
+        plan_motion(CELL, CHUCKS, steps, HELD, NEAR)
+    assert refused.value.reason == "rod_unstable"
+
+
+def test_arms_that_leave_the_rod_no_equilibrium_between_two_steps_are_refused(plan: BendingPlan) -> None:
+    holders = {one.name: _Holder(one, CHUCK) for one in CELL.arms}
+    _check_between(holders, plan.arms, plan.steps, plan.times)
+    pulled = [replace(point, q=(point.q[0], point.q[1] - 0.3, *point.q[2:])) for point in plan.arms["right"]]
+    with pytest.raises(Refused) as refused:
+        _check_between(holders, {**plan.arms, "right": tuple(pulled)}, plan.steps, plan.times)
+    assert refused.value.reason == "rod_no_equilibrium"
+
+
+def test_arms_that_the_cell_does_not_have_are_invalid() -> None:
+    with pytest.raises(Invalid, match="left, right"):
+        plan_motion(CELL, {"left": CHUCK, "middle": CHUCK}, bend(ROD, END), HELD, NEAR)
+    with pytest.raises(Invalid):
+        plan_motion(CELL, {"left": CHUCK}, bend(ROD, END), HELD, NEAR)

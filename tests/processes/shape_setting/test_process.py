@@ -1,0 +1,618 @@
+"""The heater: heat is off in the cycle in which a cause is seen, and nothing turns it on but a command."""
+
+from __future__ import annotations
+
+import pickle
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import product
+
+import pytest
+
+from rtcp.ipc.commands import Command
+from rtcp.ipc.refusals import Refusal
+from rtcp.ipc.states import State
+from rtcp.processes import ProcessSetup, Signal
+from rtcp.processes.shape_setting.interlocks import Mode, Row
+from rtcp.processes.shape_setting.messages import (
+    ArmedTooLong,
+    ArmHeater,
+    BatteryLow,
+    CauseRemains,
+    HeatEnded,
+    HeaterState,
+    HeaterTripped,
+    HeatForbidden,
+    HeatStopped,
+    MeasureResistance,
+    NoHeatProfile,
+    ProfileOutOfRange,
+    ResetTrips,
+    ResistanceMeasured,
+    ResistanceNotMeasured,
+    RodNotConfirmed,
+    RodPhase,
+    ShapeSet,
+    StartHeating,
+    StopHeating,
+    TargetNotReached,
+    TripLatched,
+    WrongHeaterState,
+)
+from rtcp.processes.shape_setting.process import ShapeSetting
+from tests.processes.shape_setting.rig import CONFIG, CONFIRMED, PERIOD_S, PROFILE, Rig
+
+MODES = (Mode.MANUAL, Mode.AUTO)
+
+
+def events(rig: Rig, kind: type) -> list[object]:
+    return [event for event in rig.context.events if isinstance(event, kind)]
+
+
+# -- a heating ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
+    rig = Rig()
+    rig.heat(mode)
+    hottest = 0.0
+    while rig.heater.state is not HeaterState.DONE and rig.context.cycle < 20_000:
+        rig.cycle()
+        hottest = max(hottest, rig.celsius)
+    assert hottest == pytest.approx(500.0, abs=20.0)
+    assert isinstance(rig.context.events[-1], ShapeSet)
+    assert not rig.relay
+    assert not rig.gate
+    assert rig.celsius == pytest.approx(450.0, abs=30.0)
+
+
+@pytest.mark.parametrize(("ohm", "joule_by_kelvin"), [(1.36, 0.19), (0.34, 0.75), (0.033, 7.8)])
+def test_one_setting_holds_rods_of_all_diameters(ohm: float, joule_by_kelvin: float) -> None:
+    rig = Rig(resistance=ohm, heat_capacity=joule_by_kelvin)
+    rig.heat(state=HeaterState.HOLDING, hold_s=2.0, ramp_k_s=100.0, max_current=300.0)
+    rig.cycle(2000)
+    for _ in range(10):
+        rig.cycle(100)
+        assert rig.celsius == pytest.approx(500.0, abs=8.0)
+
+
+def test_the_initial_resistance_is_a_mean_of_pulses_with_its_uncertainty() -> None:
+    rig = Rig()
+    rig.arm()
+    assert rig.send(CONFIRMED) is None
+    rig.until(HeaterState.ARMED)
+    (measured,) = events(rig, ResistanceMeasured)
+    assert isinstance(measured, ResistanceMeasured)
+    assert measured.pulses == CONFIG.pulses
+    assert measured.resistance == pytest.approx(0.34, rel=1e-3)
+    assert 0.0 < measured.uncertainty < 1e-3 * measured.resistance
+    assert not rig.gate
+    assert rig.relay
+
+
+def test_a_record_has_a_number_for_every_field() -> None:
+    rig = Rig()
+    rig.heat()
+    values: list[float] = [0.0] * (3 + len(rig.heater.fields()))
+    rig.heater.publish(values, 3)
+    record = dict(zip((field.name for field in rig.heater.fields()), values[3:], strict=True))
+    assert (record["state"], record["busy"], record["relay"], record["cause"]) == (4, 1, 1, 31)
+    assert record["initial_resistance"] == pytest.approx(0.34, rel=1e-2)
+    assert record["middle_temperature"] == pytest.approx(rig.celsius, abs=15.0)
+
+
+def test_the_limits_of_current_and_power_hold_the_target() -> None:
+    rig = Rig()
+    rig.heat(max_current=5.0)
+    rig.cycle(400)
+    assert rig.heater.control.target == 5.0
+    rig = Rig()
+    rig.heat(max_power=30.0)
+    rig.cycle(400)
+    assert rig.heater.control.target * rig.heater.meter.voltage == pytest.approx(30.0)
+
+
+def test_a_rod_that_does_not_get_hot_ends_the_heating_after_its_longest_time() -> None:
+    rig = Rig(replace(CONFIG, longest_s=0.5))
+    rig.heat(max_power=10.0)
+    rig.until(HeaterState.READY)
+    assert events(rig, TargetNotReached)
+    assert not rig.gate
+    assert not rig.relay
+
+
+def test_an_armed_heater_that_nobody_uses_opens_its_relay() -> None:
+    rig = Rig(replace(CONFIG, armed_s=0.5))
+    rig.arm()
+    rig.cycle(950)
+    assert rig.relay
+    rig.cycle(60)
+    assert not rig.relay
+    assert events(rig, ArmedTooLong)
+
+
+def test_lamps_show_powered_and_armed() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (1.0, 0.0)
+    rig.arm()
+    assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (1.0, 1.0)
+    rig.context.state = State.FAULT
+    rig.cycle()
+    assert (rig.get("lamp_green"), rig.get("lamp_yellow")) == (0.0, 0.0)
+
+
+# -- refusals ----------------------------------------------------------------------------------------------------------
+
+
+def refused(rig: Rig, command: Command) -> Refusal:
+    refusal = rig.send(command)
+    assert refusal is not None
+    rig.cycle()
+    assert not rig.gate
+    return refusal
+
+
+def test_heat_needs_its_steps_in_their_order() -> None:
+    rig = Rig()
+    rig.cycle()
+    assert refused(rig, ArmHeater()) == HeatForbidden(Row.KEY, Mode.OFF)
+    rig.permit(Mode.MANUAL)
+    assert refused(rig, StartHeating()) == WrongHeaterState(HeaterState.READY, HeaterState.ARMED)
+    rig.arm(Mode.MANUAL)
+    assert refused(rig, ArmHeater()) == WrongHeaterState(HeaterState.ARMED, HeaterState.READY)
+    assert refused(rig, StartHeating()) == NoHeatProfile()
+    assert rig.send(PROFILE) is None
+    assert refused(rig, StartHeating()) == ResistanceNotMeasured()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        MeasureResistance(False, RodPhase.AUSTENITE),
+        MeasureResistance(True, RodPhase.MARTENSITE),
+        MeasureResistance(True, RodPhase.UNKNOWN),
+    ],
+)
+def test_a_rod_that_is_bent_or_of_another_phase_is_not_measured(command: MeasureResistance) -> None:
+    rig = Rig()
+    rig.arm()
+    assert refused(rig, command) == RodNotConfirmed(command.phase)
+
+
+def test_pulses_wait_for_the_relay() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert rig.send(ArmHeater()) is None
+    assert rig.send(CONFIRMED) == HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"target_c": 2000.0}, {"target_c": float("nan")}, {"kelvin_per_ratio": 0.0}, {"max_current": -1.0},
+        {"hold_s": -1.0}, {"cool_c": 600.0}, {"initial_c": 510.0}, {"mean_by_middle": 1.5},
+    ],
+)  # fmt: skip
+def test_a_profile_out_of_range_is_refused(wrong: dict[str, float]) -> None:
+    rig = Rig()
+    assert isinstance(refused(rig, replace(PROFILE, **wrong)), ProfileOutOfRange)
+
+
+def test_a_weak_battery_is_refused() -> None:
+    rig = Rig()
+    rig.set(battery_voltage=11.0)
+    rig.permit(Mode.AUTO)
+    assert refused(rig, ArmHeater()) == BatteryLow(11.0, CONFIG.least_battery_voltage)
+    rig.cycle(5)
+    assert not rig.relay
+
+
+def test_the_key_at_off_forgets_the_initial_resistance() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.key(Mode.OFF)
+    rig.cycle(20)
+    rig.arm()
+    assert refused(rig, StartHeating()) == ResistanceNotMeasured()
+
+
+# -- heat off, for every row -------------------------------------------------------------------------------------------
+
+Cause = Callable[[Rig], None]
+
+
+def force(**inputs: float) -> Cause:
+    return lambda rig: rig.forced.update({key: float(value) for key, value in inputs.items()})
+
+
+def lose_cycle(rig: Rig) -> None:
+    rig.context.good = False
+
+
+def silence(arm: str) -> Cause:
+    def stop_records(rig: Rig) -> None:
+        rig.arms_follow = False
+        rig.partners[arm].time_ns -= 20_000_000
+
+    return stop_records
+
+
+def stop_arm(rig: Rig) -> None:
+    rig.partners["left"].emergency_stop = True
+
+
+def disengage_arm(rig: Rig) -> None:
+    rig.partners["left"].state = State.READY
+
+
+def release_enabling_device(rig: Rig) -> None:
+    rig.partners["left"].motion_allowed = False
+
+
+def leave_commander(rig: Rig) -> None:
+    rig.context.commander = False
+
+
+def fault_platform(rig: Rig) -> None:
+    rig.context.state = State.FAULT
+
+
+def freeze(key: str) -> Cause:
+    return lambda rig: rig.forced.update({key: rig.get(key)})
+
+
+CAUSES: list[tuple[Row, Mode, int, Cause]] = [
+    (Row.KEY, Mode.AUTO, 1, force(key_auto=0)),
+    (Row.KEY, Mode.AUTO, 1, force(key_auto=0, key_manual=1, button_a=1, button_b=1)),
+    (Row.KEY, Mode.MANUAL, 1, force(key_auto=1)),
+    (Row.BUTTON, Mode.MANUAL, 1, force(button_a=0, button_b=0)),
+    (Row.BUTTON, Mode.MANUAL, 1, force(button_a=0)),
+    (Row.BUTTON, Mode.MANUAL, 1, force(button_b=0)),
+    (Row.ROBOT_CIRCUIT, Mode.AUTO, 1, force(circuit_a=0)),
+    (Row.ROBOT_CIRCUIT, Mode.AUTO, 1, force(circuit_b=0)),
+    (Row.ARMS_PERMITTED, Mode.AUTO, 1, release_enabling_device),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, disengage_arm),
+    (Row.ARMS_ENGAGED, Mode.AUTO, 1, stop_arm),
+    (Row.PLATFORM, Mode.MANUAL, 1, fault_platform),
+    (Row.COMMANDER, Mode.MANUAL, 1, leave_commander),
+    (Row.ARM_LOST, Mode.AUTO, 1, silence("left")),
+    (Row.ARM_LOST, Mode.AUTO, 1, silence("right")),
+    (Row.RELAY_FEEDBACK, Mode.AUTO, 1, force(relay_closed=0)),
+    (Row.FUSE, Mode.AUTO, 1, force(fuse_ok=0)),
+    (Row.OVER_CURRENT, Mode.AUTO, 1, force(current=300.0)),
+    (Row.OVER_CURRENT, Mode.AUTO, 1, force(current=float("nan"))),
+    (Row.OVER_VOLTAGE, Mode.AUTO, 1, force(voltage=16.0)),
+    (Row.OVER_VOLTAGE, Mode.AUTO, 1, force(battery_voltage=16.0)),
+    (Row.OPEN_CIRCUIT, Mode.AUTO, 1, force(gate_sense=1, current=0.0, voltage=12.0)),
+    (Row.SHORT_CIRCUIT, Mode.AUTO, 1, force(gate_sense=1, current=200.0, voltage=0.1)),
+    (Row.IMPLAUSIBLE_RATIO, Mode.AUTO, 1, force(gate_sense=1, current=12.0, voltage=12.0)),
+    (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=0.0)),
+    (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=-5.0)),
+    (Row.INSULATION, Mode.AUTO, 1, force(chassis_voltage=12.0)),
+    (Row.LOST_CYCLE, Mode.AUTO, 1, lose_cycle),
+    (Row.STALE_INPUT, Mode.AUTO, CONFIG.stale_cycles, freeze("sample")),
+    (Row.STALE_INPUT, Mode.AUTO, CONFIG.stale_cycles, freeze("alive")),
+]
+
+
+@pytest.mark.parametrize(
+    ("row", "mode", "cycles", "cause"), CAUSES, ids=[f"{row.name}-{n}" for n, (row, *_) in enumerate(CAUSES)]
+)
+def test_heat_is_off_in_the_cycle_of_the_cause_and_stays_off_when_it_is_gone(
+    row: Row, mode: Mode, cycles: int, cause: Cause
+) -> None:
+    rig = Rig()
+    rig.heat(mode)
+    assert rig.gate
+    cause(rig)
+    rig.cycle(cycles)
+    assert not rig.gate
+    assert not rig.relay
+    assert rig.heater.interlocks.cause is row
+    reported = events(rig, HeatEnded) + events(rig, HeaterTripped)
+    assert [event.row for event in reported] == [row]  # type: ignore[attr-defined]
+    rig.forced.clear()
+    rig.context.good, rig.context.commander, rig.context.state = True, True, State.HOLDING
+    rig.arms_follow = True
+    for arm in rig.partners.values():
+        arm.state, arm.emergency_stop, arm.motion_allowed = State.HOLDING, False, True
+    rig.permit(mode)
+    for _ in range(50):
+        rig.cycle()
+        assert not rig.gate
+        assert not rig.relay
+
+
+def test_a_step_of_the_resistance_is_too_steep_at_once() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.cycle(400)
+    while not rig.heater.meter.fresh:
+        rig.cycle()
+    rig.forced.update(gate_sense=1.0, current=30.0, voltage=30.0 * rig.heater.meter.resistance * 1.02)
+    rig.cycle()
+    assert rig.heater.interlocks.cause is Row.STEEP_GRADIENT
+    assert not rig.gate
+    assert not rig.relay
+
+
+@pytest.mark.parametrize(
+    ("mode", "channel", "row"),
+    [
+        (Mode.MANUAL, "button_a", Row.BUTTON_DISCREPANCY),
+        (Mode.AUTO, "circuit_b", Row.CIRCUIT_DISCREPANCY),
+    ],
+)
+def test_channels_that_differ_forbid_heat_for_longer_than_the_discrepancy_time(
+    mode: Mode, channel: str, row: Row
+) -> None:
+    rig = Rig()
+    rig.arm(mode)
+    rig.forced[channel] = 0.0
+    rig.cycle()
+    assert not rig.relay
+    assert not rig.heater.supervision.holds >> row & 1
+    rig.cycle(round(CONFIG.discrepancy_s / PERIOD_S))
+    assert rig.heater.supervision.holds >> row & 1
+
+
+def test_a_gate_that_stays_on_trips_within_its_cycles() -> None:
+    rig = Rig()
+    rig.heat(state=HeaterState.COOLING, target_c=100.0, cool_c=60.0)
+    rig.cycle(20)
+    rig.forced.update(gate_sense=1.0, current=30.0, voltage=30.0 * rig.resistance)
+    rig.cycle(CONFIG.gate_cycles + 1)
+    assert rig.heater.interlocks.latched & 1 << Row.GATE_FEEDBACK
+    assert not rig.relay
+
+
+def test_a_gate_that_never_comes_on_trips_within_its_cycles() -> None:
+    rig = Rig()
+    rig.arm()
+    rig.forced["gate_sense"] = 0.0
+    assert rig.send(CONFIRMED) is None
+    rig.cycle(CONFIG.gate_cycles + 2)
+    assert rig.heater.interlocks.latched == 1 << Row.GATE_FEEDBACK
+    assert not rig.gate
+    assert not rig.relay
+
+
+def test_a_relay_that_does_not_close_trips_after_its_time() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    rig.forced["relay_closed"] = 0.0
+    assert rig.send(ArmHeater()) is None
+    rig.cycle(9)
+    assert rig.relay
+    rig.cycle(3)
+    assert not rig.relay
+    assert rig.heater.interlocks.latched == 1 << Row.RELAY_FEEDBACK
+
+
+def test_a_welded_relay_latches_after_the_heat_and_is_never_started_again_before_its_reset() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.forced["relay_closed"] = 1.0
+    assert rig.send(StopHeating()) is None
+    rig.cycle(12)
+    assert rig.heater.state is HeaterState.TRIPPED
+    assert refused(rig, ArmHeater()) == TripLatched(Row.RELAY_FEEDBACK)
+    assert refused(rig, ResetTrips()) == CauseRemains(Row.RELAY_FEEDBACK)
+    rig.forced.clear()
+    rig.cycle(10)
+    assert refused(rig, ArmHeater()) == TripLatched(Row.RELAY_FEEDBACK)
+    assert rig.send(ResetTrips()) is None
+    rig.cycle(20)
+    assert rig.heater.state is HeaterState.READY
+    assert not rig.relay
+    rig.arm()
+
+
+def test_a_cause_that_was_there_before_the_inputs_went_missing_is_not_reset() -> None:
+    rig = Rig()
+    rig.forced["chassis_voltage"] = 0.0
+    rig.cycle()
+    rig.context.good = False
+    rig.cycle()
+    assert rig.send(ResetTrips()) == CauseRemains(Row.INSULATION)
+
+
+def test_an_open_relay_is_needed_before_the_next_start() -> None:
+    rig = Rig()
+    rig.arm()
+    assert rig.send(StopHeating()) is None
+    rig.cycle()
+    assert rig.get("relay_closed")
+    assert refused(rig, ArmHeater()) == HeatForbidden(Row.RELAY_FEEDBACK, Mode.AUTO)
+    rig.cycle(10)
+    assert rig.send(ArmHeater()) is None
+
+
+def test_the_gate_is_off_where_the_mirror_contact_opens_within_the_relays_time() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    assert rig.send(ArmHeater()) is None
+    while not rig.get("relay_closed"):
+        rig.cycle()
+    assert rig.send(CONFIRMED) is None
+    rig.cycle()
+    assert rig.gate
+    rig.forced["relay_closed"] = 0.0
+    rig.cycle()
+    assert not rig.gate
+
+
+def test_no_decision_for_the_gate_leaves_while_the_relay_is_not_commanded() -> None:
+    rig = Rig()
+    rig.permit(Mode.AUTO)
+    rig.forced["relay_closed"] = 1.0
+    rig.heater.gate = True
+    rig.cycle()
+    assert not rig.gate
+
+
+def test_inputs_count_from_the_first_cycle_after_the_start() -> None:
+    rig = Rig()
+    rig.context.state = State.STARTING
+    rig.set(key_auto=1, key_manual=1)
+    rig.cycle(200)
+    assert rig.heater.interlocks.latched == 0
+    assert refused(rig, ArmHeater()) == HeatForbidden(Row.KEY, Mode.OFF)
+
+
+def test_a_key_at_both_positions_latches() -> None:
+    rig = Rig()
+    rig.set(key_auto=1, key_manual=1)
+    rig.cycle(102)
+    assert rig.heater.interlocks.latched == 1 << Row.KEY_DISCREPANCY
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_stop_turns_heat_off_at_once_and_needs_no_lease(mode: Mode) -> None:
+    rig = Rig()
+    rig.heat(mode)
+    assert not StopHeating.needs_lease
+    assert rig.send(StopHeating()) is None
+    assert not rig.gate
+    assert not rig.relay
+    rig.cycle(30)
+    assert events(rig, HeatStopped)
+    assert not rig.gate
+    assert not rig.relay
+
+
+def test_safe_turns_heat_off_at_once_until_the_next_start() -> None:
+    rig = Rig()
+    rig.heat()
+    rig.heater.safe()
+    assert not rig.gate
+    assert not rig.relay
+    rig.cycle(30)
+    assert not rig.gate
+    assert not rig.relay
+    assert rig.heater.state is HeaterState.READY
+
+
+def test_an_arm_that_the_cell_does_not_have_forbids_auto_and_not_manual() -> None:
+    rig = Rig(replace(CONFIG, arms=()))
+    signals = {name: Signal(rig.values, name) for name in rig.values}
+    rig.heater = ShapeSetting(CONFIG, ProcessSetup(PERIOD_S, signals, {}))
+    rig.permit(Mode.AUTO)
+    assert isinstance(refused(rig, ArmHeater()), HeatForbidden)
+    rig.arm(Mode.MANUAL)
+
+
+# -- all states of the inputs, and random sequences of them ------------------------------------------------------------
+
+LEVELS = ("key_auto", "key_manual", "button_a", "button_b", "circuit_a", "circuit_b", "relay_closed", "fuse_ok")
+OTHERS = ("permitted", "engaged", "recent", "good", "platform", "commander")
+
+
+def may_heat(mode: Mode, is_true: dict[str, bool]) -> bool:
+    """The rules for heat that is on, in words of their own."""
+    always = ("relay_closed", "fuse_ok", "good", "platform", "commander")
+    if not all(is_true[name] for name in always) or is_true["key_auto"] == is_true["key_manual"]:
+        return False
+    if mode is Mode.MANUAL:
+        return is_true["key_manual"] and is_true["button_a"] and is_true["button_b"]
+    robot = is_true["circuit_a"] and is_true["circuit_b"]
+    return is_true["key_auto"] and robot and is_true["permitted"] and is_true["engaged"] and is_true["recent"]
+
+
+def apply(rig: Rig, is_true: dict[str, bool]) -> None:
+    rig.forced = {name: float(is_true[name]) for name in LEVELS if name in is_true}
+    rig.context.good, rig.context.commander = is_true["good"], is_true["commander"]
+    rig.context.state = State.HOLDING if is_true["platform"] else State.DISABLING
+    rig.arms_follow = is_true["recent"]
+    for arm in rig.partners.values():
+        arm.motion_allowed = is_true["permitted"]
+        arm.state = State.HOLDING if is_true["engaged"] else State.STOPPED_BY_LIMIT
+        arm.time_ns = rig.context.now_ns - (0 if is_true["recent"] else 20_000_000)
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize("mode", MODES)
+def test_in_every_state_of_the_inputs_heat_goes_on_exactly_by_the_rules(mode: Mode) -> None:
+    rig = Rig()
+    rig.heat(mode)
+    # Nothing is left of one state for the next.
+    frozen = pickle.dumps((rig.heater, rig.context, rig.partners, rig.values, rig))
+    permitted = 0
+    for bits in product((False, True), repeat=len(LEVELS) + len(OTHERS)):
+        is_true = dict(zip((*LEVELS, *OTHERS), bits, strict=True))
+        _, _, _, _, rig = pickle.loads(frozen)
+        apply(rig, is_true)
+        if not is_true["good"]:
+            rig.set(**rig.forced)
+        rig.cycle()
+        assert rig.relay == may_heat(mode, is_true), is_true
+        assert rig.gate <= rig.relay
+        assert rig.get("lamp_yellow") == rig.relay
+        permitted += rig.relay
+    assert permitted > 0
+
+
+def run_random_sequences(count: int, seed: int) -> dict[str, int]:
+    """Let random inputs and commands act; check after each cycle that nothing is on that was not started."""
+    chance = random.Random(seed)
+    rig, seen = Rig(), dict.fromkeys(("heat", "ended", "tripped"), 0)
+    started = armed = False
+    for _ in range(count):
+        mode = chance.choice(MODES)
+        is_true = dict.fromkeys((*LEVELS[:-2], "fuse_ok", *OTHERS), True)
+        is_true.update(key_auto=mode is Mode.AUTO, key_manual=mode is Mode.MANUAL)
+        apply(rig, is_true)
+        rig.cycle(12)
+        for command in (StopHeating(), ResetTrips(), ArmHeater()):
+            rig.send(command)
+            rig.cycle(1 if command != ArmHeater() else 12)
+        armed = started = rig.relay
+        if chance.random() < 0.9:
+            # An initial resistance as if it had been measured: pulses take longer than all the rest.
+            rig.heater.initial.value = rig.resistance
+            rig.send(PROFILE)
+            started = rig.send(chance.choice((StartHeating(), CONFIRMED))) is None or started
+        for _ in range(chance.randrange(1, 8)):
+            for name in chance.sample(sorted(is_true), chance.choice((0, 0, 1, 2))):
+                is_true[name] = not is_true[name]
+            apply(rig, is_true)
+            commands: list[Command] = [ArmHeater(), StartHeating(), CONFIRMED, ResetTrips(), StopHeating(), PROFILE]
+            command = chance.choice(commands) if chance.random() < 0.2 else None
+            if command is not None and rig.send(command) is None:
+                armed |= isinstance(command, ArmHeater)
+                started |= isinstance(command, (StartHeating, MeasureResistance))
+            for _ in range(chance.choice((1, 1, 3, 12))):
+                before = len(rig.context.events)
+                rig.cycle()
+                now = {**is_true, "relay_closed": rig.get("relay_closed") > 0.5}
+                if rig.relay:
+                    rules = may_heat(rig.heater.inputs.mode, {**now, "relay_closed": True, "commander": True})
+                    assert armed
+                    assert rules
+                    assert not rig.heater.interlocks.latched
+                if rig.gate:
+                    assert started
+                    assert may_heat(rig.heater.inputs.mode, now)
+                    seen["heat"] += 1
+                if not rig.relay:
+                    armed = started = False
+                for event in rig.context.events[before:]:
+                    seen["ended"] += isinstance(event, HeatEnded)
+                    seen["tripped"] += isinstance(event, HeaterTripped)
+        rig.context.events.clear()
+        rig.celsius = 20.0
+    return seen
+
+
+def test_random_sequences_of_inputs_and_commands_never_heat_outside_the_table() -> None:
+    seen = run_random_sequences(3_000, seed=33)
+    assert min(seen.values()) > 100, seen
+
+
+@pytest.mark.slow
+def test_100_000_random_sequences_never_heat_outside_the_table() -> None:
+    seen = run_random_sequences(100_000, seed=4)
+    assert min(seen.values()) > 10_000, seen

@@ -1,0 +1,63 @@
+"""Profiles in YAML, their mistakes, and what goes to the loop."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rtcp.config.model import ConfigError
+from rtcp.processes.shape_setting.profile import heat_command, read_profile, target_ratio, target_temperatures
+from rtcp.processes.shape_setting.temperature import Place
+from tests.processes.shape_setting.rig import Rig
+
+ROOT = Path(__file__).parents[3]
+EXAMPLE = ROOT / "config" / "shape_setting" / "nitinol.yaml"
+
+
+def mistakes(tmp_path: Path, old: str, new: str) -> list[str]:
+    text = EXAMPLE.read_text()
+    assert old in text
+    file = tmp_path / "rod.yaml"
+    file.write_text(text.replace(old, new))
+    with pytest.raises(ConfigError) as raised:
+        read_profile(file)
+    return [problem.removeprefix(f"{file}:") for problem in raised.value.problems]
+
+
+def test_the_example_is_a_profile_that_the_heater_takes() -> None:
+    profile = read_profile(EXAMPLE)
+    assert Rig().send(heat_command(profile)) is None
+    mean, middle = target_temperatures(profile)
+    assert (mean.place, middle.place) == (Place.MEAN, Place.MIDDLE)
+    assert middle.celsius == pytest.approx(profile.target_c)
+    assert 20.0 < middle.celsius - mean.celsius < 35.0
+    assert 1.08 < target_ratio(profile) < 1.11
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "sentence"),
+    [
+        ("target_c: 510", "target_c: 5100", 10, "target_c: found 5100, allowed is a number from 50 to 600"),
+        ("cool_c: 80 ", "cool_c: 520", 13, "cool_c: found 520, allowed is a number from 20 to 400"),
+        ("cool_c: 80\n", "cool_c: 21\n", 13, "cool_c: found 21, allowed is more than initial_c, 22"),
+        ("alpha: 1.78e-10", "alpha: 2e-4", 4, "alloy.alpha: found 0.0002, allowed is a number from 1e-11 to 1e-08"),
+        ("hold_s: 120", "hold: 120", 11, "hold: this key does not exist; did you mean hold_s?"),
+        ("length: 0.3 ", "length: 300 ", 7, "ends.length: found 300, allowed is a number from 0.02 to 2"),
+    ],
+)
+def test_a_mistake_is_a_sentence_with_its_line(tmp_path: Path, old: str, new: str, line: int, sentence: str) -> None:
+    old = old if old in EXAMPLE.read_text() else old.rstrip()
+    problems = mistakes(tmp_path, old, new)
+    assert any(problem.startswith(f"{line}: {sentence}") for problem in problems), problems
+
+
+def test_the_loops_modules_load_no_validator_and_no_numpy() -> None:
+    program = (
+        "import sys, rtcp.processes.shape_setting.config, rtcp.processes.shape_setting.process\n"
+        "print({'pydantic', 'numpy', 'ruamel', 'scipy'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
