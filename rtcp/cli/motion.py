@@ -42,7 +42,8 @@ def _enable() -> None:
     """Enable the drives; the arm holds where it is."""
     with connect("enable") as robot:
         robot.enable()
-    report("enabled: the drives hold the arm where it is")
+        joints = robot.status().joint_names
+    report("enabled: the drives hold the arm where it is" if joints else "enabled: the platform has no arm")
 
 
 @commands.command("disable")

@@ -243,8 +243,10 @@ def loop_process() -> int:
 
 
 @contextmanager
-def stoppable(command: str) -> Iterator[Robot]:
-    """Connect; on Ctrl-C, SIGTERM and SIGHUP close the connection, which stops the arm.
+def stoppable(
+    command: str, ends: str = "the connection is closed, the arm comes to a controlled stop"
+) -> Iterator[Robot]:
+    """Connect; on Ctrl-C, SIGTERM and SIGHUP close the connection, which stops the arm, and say how it `ends`.
 
     Signals that suspend do the same: otherwise the arm would move on while Ctrl-C does not reach the command.
 
@@ -259,7 +261,7 @@ def stoppable(command: str) -> Iterator[Robot]:
             robot.close()
             code = interruption_code(interruption)
             what = "ended, not suspended" if code - 128 in SUSPENDING else "interrupted"
-            raise CommandError(f"{what}: the connection is closed, the arm comes to a controlled stop", code) from None
+            raise CommandError(f"{what}: {ends}", code) from None
 
 
 def _replace_gateway(directory: Path, error: RtcpError) -> None:

@@ -123,6 +123,25 @@ def test_by_hand_in_manual_without_arms_a_released_button_ends_the_heat(heater: 
         assert robot.processes["heater"].state == "ready"
 
 
+def test_the_command_line_shows_a_process_and_sends_it_any_of_its_commands(heater: Heater) -> None:
+    rtcp = heater.platform.rtcp
+    assert "shape_setting" in rtcp("process").stdout
+    shown = rtcp("process", "heater").stdout
+    assert "phase: unknown | austenite | martensite" in " ".join(shown.split())
+    rtcp("process", "heater", "arm_heater")
+    heater.until(lambda truth: truth["relay_closed"], "relay closed")
+    time.sleep(0.1)
+    rtcp("process", "heater", "measure_resistance", "straight_and_unloaded=true", "phase=austenite")
+    with heater.connect() as robot:
+        assert robot.processes["heater"].fields["initial_resistance"] > 0.0
+    assert "heater is ready" in rtcp("process", "heater", "stop_heating").stdout
+    rtcp("process", "heater", "measure_resistance", "straight_and_unloaded=yes", "phase=austenite", check=2)
+    rtcp("process", "heater", "melt", check=2)
+    rtcp("process", "heater", "reset_trips", "now", check=2)
+    rtcp("process", "pump", "reset_trips", check=3)
+    rtcp("process", "pump", check=3)
+
+
 def test_a_connection_that_closes_ends_the_heat(heater: Heater) -> None:
     with heater.connect() as robot:
         thread, _ = heating(heater, robot)

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 
 from rtcp.api import Robot, State
@@ -259,14 +260,19 @@ def test_a_rod_gets_its_shape_and_the_report_says_what_was_measured(cell: Heater
             time.sleep(0.05)
     assert run.code == 0, errors.result()
     assert {file.name for file in run.folder.iterdir()} == {
-        "report.html", "report.json", "shape.png", "heat.png", "along.png",
+        "report.html", "report.json", "shape.png", "heat.png", "along.png", "set.png",
     }  # fmt: skip
     page = (run.folder / "report.html").read_text()
-    assert all(f'src="{name}.png"' in page for name in ("shape", "heat", "along"))
+    assert all(f'src="{name}.png"' in page for name in ("shape", "heat", "along", "set"))
     report, facts = json.loads((run.folder / "report.json").read_text()), run.facts()
     assert facts["result"] == "the profile is complete"
     assert report["initial_resistance"] == pytest.approx(0.34, rel=0.01)
     assert max(report["samples"]["middle_temperature"]) == pytest.approx(510.0, abs=10.0)
+    grid = np.array(report["along"]["celsius"])
+    assert grid.shape == (len(report["along"]["s"]), len(report["along"]["times"]))
+    assert grid.max() == pytest.approx(510.0, abs=10.0)
+    assert grid[len(grid) // 2].max() == grid.max()
+    assert grid[0].max() < 50.0
     # The fast ramp has not reached the steady state of the fin, which the estimate is by.
     assert hottest == pytest.approx(510.0, abs=30.0)
     assert float(facts["hottest place of the rod"].split()[0]) == pytest.approx(hottest, abs=10.0)

@@ -1,7 +1,8 @@
 """Plan of a bend: two arms of a cell hold a straight rod and bring it to a wanted shape, as one motion in step.
 
 The middle of the rod stays where it is held, both arms move about it. The plan is checked whole: joints, stability and
-strain, the bodies of rod, chucks and arms. Weight is left out: it bends a rod of 1 mm by 0.3 m by 0.4 mm.
+strain, the bodies of rod, chucks and arms, keep-out boxes. Weight is left out: it bends a rod of 1 mm by 0.3 m by 0.4
+mm.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise, product
-from math import ceil
+from math import ceil, inf
 from typing import Any, Final
 
 import numpy as np
@@ -17,6 +18,8 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from kinematics import IDENTITY, Capsule, InverseKinematics, JointLimit, Placed, Pose, capsules, distance, forward
+from kinematics.capsules import from_box
+from kinematics.forward import frames
 from rtcp.config.cell import CellConfig, Member
 from rtcp.config.model import Point
 from rtcp.ipc.errors import Refused, RtcpError
@@ -37,6 +40,11 @@ _POINT_S: Final = 0.1
 _SMALLEST_PART: Final = 1e-4
 _STRETCH: Final = 1.25
 _ATTEMPTS: Final = 8
+_WRIST: Final = 4
+"""The first link that is too near to a chuck for a distance between them to mean anything."""
+_OWN_ARC: Final = 20.0
+"""Diameters; two places of the rod that are nearer along it belong to one bend: 8 % strain makes a circle of 39."""
+_SAME_RAD: Final = 1e-4
 _NEAR_STRAIGHT_RAD: Final = 0.1
 """Between the ends. Below it the rod is too near to the singular straight one to be solved again by its end pose."""
 
@@ -129,7 +137,7 @@ def plan_motion(
         )
     for step in steps[1:]:
         check(step)
-    holders = {name: _Holder(cell.member(name), chuck) for name, chuck in chucks.items()}
+    holders = {name: _Holder(cell.member(name), chuck, cell.clearance) for name, chuck in chucks.items()}
     starts = tuple(held @ step.pose(len(step.s) // 2).inverse() for step in steps)
     tools = (starts, [start @ step.end @ HALF_TURN for start, step in zip(starts, steps, strict=True)])
     ways = [list(holder.ways(poses, near[name])) for (name, holder), poses in zip(holders.items(), tools, strict=True)]
@@ -139,6 +147,7 @@ def plan_motion(
             for start, step in zip(starts, steps, strict=True)
         ]
     )
+    _check_curves(cell, curves, steps[0].rod.diameter)
     refused: RtcpError | None = None
     for pair in product(*ways):
         paths = dict(zip(holders, pair, strict=True))
@@ -154,10 +163,41 @@ def plan_motion(
     raise refused
 
 
+def plan_approach(
+    cell: CellConfig,
+    chucks: Mapping[str, Chuck],
+    now: Mapping[str, Sequence[float]],
+    begin: Mapping[str, Sequence[float]],
+    speed: float,
+) -> dict[str, list[dict[str, Any]]] | None:
+    """Return the straight motion of all joints to where a plan begins, as `Cell.run_trajectory` takes it.
+
+    It is checked as the bend is, the chucks among the bodies, which the loops do not know.
+
+    Args:
+        cell: with the two arms.
+        chucks: by the names of their arms.
+        now: where the arms are commanded, rad.
+        begin: where they are to be, rad.
+        speed: of the fastest joint, rad/s.
+
+    Returns:
+        The points by arm; None: they are there.
+
+    Raises:
+        Refused: `arms_too_near`, with what is in the way; nothing is begun.
+    """
+    if all(abs(a - b) < _SAME_RAD for name, q in begin.items() for a, b in zip(now[name], q, strict=True)):
+        return None
+    holders = {name: _Holder(cell.member(name), chuck, cell.clearance) for name, chuck in chucks.items()}
+    arms, _ = _timed(cell, holders, {name: (tuple(now[name]), tuple(begin[name])) for name in holders}, speed)
+    return {name: [asdict(point) for point in points] for name, points in arms.items()}
+
+
 class _Holder:
     """An arm with its chuck: the chuck's mouth is its tool, and the chuck the last of its bodies."""
 
-    def __init__(self, member: Member, chuck: Chuck) -> None:
+    def __init__(self, member: Member, chuck: Chuck, clearance: float) -> None:
         model = member.config.arm
         if model is None:
             raise RtcpError("invalid", f"{member.name}: its geometry is not known: give its file `kinematics`")
@@ -174,6 +214,27 @@ class _Holder:
         base = Pose.from_xyzrpy(*member.base.position, *member.base.rpy)
         self.body = Body(model, base, self.limits.acceleration)
         self._solver = InverseKinematics(model)
+        self._clearance = clearance
+        self._boxes = [(box.name, (*box.min, *box.max)) for box in member.config.cartesian.keep_out]
+        self._local = Placed(capsules(model))
+        self._chuck = len(self._local.radii) - 1
+        self._local.place(frames(model, [0.0] * len(self.limits.low)))
+        self._pairs = [
+            (which, self._chuck)
+            for which, part in enumerate(self._local.bodies)
+            if part.link < _WRIST and distance(self._local, self._local, ((which, self._chuck),))[0] > 0.0
+        ]
+
+    def zone_at(self, q: Sequence[float]) -> str | None:
+        """Return what the chuck would be too near to, in words: a keep-out box or its own arm; None: nothing."""
+        self._local.place(frames(self.body.model, q))
+        for name, box in self._boxes:
+            if from_box(self._local, self._chuck, box)[0] < self._clearance:
+                return f"the keep-out box {name} (with the chuck of {self.name})"
+        apart, link, _ = distance(self._local, self._local, self._pairs)
+        if apart < self._clearance:
+            return f"a collision with itself (chuck of {self.name} and link {self._local.bodies[link].link})"
+        return None
 
     def ways(self, poses: Sequence[Pose], near: Sequence[float]) -> Iterator[list[tuple[float, ...]]]:
         """Yield the continuous joint paths that lead the chuck through poses in the world, the nearest first.
@@ -213,6 +274,49 @@ class _Holder:
             )
 
 
+def _check_curves(cell: CellConfig, curves: Array, diameter: float) -> None:
+    """Check that the rod keeps clear of itself and of every arm's keep-out boxes; raises Refused."""
+    count = curves.shape[1] - 1
+    segment = float(np.linalg.norm(np.diff(curves[0], axis=0), axis=1)[0])
+    gap = max(ceil(_OWN_ARC * diameter / segment), 2)
+    own = [(i, j) for i in range(count) for j in range(i + gap, count)]
+    for number, curve in enumerate(curves):
+        rod = _placed(curve, 0.5 * diameter)
+        apart, place, other = distance(rod, rod, own)
+        if apart <= 0.0:
+            raise RtcpError(
+                "refused",
+                f"at step {number} of {len(curves) - 1} the rod would touch itself, {place * segment:.3f} and "
+                f"{other * segment:.3f} m from its start: bend it less",
+                "rod_collision",
+                {"step": number, "distance": apart, "s": place * segment},
+            )
+        for member in cell.arms:
+            boxes = member.config.cartesian.keep_out
+            if not boxes:
+                continue
+            back = Pose.from_xyzrpy(*member.base.position, *member.base.rpy).inverse()
+            local = _placed(curve @ np.reshape(back.rotation, (3, 3)).T + np.array(back.position), 0.5 * diameter)
+            for box in boxes:
+                near = [from_box(local, which, (*box.min, *box.max))[0] for which in range(count)]
+                if min(near) < cell.clearance:
+                    at = int(np.argmin(near)) * segment
+                    raise RtcpError(
+                        "refused",
+                        f"at step {number} of {len(curves) - 1} the rod, {at:.3f} m from its start, would be "
+                        f"{min(near):.3f} m from the keep-out box {box.name} of {member.name}, allowed is at least "
+                        f"{cell.clearance:g} m: hold the rod elsewhere",
+                        "rod_collision",
+                        {"arm": member.name, "step": number, "distance": min(near), "s": at},
+                    )
+
+
+def _placed(curve: Array, radius: float) -> Placed:
+    rod = Placed([Capsule(0, a, b, radius) for a, b in pairwise(map(tuple, curve.tolist()))])
+    rod.place(())
+    return rod
+
+
 def _check_rod(
     holders: Mapping[str, _Holder],
     paths: Mapping[str, Sequence[Sequence[float]]],
@@ -226,12 +330,10 @@ def _check_rod(
     """
     least, count = np.inf, curves.shape[1] - 1
     segment = float(np.linalg.norm(np.diff(curves[0], axis=0), axis=1)[0])
-    radius = 0.5 * diameter
     moved = np.abs(np.diff(curves, axis=0, prepend=curves[:1])).max(axis=(1, 2))
     before = {name: np.zeros(0) for name in holders}
     for number, curve in enumerate(curves):
-        rod = Placed([Capsule(0, a, b, radius) for a, b in pairwise(map(tuple, curve.tolist()))])
-        rod.place(())
+        rod = _placed(curve, 0.5 * diameter)
         for index, (name, holder) in enumerate(holders.items()):
             holder.body.place(paths[name][number])
             placed = holder.body.placed
@@ -264,11 +366,15 @@ def _check_rod(
 
 
 def _timed(
-    cell: CellConfig, holders: Mapping[str, _Holder], paths: Mapping[str, Sequence[Sequence[float]]]
+    cell: CellConfig,
+    holders: Mapping[str, _Holder],
+    paths: Mapping[str, Sequence[Sequence[float]]],
+    most: float = inf,
 ) -> tuple[dict[str, tuple[Point, ...]], tuple[float, ...]]:
     """Return the points of both arms and the times of the steps: one spline through the steps, one time law for both.
 
-    The time law is 10 x^3 - 15 x^4 + 6 x^5; its duration is the least that keeps speeds, accelerations and jerks.
+    The time law is 10 x^3 - 15 x^4 + 6 x^5; its duration is the least that keeps speeds, `most` (rad/s) of any joint
+    among them, accelerations and jerks.
     """
     joints = np.hstack([np.asarray(path) for path in paths.values()])
     along = np.append(0.0, np.cumsum(np.abs(np.diff(joints, axis=0)).max(axis=1) + _SMALLEST_PART))
@@ -279,7 +385,7 @@ def _timed(
     position, speed, acceleration = _by_time(spline, x)
     jerk = np.gradient(acceleration, x, axis=0)
     limits = [holder.limits for holder in holders.values()]
-    fastest = SPEED_SHARE * np.concatenate([one.velocity for one in limits])
+    fastest = np.minimum(SPEED_SHARE * np.concatenate([one.velocity for one in limits]), most)
     strongest = ACCELERATION_SHARE * np.concatenate([one.acceleration for one in limits])
     jerkiest = np.concatenate([one.jerk for one in limits])
     duration = max(
@@ -307,13 +413,14 @@ def _timed(
             first += 6
         try:
             _check_motion(cell, holders, arms)
-        except PlanTooFast as too_fast:
-            if attempt == _ATTEMPTS - 1:
-                raise RtcpError("refused", str(too_fast), type(too_fast).__name__) from None
+        except PlanRefused as refused:
+            too_fast = isinstance(refused, PlanTooFast)
+            # Arms that approach may be too near for the stops of their speed; those of a bend have other ways.
+            if attempt == _ATTEMPTS - 1 or not (too_fast or most < inf):
+                reason = type(refused).__name__ if too_fast else "arms_too_near"
+                raise RtcpError("refused", str(refused), reason) from None
             duration *= _STRETCH
             continue
-        except PlanRefused as refused:
-            raise RtcpError("refused", str(refused), "arms_too_near") from None
         break
     return arms, tuple(float(one) for one in duration * np.interp(along, law, x))
 
@@ -331,7 +438,8 @@ def _check_motion(cell: CellConfig, holders: Mapping[str, _Holder], arms: Mappin
     curves = {}
     for name, points in arms.items():
         names = [f"{name} {one.name}" for one in cell.member(name).config.joints]
-        plan = plan_trajectory(points, holders[name].limits, points[0].q, names=names)
+        holder = holders[name]
+        plan = plan_trajectory(points, holder.limits, points[0].q, names=names, zone_at=holder.zone_at)
         curves[name] = Curve(plan.rows, len(points[0].q))
     plan_brakes(curves, {name: holder.limits for name, holder in holders.items()})
     bodies = {name: holder.body for name, holder in holders.items()}

@@ -74,28 +74,23 @@ class CurrentControl:
 
 
 class Ramp:
-    """Setpoint of the temperature in the middle: a ramp, that waits for a rod that is too far behind, then the target.
-
-    Args:
-        period_s: the cycle, s.
-    """
+    """Setpoint of the temperature in the middle: a ramp, that waits for a rod too far behind, then the target."""
 
     LEAD_K = 40.0
     """The setpoint waits while the measured temperature is further behind, K."""
     REACHED_K = 3.0
     """The target counts as reached within this, K."""
 
-    def __init__(self, period_s: float) -> None:
-        self._period_s = period_s
-        self._step = 0.0
+    def __init__(self) -> None:
+        self._rate = 0.0
         self.setpoint_c = self.target_c = 0.0
 
     def begin(self, start_c: float, target_c: float, ramp_k_s: float) -> None:
         """Begin at a temperature, C."""
-        self.setpoint_c, self.target_c, self._step = start_c, target_c, ramp_k_s * self._period_s
+        self.setpoint_c, self.target_c, self._rate = start_c, target_c, ramp_k_s
 
-    def update(self, middle_c: float) -> bool:
-        """Move on by a cycle; return whether the measured temperature has reached the target."""
+    def update(self, middle_c: float, passed_s: float) -> bool:
+        """Move on by a time, s; return whether the measured temperature has reached the target."""
         if self.setpoint_c - middle_c < self.LEAD_K:
-            self.setpoint_c = min(self.setpoint_c + self._step, self.target_c)
+            self.setpoint_c = min(self.setpoint_c + self._rate * passed_s, self.target_c)
         return self.setpoint_c >= self.target_c and middle_c >= self.target_c - self.REACHED_K

@@ -94,7 +94,9 @@ class ShapeSetting(Process):
     def __init__(self, config: ShapeSettingConfig, setup: ProcessSetup) -> None:
         super().__init__(config, setup)
         self._config = config
-        self._period_s = period_s = setup.period_s
+        period_s = setup.period_s
+        self._passed_s, self._before_ns = 0.0, 0
+        """Since the cycle before, s: longer than a period where ticks were skipped."""
         signals = setup.signals
         self._digital = [
             (name, signals[getattr(config, name)])
@@ -117,7 +119,7 @@ class ShapeSetting(Process):
         self.control = CurrentControl(
             period_s, config.average_s, config.proportional, config.integral, config.derivative
         )  # fmt: skip
-        self.ramp = Ramp(period_s)
+        self.ramp = Ramp()
         self.state = HeaterState.OFF
         self._profile: SetHeatProfile | None = None
         self._scale = RatioScale(0.0, 1.0, 0.0, 1.0)
@@ -255,8 +257,11 @@ class ShapeSetting(Process):
             # The inputs are not valid yet.
             self._open()
             return
+        now_ns = context.now_ns
+        self._passed_s = 1e-9 * (now_ns - self._before_ns) if self._before_ns else context.period_s
+        self._before_ns = now_ns
         self._read()
-        self._since_heat_s = 0.0 if self.state in _HOT else self._since_heat_s + self._period_s
+        self._since_heat_s = 0.0 if self.state in _HOT else self._since_heat_s + self._passed_s
         inputs, interlocks, meter = self.inputs, self.interlocks, self.meter
         meter.update(inputs.voltage, inputs.current, inputs.sample, inputs.gate_sense)
         holds = self.supervision.update(
@@ -271,7 +276,7 @@ class ShapeSetting(Process):
         self._pending.clear()
         self.control.measure(inputs.current)
         if context.good and self.state in _BUSY:
-            self.energy += inputs.voltage * inputs.current * self._period_s
+            self.energy += inputs.voltage * inputs.current * self._passed_s
         if not interlocks.closed:
             self._rest()
         else:
@@ -320,7 +325,7 @@ class ShapeSetting(Process):
 
     def _wait(self, context: PartContext) -> None:
         """Open a relay that nobody uses: no commander watches over an armed heater."""
-        self._elapsed_s += self._period_s
+        self._elapsed_s += self._passed_s
         if self._elapsed_s > self._config.armed_s:
             context.report(ArmedTooLong(self._config.armed_s))
             self._open()
@@ -328,7 +333,7 @@ class ShapeSetting(Process):
     def _pulse(self, context: PartContext) -> None:
         """Do a cycle of the pulses: the gate is on until a conversion with the gate on throughout has come."""
         initial, config = self.initial, self._config
-        self._pulse_s += self._period_s
+        self._pulse_s += self._passed_s
         if self.gate and self.meter.fresh:
             initial.add(self.meter.resistance)
             self.gate, self._pulse_s = False, 0.0
@@ -348,8 +353,8 @@ class ShapeSetting(Process):
         config, meter, control, profile, scale = self._config, self.meter, self.control, self._profile, self._scale
         assert profile is not None
         middle = scale.middle(self.ratio)
-        reached = self.ramp.update(middle)
-        self._elapsed_s += self._period_s
+        reached = self.ramp.update(middle, self._passed_s)
+        self._elapsed_s += self._passed_s
         if meter.voltage:
             limit = min(profile.max_current, profile.max_power / meter.voltage)
             setpoint = scale.ratio_for_middle(self.ramp.setpoint_c)
@@ -359,7 +364,7 @@ class ShapeSetting(Process):
             self.state, self._hold_s = HeaterState.HOLDING, 0.0
             context.report(HoldBegun(middle, profile.hold_s))
         elif self.state is HeaterState.HOLDING:
-            self._hold_s += self._period_s
+            self._hold_s += self._passed_s
             if self._hold_s >= profile.hold_s:
                 self.state, self.gate, self._hold_s = HeaterState.COOLING, False, 0.0
                 control.reset()
@@ -373,7 +378,7 @@ class ShapeSetting(Process):
         assert self._profile is not None
         self.gate = self.meter.age_s >= self._config.cooling_interval_s
         middle = self._scale.middle(self.ratio)
-        self._hold_s += self._period_s
+        self._hold_s += self._passed_s
         if self.meter.fresh and middle <= self._profile.cool_c:
             context.report(ShapeSet(middle))
             self._open()

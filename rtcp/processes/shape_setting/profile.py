@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
+import numpy.typing as npt
 from annotated_types import Ge, Gt, Le
 
 from rtcp.config.document import Finding, read
@@ -97,6 +99,24 @@ def target_temperatures(profile: HeatProfile) -> tuple[Temperature, Temperature]
         profile.alloy, scale, target_ratio(profile), profile.ratio_uncertainty, profile.initial_uncertainty_k
     )
     return mean, middle_temperature(profile.ends, scale, mean)
+
+
+def temperatures_along(
+    profile: HeatProfile, s: npt.NDArray[np.float64], middle: npt.ArrayLike
+) -> npt.NDArray[np.float64]:
+    """Return the temperatures along the rod, (n, k), C, by the solution of a fin.
+
+    Args:
+        profile: of the chucks and the cold ends.
+        s: places from the rod's start, (n,), m.
+        middle: temperatures in the middle, (k,), C.
+    """
+    half = 0.5 * profile.ends.length / profile.ends.end_length
+    x = np.append(np.abs(s / profile.ends.end_length - half), 0.0)
+    # cosh(x) / cosh(half) without an overflow, and last in the middle
+    cold = np.exp(x - half) * (1.0 + np.exp(-2.0 * x)) / (1.0 + np.exp(-2.0 * half))
+    rise = (1.0 - cold[:-1]) / (1.0 - cold[-1])
+    return np.asarray(profile.chuck_c + rise[:, None] * (np.asarray(middle, dtype=np.float64) - profile.chuck_c))
 
 
 def heat_command(profile: HeatProfile) -> SetHeatProfile:

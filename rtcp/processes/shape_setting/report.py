@@ -11,14 +11,18 @@ import numpy as np
 
 from rtcp.processes.rod.set_shape import aligned
 from rtcp.processes.shape_setting.job import Job
-from rtcp.processes.shape_setting.profile import HeatProfile, target_temperatures
+from rtcp.processes.shape_setting.profile import HeatProfile, target_temperatures, temperatures_along
 from rtcp.processes.shape_setting.run import Array, Outcome
 
 _SHAPES = (("wanted", "k--"), ("held", "tab:blue"), ("released", "tab:red"))
+_PLACES, _MOST_TIMES = 61, 300
+"""Size of the grid of temperatures along the rod over time."""
 
 
 def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome, problem: str) -> Path:
-    """Write `report.html`, `report.json`, `shape.png`, `heat.png` and, where it is known, `along.png`; return the page.
+    """Write `report.html`, `report.json` and, of what is known, `shape.png`, `heat.png`, `along.png`, `set.png`.
+
+    Returns the page.
 
     Args:
         folder: which exists.
@@ -27,19 +31,23 @@ def write_report(folder: Path, job: Job, profile: HeatProfile, outcome: Outcome,
         outcome: what was measured.
         problem: what ended the run early; empty: nothing.
     """
-    drawn = (_shapes(folder, outcome), _heat(folder, outcome), _along(folder, outcome))
+    along = _temperatures(profile, outcome)
+    drawn = (_shapes(folder, outcome), _heat(folder, outcome), _along(folder, along), _set(folder, outcome))
     pictures = [picture for picture in drawn if picture]
     facts = _facts(job, profile, outcome, problem)
-    (folder / "report.json").write_text(json.dumps(_plain(facts, outcome), indent=1))
+    (folder / "report.json").write_text(json.dumps(_plain(facts, outcome, along), indent=1))
     rows = "".join(f"<tr><th scope=row>{html.escape(k)}<td>{html.escape(str(v))}" for k, v in facts.items())
     steps = "".join(f"<tr><td>{at:.1f} s<td>{html.escape(what)}" for at, what in outcome.steps)
     interlocks = "".join(f"<tr><th scope=row>{name}<td>{state}" for name, state in outcome.interlocks.items())
-    images = "".join(f'<p><img src="{name}" alt="{html.escape(text)}">' for name, text in pictures)
+    images = "".join(
+        f'<figure><img src="{name}" alt="{html.escape(text)}"><figcaption>{html.escape(text)}</figcaption></figure>'
+        for name, text in pictures
+    )
     page = folder / "report.html"
     page.write_text(
         f"<!doctype html><html lang=en><meta charset=utf-8><title>Shape setting</title>"
-        "<style>body{font:16px sans-serif;max-width:60em;margin:2em auto}td,th{text-align:left;padding:.2em 1em .2em 0}"
-        "img{max-width:100%}</style>"
+        "<style>body{font:16px sans-serif;max-width:60em;margin:2em auto}"
+        "figure{margin:1em 0}td,th{text-align:left;padding:.2em 1em .2em 0}img{max-width:100%}</style>"
         f"<h1>Shape setting</h1><table>{rows}</table>{images}<h2>Steps</h2><table>{steps}</table>"
         f"<h2>Interlocks at the end</h2><table>{interlocks}</table></html>\n"
     )
@@ -63,12 +71,29 @@ def _facts(job: Job, profile: HeatProfile, outcome: Outcome, problem: str) -> di
     if outcome.released is not None:
         largest, mean_square = outcome.error
         facts["released rod against the wanted one"] = f"{1e3 * mean_square:.2f} mm rms, {1e3 * largest:.2f} mm at most"
-        facts["ends that stay straight"] = " and ".join(f"{1e3 * one:.0f} mm" for one in outcome.straight)
+        whole = sum(outcome.straight) >= job.rod.length
+        ends = " and ".join(f"{1e3 * one:.0f} mm" for one in outcome.straight)
+        facts["ends that stay straight"] = (
+            "the whole rod: less than half of the bend is set anywhere" if whole else ends
+        )
     return facts
 
 
-def _plain(facts: dict[str, str], outcome: Outcome) -> dict[str, Any]:
+def _temperatures(profile: HeatProfile, outcome: Outcome) -> tuple[Array, Array, Array] | None:
+    """Return the temperatures along the rod over time: times, s, (k,), places, m, (n,), and the grid, (n, k), C."""
+    if len(outcome.times) < 2:
+        return None
+    chosen = np.linspace(0, len(outcome.times) - 1, min(_MOST_TIMES, len(outcome.times))).round().astype(int)
+    places = np.linspace(0.0, profile.ends.length, _PLACES)
+    middle = np.array(outcome.samples["middle_temperature"])[chosen]
+    return np.array(outcome.times)[chosen], places, temperatures_along(profile, places, middle)
+
+
+def _plain(facts: dict[str, str], outcome: Outcome, along: tuple[Array, Array, Array] | None) -> dict[str, Any]:
     made: dict[str, Any] = {"facts": facts}
+    if along is not None:
+        times, places, grid = along
+        made["along"] = {"times": times.tolist(), "s": places.tolist(), "celsius": grid.round(1).tolist()}
     for name, value in vars(outcome).items():
         made[name] = value.tolist() if isinstance(value, np.ndarray) else value
     return made
@@ -122,7 +147,23 @@ def _heat(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
     return "heat.png", "temperatures by the resistance, and the average current, over time"
 
 
-def _along(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
+def _along(folder: Path, along: tuple[Array, Array, Array] | None) -> tuple[str, str] | None:
+    if along is None:
+        return None
+    import matplotlib.pyplot as plt
+
+    times, places, grid = along
+    figure, axis = plt.subplots(figsize=(10, 3.5), layout="constrained")
+    shown = axis.pcolormesh(times, 1e3 * places, grid, cmap="inferno", shading="gouraud")
+    figure.colorbar(shown, ax=axis, label="C")
+    axis.set_xlabel("s")
+    axis.set_ylabel("along the rod, mm")
+    figure.savefig(folder / "along.png", dpi=120)
+    plt.close(figure)
+    return "along.png", "temperature along the rod over time, by the resistance and the cold ends of the profile"
+
+
+def _set(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
     if outcome.s is None or outcome.fraction is None or outcome.highest is None:
         return None
     import matplotlib.pyplot as plt
@@ -135,6 +176,6 @@ def _along(folder: Path, outcome: Outcome) -> tuple[str, str] | None:
     other = axis.twinx()
     other.plot(1e3 * outcome.s, outcome.fraction, "tab:blue")
     other.set_ylabel("set, 0 to 1")
-    figure.savefig(folder / "along.png", dpi=120)
+    figure.savefig(folder / "set.png", dpi=120)
     plt.close(figure)
-    return "along.png", "highest temperature along the rod, red, and which part of the bend is set, blue"
+    return "set.png", "highest temperature along the rod, red, and which part of the bend is set, blue"

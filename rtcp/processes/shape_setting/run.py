@@ -24,11 +24,11 @@ from rtcp.config.cell import Member
 from rtcp.config.model import VIRTUAL
 from rtcp.ipc.runtime_directory import control_socket
 from rtcp.processes.rod import BendingPlan, Equilibrium, Release, plan_motion, release, set_fraction, shoot
-from rtcp.processes.rod.bending import HALF_TURN
+from rtcp.processes.rod.bending import HALF_TURN, plan_approach
 from rtcp.processes.shape_setting.config import ShapeSettingConfig
 from rtcp.processes.shape_setting.interlocks import TABLE
 from rtcp.processes.shape_setting.job import Job, pose_of
-from rtcp.processes.shape_setting.profile import HeatProfile, heat_command
+from rtcp.processes.shape_setting.profile import HeatProfile, heat_command, temperatures_along
 
 Array = npt.NDArray[np.float64]
 SAMPLE_S: Final = 0.2
@@ -140,12 +140,15 @@ class ShapeSettingRun:
         last = self.plan.steps[-1]
         self.outcome.wanted, self.outcome.s, self.outcome.strain = last.p, last.s, last.largest_strain
         heater.command("stop_heating")
-        self._confirm("the chucks are empty, nothing stands between the arms")
+        self._confirm("the chucks hold nothing, nothing stands between the arms")
         self._begin("arms are enabled and go to where the straight rod is gripped")
         for robot in cell.arms.values():
             if robot.state is State.READY:
                 robot.enable()
-        cell.move_joints(self.plan.begin, self._job.approach_speed)
+        now = {name: cell.arms[name].status().commanded_positions for name in self.plan.begin}
+        approach = plan_approach(cell.config, self._job.holders, now, self.plan.begin, self._job.approach_speed)
+        if approach is not None:
+            cell.run_trajectory(approach)
         room = f"{self._profile.initial_c:g} C"
         self._confirm(f"grip the rod, straight and unloaded, at {room}, which is above its Af; the key is at Auto")
         virtual = VirtualRod(self._robot) if _is_virtual(self._member) else None
@@ -256,20 +259,12 @@ class ShapeSettingRun:
             outcome.fraction, outcome.highest = np.interp(held.s, at, fraction), np.interp(held.s, at, highest)
             virtual.release()
         else:
-            grid = self._along(held.s)
+            grid = temperatures_along(self._profile, held.s, outcome.samples["middle_temperature"])
             outcome.fraction, outcome.highest = set_fraction(outcome.times, grid), grid.max(axis=1)
         freed: Release = release(held, np.clip(outcome.fraction, 0.0, 1.0), outcome.wanted)
         outcome.released = freed.shape.p
         outcome.straight = freed.straight_start, freed.straight_end
         outcome.error = float(freed.error.max()), float(np.sqrt(np.mean(freed.error**2)))
-
-    def _along(self, s: Array) -> Array:
-        """Return the temperatures along the rod, (n, k), C, from those of the middle, by the solution of a fin."""
-        ends, chuck = self._profile.ends, self._profile.chuck_c
-        half = 0.5 * ends.length
-        shape = 1.0 - np.cosh((s - half) / ends.end_length) / np.cosh(half / ends.end_length)
-        middle = np.array(self.outcome.samples["middle_temperature"])
-        return np.asarray(chuck + (shape / shape.max())[:, None] * (middle - chuck)[None, :])
 
     def _note_interlocks(self, heater: Process) -> None:
         fields = heater.fields

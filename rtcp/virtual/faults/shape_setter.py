@@ -48,8 +48,7 @@ class CircuitOfHeater(DeviceFault):
 
 @dataclass(frozen=True)
 class Contacts(DeviceFault):
-    """Contacts at the heater's box: bit 0 of `closed` is the key in Auto, 1 in Manual, 2 and 3 the button, 4 and 5 the
-    robot's circuit."""
+    """Closed contacts at the heater's box: bits 0 key at Auto, 1 at Manual, 2, 3 button, 4, 5 robot's circuit."""
 
     name = "contacts"
     slave: Position

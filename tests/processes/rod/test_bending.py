@@ -13,6 +13,7 @@ from kinematics.pose import rotation_from_rpy
 from rtcp.config.cell import CellConfig
 from rtcp.config.cell_file import load_cell
 from rtcp.config.find import default_config
+from rtcp.config.model import KeepOut
 from rtcp.ipc.errors import Invalid, Refused
 from rtcp.processes.rod import (
     BendingPlan,
@@ -26,7 +27,7 @@ from rtcp.processes.rod import (
     pre_bend,
     sample_equilibrium,
 )
-from rtcp.processes.rod.bending import _check_between, _Holder
+from rtcp.processes.rod.bending import _check_between, _check_curves, _Holder, plan_approach
 
 CELL = load_cell(default_config().parent / "cell.yaml")
 ROD = Rod(0.3, 1e-3)
@@ -144,12 +145,76 @@ def test_an_unstable_step_is_refused(number: int) -> None:
 
 
 def test_arms_that_leave_the_rod_no_equilibrium_between_two_steps_are_refused(plan: BendingPlan) -> None:
-    holders = {one.name: _Holder(one, CHUCK) for one in CELL.arms}
+    holders = {one.name: _Holder(one, CHUCK, CELL.clearance) for one in CELL.arms}
     _check_between(holders, plan.arms, plan.steps, plan.times)
     pulled = [replace(point, q=(point.q[0], point.q[1] - 0.3, *point.q[2:])) for point in plan.arms["right"]]
     with pytest.raises(Refused) as refused:
         _check_between(holders, {**plan.arms, "right": tuple(pulled)}, plan.steps, plan.times)
     assert refused.value.reason == "rod_no_equilibrium"
+
+
+def test_the_approach_is_a_straight_motion_of_all_joints_within_its_speed(plan: BendingPlan) -> None:
+    now = {name: tuple(q - 0.2 for q in begin) for name, begin in plan.begin.items()}
+    found = plan_approach(CELL, CHUCKS, now, plan.begin, 0.1)
+    assert found is not None
+    for name, points in found.items():
+        assert points[0]["q"] == pytest.approx(now[name])
+        assert points[-1]["q"] == pytest.approx(plan.begin[name])
+        assert all(np.ptp(np.array(point["q"]) - now[name]) < 1e-9 for point in points)
+        assert max(abs(v) for point in points for v in point["v"]) == pytest.approx(0.1, rel=0.02)
+    assert plan_approach(CELL, CHUCKS, plan.begin, plan.begin, 0.1) is None
+
+
+def test_an_approach_on_which_the_chucks_would_meet_is_refused_though_the_bare_arms_would_pass(
+    plan: BendingPlan,
+) -> None:
+    apart = {name: (q[0], q[1] - 0.3, *q[2:]) for name, q in plan.begin.items()}
+    near = {name: (q[0], q[1] + 0.6, q[2] - 0.6, *q[3:]) for name, q in plan.begin.items()}
+    bare = Chuck(Pose.from_xyzrpy(0.0, 0.0, 0.03, 0.0, -pi / 2, 0.0), 0.02)
+    assert plan_approach(CELL, dict.fromkeys(CHUCKS, bare), apart, near, 0.3) is not None
+    with pytest.raises(Refused, match="left and right") as refused:
+        plan_approach(CELL, CHUCKS, apart, near, 0.3)
+    assert refused.value.reason == "arms_too_near"
+
+
+def with_box(low: tuple[float, float, float], high: tuple[float, float, float]) -> CellConfig:
+    """Return the cell with a keep-out box at the left arm, in the frame of its base."""
+    arms = tuple(
+        one
+        if one.name != "left"
+        else replace(
+            one,
+            config=replace(
+                one.config, cartesian=replace(one.config.cartesian, keep_out=(KeepOut("bench", low, high),))
+            ),
+        )
+        for one in CELL.arms
+    )
+    return replace(CELL, arms=arms)
+
+
+@pytest.mark.parametrize(
+    ("height", "words"), [(0.0, "the rod, .* from the keep-out box bench of left"), (-0.1, "chuck of left")]
+)
+def test_a_keep_out_box_at_the_rod_or_at_a_chuck_is_refused(plan: BendingPlan, height: float, words: str) -> None:
+    left = CELL.member("left").base
+    back = Pose.from_xyzrpy(*left.position, *left.rpy).inverse()
+    place = tuple(plan.curves[-1][30 if height == 0.0 else 0].tolist())
+    x, y, z = (back @ Pose(place, rotation_from_rpy(0.0, 0.0, 0.0))).position
+    z += height
+    cell = with_box((x - 0.03, y - 0.03, z - 0.03), (x + 0.03, y + 0.03, z + 0.03))
+    with pytest.raises(Refused, match=words):
+        planned(cell=cell)
+
+
+def test_a_rod_that_would_touch_itself_is_refused() -> None:
+    turn = np.linspace(0.0, 2.2 * pi, 61)
+    flat = np.stack([0.04 * np.cos(turn), 0.04 * np.sin(turn), np.zeros(61)], axis=1)
+    with pytest.raises(Refused, match="touch itself") as refused:
+        _check_curves(CELL, np.array([flat]), 1e-3)
+    assert refused.value.reason == "rod_collision"
+    flat[:, 2] = 0.002 * turn
+    _check_curves(CELL, np.array([flat]), 1e-3)
 
 
 def test_arms_that_the_cell_does_not_have_are_invalid() -> None:

@@ -79,20 +79,20 @@ def test_the_derivative_is_of_the_measured_ratio() -> None:
 
 
 def test_a_ramp_rises_at_its_rate_and_ends_at_the_target() -> None:
-    ramp = Ramp(PERIOD_S)
+    ramp = Ramp()
     ramp.begin(20.0, 120.0, 50.0)
     for _ in range(2000):
-        ramp.update(ramp.setpoint_c)
+        ramp.update(ramp.setpoint_c, PERIOD_S)
     assert ramp.setpoint_c == pytest.approx(70.0)
     for _ in range(3000):
-        reached = ramp.update(ramp.setpoint_c)
+        reached = ramp.update(ramp.setpoint_c, PERIOD_S)
     assert (ramp.setpoint_c, reached) == (120.0, True)
-    assert not ramp.update(120.0 - 2 * Ramp.REACHED_K)
+    assert not ramp.update(120.0 - 2 * Ramp.REACHED_K, PERIOD_S)
 
 
 def test_a_ramp_waits_for_a_rod_that_is_far_behind() -> None:
-    ramp = Ramp(PERIOD_S)
+    ramp = Ramp()
     ramp.begin(20.0, 500.0, 100.0)
     for _ in range(10_000):
-        ramp.update(20.0)
+        ramp.update(20.0, PERIOD_S)
     assert ramp.setpoint_c == pytest.approx(20.0 + Ramp.LEAD_K, abs=0.1)

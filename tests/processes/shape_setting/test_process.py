@@ -68,6 +68,19 @@ def test_a_profile_heats_holds_cools_and_opens_the_relay(mode: Mode) -> None:
     assert rig.celsius == pytest.approx(450.0, abs=30.0)
 
 
+def test_a_hold_and_its_energy_count_the_time_of_skipped_ticks() -> None:
+    rig = Rig()
+    rig.heat(state=HeaterState.HOLDING, hold_s=1.0)
+    cycles, energy = 0, rig.heater.energy
+    while rig.heater.state is HeaterState.HOLDING:
+        rig.context.now_ns += 500_000
+        rig.cycle()
+        energy += rig.get("voltage") * rig.get("current") * 2 * PERIOD_S
+        cycles += 1
+    assert cycles == pytest.approx(1000, abs=20)
+    assert rig.heater.energy == pytest.approx(energy, rel=1e-6)
+
+
 @pytest.mark.parametrize(("ohm", "joule_by_kelvin"), [(1.36, 0.19), (0.34, 0.75), (0.033, 7.8)])
 def test_one_setting_holds_rods_of_all_diameters(ohm: float, joule_by_kelvin: float) -> None:
     rig = Rig(resistance=ohm, heat_capacity=joule_by_kelvin)

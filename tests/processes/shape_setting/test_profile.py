@@ -4,12 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from rtcp.config.model import ConfigError
-from rtcp.processes.shape_setting.profile import heat_command, read_profile, target_ratio, target_temperatures
+from rtcp.processes.shape_setting.profile import (
+    heat_command,
+    read_profile,
+    target_ratio,
+    target_temperatures,
+    temperatures_along,
+)
 from rtcp.processes.shape_setting.temperature import Place
 from tests.processes.shape_setting.rig import Rig
 
@@ -52,6 +60,19 @@ def test_a_mistake_is_a_sentence_with_its_line(tmp_path: Path, old: str, new: st
     old = old if old in EXAMPLE.read_text() else old.rstrip()
     problems = mistakes(tmp_path, old, new)
     assert any(problem.startswith(f"{line}: {sentence}") for problem in problems), problems
+
+
+def test_the_temperatures_along_the_rod_have_chucks_middle_and_mean_of_the_scale() -> None:
+    profile = read_profile(EXAMPLE)
+    s = np.linspace(0.0, profile.ends.length, 3001)
+    grid = temperatures_along(profile, s, [profile.chuck_c, 510.0])
+    assert grid.shape == (3001, 2)
+    assert grid[:, 0] == pytest.approx(profile.chuck_c)
+    assert (grid[0, 1], grid[1500, 1], grid[-1, 1]) == pytest.approx((profile.chuck_c, 510.0, profile.chuck_c))
+    share = (np.trapezoid(grid[:, 1], s) / profile.ends.length - profile.chuck_c) / (510.0 - profile.chuck_c)
+    assert share == pytest.approx(profile.ends.mean_by_middle(), rel=1e-4)
+    thin = replace(profile, ends=replace(profile.ends, end_length=1e-5))
+    assert temperatures_along(thin, s, [510.0])[1, 0] == pytest.approx(510.0, abs=0.1)
 
 
 def test_the_loops_modules_load_no_validator_and_no_numpy() -> None:
