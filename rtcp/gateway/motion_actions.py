@@ -48,7 +48,7 @@ from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import COLUMNS, Plan, PlanRefused
+from rtcp.motion.planning.plan import COLUMNS, KIND, LINE, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import OpenPlan, plan_trajectory
 
 T = TypeVar("T")
@@ -117,14 +117,22 @@ class Planner:
             raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
         return list(found.q)
 
-    def lines(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
-        """Return the plan of straight lines from `q_now` to each stop in turn, at most at `speed`, m/s."""
+    def path(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
+        """Return the plan of a path from `q_now` to each stop in turn, its lines and arcs at most at `speed`, m/s.
+
+        Straight lines with a rest at each stop are rows for `RunLines`, anything else is a trajectory.
+        """
         for at, stop in enumerate(stops):
             if stop.pose is not None:
                 _require_pose(stop.pose, f"poses[{at}]")
         model, cartesian = self._model(), self._config.cartesian
+        plain = all(stop.via is None and not stop.by_joints and not stop.blend for stop in stops)
         try:
-            return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            if plain:
+                return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            from rtcp.motion.planning.path import plan_path  # here: scipy loads slowly, and few need it
+
+            return plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused)) from None
 
@@ -422,7 +430,7 @@ class MotionActions:
         return PLAN_ROWS - _KEPT_ROWS - len(plan.times) + passed
 
     async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
-        """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
+        """Run a path to each stop in turn; with `approach` the joints first move to the first one."""
         async with self._channel.lease(caller) as lease:
             if approach and stops:
                 first = stops[0]
@@ -435,8 +443,9 @@ class MotionActions:
                 stops = stops[1:]
                 if not stops:
                     return arrival
-            plan = await asyncio.to_thread(self._planner.lines, stops, self.plan_start(), speed)
-            return await self._run_plan(lease, RunLines, plan, self._write(plan), "the path")
+            plan = await asyncio.to_thread(self._planner.path, stops, self.plan_start(), speed)
+            kind = RunLines if plan.rows[0][KIND] == LINE else RunTrajectory
+            return await self._run_plan(lease, kind, plan, self._write(plan), "the path")
 
     async def preview(
         self,
@@ -458,7 +467,7 @@ class MotionActions:
             return {"path": path, "duration_s": duration_s, "length_m": None, "slowed": None}
 
         def plan() -> tuple[Plan, preview.JointPath]:
-            made = self._planner.lines(stops, here, speed) if stops else self._planner.trajectory(points, here)
+            made = self._planner.path(stops, here, speed) if stops else self._planner.trajectory(points, here)
             return made, self._planner.way(made, here)
 
         made, path = await asyncio.to_thread(plan)
@@ -485,7 +494,7 @@ class MotionActions:
         def plan() -> tuple[Plan | None, preview.JointPath]:
             if not (points or rest):
                 return None, []
-            made = self._planner.lines(rest, first, speed) if stops else self._planner.trajectory(points, first)
+            made = self._planner.path(rest, first, speed) if stops else self._planner.trajectory(points, first)
             return made, self._planner.way(made, first)
 
         made, path = await asyncio.to_thread(plan)
