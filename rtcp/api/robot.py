@@ -285,6 +285,24 @@ class Methods:
         return Call("move_arc", params, _arrival, progress)
 
     @Method
+    def move_by(
+        self,
+        offset: Sequence[float],
+        frame: str = "base",
+        speed: float | None = None,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Move by an offset from where the arm is, as one step of a jog.
+
+        Args:
+            offset: of the tool, m and rad, along and about the axes of the frame, on a straight line; or of the joints.
+            frame: `base`, `tool` or `joints`.
+            speed: of the tool, m/s, or of the fastest joint, rad/s; None: its limit.
+            progress: called about ten times a second meanwhile.
+        """
+        return Call("move_by", {"offset": list(offset), "frame": frame, "speed": speed}, _arrival, progress)
+
+    @Method
     def run(self, file: str, approach: bool = False, progress: OnProgress | None = None) -> Call[Arrival]:
         """Run a motion file (`docs/motion.md`), checked as a whole first.
 

@@ -351,6 +351,11 @@ class Methods:
             raise RtcpError("invalid", f"via: found {len(via)} numbers, allowed are 3: x y z, m")
         return await self._motion.run_path(caller, [Stop(pose, speed=speed, via=via, angle=angle)], None, False)
 
+    @method()
+    async def move_by(self, caller: Caller, offset: Numbers, frame: Frame = "base", speed: float | None = None) -> Json:
+        """Move by an offset: the tool on a line, m and rad along and about the axes of `frame`, or the joints, rad."""
+        return await self._motion.move_by(caller, offset, JogFrame[frame.upper()], speed)
+
     @method(at_once=True)
     async def preview(
         self,

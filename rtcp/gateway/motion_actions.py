@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from kinematics.forward import frames
+from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
-from kinematics.pose import Pose
+from kinematics.pose import Pose, times
 from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
@@ -42,7 +42,7 @@ from rtcp.ipc.refusals import (
     SpeedOutOfRange,
     WrongState,
 )
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.motion.guards.zones import ITSELF, Zones
 from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
@@ -116,6 +116,14 @@ class Planner:
         if box := self._zone_at(found.q):
             raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
         return list(found.q)
+
+    def moved_by(self, q: Sequence[float], offset: Sequence[float], frame: JogFrame) -> Pose:
+        """Return the tool's pose at `q`, rad, moved and turned along the axes of the base or of the tool (m, rad)."""
+        here, moved = forward(self._model(), q), Pose.from_xyzrpy(*offset)
+        if frame is JogFrame.TOOL:
+            return here @ moved
+        x, y, z = (a + b for a, b in zip(here.position, moved.position, strict=True))
+        return Pose((x, y, z), times(moved.rotation, here.rotation))
 
     def path(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
         """Return the plan of a path from `q_now` to each stop in turn, its lines and arcs at most at `speed`, m/s.
@@ -238,6 +246,18 @@ class MotionActions:
         async with self._channel.lease(caller) as lease:
             q = await asyncio.to_thread(self._planner.joints_at, pose, self.plan_start())
             return await self._move(lease, q, speed, True)
+
+    async def move_by(self, caller: Caller, offset: Sequence[float], frame: JogFrame, speed: float | None) -> Json:
+        """Move by an offset from where the arm is commanded: the tool on a line, m and rad, or the joints, rad."""
+        here = self.plan_start()
+        count = len(here) if frame is JogFrame.JOINTS else len(_COORDINATES)
+        if len(offset) != count:
+            raise RtcpError("invalid", f"offset: found {len(offset)} numbers, allowed are {count}")
+        if frame is JogFrame.JOINTS:
+            return await self.move_joints(caller, [a + b for a, b in zip(here, offset, strict=True)], speed, True)
+        _require_pose(offset, "offset")
+        goal = self._planner.moved_by(here, offset, frame)
+        return await self.run_path(caller, [Stop((*goal.position, *goal.rpy))], speed, False)
 
     async def run_file(self, caller: Caller, file: str, approach: bool) -> Json:
         """Run a motion file."""

