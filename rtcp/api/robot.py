@@ -245,11 +245,62 @@ class Methods:
 
     @Method
     def move_line(
-        self, poses: Sequence[Sequence[float]], speed: float | None = None, progress: OnProgress | None = None
+        self,
+        poses: Sequence[Sequence[float]],
+        speed: float | None = None,
+        progress: OnProgress | None = None,
+        blend: float = 0.0,
     ) -> Call[Arrival]:
-        """Move the tool on straight lines through poses (m, rad), at `speed`, m/s; None: its limit."""
-        params = {"poses": [list(pose) for pose in poses], "speed": speed}
+        """Move the tool on straight lines through poses (m, rad), at `speed`, m/s; None: its limit.
+
+        Args:
+            poses: at least one.
+            speed: of the tool.
+            progress: called about ten times a second meanwhile.
+            blend: radius within which corners are rounded, m; 0: the tool rests at each pose.
+        """
+        params = {"poses": [list(pose) for pose in poses], "speed": speed, "blend": blend}
         return Call("move_line", params, _arrival, progress)
+
+    @Method
+    def move_arc(
+        self,
+        via: Sequence[float],
+        pose: Sequence[float],
+        angle: float | None = None,
+        speed: float | None = None,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Move the tool on the arc through a place to a pose.
+
+        Args:
+            via: x y z, m; also longer: of a pose the first three count.
+            pose: x y z, m, and rx ry rz, rad: its end.
+            angle: rad; the tool travels so far on the circle through here, `via` and `pose`, and keeps its orientation:
+                `2 * pi` is the whole circle. None: up to the pose.
+            speed: m/s; None: its limit.
+            progress: called about ten times a second meanwhile.
+        """
+        params = {"via": list(via)[:3], "pose": list(pose), "angle": angle, "speed": speed}
+        return Call("move_arc", params, _arrival, progress)
+
+    @Method
+    def move_by(
+        self,
+        offset: Sequence[float],
+        frame: str = "base",
+        speed: float | None = None,
+        progress: OnProgress | None = None,
+    ) -> Call[Arrival]:
+        """Move by an offset from where the arm is, as one step of a jog.
+
+        Args:
+            offset: of the tool, m and rad, along and about the axes of the frame, on a straight line; or of the joints.
+            frame: `base`, `tool` or `joints`.
+            speed: of the tool, m/s, or of the fastest joint, rad/s; None: its limit.
+            progress: called about ten times a second meanwhile.
+        """
+        return Call("move_by", {"offset": list(offset), "frame": frame, "speed": speed}, _arrival, progress)
 
     @Method
     def run(self, file: str, approach: bool = False, progress: OnProgress | None = None) -> Call[Arrival]:
@@ -343,9 +394,11 @@ class Methods:
         approach: bool = False,
         progress: OnProgress | None = None,
     ) -> Call[Arrival]:
-        """Run a path of straight lines through stops `{"pose": [...]}` or `{"q": [...]}`, each with or without `speed`.
+        """Run a path through stops `{"pose": [...]}` or `{"q": [...]}`, each with or without `speed`.
 
-        `speed`: of the tool, m/s, where a stop has none. With `approach` the joints first move to the first stop.
+        With `via` beside it on an arc, with `by_joints` by the joints, with `blend` without a rest: the keys of `path`
+        in `docs/motion.md`. `speed`: of the tool, m/s, where a stop has none. With `approach` the joints first move to
+        the first stop.
         """
         params = {"stops": [dict(stop) for stop in stops], "speed": speed, "approach": approach}
         return Call("run_path", params, _arrival, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,6 +12,7 @@ import typer
 from rtcp.api import Arrival, State
 from rtcp.cli.arguments import (
     NUMBERS_AS_WRITTEN,
+    POSE,
     AsJson,
     as_written,
     finite,
@@ -173,6 +175,58 @@ def _move(
             arrived = robot.move_pose(target, speed, line, shown)
         else:
             arrived = robot.move_joints(target, speed, not unsynchronized, shown)
+    report(arrival(arrived))
+
+
+@commands.command("step", context_settings=NUMBERS_AS_WRITTEN)
+def _step(
+    axis: Annotated[str, typer.Argument(metavar="AXIS", help="x, y, z, rx, ry, rz, or a joint's name or number.")],
+    amount: Annotated[str, as_written("AMOUNT", "With its unit: 1mm, -10mm, 0.01m, 1deg, -0.1rad.")],
+    tool: Annotated[bool, option("--tool", "Along the axes of the tool. Default: of the base.")] = False,
+    speed: Annotated[
+        float | None, option("--speed", help="Of the tool, m/s, or of the joint, rad/s. Default: configured.")
+    ] = None,
+) -> None:
+    """Move one step along or about an axis, or of one joint; returns on arrival. Ctrl-C stops the arm."""
+    by_joint = axis not in POSE
+    positive("--speed", speed, "rad/s" if by_joint else "m/s")
+    unit = "m" if axis in POSE[:3] else "rad"
+    size = _amount(amount, unit)
+    with stoppable("step") as robot, progress() as shown:
+        names = robot.status().joint_names
+        known = [*POSE] if not by_joint else [*names, *(str(number) for number in range(1, len(names) + 1))]
+        if axis not in known:
+            raise CommandError(f"{axis!r} is no axis: {', '.join((*POSE, *names))}, or the number of a joint")
+        count = len(names) if by_joint else len(POSE)
+        offset = [size if at == known.index(axis) % count else 0.0 for at in range(count)]
+        frame = "joints" if by_joint else "tool" if tool else "base"
+        arrived = robot.move_by(offset, frame, speed, shown)
+    report(arrival(arrived))
+
+
+def _amount(text: str, unit: str) -> float:
+    """Return a length in m or an angle in rad."""
+    factors = {"mm": 1e-3, "m": 1.0} if unit == "m" else {"deg": math.pi / 180.0, "rad": 1.0}
+    for ending, factor in factors.items():
+        if text.endswith(ending):
+            return factor * number(text.removesuffix(ending), "AMOUNT", ending)
+    raise CommandError(f"{text!r} is not an amount for this axis: a number with {' or '.join(factors)}, as 1{unit}")
+
+
+@commands.command("arc", context_settings=NUMBERS_AS_WRITTEN)
+def _arc(
+    pose: Annotated[list[str], as_written("X Y Z RX RY RZ", "Its end: m, and rad of Rx Ry Rz.")],
+    via: Annotated[tuple[float, float, float], typer.Option("--via", metavar="X Y Z", help="A place on it, m.")],
+    angle: Annotated[
+        str | None, option("--angle", "RAD", "Travel so far on the circle, as 2*pi. Default: up to the end.")
+    ] = None,
+    speed: Annotated[float | None, option("--speed", help="Of the tool, m/s. Default: configured.")] = None,
+) -> None:
+    """Move the tool on an arc, or a circle; returns on arrival. Ctrl-C stops the arm."""
+    positive("--speed", speed, "m/s")
+    turn = None if angle is None else number(angle, "--angle", "rad")
+    with stoppable("arc") as robot, progress() as shown:
+        arrived = robot.move_arc(via, pose_values(pose), turn, speed, shown)
     report(arrival(arrived))
 
 

@@ -808,14 +808,22 @@ class Point:
 
 @dataclass(frozen=True)
 class Stop:
-    """The end of a straight line; it has either `pose` or `q`."""
+    """The end of a line, an arc or a move by the joints; it has either `pose` or `q`."""
 
     pose: _Coordinates | None = None
     """x, y, z, rx, ry, rz of the tool, m and rad."""
     q: _Coordinates | None = None
     """Joint positions that have the pose, rad."""
     speed: Positive | None = None
-    """Speed of the tool on the line to it, m/s; None: that of the whole path."""
+    """Speed of the tool on the way to it, m/s; None: that of the path. By the joints: of the fastest one, rad/s."""
+    via: Annotated[tuple[float, ...], MinLen(3), MaxLen(3)] | None = None
+    """x, y, z, m: the tool gets there on the arc through it; None: on a line."""
+    angle: Angle | None = None
+    """Angle to travel on the circle through here, `via` and the stop, rad; None: up to the stop."""
+    by_joints: bool = False
+    """Whether the joints lead there, not a line."""
+    blend: NotNegative = 0.0
+    """Radius within which the corner at this stop is rounded, m, at most half of the ways; 0: the tool rests there."""
 
 
 @dataclass(frozen=True)

@@ -554,6 +554,10 @@ def _point(point: Point) -> Iterator[Finding]:
 def _stop(stop: Stop) -> Iterator[Finding]:
     if (stop.pose is None) == (stop.q is None):
         yield (), f"found {'neither' if stop.pose is None else 'both'} of pose and q; one of them is needed"
+    if stop.angle is not None and stop.via is None:
+        yield ("angle",), "an angle needs via beside it"
+    if stop.by_joints and stop.via is not None:
+        yield ("by_joints",), "found via beside it, allowed is one of them"
 
 
 @rule(MotionFile, EVERY_KEY)

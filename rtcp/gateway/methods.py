@@ -319,13 +319,42 @@ class Methods:
         return await self._motion.move_pose(caller, pose, speed, line)
 
     @method()
-    async def move_line(self, caller: Caller, poses: tuple[Numbers, ...], speed: float | None = None) -> Json:
-        """Move the tool on straight lines through poses, m and rad, at `speed`, m/s.
+    async def move_line(
+        self,
+        caller: Caller,
+        poses: tuple[Numbers, ...],
+        speed: float | None = None,
+        blend: Annotated[float, Ge(0)] = 0.0,
+    ) -> Json:
+        """Move the tool on straight lines through poses, m and rad, at `speed`, m/s; corners rounded within `blend`, m.
 
         Returns as `move_joints`, and `duration_s`, `length_m`, and `slowed`, the fraction of the speed that the joints
         allowed.
         """
-        return await self._motion.run_path(caller, [Stop(pose) for pose in poses], speed, False)
+        return await self._motion.run_path(caller, [Stop(pose, blend=blend) for pose in poses], speed, False)
+
+    @method()
+    async def move_arc(
+        self,
+        caller: Caller,
+        via: Numbers,
+        pose: Numbers,
+        angle: float | None = None,
+        speed: float | None = None,
+    ) -> Json:
+        """Move the tool on the arc through `via`, x y z, m, to a pose, m and rad, at `speed`, m/s.
+
+        Returns as `move_line`. With `angle`, rad, it travels so far on the circle through the three places, and keeps
+        its orientation.
+        """
+        if len(via) != 3:
+            raise RtcpError("invalid", f"via: found {len(via)} numbers, allowed are 3: x y z, m")
+        return await self._motion.run_path(caller, [Stop(pose, speed=speed, via=via, angle=angle)], None, False)
+
+    @method()
+    async def move_by(self, caller: Caller, offset: Numbers, frame: Frame = "base", speed: float | None = None) -> Json:
+        """Move by an offset: the tool on a line, m and rad along and about the axes of `frame`, or the joints, rad."""
+        return await self._motion.move_by(caller, offset, JogFrame[frame.upper()], speed)
 
     @method(at_once=True)
     async def preview(
@@ -447,7 +476,11 @@ class Methods:
     async def run_path(
         self, caller: Caller, stops: tuple[Stop, ...], speed: float | None = None, approach: bool = False
     ) -> Json:
-        """Run straight lines to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s."""
+        """Run a path to stops: each a `pose` or the joints `q` that have it, and if given its `speed`, m/s.
+
+        On a straight line, on the arc through `via`, x y z, m, or where it says so `by_joints`; it rests there, or
+        rounds the corner within `blend`, m: the keys of `path` in `docs/motion.md`. Returns as `move_line`.
+        """
         return await self._motion.run_path(caller, stops, speed, approach)
 
     @method()

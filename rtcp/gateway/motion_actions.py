@@ -12,10 +12,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from kinematics.forward import frames
+from kinematics.forward import forward, frames
 from kinematics.inverse import InverseKinematics
 from kinematics.model import ArmModel, JointLimit
-from kinematics.pose import Pose
+from kinematics.pose import Pose, times
 from rtcp.config.model import ArmConfig, ConfigError, Point, Stop
 from rtcp.gateway.command_channel import IN_MOTION, Caller, CommandChannel, Json
 from rtcp.gateway.tolerances import Tolerances, Tracking, Violation
@@ -42,13 +42,13 @@ from rtcp.ipc.refusals import (
     SpeedOutOfRange,
     WrongState,
 )
-from rtcp.ipc.states import ControlMode, State
+from rtcp.ipc.states import ControlMode, JogFrame, State
 from rtcp.motion.guards.zones import ITSELF, Zones
 from rtcp.motion.joint_motion import LONGEST_S
 from rtcp.motion.limits import Limits
 from rtcp.motion.planning import preview
 from rtcp.motion.planning.lines import plan_lines
-from rtcp.motion.planning.plan import COLUMNS, Plan, PlanRefused
+from rtcp.motion.planning.plan import COLUMNS, KIND, LINE, Plan, PlanRefused
 from rtcp.motion.planning.trajectories import OpenPlan, plan_trajectory
 
 T = TypeVar("T")
@@ -117,14 +117,30 @@ class Planner:
             raise RtcpError("refused", f"the pose cannot be reached: the arm would be in {box}")
         return list(found.q)
 
-    def lines(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
-        """Return the plan of straight lines from `q_now` to each stop in turn, at most at `speed`, m/s."""
+    def moved_by(self, q: Sequence[float], offset: Sequence[float], frame: JogFrame) -> Pose:
+        """Return the tool's pose at `q`, rad, moved and turned along the axes of the base or of the tool (m, rad)."""
+        here, moved = forward(self._model(), q), Pose.from_xyzrpy(*offset)
+        if frame is JogFrame.TOOL:
+            return here @ moved
+        x, y, z = (a + b for a, b in zip(here.position, moved.position, strict=True))
+        return Pose((x, y, z), times(moved.rotation, here.rotation))
+
+    def path(self, stops: Sequence[Stop], q_now: Sequence[float], speed: float | None) -> Plan:
+        """Return the plan of a path from `q_now` to each stop in turn, its lines and arcs at most at `speed`, m/s.
+
+        Straight lines with a rest at each stop are rows for `RunLines`, anything else is a trajectory.
+        """
         for at, stop in enumerate(stops):
             if stop.pose is not None:
                 _require_pose(stop.pose, f"poses[{at}]")
         model, cartesian = self._model(), self._config.cartesian
+        plain = all(stop.via is None and not stop.by_joints and not stop.blend for stop in stops)
         try:
-            return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            if plain:
+                return plan_lines(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
+            from rtcp.motion.planning.path import plan_path  # here: scipy loads slowly, and few need it
+
+            return plan_path(model, self.limits, cartesian, q_now, stops, speed=speed, zone_at=self._zone_at)
         except PlanRefused as refused:
             raise RtcpError("refused", str(refused)) from None
 
@@ -230,6 +246,18 @@ class MotionActions:
         async with self._channel.lease(caller) as lease:
             q = await asyncio.to_thread(self._planner.joints_at, pose, self.plan_start())
             return await self._move(lease, q, speed, True)
+
+    async def move_by(self, caller: Caller, offset: Sequence[float], frame: JogFrame, speed: float | None) -> Json:
+        """Move by an offset from where the arm is commanded: the tool on a line, m and rad, or the joints, rad."""
+        here = self.plan_start()
+        count = len(here) if frame is JogFrame.JOINTS else len(_COORDINATES)
+        if len(offset) != count:
+            raise RtcpError("invalid", f"offset: found {len(offset)} numbers, allowed are {count}")
+        if frame is JogFrame.JOINTS:
+            return await self.move_joints(caller, [a + b for a, b in zip(here, offset, strict=True)], speed, True)
+        _require_pose(offset, "offset")
+        goal = self._planner.moved_by(here, offset, frame)
+        return await self.run_path(caller, [Stop((*goal.position, *goal.rpy))], speed, False)
 
     async def run_file(self, caller: Caller, file: str, approach: bool) -> Json:
         """Run a motion file."""
@@ -422,7 +450,7 @@ class MotionActions:
         return PLAN_ROWS - _KEPT_ROWS - len(plan.times) + passed
 
     async def run_path(self, caller: Caller, stops: Sequence[Stop], speed: float | None, approach: bool) -> Json:
-        """Run straight lines to each stop in turn; with `approach` the joints first move to the first one."""
+        """Run a path to each stop in turn; with `approach` the joints first move to the first one."""
         async with self._channel.lease(caller) as lease:
             if approach and stops:
                 first = stops[0]
@@ -435,8 +463,9 @@ class MotionActions:
                 stops = stops[1:]
                 if not stops:
                     return arrival
-            plan = await asyncio.to_thread(self._planner.lines, stops, self.plan_start(), speed)
-            return await self._run_plan(lease, RunLines, plan, self._write(plan), "the path")
+            plan = await asyncio.to_thread(self._planner.path, stops, self.plan_start(), speed)
+            kind = RunLines if plan.rows[0][KIND] == LINE else RunTrajectory
+            return await self._run_plan(lease, kind, plan, self._write(plan), "the path")
 
     async def preview(
         self,
@@ -458,7 +487,7 @@ class MotionActions:
             return {"path": path, "duration_s": duration_s, "length_m": None, "slowed": None}
 
         def plan() -> tuple[Plan, preview.JointPath]:
-            made = self._planner.lines(stops, here, speed) if stops else self._planner.trajectory(points, here)
+            made = self._planner.path(stops, here, speed) if stops else self._planner.trajectory(points, here)
             return made, self._planner.way(made, here)
 
         made, path = await asyncio.to_thread(plan)
@@ -485,7 +514,7 @@ class MotionActions:
         def plan() -> tuple[Plan | None, preview.JointPath]:
             if not (points or rest):
                 return None, []
-            made = self._planner.lines(rest, first, speed) if stops else self._planner.trajectory(points, first)
+            made = self._planner.path(rest, first, speed) if stops else self._planner.trajectory(points, first)
             return made, self._planner.way(made, first)
 
         made, path = await asyncio.to_thread(plan)

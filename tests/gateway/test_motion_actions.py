@@ -41,7 +41,7 @@ def beside(arm: FakePlatform, dy: float) -> list[float]:
 
 def end_of_line(arm: FakePlatform, pose: list[float]) -> tuple[float, ...]:
     """Where the joints are at the end of a line: what the fake loop is to come to."""
-    return Planner(arm.config, Limits(arm.config)).lines([Stop(tuple(pose))], BENT, None).end
+    return Planner(arm.config, Limits(arm.config)).path([Stop(tuple(pose))], BENT, None).end
 
 
 def test_a_move_sends_its_speed_and_whether_the_joints_arrive_together(arm: FakePlatform) -> None:

@@ -180,3 +180,16 @@ def test_a_line_is_accelerated_so_gently_that_the_joints_keep_their_limits(
 
 def test_a_line_that_no_joint_hinders_keeps_its_speed(plan: Any, moved: Any) -> None:
     assert plan([moved(0.0, 0.0, -0.1)], speed=0.02).slowed == 1.0
+
+
+@pytest.mark.parametrize("length", [0.001, 0.01, 0.02])
+def test_a_line_whose_acceleration_is_only_just_reached_is_travelled(
+    arm: Any, new_drive: Any, moved: Any, memory: Any, length: float
+) -> None:
+    """0.5 m/s^2 and 5 m/s^3 are both reached on 10 mm exactly, where ruckig finds no profile."""
+    drive = new_drive().at(Q)
+    made = plan_lines(arm.arm, drive.limits, arm.cartesian, Q, [moved(0.0, 0.0, -length)])
+    mode = drive.controller(LineController)
+    assert drive.execute(mode, memory(made.rows), 1) is None
+    assert drive.until_rest(mode) == pytest.approx(made.duration_s, abs=0.01)
+    assert drive.state.commanded == pytest.approx(made.end, abs=1e-6)

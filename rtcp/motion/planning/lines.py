@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import ceil, hypot, inf, isfinite, sqrt
 from typing import TYPE_CHECKING, Final
@@ -21,15 +21,18 @@ from rtcp.motion.planning.plan import KIND, LINE, Plan, PlanRefused, ZoneAt
 if TYPE_CHECKING:
     from rtcp.motion.limits import Limits
 
+PoseAt = Callable[[float], Pose]
+"""The poses of a line or an arc, by the fraction of it, 0 to 1."""
 SAMPLE_M, SAMPLE_RAD = 0.002, 0.01
 """A line is looked at whenever the tool has moved or turned so far."""
 _JUMP_RAD: Final = 0.3
 """A joint that moves by more between two samples changes its branch, or is at a singularity."""
 _UNUSED = (0.0,) * (KIND - 19)
-_NO_WAY_M, _NO_WAY_RAD = 1e-6, 1e-6
-_OF_LIMIT: Final = 0.95
+NO_WAY_M, NO_WAY_RAD = 1e-6, 1e-6
+OF_LIMIT: Final = 0.95
 """Of a joint's limits a line uses so much: between the samples they hold too."""
 _SAME_RAD: Final = 1e-3
+_TRIES, _A_LITTLE_LESS = 3, 1.0 - 1e-4
 
 
 @dataclass(frozen=True)
@@ -81,19 +84,19 @@ def plan_lines(
     slowed = 1.0
     for number, stop in enumerate(stops, 1):
         where = f"the line to pose {number}" if len(stops) > 1 else "the line"
-        goal = _goal(model, stop, where)
-        fast = _speed(stop, speed, cartesian, where)
+        goal = goal_of(model, stop, where)
+        fast = speed_of(stop, speed, cartesian, where)
         turns = quaternion(here.rotation), quaternion(goal.rotation)
         way = hypot(*(b - a for a, b in zip(here.position, goal.position, strict=True)))
         _, angle = turn_between(*turns)
-        if way > _NO_WAY_M or angle > _NO_WAY_RAD:
-            joints = _follow(inverse, limits, cartesian, here, goal, q, where, zone_at)
+        if way > NO_WAY_M or angle > NO_WAY_RAD:
+            joints = follow(inverse, limits, cartesian, straight(here, goal), (way, angle), q, where, zone_at)
             piece = _Piece(number, here, goal, turns, way, angle, joints, fast)
             row, part = _timed(piece, limits, cartesian, where)
             rows.append(row)
             length, slowed = length + way, min(slowed, part)
             q, here = joints[-1], goal
-        _same_branch(stop, q, where, model)
+        check_branch(stop, q, where, model)
     if not rows:
         raise PlanRefused("the tool is already where the path leads, there is nothing to move")
     duration = 0.0
@@ -103,7 +106,8 @@ def plan_lines(
     return Plan(tuple(rows), duration, length, slowed, q)
 
 
-def _goal(model: ArmModel, stop: Stop, where: str) -> Pose:
+def goal_of(model: ArmModel, stop: Stop, where: str) -> Pose:
+    """Return the pose of a stop, or raise PlanRefused."""
     given = stop.pose if stop.q is None else stop.q
     if given is None or (stop.pose is not None and stop.q is not None):
         raise PlanRefused(f"{where}: either a pose or joint positions are needed")
@@ -115,7 +119,8 @@ def _goal(model: ArmModel, stop: Stop, where: str) -> Pose:
     return Pose.from_xyzrpy(*given) if stop.q is None else forward(model, given)
 
 
-def _speed(stop: Stop, of_path: float | None, cartesian: CartesianConfig, where: str) -> float:
+def speed_of(stop: Stop, of_path: float | None, cartesian: CartesianConfig, where: str) -> float:
+    """Return the tool's speed on the way to a stop, m/s, or raise PlanRefused."""
     speed = stop.speed if stop.speed is not None else of_path if of_path is not None else cartesian.speed
     if not isfinite(speed) or not 0.0 < speed <= cartesian.speed:
         raise PlanRefused(
@@ -125,23 +130,47 @@ def _speed(stop: Stop, of_path: float | None, cartesian: CartesianConfig, where:
     return speed
 
 
-def _follow(
+def straight(start: Pose, end: Pose) -> PoseAt:
+    """Return the poses of a straight line, by the fraction of it."""
+    from_q, to_q = quaternion(start.rotation), quaternion(end.rotation)
+    axis, angle = turn_between(from_q, to_q)
+    way = [b - a for a, b in zip(start.position, end.position, strict=True)]
+    turned = rotation(from_q)
+
+    def pose_at(x: float) -> Pose:
+        px, py, pz = (a + x * w for a, w in zip(start.position, way, strict=True))
+        return Pose((px, py, pz), turned_by(turned, axis, x * angle))
+
+    return pose_at
+
+
+def follow(
     inverse: InverseKinematics,
     limits: Limits,
     cartesian: CartesianConfig,
-    start: Pose,
-    end: Pose,
+    pose_at: PoseAt,
+    extent: tuple[float, float],
     q: tuple[float, ...],
     where: str,
     zone_at: ZoneAt | None,
 ) -> list[tuple[float, ...]]:
-    """Return the joints along the line, looked at in every sample."""
-    from_q, to_q = quaternion(start.rotation), quaternion(end.rotation)
-    axis, angle = turn_between(from_q, to_q)
-    way = [b - a for a, b in zip(start.position, end.position, strict=True)]
-    length = hypot(*way)
+    """Return the joints along a line or an arc, at even fractions of it, each looked at.
+
+    Args:
+        inverse: of the arm.
+        limits: of the joints.
+        cartesian: how near to a singularity it may come.
+        pose_at: the poses by the fraction, 0 to 1.
+        extent: how far the tool moves, m, and turns, rad.
+        q: where it begins, rad.
+        where: names it in what is raised.
+        zone_at: looked at in every sample.
+
+    Raises:
+        PlanRefused: with the place on it, what was found and what is allowed.
+    """
+    length, angle = extent
     count = max(8, ceil(length / SAMPLE_M), ceil(angle / SAMPLE_RAD))
-    turned = rotation(from_q)
     found: list[tuple[float, ...]] = []
     names = inverse.model.joint_names
     for k in range(count + 1):
@@ -149,12 +178,10 @@ def _follow(
         place = f"{where} at {x * length:.3f} m of {length:.3f} m" if length > 1e-4 else (
             f"{where} at {x * angle:.3f} rad of {angle:.3f} rad"
         )  # fmt: skip
-        px, py, pz = (a + x * w for a, w in zip(start.position, way, strict=True))
-        pose = Pose((px, py, pz), turned_by(turned, axis, x * angle))
-        near = inverse.solve_near(pose, q)
+        near = inverse.solve_near(pose_at(x), q)
         if near.q is None:
             raise PlanRefused(f"{place}: {near.reason}")
-        _check_singular(inverse.model, near.q, cartesian, place)
+        check_singular(inverse.model, near.q, cartesian, place)
         for i, (before, after) in enumerate(zip(q, near.q, strict=True)):
             if abs(after - before) > _JUMP_RAD:
                 raise PlanRefused(f"{place}: {names[i]} would have to jump from {before:.3f} to {after:.3f} rad")
@@ -170,7 +197,8 @@ def _follow(
     return found
 
 
-def _check_singular(model: ArmModel, q: Sequence[float], cartesian: CartesianConfig, place: str) -> None:
+def check_singular(model: ArmModel, q: Sequence[float], cartesian: CartesianConfig, place: str) -> None:
+    """Raise PlanRefused where a configuration is nearer to a singularity than is allowed."""
     distances = singularity_distances(model, q)
     allowed = cartesian.singularity
     for what, unit, found, least in (
@@ -190,7 +218,7 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
     length, angle = piece.length, piece.angle
 
     def both(linear: float, angular: float) -> float:
-        return min(linear / length if length > _NO_WAY_M else inf, angular / angle if angle > _NO_WAY_RAD else inf)
+        return min(linear / length if length > NO_WAY_M else inf, angular / angle if angle > NO_WAY_RAD else inf)
 
     wanted = speed = both(piece.speed, cartesian.angular_speed)
     acceleration = both(cartesian.acceleration, cartesian.angular_acceleration)
@@ -205,33 +233,40 @@ def _timed(piece: _Piece, limits: Limits, cartesian: CartesianConfig, where: str
             second = count * count * abs(after - 2.0 * here + before)
             bends.append((i, first, second))
             if first > 0.0:
-                speed = min(speed, _OF_LIMIT * limits.velocity[i] / first)
+                speed = min(speed, OF_LIMIT * limits.velocity[i] / first)
             if second > 0.0:
-                speed = min(speed, sqrt(0.5 * _OF_LIMIT * limits.acceleration[i] / second))
+                speed = min(speed, sqrt(0.5 * OF_LIMIT * limits.acceleration[i] / second))
     for i, first, second in bends:
         if first > 0.0:
-            left = _OF_LIMIT * limits.acceleration[i] - second * speed * speed
+            left = OF_LIMIT * limits.acceleration[i] - second * speed * speed
             acceleration = min(acceleration, left / first)
+    duration, acceleration = _duration(speed, acceleration, jerk, where)
     row = (
         *piece.start.position, *piece.turns[0], *piece.end.position, *piece.turns[1],
-        speed, acceleration, jerk, length, _duration(speed, acceleration, jerk, where), *_UNUSED, LINE,
+        speed, acceleration, jerk, length, duration, *_UNUSED, LINE,
     )  # fmt: skip
     return row, speed / wanted
 
 
-def _duration(speed: float, acceleration: float, jerk: float, where: str) -> float:
+def _duration(speed: float, acceleration: float, jerk: float, where: str) -> tuple[float, float]:
+    """Return how long the fraction takes, and the acceleration by which that was found."""
     way, found = InputParameter(1), Trajectory(1)
     way.target_position = [1.0]
-    way.max_velocity, way.max_acceleration, way.max_jerk = [speed], [acceleration], [jerk]
-    try:
-        if Ruckig(1, 0.001).calculate(way, found) >= 0:
-            return float(found.duration)
-    except (RuckigError, ValueError):
-        pass
+    way.max_velocity, way.max_jerk = [speed], [jerk]
+    for _ in range(_TRIES):
+        way.max_acceleration = [acceleration]
+        try:
+            if Ruckig(1, 0.001).calculate(way, found) >= 0:
+                return float(found.duration), acceleration
+        except (RuckigError, ValueError):
+            pass
+        # Where the acceleration is only just reached, as on 10 mm with 0.5 m/s^2 and 5 m/s^3, ruckig finds nothing.
+        acceleration *= _A_LITTLE_LESS
     raise PlanRefused(f"{where}: no motion along it was found")
 
 
-def _same_branch(stop: Stop, q: Sequence[float], where: str, model: ArmModel) -> None:
+def check_branch(stop: Stop, q: Sequence[float], where: str, model: ArmModel) -> None:
+    """Raise PlanRefused where a line has led to other joints than those of its stop."""
     if stop.q is None:
         return
     for name, wanted, found in zip(model.joint_names, stop.q, q, strict=True):

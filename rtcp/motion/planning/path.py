@@ -1,0 +1,489 @@
+"""Plans of paths that do not rest at each stop: lines, arcs and joint moves, their corners blended, in one trajectory.
+
+Every leg is a curve of the joints over its nominal time, at which the tool, or by the joints the fastest of them, has
+the commanded speed. A corner with a radius is replaced by a quintic of the joints, from where the tool comes that near
+to the corner to where it has left it: position, velocity and acceleration go over, whatever two legs meet. The time law
+(`time_law`) then finds how fast all of it may pass, and rows for `TrajectoryController` are taken from it, as many as a
+quintic between two of them needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import atan2, ceil, dist, inf, tau
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from scipy.interpolate import BPoly, CubicSpline, PPoly
+
+from kinematics.forward import forward, forward_batch
+from kinematics.inverse import InverseKinematics
+from kinematics.jacobian import jacobian
+from kinematics.model import ArmModel
+from kinematics.pose import Pose, Vector
+from rtcp.config.model import MOST_POINTS, CartesianConfig, Point, Stop
+from rtcp.motion.planning.interpolation import quaternion, rotation, turn_between, turned_by
+from rtcp.motion.planning.lines import (
+    NO_WAY_M,
+    NO_WAY_RAD,
+    OF_LIMIT,
+    PoseAt,
+    check_branch,
+    check_singular,
+    follow,
+    goal_of,
+    speed_of,
+    straight,
+)
+from rtcp.motion.planning.plan import Plan, PlanRefused, PlanTooFast, ZoneAt
+from rtcp.motion.planning.time_law import Array, Bounds, TimeLaw
+from rtcp.motion.planning.trajectories import plan_trajectory
+
+if TYPE_CHECKING:
+    from rtcp.motion.limits import Limits
+
+_FLAT: Final = 1e-4
+"""Sine below which three points of an arc are on a line."""
+_LONGEST_TURN: Final = 100.0 * tau
+_SHRINK, _SHRINKS = 0.7, 8
+_IN_BALL: Final = 1.02
+_BLEND_SAMPLES: Final = 17
+_FITS, _SHORTEST = 5, 0.3
+"""How often the nominal time of a blend is adapted, and its least share of that of the corner."""
+_PITCH_M, _PITCH_RAD = 0.001, 0.005
+"""The bounds along a path are looked at whenever the tool has moved, or a joint has turned, so far."""
+_LEAST_SAMPLES, _MOST_SAMPLES = 24, 200_000
+_MOST_RATE, _MOST_ACCELERATION, _MOST_JERK = 1.5, 1e3, 1e5
+"""Of the parameter, where nothing bounds it."""
+_ROW_S, _LEAST_ROW_S = 0.1, 0.002
+_ROW_RAD, _ROW_RAD_S = 2e-6, 2e-4
+"""Rows are as dense as the quintics between them need to be so exact."""
+_STRETCH, _STRETCHES = 1.02, 20
+
+
+@dataclass(frozen=True)
+class _Leg:
+    """A way between two corners; `curve(x, nu)` gives the joints, (k, n), or their derivative, at nominal times, s.
+
+    speed: of the tool, m/s; None: by the joints.
+    """
+
+    where: str
+    curve: Callable[..., Array]
+    duration_s: float
+    speed: float | None
+    length_m: float
+    end: tuple[float, ...]
+    blend: float
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A part of a leg, or a blend: its curve from `start` on, for a nominal time, and the tool's speed at both ends.
+
+    is_blend: between two legs of the tool: there it may go faster than nominal, to keep the tool's speed.
+    """
+
+    curve: Callable[..., Array]
+    start_s: float
+    duration_s: float
+    speeds: tuple[float, float] | None
+    is_blend: bool = False
+
+
+def plan_path(
+    model: ArmModel,
+    limits: Limits,
+    cartesian: CartesianConfig,
+    q_now: Sequence[float],
+    stops: Sequence[Stop],
+    *,
+    speed: float | None = None,
+    zone_at: ZoneAt | None = None,
+) -> Plan:
+    """Return the plan of a path for `TrajectoryController`, at rest at its ends and at each stop without a blend.
+
+    Args:
+        model: the arm.
+        limits: of the joints; where the path would break them it is slowed down.
+        cartesian: speeds, accelerations and jerks of the tool, and how near to a singularity it may come.
+        q_now: where the arm is commanded, at rest, rad, shape (6,).
+        stops: at least one; one where the arm is already is passed over.
+        speed: m/s, where a line or an arc has none of its own; None: that of `cartesian`.
+        zone_at: looked at along the whole way.
+
+    Raises:
+        PlanRefused: with the stop, what was found and what is allowed.
+    """
+    if not stops:
+        raise PlanRefused("the path has no stops, at least one is needed")
+    if len(stops) > MOST_POINTS:
+        raise PlanRefused(f"the path has {len(stops)} stops, at most {MOST_POINTS} are allowed")
+    legs = _legs(model, limits, cartesian, q_now, stops, speed, zone_at)
+    if not legs:
+        raise PlanRefused("the arm is already where the path leads, there is nothing to move")
+    points: list[Point] = [_rest(0.0, tuple(q_now))]
+    slowed = 1.0
+    for section in _sections(model, cartesian, legs):
+        path = _Path(section)
+        bounds, part = path.bounds(model, limits, cartesian)
+        slowed = min(slowed, part)
+        points += _rows(path, TimeLaw(bounds), points[-1].t)
+        if len(points) > MOST_POINTS:
+            raise PlanRefused(
+                f"the path needs more than {MOST_POINTS} rows: run it in several parts, or with fewer stops"
+            )
+    names = model.joint_names
+    for _ in range(_STRETCHES):
+        try:
+            plan = plan_trajectory(points, limits, q_now, names=names, zone_at=zone_at)
+        except PlanTooFast:
+            # between two samples, or by more than what the bounds along the path take into account
+            points = [_slower(point) for point in points]
+            slowed /= _STRETCH
+            continue
+        return replace(plan, length_m=sum(leg.length_m for leg in legs), slowed=slowed)
+    raise PlanRefused("no time law was found that keeps the joints' limits: choose another way")
+
+
+def _legs(
+    model: ArmModel,
+    limits: Limits,
+    cartesian: CartesianConfig,
+    q_now: Sequence[float],
+    stops: Sequence[Stop],
+    speed: float | None,
+    zone_at: ZoneAt | None,
+) -> list[_Leg]:
+    inverse = InverseKinematics(model)
+    legs: list[_Leg] = []
+    q, here = tuple(q_now), forward(model, q_now)
+    for number, stop in enumerate(stops, 1):
+        what = "the move" if stop.by_joints else "the line" if stop.via is None else "the arc"
+        where = f"{what} to stop {number}" if len(stops) > 1 else what
+        goal = goal_of(model, stop, where)
+        if stop.by_joints:
+            leg = _by_joints(inverse, limits, q, stop, goal, where)
+        else:
+            pose_at, extent = (straight(here, goal), _extent(here, goal)) if stop.via is None else (
+                _arc(here, stop.via, goal, stop.angle, where)
+            )  # fmt: skip
+            leg = _of_tool(inverse, limits, cartesian, q, pose_at, extent, stop, speed, where, zone_at)
+        if leg is not None:
+            legs.append(leg)
+            q, here = leg.end, forward(model, leg.end)
+        elif legs and legs[-1].blend != stop.blend:
+            legs[-1] = replace(legs[-1], blend=stop.blend)
+        if not stop.by_joints and stop.via is None:
+            check_branch(stop, q, where, model)
+    return legs
+
+
+def _extent(start: Pose, end: Pose) -> tuple[float, float]:
+    return dist(start.position, end.position), turn_between(quaternion(start.rotation), quaternion(end.rotation))[1]
+
+
+def _by_joints(
+    inverse: InverseKinematics, limits: Limits, q: tuple[float, ...], stop: Stop, goal: Pose, where: str
+) -> _Leg | None:
+    fastest = max(limits.velocity)
+    if stop.speed is not None and not 0.0 < stop.speed <= fastest:
+        raise PlanRefused(
+            f"{where}: found a speed of {stop.speed:g} rad/s, allowed is more than 0 and at most {fastest:g} rad/s"
+        )
+    if stop.q is not None:
+        end = tuple(stop.q)
+    else:
+        near = inverse.solve_near(goal, q)
+        if near.q is None:
+            raise PlanRefused(f"{where}: {near.reason}")
+        end = near.q
+    for name, at, low, high in zip(inverse.model.joint_names, end, limits.low, limits.high, strict=True):
+        if not low <= at <= high:
+            raise PlanRefused(f"{where}: {name} would be at {at:.4f} rad, allowed is {low:g} to {high:g} rad")
+    ways = [b - a for a, b in zip(q, end, strict=True)]
+    duration = max(
+        abs(way) / min(OF_LIMIT * most, inf if stop.speed is None else stop.speed)
+        for way, most in zip(ways, limits.velocity, strict=True)
+    )
+    if duration <= 1e-6:
+        return None
+    curve = PPoly(np.array([[[way / duration for way in ways]], [list(q)]]), [0.0, duration])
+    length = dist(forward(inverse.model, q).position, forward(inverse.model, end).position)
+    return _Leg(where, curve, duration, None, length, end, stop.blend)
+
+
+def _arc(
+    start: Pose, via: Sequence[float], end: Pose, angle: float | None, where: str
+) -> tuple[PoseAt, tuple[float, float]]:
+    """Return the poses of the arc from a pose through a point to a pose, and how far the tool moves and turns.
+
+    With an angle it is travelled on the circle through the three places, and the tool keeps its orientation.
+    """
+    a, b, c = (np.array(one, dtype=np.float64) for one in (start.position, via, end.position))
+    u, w = b - a, c - a
+    normal = np.cross(u, w)
+    size = float(np.linalg.norm(u) * np.linalg.norm(w))
+    across = float(np.linalg.norm(normal))
+    if not across > _FLAT * size or size < NO_WAY_M**2 or float(np.linalg.norm(c - b)) < NO_WAY_M:
+        raise PlanRefused(
+            f"{where}: its start, its via and its end are on one line or not three places: give a via beside the line"
+        )
+    # the centre of the circle through three points
+    to_centre = (np.cross(normal, u) * float(w @ w) + np.cross(w, normal) * float(u @ u)) / (2.0 * across * across)
+    centre, radius = a + to_centre, float(np.linalg.norm(to_centre))
+    first = -to_centre / radius
+    second = np.cross(normal / across, first)
+    if angle is None:
+        out = c - centre
+        turn = atan2(float(out @ second), float(out @ first)) % tau
+        axis, tool_turn = turn_between(quaternion(start.rotation), quaternion(end.rotation))
+    else:
+        if not 0.0 < abs(angle) <= _LONGEST_TURN:
+            raise PlanRefused(f"{where}: found an angle of {angle:g} rad, allowed is up to {_LONGEST_TURN:g}, not 0")
+        turn, axis, tool_turn = angle, (0.0, 0.0, 1.0), 0.0
+    turned = rotation(quaternion(start.rotation))
+
+    def pose_at(x: float) -> Pose:
+        place = centre + radius * (np.cos(x * turn) * first + np.sin(x * turn) * second)
+        at: Vector = (float(place[0]), float(place[1]), float(place[2]))
+        return Pose(at, turned_by(turned, axis, x * tool_turn) if tool_turn else turned)
+
+    return pose_at, (radius * abs(turn), tool_turn)
+
+
+def _of_tool(
+    inverse: InverseKinematics,
+    limits: Limits,
+    cartesian: CartesianConfig,
+    q: tuple[float, ...],
+    pose_at: PoseAt,
+    extent: tuple[float, float],
+    stop: Stop,
+    speed: float | None,
+    where: str,
+    zone_at: ZoneAt | None,
+) -> _Leg | None:
+    fast = speed_of(stop, speed, cartesian, where)
+    length, angle = extent
+    if length <= NO_WAY_M and angle <= NO_WAY_RAD:
+        return None
+    joints = follow(inverse, limits, cartesian, pose_at, extent, q, where, zone_at)
+    duration = max(length / fast, angle / cartesian.angular_speed)
+    curve = CubicSpline(np.linspace(0.0, duration, len(joints)), np.array(joints))
+    return _Leg(where, curve, duration, fast, length, joints[-1], stop.blend)
+
+
+def _sections(model: ArmModel, cartesian: CartesianConfig, legs: Sequence[_Leg]) -> list[list[_Piece]]:
+    """Return what lies between two rests: legs without what their blends replace, and the blends."""
+    sections: list[list[_Piece]] = [[]]
+    begin = 0.0
+    for leg, following in zip(legs, [*legs[1:], None], strict=True):
+        speeds = None if leg.speed is None else (leg.speed, leg.speed)
+        if following is None or leg.blend <= 0.0:
+            sections[-1].append(_Piece(leg.curve, begin, leg.duration_s - begin, speeds))
+            sections.append([])
+            begin = 0.0
+            continue
+        leave, blend, begin_next = _blend(model, cartesian, leg, following, begin)
+        sections[-1] += [_Piece(leg.curve, begin, leave - begin, speeds), blend]
+        begin = begin_next
+    return sections[:-1]
+
+
+def _blend(
+    model: ArmModel, cartesian: CartesianConfig, leg: _Leg, following: _Leg, begin: float
+) -> tuple[float, _Piece, float]:
+    """Return where a leg is left, the blend, and where the following leg is entered."""
+    corner = forward(model, leg.end).position
+    radius = leg.blend
+    of_tool = leg.speed is not None and following.speed is not None
+    for _ in range(_SHRINKS):
+        leave = _within(model, leg, corner, radius, leg.duration_s)
+        enter = _within(model, following, corner, radius, 0.0)
+        ends = [[leg.curve(leave, nu) for nu in range(3)], [following.curve(enter, nu) for nu in range(3)]]
+        speed = 0.5 * (_tool_speed(model, leg, leave) + _tool_speed(model, following, enter))
+        whole = duration = leg.duration_s - leave + enter
+        for _ in range(_FITS):
+            curve = BPoly.from_derivatives([0.0, duration], ends)
+            joints = curve(np.linspace(0.0, duration, _BLEND_SAMPLES))
+            places = [forward(model, q).position for q in joints.tolist()]
+            # As long as its way takes at the speeds of its ends: that bends least.
+            length = sum(map(dist, places[1:], places[:-1]))
+            duration = min(max(length / speed if speed else inf, _SHORTEST * whole), whole)
+        far = max(dist(places[0], corner), dist(places[-1], corner))
+        if all(dist(place, corner) <= _IN_BALL * far + NO_WAY_M for place in places):
+            if of_tool:
+                for q in joints.tolist():
+                    check_singular(model, q, cartesian, f"the blend at the end of {leg.where}")
+            speeds = (leg.speed, following.speed) if leg.speed is not None and following.speed is not None else None
+            return leave, _Piece(curve, 0.0, float(curve.x[-1]), speeds, of_tool), enter
+        radius *= _SHRINK
+    raise PlanRefused(
+        f"{leg.where}: its corner cannot be blended within {leg.blend:g} m: choose another radius, or a rest"
+    )
+
+
+def _tool_speed(model: ArmModel, leg: _Leg, x: float) -> float:
+    """Return the tool's nominal speed at a nominal time, m/s."""
+    rates = leg.curve(x, 1)
+    rows = jacobian(model, leg.curve(x).tolist())
+    return float(np.linalg.norm(np.array(rows[:3]) @ rates))
+
+
+def _within(model: ArmModel, leg: _Leg, corner: Vector, radius: float, end: float) -> float:
+    """Return the nominal time at which the tool is `radius` from the corner at an `end` of a leg; at most half of it.
+
+    Half of a joint move at which the tool does not move is all of it that a blend takes.
+    """
+
+    def far(x: float) -> float:
+        return dist(forward(model, leg.curve(x).tolist()).position, corner)
+
+    out, near = 0.5 * leg.duration_s, end
+    if far(out) <= radius:
+        return out
+    for _ in range(50):
+        middle = 0.5 * (out + near)
+        out, near = (out, middle) if far(middle) <= radius else (middle, near)
+    return 0.5 * (out + near)
+
+
+class _Path:
+    """The pieces between two rests as one curve over the nominal time.
+
+    Args:
+        pieces: in their order.
+    """
+
+    def __init__(self, pieces: Sequence[_Piece]) -> None:
+        self._pieces = pieces
+        self._ends = np.cumsum([piece.duration_s for piece in pieces])
+        self.duration_s = float(self._ends[-1])
+
+    def at(self, x: Array, nu: int) -> Array:
+        """Return the joints, (k, n), or a derivative of them, at nominal times, (k,), s."""
+        which = np.minimum(np.searchsorted(self._ends, x), len(self._pieces) - 1)
+        found: Array | None = None
+        for number in np.unique(which):
+            piece, here = self._pieces[number], which == number
+            local = np.clip(x[here] - (self._ends[number] - piece.duration_s), 0.0, piece.duration_s) + piece.start_s
+            values = piece.curve(local, nu)
+            if found is None:
+                found = np.empty((len(x), values.shape[1]))
+            found[here] = values
+        assert found is not None
+        return found
+
+    def bounds(self, model: ArmModel, limits: Limits, cartesian: CartesianConfig) -> tuple[Bounds, float]:
+        """Return the bounds of the time law, and the part of the commanded speed that they leave to the tool."""
+        grid = self._grid(limits, cartesian)
+        pitch = float(grid[1])
+        first, second, third = (np.abs(self.at(grid, nu)) for nu in (1, 2, 3))
+        places, turns = forward_batch(model, self.at(grid, 0))
+        velocity = np.gradient(places, pitch, axis=0)
+        speed = np.linalg.norm(velocity, axis=1)
+        bow = np.linalg.norm(np.gradient(velocity, pitch, axis=0), axis=1)
+        step = np.einsum("kji,kjl->kil", turns[:-1], turns[1:])
+        spin = (
+            0.5
+            / pitch
+            * np.linalg.norm(
+                [step[:, 2, 1] - step[:, 1, 2], step[:, 0, 2] - step[:, 2, 0], step[:, 1, 0] - step[:, 0, 1]], axis=0
+            )
+        )
+        spin = np.maximum(np.append(spin, 0.0), np.append(0.0, spin))
+        wanted, of_tool = self._wanted(grid, speed, spin, cartesian)
+        fastest, strongest, jerkiest = (np.array(one) for one in (limits.velocity, limits.acceleration, limits.jerk))
+        with np.errstate(divide="ignore"):
+            rate = np.minimum(wanted, (OF_LIMIT * fastest / first).min(axis=1))
+            rate = np.minimum(rate, np.sqrt((0.5 * OF_LIMIT * strongest / second).min(axis=1)))
+            rate = np.minimum(rate, np.cbrt((OF_LIMIT * jerkiest / third).min(axis=1)))
+            rate = np.where(of_tool, np.minimum(rate, np.sqrt(cartesian.acceleration / bow)), rate)
+            left = np.maximum(OF_LIMIT * strongest - second * (rate * rate)[:, None], 0.0)
+            acceleration, jerk = (left / first).min(axis=1), (jerkiest / first).min(axis=1)
+            for bound, linear, angular in (
+                (acceleration, cartesian.acceleration, cartesian.angular_acceleration),
+                (jerk, cartesian.jerk, cartesian.angular_jerk),
+            ):
+                of_both = np.minimum(linear / speed, angular / spin)
+                np.minimum(bound, np.where(of_tool, of_both, inf), out=bound)
+        part = float((rate / wanted)[of_tool].min(initial=1.0))
+        return Bounds(
+            pitch,
+            np.minimum(rate, _MOST_RATE),
+            np.minimum(acceleration, _MOST_ACCELERATION),
+            np.minimum(jerk, _MOST_JERK),
+        ), min(part, 1.0)  # fmt: skip
+
+    def _grid(self, limits: Limits, cartesian: CartesianConfig) -> Array:
+        speed = max((max(piece.speeds) for piece in self._pieces if piece.speeds), default=0.0)
+        pitch = min(
+            _PITCH_M / speed if speed else inf,
+            _PITCH_RAD / max(limits.velocity),
+            min(piece.duration_s for piece in self._pieces if piece.duration_s > 1e-9) / _LEAST_SAMPLES,
+        )
+        count = min(ceil(self.duration_s / pitch), _MOST_SAMPLES)
+        return np.linspace(0.0, self.duration_s, count + 1)
+
+    def _wanted(self, grid: Array, speed: Array, spin: Array, cartesian: CartesianConfig) -> tuple[Array, Array]:
+        """Return the rate at which the tool has the commanded speed, and where there is one."""
+        wanted, of_tool = np.ones(len(grid)), np.zeros(len(grid), dtype=bool)
+        for piece, end in zip(self._pieces, self._ends, strict=True):
+            if piece.speeds is None:
+                continue
+            here = (grid >= end - piece.duration_s) & (grid <= end)
+            of_tool |= here
+            if piece.is_blend:
+                part = (grid[here] - (end - piece.duration_s)) / piece.duration_s
+                fast = piece.speeds[0] + (piece.speeds[1] - piece.speeds[0]) * part
+                with np.errstate(divide="ignore"):
+                    wanted[here] = np.minimum(fast / speed[here], cartesian.angular_speed / spin[here])
+        return wanted, of_tool
+
+
+def _rest(t: float, q: tuple[float, ...]) -> Point:
+    still = (0.0,) * len(q)
+    return Point(t, q, still, still)
+
+
+def _slower(point: Point) -> Point:
+    assert point.v is not None
+    assert point.a is not None
+    return Point(
+        point.t * _STRETCH, point.q, tuple(v / _STRETCH for v in point.v), tuple(a / _STRETCH**2 for a in point.a)
+    )
+
+
+def _rows(path: _Path, law: TimeLaw, begin_s: float) -> list[Point]:
+    """Return the points of a section behind its first, dense enough for quintics between them."""
+    times = np.linspace(0.0, law.duration_s, max(ceil(law.duration_s / _ROW_S), 2) + 1)
+
+    def at(when: Array) -> tuple[Array, Array, Array]:
+        x, rate, change = law.at(when)
+        first, second = path.at(x, 1), path.at(x, 2)
+        return (
+            path.at(x, 0),
+            first * rate[:, None],
+            second * (rate * rate)[:, None] + first * change[:, None],
+        )
+
+    while True:
+        q, v, a = at(times)
+        lengths = np.diff(times)
+        step = lengths[:, None]
+        middle = 0.5 * (q[1:] + q[:-1]) + 5 / 32 * step * (v[:-1] - v[1:]) + 1 / 64 * step**2 * (a[:-1] + a[1:])
+        speed = 15 / 8 * np.diff(q, axis=0) / step - 7 / 16 * (v[:-1] + v[1:]) + 1 / 32 * step * np.diff(a, axis=0)
+        exact_q, exact_v, _ = at(times[:-1] + 0.5 * lengths)
+        wrong = (np.abs(middle - exact_q).max(axis=1) > _ROW_RAD) | (np.abs(speed - exact_v).max(axis=1) > _ROW_RAD_S)
+        wrong &= lengths > 2.0 * _LEAST_ROW_S
+        if not wrong.any() or len(times) > MOST_POINTS:
+            break
+        times = np.sort(np.append(times, (times[:-1] + 0.5 * lengths)[wrong]))
+    points = [
+        Point(begin_s + float(t), tuple(row_q), tuple(row_v), tuple(row_a))
+        for t, row_q, row_v, row_a in zip(times[1:], q[1:].tolist(), v[1:].tolist(), a[1:].tolist(), strict=True)
+    ]
+    points[-1] = _rest(points[-1].t, points[-1].q)
+    return points
